@@ -84,6 +84,9 @@ class FakeRecalibrator:
     def what_if(self, joints):
         return {"joints": dict(joints)}
 
+    def rolled_back_event(self, sequence, to):
+        return {"event": "decision", "sequence": sequence, "at": 0.0, "kind": "rollback", "to": to, "sentence": "Back."}
+
     def started_event(self, resumed):
         return {"event": "started", "level": "nominal"}
 

@@ -113,9 +113,6 @@ class JournalReplayer:
             sequence = entry.sequence
             with parsing(sequence):
                 to = int(content["to"])
-            sentence = f"The estimate was set back to what it was after entry {to}."
-            rollback = {"event": "decision", "sequence": sequence, "kind": "rollback", "to": to, "sentence": sentence}
-            self.decisions.append(rollback)
             if to in self._held:
                 self._state_replayer.apply(sequence, ROLLBACK, {"to": to})
             elif self._verifier.resumes:
@@ -127,6 +124,7 @@ class JournalReplayer:
                     "would have made of it cannot be found.",
                     hint=f"Replay up to there only: --until {sequence - 1}.",
                 )
+            self.decisions.append(self.session.rolled_back_event(sequence, to))
             if content.get("digest") and not self._is_lost:
                 self._verifier.compare_digest(sequence, content["digest"], self.session)
         elif not self._is_lost:

@@ -153,9 +153,7 @@ class Recalibration:
         except BaseException:
             self._session.restore(before)
             raise
-        sentence = f"The estimate was set back to what it was after entry {sequence}."
-        event = {"event": "decision", "sequence": self.sequence, "at": time.time(), "kind": "rollback"}
-        self._outputs.event({**event, "to": sequence, "sentence": sentence})
+        self._outputs.event({**self._session.rolled_back_event(self.sequence, sequence), "at": time.time()})
         self._checkpoint()
         self.write_calibration()
 

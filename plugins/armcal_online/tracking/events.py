@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 from armcal.estimate.online import Linearised
 
 from armcal_online.sources.source import Incoming
+from armcal_online.tracking.decisions import LEVEL_ADVICE, Decision, advice, per_cent, sure
 from armcal_online.tracking.directions import Steps
 from armcal_online.tracking.health import Health
 from armcal_online.tracking.hypotheses import Recent
-from armcal_online.tracking.sentences import Decision
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.start import FilterSetup
-from armcal_online.tracking.state import State
+from armcal_online.tracking.state import Arrival, State
+from armcal_online.tracking.tip_error import TipError
+
+_MOST_LOG_ODDS = 700.0
+_FIRST_DATE, _LAST_DATE = 1e8, 1e11
+"""Unix seconds (1973 to 5138); other times are of a clock that began elsewhere."""
 
 
 def started(
@@ -75,9 +81,33 @@ def judged(
     return event
 
 
-def decided(state: State, decision: Decision) -> dict[str, Any]:
-    """Something that was decided."""
-    event = _event("decision", state, kind=decision.kind, since=decision.since, sentence=decision.sentence)
+def decided(state: State, decision: Decision, tip: TipError | None, calm: int) -> dict[str, Any]:
+    """Something that was decided: what, since when, how sure, how far the tip was off, what to do, what confirms it.
+
+    Args:
+        state: after the decision.
+        decision: what was decided.
+        tip: how far the tip was off without it, where that is known.
+        calm: after so many records without trouble the level improves.
+    """
+    first, good = state.known(decision.since), state.good_before(decision.since)
+    log_odds = min(max(decision.log_odds, -_MOST_LOG_ODDS), _MOST_LOG_ODDS)
+    event = _event("decision", state, kind=decision.kind, what=f"{decision.what}.", since=decision.since)
+    if first is not None:
+        event |= {"since_id": first.record_id, "since_at": first.at}
+    event |= {"sure_percent": per_cent(log_odds), "log_odds": log_odds, "why": f"{decision.why}."}
+    if tip is not None:
+        event |= {f"tip_error_{tip.unit}": tip.size, "tip_error_is": tip.source}
+    subject = decision.subject or "it"
+    names = {
+        "subject": f"joint {subject}" if decision.kind.startswith("joint") else subject,
+        "candidates": " and ".join(decision.candidates) or subject,
+        **_names(good, calm),
+    }
+    event |= {**advice(decision.kind, names), "last_good": _named(good)}
+    off = "" if tip is None else f" The tip was {tip.size:.3g} {tip.unit} off."
+    text = f"{decision.what}. First record affected: {record_name(decision.since, first)}. {sure(log_odds)}.{off}"
+    event["sentence"] = text
     if decision.subject:
         event["joint" if decision.kind.startswith("joint") else "measurement"] = decision.subject
     if len(decision.candidates) > 1:
@@ -88,14 +118,64 @@ def decided(state: State, decision: Decision) -> dict[str, Any]:
     return event
 
 
-def noted(state: State, kind: str, text: str) -> dict[str, Any]:
+def noted(state: State, kind: str, text: str, calm: int) -> dict[str, Any]:
     """Something odd that did no harm."""
-    return _event("decision", state, kind=kind, sentence=f"{text[:1].upper()}{text[1:]}.")
+    sentence = f"{text[:1].upper()}{text[1:]}."
+    texts = advice(kind, _names(state.good_before(state.sequence + 1), calm))
+    return _event("decision", state, kind=kind, what=sentence, **texts, sentence=sentence)
 
 
-def level_changed(state: State, before: str, health: Health) -> dict[str, Any]:
-    """Health got better or worse."""
-    return {**_event("level", state), "from": before, "to": health.level, "sentence": health.sentence}
+def last_good(state: State) -> dict[str, Any] | None:
+    """The last record that was accepted while the level was nominal and nothing was decided."""
+    return _named(state.good_before(state.sequence + 1))
+
+
+def level_changed(state: State, before: str, health: Health, calm: int) -> dict[str, Any]:
+    """Health got better or worse; what to do, and the last good record."""
+    good = state.good_before(state.sequence)
+    return {
+        **_event("level", state),
+        "from": before,
+        "to": health.level,
+        "do": LEVEL_ADVICE[health.level].format_map(_names(good, calm)),
+        "last_good": _named(good),
+        "sentence": health.sentence,
+    }
+
+
+def rolled_back(state: State, sequence: int, to: int, calm: int) -> dict[str, Any]:
+    """The estimate was set back by an entry ``sequence`` to the state after entry ``to``, if the journal keeps it."""
+    is_there = state.sequence <= to
+    there = record_name(state.sequence, state.known(state.sequence)) if is_there else record_name(to, None)
+    sentence = f"The estimate was set back to what it was after {there}."
+    texts = advice("rollback", _names(None, calm))
+    event = _event("decision", state, kind="rollback", to=to, what=sentence, **texts, sentence=sentence)
+    return {**event, "sequence": sequence, "last_good": last_good(state) if is_there else None}
+
+
+def record_name(sequence: int, arrival: Arrival | None) -> str:
+    """A record by its own name and time, beside its number."""
+    if arrival is None:
+        return f"entry {sequence}"
+    return f"record {arrival.record_id} ({spoken_time(arrival.at)}, entry {sequence})"
+
+
+def spoken_time(at: float) -> str:
+    """A time as people read it: unix seconds as a date, seconds of another clock as they are."""
+    if not _FIRST_DATE < at < _LAST_DATE:
+        return f"at {at:g} s"
+    return f"{datetime.fromtimestamp(at, UTC):%Y-%m-%d %H:%M:%S} UTC"
+
+
+def _names(good: Arrival | None, calm: int) -> dict[str, Any]:
+    """What an advice names."""
+    if good is None:
+        return {"calm": calm, "good": "the calibration that it began from"}
+    return {"calm": calm, "good": record_name(good.sequence, good)}
+
+
+def _named(arrival: Arrival | None) -> dict[str, Any] | None:
+    return None if arrival is None else {"sequence": arrival.sequence, "id": arrival.record_id, "at": arrival.at}
 
 
 def estimated(state: State, parameters: Mapping[str, list[float]]) -> dict[str, Any]:

@@ -12,10 +12,10 @@ from scipy.special import logsumexp
 
 from armcal_online.tracking import sentences
 from armcal_online.tracking.belief import Belief
+from armcal_online.tracking.decisions import EXPLAINED, Decision, log_odds_of
 from armcal_online.tracking.directions import Steps
 from armcal_online.tracking.health import Health, improbability, many_outliers, nis_limit
 from armcal_online.tracking.hypotheses import Candidate, Explanation, Hypothesis, HypothesisFilter
-from armcal_online.tracking.sentences import EXPLAINED, Decision
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.state import State
 from armcal_online.tracking.state_space import StateSpace
@@ -101,16 +101,16 @@ class Judge:
         margin = best.log_odds - others[0].log_odds if others else math.inf
         is_named = len(large) >= gate.window - 1 or margin >= math.log(settings.naming_odds)
         if total > math.log(settings.odds) and is_named:
-            return self._follow_change(state, alike, others, margin)
+            return self._follow_change(state, alike, others)
         state = replace(state, wary=bool(best.log_odds > 0))
         rejected = sum(record.rejected for record in state.recent)
+        by_chance = many_outliers(rejected, gate.window, self._settings.outliers.fraction)
         if rejected >= gate.window - 1 and len(state.recent) >= gate.window:
             text = f"{rejected} of the last {len(state.recent)} records do not fit"
-            return state, sentences.no_longer_fits(state, self._steps, text)
-        by_chance = many_outliers(rejected, gate.window, self._settings.outliers.fraction)
+            return state, sentences.no_longer_fits(state, self._steps, text, log_odds_of(by_chance))
         if rejected < gate.rejected or by_chance >= settings.probability:
             return state, None
-        return state, sentences.unexplained(state, rejected, best)
+        return state, sentences.unexplained(state, rejected, by_chance, best)
 
     def _indistinguishable(self, explanations: Sequence[Explanation]) -> list[Explanation]:
         """The likeliest, and if it is a joint's the other joints that these records cannot distinguish from it."""
@@ -128,7 +128,7 @@ class Judge:
         return list(near.values())
 
     def _follow_change(
-        self, state: State, alike: Sequence[Explanation], others: Sequence[Explanation], margin: float
+        self, state: State, alike: Sequence[Explanation], others: Sequence[Explanation]
     ) -> tuple[State, Decision]:
         """The state with what a change reopens, from before it on."""
         best, since = alike[0], state.recent[alike[0].onset :]
@@ -153,17 +153,18 @@ class Judge:
             drifted=0,
             wary=False,
             suspects=suspects,
-            suspected=state.sequence,
+            suspected=since[0].sequence,
             before_change=since[0].before if suspects else None,
         )
         size = self._size(since[0].before, belief, best.hypothesis)
-        decision = sentences.change(state, self._steps, alike, margin, others, size)
+        decision = sentences.change(state, self._steps, alike, others, size)
         if best.hypothesis.kind == "general_change":
             late = tuple(s for s in state.changes if state.sequence - s < 10 * self._settings.gate.window)
             after = replace(after, changes=(*late, state.sequence)[-_UNEXPLAINED:])
             if len(after.changes) >= _UNEXPLAINED:
                 text = f"{len(after.changes)} changes that nothing explains came within a short time"
-                return after, sentences.no_longer_fits(state, self._steps, text)
+                first = after.changes[0]
+                return after, sentences.no_longer_fits(state, self._steps, text, decision.log_odds, first)
         return after, decision
 
     def _name_suspect(self, state: State) -> tuple[State, Decision | None]:
@@ -199,17 +200,20 @@ class Judge:
         if len(state.nis_window) < settings.window:
             return state, None
         known = min(map(self._filter.freedom, state.recent), default=math.inf)
-        if improbability(state.nis_window, known) >= settings.probability:
+        by_chance = improbability(state.nis_window, known)
+        if by_chance >= settings.probability:
             return replace(state, drifted=0, nis_window=state.nis_window[settings.window // 2 :]), None
         total, freedom = (float(sum(column)) for column in zip(*state.nis_window, strict=True))
         ratio, count = total / freedom, len(state.nis_window)
         state = replace(state, nis_window=(), drifted=state.drifted + 1)
         if state.drifted >= _UNEXPLAINED:
             text = f"the NIS of {count} records is {ratio:.1f} times what chance makes it, again and again"
-            return state, sentences.no_longer_fits(state, self._steps, text)
+            since = sentences.first_of(state, _UNEXPLAINED * count)
+            return state, sentences.no_longer_fits(state, self._steps, text, log_odds_of(by_chance), since)
         factor = min(math.sqrt(ratio), _MOST_WIDENING)
         belief = state.belief.widened(len(self._space.scales), factor)
-        return replace(state, belief=belief, anchor=belief, held=()), sentences.drift(state, count, ratio, factor)
+        decision = sentences.drift(state, count, ratio, by_chance, factor)
+        return replace(state, belief=belief, anchor=belief, held=()), decision
 
     def _size(self, before: Belief, after: Belief, hypothesis: Hypothesis) -> tuple[float, float]:
         """How far a joint stepped (rad or m), and its standard deviation."""

@@ -25,6 +25,7 @@ from pydantic import ValidationError
 from armcal_online.sources.source import Incoming
 from armcal_online.tracking import events
 from armcal_online.tracking.belief import most_likely
+from armcal_online.tracking.decisions import EXPLAINED
 from armcal_online.tracking.directions import Steps, find_steps
 from armcal_online.tracking.evaluator import identity
 from armcal_online.tracking.health import nis_limit
@@ -33,7 +34,8 @@ from armcal_online.tracking.judge import Judge
 from armcal_online.tracking.observer import Reading
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.start import FilterSetup, filter_setup
-from armcal_online.tracking.state import REMEMBERED, State, Tick, advanced, ticked
+from armcal_online.tracking.state import Arrival, State, Tick, advanced, remembering, ticked
+from armcal_online.tracking.tip_error import tip_error
 from armcal_online.tracking.updated import calibration_text, deviations
 from armcal_online.tracking.what_if import worth_of_record
 
@@ -135,7 +137,8 @@ class Recalibrator:
             passed["sequence"] = 1e9 if state.place is None else abs(place - state.place)
             state = replace(state, place=place)
         judged = self._judged(incoming, replace(state, clock=tick.clock), readings, passed)
-        return (events.noted(self.state, "clock", tick.note), *judged) if tick.note else judged
+        calm = self._settings.levels.calm
+        return (events.noted(self.state, "clock", tick.note, calm), *judged) if tick.note else judged
 
     def _admitted(self, incoming: Incoming, state: State, time: float | None, tick: Tick) -> tuple[State, str]:
         """The state with the record known, and why it is passed over, if it is."""
@@ -144,13 +147,14 @@ class Recalibrator:
         # Where and when a record arrived does not make it another.
         content = incoming.as_dict()
         identifying = json.dumps([content["id"], content["channels"], content["labels"]], sort_keys=True)
-        mark = incoming.record_id, hashlib.sha256(identifying.encode()).hexdigest()[:12]
-        if mark in state.ids:
+        mark = hashlib.sha256(identifying.encode()).hexdigest()[:12]
+        if any((known.record_id, known.content) == (incoming.record_id, mark) for known in state.ids):
             return state, "the same record came before"
-        state = replace(state, ids=(*state.ids, mark)[-REMEMBERED:])
+        at = incoming.arrived if time is None else time
+        state = remembering(state, Arrival(incoming.record_id, mark, state.sequence, at))
         if tick.stale:
             return replace(state, clock=tick.clock), tick.stale
-        state = replace(state, at=incoming.arrived if time is None else time)
+        state = replace(state, at=at)
         for arm in self._calibration.system.arms.values():
             for joint in arm.commanded:
                 angle = incoming.channels.get(f"{arm.name}.{joint}", 0.0)
@@ -188,13 +192,18 @@ class Recalibrator:
         state, decisions = self._judge.after(gated) if self._settings.gating == "on" else (gated, ())
         health, level = self._judge.health(gated, decisions, first), self.state.health.level
         record_events = [events.judged(incoming, state, recent, first, limit, self.setup)]
+        calm = self._settings.levels.calm
         for decision in decisions:
             # These two stand until something else is decided: they are news once.
             if decision.kind not in ("unexplained", "model_no_longer_fits") or decision.level != level:
-                record_events.append(events.decided(state, decision))
+                explained = state.belief if decision.kind in EXPLAINED else gated.belief
+                tip = tip_error(observer, gated.recent, decision.since, gated.belief, explained)
+                record_events.append(events.decided(state, decision, tip, calm))
         if health.level != level:
-            record_events.append(events.level_changed(state, level, health))
-        self.state = replace(state, health=health)
+            record_events.append(events.level_changed(state, level, health, calm))
+        is_good = not rejected and not decisions and health.level == "nominal"
+        newest = replace(state.ids[-1], is_good=is_good)
+        self.state = replace(state, health=health, ids=(*state.ids[:-1], newest))
         every = self._settings.output.estimate_every_records
         if decisions or (state.counts["accepted"] % every == 0 and not recent.rejected):
             record_events.append(events.estimated(self.state, self.estimate))
@@ -204,6 +213,10 @@ class Recalibrator:
         """The first event of a process."""
         return events.started(self.state, self.setup, self._settings, self.estimate, resumed, self.steps)
 
+    def rolled_back_event(self, sequence: int, to: int) -> dict[str, Any]:
+        """That entry ``sequence`` set the estimate back to what it was after entry ``to``, where it is now."""
+        return events.rolled_back(self.state, sequence, to, self._settings.levels.calm)
+
     def status(self) -> dict[str, Any]:
         """Health, counts and estimate now, as JSON."""
         state = self.state
@@ -212,6 +225,7 @@ class Recalibrator:
             "why": state.health.sentence,
             "counts": dict(state.counts),
             "record_time": state.at,
+            "last_good": events.last_good(state),
             "parameters": self.estimate,
             "evaluator": self.setup.problem.backend,
         }

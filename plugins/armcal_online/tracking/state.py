@@ -21,8 +21,8 @@ from armcal_online.tracking.hypotheses import Candidate, Recent
 from armcal_online.tracking.settings import ClockSettings
 from armcal_online.tracking.start import FilterSetup
 
-REMEMBERED = 64
-"""So many ids are remembered, to know a record that comes twice."""
+REMEMBERED = 128
+"""So many records are remembered: to know one that comes twice, and to name the first after a change."""
 _REFRESHED = 25
 """After so many accepted records the origin is put where it is most likely within the bounds."""
 
@@ -79,6 +79,25 @@ def _span(seconds: float) -> str:
 
 
 @dataclass(frozen=True)
+class Arrival:
+    """A record that came.
+
+    Attributes:
+        record_id: its own name.
+        content: a hash of it.
+        sequence: its number.
+        at: its time (as ``State.at``).
+        is_good: whether it was accepted, nothing was decided, and the level was nominal after it.
+    """
+
+    record_id: str
+    content: str
+    sequence: int
+    at: float
+    is_good: bool = False
+
+
+@dataclass(frozen=True)
 class State:
     """Between two records; with it and the records after, everything comes out again.
 
@@ -92,10 +111,11 @@ class State:
         health: and why.
         nis_window: NIS and degrees of freedom of the last accepted records.
         counts: of accepted, rejected and ignored records.
-        ids: of the last records, with a hash of their content.
+        ids: the last records, in order.
+        good: the last good record of those before.
         wary: whether the last records look like a change, which is not certain yet.
         suspects: joints that could not be distinguished when one of them stepped, each followed by itself.
-        suspected: the record at which that was decided.
+        suspected: the first record after that.
         before_change: the belief before it.
         drifted: how often in a row the NIS as a whole was too large.
         changes: sequence numbers of the last changes that nothing explained.
@@ -112,7 +132,8 @@ class State:
     health: Health = field(default_factory=Health)
     nis_window: tuple[tuple[float, int], ...] = ()
     counts: Mapping[str, int] = field(default_factory=lambda: {"accepted": 0, "rejected": 0, "ignored": 0})
-    ids: tuple[tuple[str, str], ...] = ()
+    ids: tuple[Arrival, ...] = ()
+    good: Arrival | None = None
     wary: bool = False
     suspects: tuple[Candidate, ...] = ()
     suspected: int = 0
@@ -121,6 +142,15 @@ class State:
     changes: tuple[int, ...] = ()
     sequence: int = 0
     at: float = 0.0
+
+    def known(self, sequence: int) -> Arrival | None:
+        """The record of a number, if it is remembered."""
+        return next((arrival for arrival in reversed(self.ids) if arrival.sequence == sequence), None)
+
+    def good_before(self, sequence: int) -> Arrival | None:
+        """The last good record before a number; None before the first."""
+        earlier = (arrival for arrival in reversed(self.ids) if arrival.is_good and arrival.sequence < sequence)
+        return next(earlier, self.good if self.good is not None and self.good.sequence < sequence else None)
 
     def as_dict(self) -> dict[str, Any]:
         """As JSON, to the last bit."""
@@ -151,6 +181,13 @@ class State:
         rest = [asdict(self.health), dict(self.counts), asdict(self.clock), self.sequence, self.drifted]
         hashed.update(json.dumps(rest, sort_keys=True).encode())
         return hashed.hexdigest()[:16]
+
+
+def remembering(state: State, arrival: Arrival) -> State:
+    """The state with one more record; the oldest is forgotten, but for the last good one."""
+    ids = (*state.ids, arrival)
+    gone = [earlier for earlier in ids[:-REMEMBERED] if earlier.is_good]
+    return replace(state, ids=ids[-REMEMBERED:], good=gone[-1] if gone else state.good)
 
 
 def _encoded(value: Any) -> Any:

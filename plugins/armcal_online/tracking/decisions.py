@@ -1,0 +1,206 @@
+"""The kinds of decisions: what each means, what an operator does about it, and what would confirm it.
+
+A new kind is one entry of ``KINDS`` and its section in docs/decisions.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from armcal_online.tracking.health import Level
+
+
+@dataclass(frozen=True)
+class DecisionKind:
+    """One kind of decision.
+
+    ``do`` and ``confirm`` are whole sentences for somebody who cannot reach the arm. They may hold ``{subject}`` (the
+    joint or instrument), ``{candidates}`` (all joints that it may be), ``{calm}`` (how many records in a row without
+    trouble improve the level) and ``{good}`` (where to roll back to).
+
+    Attributes:
+        means: what happened, in general; for the page of all decisions.
+        do: what to do now.
+        confirm: what would confirm it, or show that it is wrong.
+        level: of health that it means; None: it says nothing about the arm.
+        explains: whether what did not fit is explained by it.
+    """
+
+    means: str
+    do: str
+    confirm: str
+    level: Level | None
+    explains: bool = False
+
+
+KINDS: Mapping[str, DecisionKind] = {
+    "joint_slipped": DecisionKind(
+        means="The zero of one joint moved at once, as when a servo horn slips a tooth. The new offset is in use.",
+        do="Go on with coarse work. Take {calm} records at different poses before precise work.",
+        confirm="Take 3 records that differ in {subject} alone: they fit if it slipped. If it slips again, the joint "
+        "is loose: keep its load low. If they do not fit, roll back to {good}.",
+        level="watch",
+        explains=True,
+    ),
+    "joint_replaced": DecisionKind(
+        means="One joint behaves like another servo: its offset, gain, backlash and compliance changed together. All "
+        "of them are estimated anew.",
+        do="Stop precise work that needs {subject}. Take {calm} records with it at angles over its whole range, "
+        "approached from both sides.",
+        confirm="Was its servo replaced or restarted? If not, take the same pose three times: readings that differ "
+        "from each other mean that the joint is loose.",
+        level="watch",
+        explains=True,
+    ),
+    "joint_stepped": DecisionKind(
+        means="One of several joints stepped. In the poses since, their steps move the tip alike, so that no record "
+        "says which joint it was.",
+        do="Go on with coarse work near the newest poses only. Take 3 records with {candidates} at clearly different "
+        "angles, one joint at a time.",
+        confirm="The decision joint_named follows as soon as a pose distinguishes them.",
+        level="watch",
+        explains=True,
+    ),
+    "joint_named": DecisionKind(
+        means="The records now determine which of several joints stepped. The others have their offsets of before.",
+        do="Go on with coarse work. Take {calm} records at different poses before precise work.",
+        confirm="Take 3 records that differ in {subject} alone: they fit if it was this joint. If they do not, roll "
+        "back to {good}.",
+        level="watch",
+        explains=True,
+    ),
+    "sensor_moved": DecisionKind(
+        means="The frame of an instrument moved against the arm's base, as when a camera is bumped. Its place is "
+        "estimated anew; the arm itself did not change.",
+        do="Go on, in the new frame of {subject}. Measure targets again before the arm goes to them: positions from "
+        "before are in the old frame. Take {calm} records at different poses before precise work.",
+        confirm="Look at something fixed to the arm's base with {subject}: it appears moved if {subject} moved. If it "
+        "did not, the arm changed: roll back to {good}.",
+        level="watch",
+        explains=True,
+    ),
+    "drift": DecisionKind(
+        means="Records miss by more than stated, although no single one does by much: parameters drift faster than "
+        "process_noise states, or the instrument is worse than stated. All standard deviations were increased.",
+        do="Go on with coarse work. Take {calm} records at the poses of the work before precise work.",
+        confirm="If it comes again within a day, it is no chance: state a larger process_noise, or a larger noise of "
+        "the instrument.",
+        level="watch",
+        explains=True,
+    ),
+    "general_change": DecisionKind(
+        means="Something changed that no single joint or instrument explains. All standard deviations were increased, "
+        "and everything is estimated again.",
+        do="Stop precise work. Take 20 records at poses that move every joint.",
+        confirm="The new records fit and the level improves if the change is one of the parameters. If it does not "
+        "after 20 records, roll back to {good}.",
+        level="suspect",
+    ),
+    "unexplained": DecisionKind(
+        means="Several of the last records do not fit, and no change explains them yet. Nothing was changed.",
+        do="Stop precise work. Take 10 records at poses that move every joint.",
+        confirm="If the new records fit, the others were wrong measurements: look at dust, glare and the target. If "
+        "they do not, a decision that names the change follows.",
+        level="suspect",
+    ),
+    "model_no_longer_fits": DecisionKind(
+        means="No change of the parameters makes the records fit. The calibration must not be used: commands that "
+        "would use it refuse it.",
+        do="Stop the arm's work. Check the measurements first (target, lens, clock, joint readings). If they were "
+        "wrong, roll back to {good}. If they are right, take 40 records all over the workspace, and calibrate "
+        "again from the records since.",
+        confirm="Go back to 3 poses recorded before: if they are measured as then, the arm is as it was, and the "
+        "records between were wrong.",
+        level="lost",
+    ),
+    "clock": DecisionKind(
+        means="The clock of the records jumped. Estimate and level are not touched by it.",
+        do="Go on. Set the clock of what sends the records.",
+        confirm="The next records come without this note.",
+        level=None,
+    ),
+    "rollback": DecisionKind(
+        means="Somebody set the estimate back to what it was after an earlier record. Later records are kept in the "
+        "journal, and have no effect. The level is that of then.",
+        do="Take {calm} records at different poses before precise work.",
+        confirm="The new records fit if the arm is as it was then.",
+        level=None,
+    ),
+}
+"""All kinds, by name."""
+
+EXPLAINED = tuple(name for name, kind in KINDS.items() if kind.explains)
+"""Decisions after which what did not fit is explained."""
+
+LEVEL_ADVICE: Mapping[Level, str] = {
+    "nominal": "Go on.",
+    "watch": "Go on with coarse work. Take {calm} records at different poses before precise work.",
+    "suspect": "Stop precise work. Take 10 records at poses that move every joint.",
+    "lost": "Stop the arm's work. Roll back to {good}, or calibrate again.",
+}
+"""What to do at a level that no decision explains."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Something that was decided.
+
+    Attributes:
+        kind: its name in ``KINDS``.
+        what: what happened, a clause without a full stop.
+        why: the evidence, a clause without a full stop.
+        log_odds: of this against everything else that was considered.
+        since: the number of the first record that it affects.
+        subject: a joint's channel, or a measurement.
+        candidates: joints that these records cannot distinguish, the likeliest first.
+        size: of a step (rad or m).
+        dimension: of that.
+    """
+
+    kind: str
+    what: str
+    why: str
+    log_odds: float
+    since: int
+    subject: str = ""
+    candidates: tuple[str, ...] = ()
+    size: float | None = None
+    dimension: str = ""
+
+    @property
+    def level(self) -> Level:
+        """Of health that it means."""
+        return KINDS[self.kind].level or "nominal"
+
+    @property
+    def sentence(self) -> str:
+        """What happened, how sure that is, and why."""
+        return f"{self.what}. {sure(self.log_odds)}: {self.why}."
+
+
+def per_cent(log_odds: float) -> float:
+    """The probability of something by its log odds, in per cent."""
+    return 100 / (1 + math.exp(-min(max(log_odds, -700.0), 700.0)))
+
+
+def log_odds_of(by_chance: float) -> float:
+    """Log odds of what chance alone explains with a probability."""
+    chance = min(max(by_chance, 1e-300), 1.0)
+    return math.log1p(-chance) - math.log(chance) if chance < 1 else -700.0
+
+
+def sure(log_odds: float) -> str:
+    """How sure, in words; never ``100 %``."""
+    known = per_cent(log_odds)
+    if known > 99.9:
+        return "More than 99.9 % sure"
+    return f"{known:.1f} % sure" if known > 99 else f"{known:.0f} % sure"
+
+
+def advice(kind: str, names: Mapping[str, Any]) -> dict[str, str]:
+    """``do`` and ``confirm`` of a decision, with the names of its joints, instrument and records."""
+    texts = KINDS[kind]
+    return {"do": texts.do.format_map(names), "confirm": texts.confirm.format_map(names)}
