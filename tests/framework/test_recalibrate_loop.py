@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from io import BytesIO
 from pathlib import Path
@@ -92,6 +93,8 @@ def test_an_update_of_armcal_goes_on_where_it_was_though_the_last_bits_differ(
     folder = tmp_path / "out"
     with pytest.raises(PowerCutError):
         run(folder, Listed(made(1, 20), cut=True))
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    shutil.copy(tmp_path / "out.start.yaml", tmp_path / "copy.start.yaml")
     take = FakeRecalibrator.take
 
     def other(self: FakeRecalibrator, incoming: Incoming, sequence: int) -> Any:
@@ -108,6 +111,9 @@ def test_an_update_of_armcal_goes_on_where_it_was_though_the_last_bits_differ(
     monkeypatch.setattr(FakeRecalibrator, "__init__", updated)
     assert run(folder, Listed(made(1, 30))).count == 29
     assert any("Another evaluator" in event.get("sentence", "") for event in events(folder))
+    with stepping(copy, Listed([])) as (going, fake):
+        going.recalibration.roll_back(next(e for e in read_entries(folder / "journal") if e.kind == "record").sequence)
+        assert fake.count == 1
 
 
 def test_damage_before_the_newest_checkpoint_is_told_and_stops_nothing(tmp_path: Path) -> None:

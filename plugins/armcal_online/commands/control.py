@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import click
 from armcal.cli.common import Console, speaking
 from armcal.errors import InputError, Location
 
-from armcal_online.running.control import ask
+from armcal_online.running.control import GOOD, ask, is_running
 
 _COMMANDS = ("status", "pause", "resume", "finish", "rollback", "what-if")
 
@@ -24,17 +25,17 @@ _COMMANDS = ("status", "pause", "resume", "finish", "rollback", "what-if")
 def control(console: Console, folder: Path, command: str, values: tuple[str, ...], timeout: float) -> None:
     """Query or command the recalibration that runs in FOLDER.
 
-    `rollback N` takes up the estimate as it was after record N; `what-if q1_deg=10 q2_deg=20 ...` predicts the tip.
+    `rollback good` takes up the estimate as it was after the last good record, `rollback N` after entry N; both work
+    after the end too. `what-if q1_deg=10 q2_deg=20 ...` predicts the tip.
     """
     request: dict[str, Any] = {"command": command}
     if command == "rollback":
-        if len(values) != 1 or not (values[0].isascii() and values[0].isdigit()):
-            raise InputError(
-                f"found {' '.join(values) or 'nothing'}, expected a sequence number.",
-                where=Location("rollback"),
-                hint="For example: armcal control DIR rollback 120.",
-            )
-        request["to"] = int(values[0])
+        request["to"] = _target(values)
+        if not is_running(folder):
+            from armcal_online.replaying.roll_back import roll_back_ended  # late: no other command builds the arm
+
+            _show(console, roll_back_ended(folder, request["to"], console.registry()))
+            return
     elif command == "what-if":
         request = {"command": "what_if", "joints": dict(map(_value, values))}
     elif values:
@@ -44,8 +45,22 @@ def control(console: Console, folder: Path, command: str, values: tuple[str, ...
     if not reply.pop("ok", False):
         error = str(reply.get("error", "its answer cannot be understood."))
         raise InputError(error, hint="" if error.endswith((".", "?")) else "Ask `armcal control DIR status` first.")
+    _show(console, reply)
+
+
+def _show(console: Console, reply: Mapping[str, Any]) -> None:
     if not console.quiet:
         click.echo(json.dumps(reply, indent=2))
+
+
+def _target(values: tuple[str, ...]) -> int | str:
+    if len(values) == 1 and (values[0] == GOOD or (values[0].isascii() and values[0].isdigit())):
+        return values[0] if values[0] == GOOD else int(values[0])
+    raise InputError(
+        f"found {' '.join(values) or 'nothing'}, expected a sequence number, or {GOOD}.",
+        where=Location("rollback"),
+        hint=f"For example: armcal control DIR rollback 120, or armcal control DIR rollback {GOOD}.",
+    )
 
 
 def _value(text: str) -> tuple[str, float]:

@@ -44,8 +44,8 @@ class KeptJournal:
     cut: Cut | None
     damage: JournalDamagedError | None
 
-    def check_until(self, until: int | None) -> None:
-        """Refuse an entry to end with that the journal does not hold.
+    def check_until(self, until: int | None, name: str = "--until") -> None:
+        """Refuse an entry to end with that the journal does not hold; ``name`` is what was given.
 
         Raises:
             InputError: it does not.
@@ -54,7 +54,7 @@ class KeptJournal:
         if until is not None and not start <= until <= self.last:
             raise InputError(
                 f"found no entry {until}; the journal goes from {start} to {self.last}.",
-                where=Location("--until"),
+                where=Location(name),
                 hint="Give the sequence number of an entry that is kept.",
             )
 

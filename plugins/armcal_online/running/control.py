@@ -22,6 +22,8 @@ from armcal_online.running.loop import Recalibration
 from armcal_online.tracking.recalibrator import Recalibrator
 
 SOCKET = "control.sock"
+GOOD = "good"
+"""In place of a sequence number: that of the last good record."""
 COMMANDS = ("status", "pause", "resume", "rollback", "finish", "what_if")
 
 _LONGEST = 64 * 1024
@@ -139,6 +141,17 @@ class ControlServer:
             return _refusal(f"It failed ({type(fault).__name__}: {fault}).")
 
 
+def is_running(folder: Path) -> bool:
+    """Whether somebody listens at the socket in a folder."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        try:
+            with short_address(folder / SOCKET) as address:
+                connection.connect(address)
+        except OSError:
+            return False
+    return True
+
+
 def ask(folder: Path, request: Mapping[str, Any], timeout_s: float = 30.0) -> dict[str, Any]:
     """The reply of the recalibration that runs in a folder: ``ok``, and the answer or an ``error``.
 
@@ -180,14 +193,32 @@ def answer(recalibration: Recalibration, session: Recalibrator, request: Mapping
         case "finish":
             recalibration.finishing = "It was asked to finish."
         case "rollback":
-            to = request.get("to")
-            if isinstance(to, bool) or not isinstance(to, int) or to < 0:
-                hint = "Give the sequence number of a record; every event has it."
-                raise InputError(f"found {to!r}, expected a sequence number.", where=Location("to"), hint=hint)
-            recalibration.roll_back(to)
+            return rolled_back(recalibration, session, request.get("to"))
         case "what_if":
             return session.what_if(joint_values(request.get("joints"), session.request))
     return recalibration.status()
+
+
+def rolled_back(recalibration: Recalibration, session: Recalibrator, to: Any) -> Mapping[str, Any]:
+    """The reply after a roll-back: to the state after an entry (its number), or after the last good record (``good``).
+
+    Raises:
+        InputError: it is neither, or no record was good.
+        DataError: the journal does not reach there; nothing is changed.
+    """
+    before = recalibration.sequence
+    if to == GOOD:
+        good = session.status()["last_good"]
+        if good is None:
+            hint = "Begin a new --out from the calibration that this one began from."
+            raise InputError("no record was good yet.", where=Location("rollback"), hint=hint)
+        to = good["sequence"]
+    if isinstance(to, bool) or not isinstance(to, int) or to < 0:
+        hint = f"Give the sequence number of a record, which every event has, or {GOOD} for the last good record."
+        raise InputError(f"found {to!r}, expected a sequence number.", where=Location("to"), hint=hint)
+    sentence = recalibration.roll_back(to)
+    again = f"Nothing is lost: roll back to {before} to have the estimate as it was before this."
+    return {"sentence": f"{sentence} {again}", "to": to, "before": before, **recalibration.status()}
 
 
 def joint_values(joints: Any, request: ReadRequest) -> dict[str, float]:

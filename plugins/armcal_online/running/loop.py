@@ -139,8 +139,11 @@ class Recalibration:
         if self.paused:
             self._command(RESUME)
 
-    def roll_back(self, sequence: int) -> None:
+    def roll_back(self, sequence: int) -> str:
         """Take up the estimate as it was after an entry; records since then stay taken, and have no effect.
+
+        Returns:
+            where it went back to, as a sentence.
 
         Raises:
             DataError, InputError: the journal does not reach there; nothing is changed.
@@ -153,9 +156,11 @@ class Recalibration:
         except BaseException:
             self._session.restore(before)
             raise
-        self._outputs.event({**self._session.rolled_back_event(self.sequence, sequence), "at": time.time()})
+        event = {**self._session.rolled_back_event(self.sequence, sequence), "at": time.time()}
+        self._outputs.event(event)
         self._checkpoint()
         self.write_calibration()
+        return str(event["sentence"])
 
     def status(self) -> dict[str, Any]:
         """Of session, journal and source now, as JSON."""

@@ -22,7 +22,7 @@ from armcal.io.standard_output import StandardOutput
 from armcal_online.running.control import SOCKET, ControlServer, answer
 from armcal_online.running.loop import Pace, Recalibration
 from armcal_online.running.outputs import CALIBRATION, RESERVE, STATUS, Outputs
-from armcal_online.running.state_replayer import STARTED, ReplayDiffersError, StateReplayer
+from armcal_online.running.state_replayer import STARTED, StateReplayer
 from armcal_online.sources.row_parser import RowParser
 from armcal_online.sources.source import Source
 from armcal_online.tracking.recalibrator import Recalibrator
@@ -47,6 +47,7 @@ class Setup:
         pace: how often things are written.
         limits: how large the journal may grow.
         stream: where events are written to, besides the file.
+        begun_from: the text of ``calibration``, where that file may be gone.
     """
 
     folder: Path
@@ -57,6 +58,7 @@ class Setup:
     limits: JournalLimits = field(default_factory=JournalLimits)
     stream: StandardOutput = field(default_factory=lambda: StandardOutput(None))
     files: FileLayer = REAL_FILES
+    begun_from: bytes | None = None
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,8 @@ def opened(setup: Setup, session: Recalibrator, source_of: SourceOf) -> Iterator
 
 def _calibration_text(setup: Setup) -> bytes:
     """The calibration to begin from, which the folder must not replace."""
+    if setup.begun_from is not None:
+        return setup.begun_from
     if setup.calibration.resolve() == (setup.folder / CALIBRATION).resolve():
         raise InputError(
             "the calibration to begin from would be replaced by the updated one.",
@@ -149,14 +153,10 @@ def _recover(setup: Setup, journal: Journal, state_replayer: StateReplayer, head
                 hint="Give what it was begun with, or a new --out (perhaps from a copy of its calibration.yaml).",
             )
     state_replayer.restore(recovered.checkpoint, recovered.checkpoint_sequence)
-    same_evaluator = recovered.header.get("evaluator") == header["evaluator"]
+    # Another version gives other last bits: no reason for a rover to stand still after an update.
+    state_replayer.is_exact = recovered.header.get("evaluator") == header["evaluator"]
     for entry in recovered.entries:
-        try:
-            state_replayer.apply(entry.sequence, entry.kind, entry.content)
-        except ReplayDiffersError:
-            # Another version gives other last bits: no reason for a rover to stand still after an update.
-            if same_evaluator:
-                raise
-    if not same_evaluator:
+        state_replayer.apply(entry.sequence, entry.kind, entry.content)
+    if not state_replayer.is_exact:
         journal.checkpoint(state_replayer.checkpoint())
     return True

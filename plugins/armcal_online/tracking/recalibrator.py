@@ -280,6 +280,7 @@ class Recalibrator:
         source = {
             "records": dict(state.counts),
             "sequence": state.sequence,
+            "record": state.ids[-1].record_id if state.ids else None,
             "time_s": state.at,
             "level": state.health.level,
             "why": state.health.sentence,
