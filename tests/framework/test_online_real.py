@@ -133,6 +133,22 @@ def test_a_step_of_joint_3_is_named_and_followed(halves: Halves, step_deg: float
     assert [e["joint"] for e in course.decisions()[2:] if "joint" in e] == []
 
 
+@pytest.mark.parametrize("halves", MODELS, indirect=True)
+@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in range(1, 6))])
+def test_a_tenth_of_the_records_exchanged_is_no_change_of_the_arm(halves: Halves, seed: int) -> None:
+    """Two by two; of two rows exchanged one says by half a metre that the arm is elsewhere."""
+    even, random = halves.even, np.random.default_rng(seed)
+    order, count = np.arange(len(even)), len(even) // 20
+    places = random.choice(len(even), 2 * count, replace=False)
+    order[places[:count]], order[places[count:]] = places[count:], places[:count]
+    axes = {name: column[order] for name, column in even.channels.items() if name.startswith("tracker.")}
+    course = run(replace(halves, even=replace(even, channels={**even.channels, **axes})), RecalibrateSettings())
+    rejected = course.session.state.counts["rejected"]
+    print(f"{2 * count} of {len(even)} exchanged, {rejected} rejected: {[d['sentence'] for d in course.decisions()]}")
+    assert {decision["kind"] for decision in course.decisions()} <= {"unexplained"}
+    assert rejected >= 1.8 * count
+
+
 @pytest.mark.slow
 def test_without_gate_and_process_noise_the_filter_ends_where_a_batch_over_all_does(
     poses: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

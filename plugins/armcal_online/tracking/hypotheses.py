@@ -19,6 +19,7 @@ from armcal.estimate.online import Gaussian, OnlineEstimator, log_likelihood
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.directions import Steps
 from armcal_online.tracking.observer import JointNoise, Observer, Reading
+from armcal_online.tracking.outliers import log_density_of_outlier
 from armcal_online.tracking.process_noise import ProcessNoise
 from armcal_online.tracking.settings import ChangeSettings, OutlierSettings
 from armcal_online.tracking.state_space import StateSpace
@@ -26,6 +27,8 @@ from armcal_online.tracking.window_evidence import RecordsSince
 
 _SCALES = (1.0, 0.1)
 """A change is of the stated size, or small: to a prior wide enough for a slipped tooth a small step is unlikely."""
+_MOST_ONSETS = 5
+"""So many of the last records with a large NIS are tried as the first after a change."""
 Kind = Literal["none", "joint_slipped", "joint_replaced", "sensor_moved", "general_change"]
 
 
@@ -78,13 +81,17 @@ class Explanation:
         hypothesis: the change.
         onset: the first record after the change.
         log_odds: of it against no change, its prior probability included.
-        share: of the records' NIS that it takes away.
+        share: of the NIS of the records that it takes for good ones, how much it takes away.
+        large: how many records with a large NIS it explains.
+        rejected: how many of them had been rejected.
     """
 
     hypothesis: Hypothesis
     onset: int
     log_odds: float
     share: float
+    large: int
+    rejected: int
 
 
 @dataclass(frozen=True)
@@ -133,37 +140,43 @@ class HypothesisFilter:
     ) -> None:
         self._observer, self._estimator = observer, estimator
         self._process_noise, self._outliers = process_noise, outliers
+        self.is_model_wrong = any(state.instance for state in observer.gauss_markov.states)
 
     def compare(
-        self, recent: Sequence[Recent], onsets: Sequence[int], changes: Sequence[Hypothesis]
+        self, recent: Sequence[Recent], large: Sequence[int], changes: Sequence[Hypothesis]
     ) -> list[Explanation]:
-        """Every hypothesis from its likeliest onset, the likeliest first."""
+        """Every hypothesis from its likeliest onset, the likeliest first; ``large`` are records that do not fit."""
         likeliest: dict[int, Explanation] = {}
-        for onset in onsets:
+        for onset in large[-_MOST_ONSETS:]:
             records = recent[onset:]
-            before = records[0].before
-            since = RecordsSince(
-                before,
-                [self._observer.observation(before, r.readings, r.joint_noise) for r in records],
-                [r.passed for r in records],
-                self._process_noise,
-                [self._outlier_covariance(r) for r in records],
-                self._outliers.fraction,
-                min(map(self.freedom, records)),
-            )
-            none = since.weigh(np.zeros((self._observer.size, 0)))
-            nis = sum(r.nis for r in records)
+            since = self._records_since(records)
+            none = since.weigh(np.zeros((self._observer.size, 0))).log_likelihood
+            misfits = [i - onset for i in large if i >= onset]
+            rejected = [i for i in misfits if records[i].rejected]
             for place, change in enumerate(changes):
                 try:
                     weighed = since.weigh(change.directions, change.factor)
                 except (ArmcalError, np.linalg.LinAlgError):
                     continue
-                odds = weighed.log_likelihood - none.log_likelihood + change.log_prior
-                kept = sum(r.nis for r, fits in zip(records, weighed.fits, strict=True) if fits)
-                share = max(0.0, kept - weighed.nis) / nis if nis > 0 else 0.0
+                odds = weighed.log_likelihood - none + change.log_prior
+                misfit = sum(r.nis for r, fits in zip(records, weighed.fits, strict=True) if fits)
+                share = max(0.0, 1 - weighed.nis / misfit) if misfit > 0 else 0.0
                 if place not in likeliest or odds > likeliest[place].log_odds:
-                    likeliest[place] = Explanation(change, onset, odds, share)
+                    counts = int(weighed.fits[misfits].sum()), int(weighed.fits[rejected].sum())
+                    likeliest[place] = Explanation(change, onset, odds, share, *counts)
         return sorted(likeliest.values(), key=lambda explanation: -explanation.log_odds)
+
+    def _records_since(self, records: Sequence[Recent]) -> RecordsSince:
+        before = records[0].before
+        return RecordsSince(
+            before,
+            [self._observer.observation(before, r.readings, r.joint_noise) for r in records],
+            [r.passed for r in records],
+            self._process_noise,
+            [self._outlier_covariance(r) for r in records],
+            self._outliers.fraction,
+            min(map(self.freedom, records)),
+        )
 
     def follow(self, place: int, recent: Sequence[Recent], directions: Array, factor: float = 1.0) -> Candidate:
         """A change before the first of some records that reopens ``directions``, followed through them."""
@@ -188,9 +201,8 @@ class HypothesisFilter:
         observation = self._observer.observation(belief, record.readings, record.joint_noise)
         try:
             first = observation.at(belief.gaussian.mean)
-            expected = first.slope @ belief.gaussian.covariance @ first.slope.T + first.noise
-            freedom, wide = self.freedom(record), expected + self._outlier_covariance(record)
-            outside = np.log(share) + log_likelihood(first.innovation, wide, freedom)
+            freedom, stated = self.freedom(record), self._outlier_covariance(record)
+            outside = np.log(share) + log_density_of_outlier(first.innovation, first.noise, stated, freedom)
             update = self._estimator.update(belief.gaussian, [observation])
         except ArmcalError:
             return candidate

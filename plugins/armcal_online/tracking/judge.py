@@ -22,8 +22,10 @@ from armcal_online.tracking.state_space import StateSpace
 
 _LARGE = 0.01
 """A record with an NIS as large as this is one in a hundred: two of them near each other are looked into."""
-_MOST_ONSETS = 5
-"""So many of the last records with a large NIS are tried as the first after a change."""
+_AGREEING = 2
+"""A change explains at least so many of the records that do not fit, and at least this share of the misfit: one wrong
+record alone is no evidence of it."""
+_SHARE = 0.5
 _MOST_WIDENING = 3.0
 _UNEXPLAINED = 3
 """So many changes that nothing explains, or windows of too large NIS: the model no longer fits."""
@@ -90,7 +92,7 @@ class Judge:
         ]
         if len(large) < 2 or not (state.wary or large[-1] == len(state.recent) - 1):
             return (replace(state, wary=False) if len(large) < 2 else state), None
-        explanations = self._filter.compare(state.recent, large[-_MOST_ONSETS:], self._changes)
+        explanations = self._filter.compare(state.recent, large, self._changes)
         if not explanations:
             return state, None
         best, gate, settings = explanations[0], self._settings.gate, self._settings.changes
@@ -100,7 +102,10 @@ class Judge:
         total = float(logsumexp([explanation.log_odds for explanation in alike]))
         margin = best.log_odds - others[0].log_odds if others else math.inf
         is_named = len(large) >= gate.window - 1 or margin >= math.log(settings.naming_odds)
-        if total > math.log(settings.odds) and is_named:
+        # Where the model is slightly wrong, as neighbours that err alike show, large NIS alone are no evidence.
+        agreeing = best.rejected if self._filter.is_model_wrong else best.large
+        explains = agreeing >= _AGREEING and best.share >= _SHARE
+        if total > math.log(settings.odds) and is_named and explains:
             return self._follow_change(state, alike, others)
         state = replace(state, wary=bool(best.log_odds > 0))
         rejected = sum(record.rejected for record in state.recent)
@@ -180,7 +185,8 @@ class Judge:
         settled = replace(state, suspects=(), before_change=None)
         if state.sequence - state.suspected > _LONGEST_NAMING:
             return settled, None
-        if margin < math.log(self._settings.changes.naming_odds):
+        changes = self._settings.changes
+        if margin < math.log(changes.naming_odds if others else changes.odds):
             return replace(state, suspects=tuple(followed)), None
         if not others and change.kind == "joint_slipped":
             return settled, None

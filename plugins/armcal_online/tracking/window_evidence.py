@@ -3,26 +3,30 @@
 The innovations of the records, predicted from the belief before the first, are jointly Gaussian (Student's t where
 few records determined the noise): they share the belief's error and the Gauss-Markov states. A change adds what it
 reopens to that covariance. The records are linearised where it leads (Gauss-Newton over what it reopens alone), as a
-slipped tooth is no small step. Each record may also be an outlier, whichever is likelier.
+slipped tooth is no small step. Each record may also be an outlier, of any size, whichever is likelier.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import accumulate, pairwise
+from itertools import accumulate, combinations, pairwise
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.estimate.online import Linearised, Observation, log_density
+from armcal.estimate.online import Linearised, Observation
 from numpy.typing import NDArray
 
 from armcal_online.tracking.belief import Belief
+from armcal_online.tracking.joint_density import JointDensity
+from armcal_online.tracking.outliers import log_density_of_outlier
 from armcal_online.tracking.process_noise import ProcessNoise
 
 _ROUNDS = 3
 _STEPS = 8
 _SETTLED = 0.02
+_GAIN = 1e-9
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,7 @@ class RecordsSince:
         observations: of the records, about the belief's origin.
         passed: the distance of each from the one before, by channel; the first one's is not used.
         process_noise: of beliefs.
-        outlier_covariances: of an outlier's error, a record each.
+        outlier_covariances: of an outlier's error of the stated size, a record each.
         share: of outliers.
         freedom: degrees of freedom with which the records' noise is known.
     """
@@ -61,18 +65,19 @@ class RecordsSince:
         share: float,
         freedom: float,
     ) -> None:
-        self._observations, self._outlier_covariances, self._freedom = observations, outlier_covariances, freedom
-        self._log_share, self._n = (np.log(share), np.log(1 - share)), len(process_noise.rates)
+        self._observations, self._freedom, self._n = observations, freedom, len(process_noise.rates)
         gaussian = before.gaussian
-        self._kept, self._means, self._priors = [np.ones(len(gaussian.mean))], [gaussian.mean], [gaussian.covariance]
+        kept, self._means, self._priors = [], [gaussian.mean], [gaussian.covariance]
         belief = before
         for step in passed[1:]:
             belief = process_noise.faded(belief, step)
-            kept = np.ones(len(gaussian.mean))
-            kept[self._n :] = process_noise.gauss_markov.kept(step)
-            self._kept.append(kept)
+            kept.append(process_noise.gauss_markov.kept(step))
             self._means.append(belief.gaussian.mean)
             self._priors.append(belief.gaussian.covariance)
+        self._left = np.ones((len(passed), len(passed), len(gaussian.mean) - self._n))
+        for i, j in combinations(range(len(passed)), 2):
+            self._left[i, j] = np.prod(kept[i:j], axis=0)
+        self._log_outliers = math.log(1 - share), math.log(share) + self._outlier_densities(outlier_covariances)
 
     def weigh(self, directions: Array, factor: float = 1.0) -> Weighed:
         """A change that reopens ``directions`` (N x k) and makes standard deviations of parameters larger.
@@ -95,6 +100,15 @@ class RecordsSince:
         assert best is not None
         return best
 
+    def _outlier_densities(self, stated: Sequence[Array]) -> Array:
+        """Of each record by itself (records), whatever has changed: an outlier says nothing about the arm."""
+        densities = []
+        for one, mean, prior, error in zip(self._observations, self._means, self._priors, stated, strict=True):
+            record = one.at(mean)
+            expected = record.slope @ prior @ record.slope.T + record.noise
+            densities.append(log_density_of_outlier(record.innovation, expected, error, self._freedom))
+        return np.array(densities)
+
     def _records(self, directions: Array, shift: Array) -> list[Linearised]:
         moved = directions @ shift if len(shift) else 0.0
         return [one.at(mean + moved) for one, mean in zip(self._observations, self._means, strict=True)]
@@ -116,60 +130,41 @@ class RecordsSince:
         self, directions: Array, shift: Array, fits: NDArray[np.bool_], factor: float
     ) -> Weighed:
         """The likeliest choice of outliers, one record changed at a time, and the evidence with it."""
-        count = len(self._observations)
-        every = np.ones(count, dtype=bool)
+        every = np.ones(len(self._observations), dtype=bool)
         innovation, slope, covariance, rows = self._stacked(self._records(directions, shift), every, factor)
         across = slope @ directions
-        innovation, covariance = innovation + across @ shift, covariance + across @ across.T
-
-        def evidence(chosen: NDArray[np.bool_]) -> float:
-            whole = covariance.copy()
-            for i in np.flatnonzero(~chosen).tolist():
-                whole[rows[i], rows[i]] += self._outlier_covariances[i]
-            density, _ = _density(innovation, whole, self._freedom)
-            return density + float(chosen.sum() * self._log_share[1] + (~chosen).sum() * self._log_share[0])
-
-        chosen, best = fits.copy(), evidence(fits)
-        for _ in range(count):
-            top, i = max((evidence(chosen ^ (np.arange(count) == i)), i) for i in range(count))
-            if top <= best + 1e-9:
-                break
-            best, chosen[i] = top, not chosen[i]
-        inside = np.concatenate([np.full(rows[i].stop - rows[i].start, fit) for i, fit in enumerate(chosen.tolist())])
-        nis = 0.0
-        if inside.any():
-            _, nis = _density(innovation[inside], covariance[np.ix_(inside, inside)], self._freedom)
-        return Weighed(best, shift, chosen, nis)
+        joint = JointDensity(innovation + across @ shift, covariance + across @ across.T, rows)
+        log_good, chosen, best, nis = self._log_outliers[0], fits.copy(), -np.inf, 0.0
+        while True:
+            here, changed = joint.log_densities(chosen, self._freedom)
+            outside = float(self._log_outliers[1][~chosen].sum())
+            own = np.where(chosen, self._log_outliers[1] - log_good, log_good - self._log_outliers[1])
+            best, nis = here.log_density + float(chosen.sum()) * log_good + outside, here.nis
+            gains = changed - here.log_density + own
+            i = int(np.argmax(gains))
+            if gains[i] <= _GAIN:
+                return Weighed(best, shift, chosen, nis)
+            chosen[i] = not chosen[i]
 
     def _stacked(
         self, records: Sequence[Linearised], chosen: NDArray[np.bool_], factor: float
     ) -> tuple[Array, Array, Array, list[slice]]:
         """Innovations of chosen records, their slopes by a shift at the first, covariance without it, rows of each."""
-        places = [int(i) for i in np.flatnonzero(chosen)]
-        ends = [0, *accumulate(len(records[i].innovation) for i in places)]
+        places = np.flatnonzero(chosen).tolist()
+        counts = [len(records[i].innovation) for i in places]
+        ends = [0, *accumulate(counts)]
         rows = [slice(start, stop) for start, stop in pairwise(ends)]
-        covariance = np.zeros((ends[-1], ends[-1]))
-        scale = np.ones(len(self._means[0]))
-        scale[: self._n] = factor
-        for a, i in enumerate(places):
-            prior = self._priors[i] * scale[:, None] * scale
-            kept = np.ones(len(scale))
-            for b in range(a, len(places)):
-                j = places[b]
-                for k in range((places[b - 1] if b > a else j) + 1, j + 1):
-                    kept = kept * self._kept[k]
-                part = records[i].slope @ (prior * kept) @ records[j].slope.T
-                covariance[rows[a], rows[b]] = part
-                covariance[rows[b], rows[a]] = part.T
-            covariance[rows[a], rows[a]] += records[i].noise
-        innovation = np.concatenate([records[i].innovation for i in places])
-        return innovation, np.vstack([records[i].slope for i in places]), covariance, rows
-
-
-def _density(innovation: Array, covariance: Array, freedom: float) -> tuple[float, float]:
-    """Log density, and squared Mahalanobis distance."""
-    root = np.linalg.cholesky(covariance)
-    whitened = np.linalg.solve(root, innovation)
-    nis = float(whitened @ whitened)
-    log_determinant = 2 * float(np.sum(np.log(np.diag(root))))
-    return log_density(nis, log_determinant, len(innovation), freedom), nis
+        scale, n = np.ones(len(self._means[0])), self._n
+        scale[:n] = factor
+        slope = np.vstack([records[i].slope for i in places])
+        carried = np.vstack([(records[i].slope * scale) @ self._priors[i] for i in places]) * scale
+        # The error of a parameter stays from record to record, of the Gauss-Markov states what is left.
+        of = np.repeat(places, counts)
+        covariance = carried[:, :n] @ slope[:, :n].T
+        if len(scale) > n:
+            left = self._left[np.ix_(of, of)]
+            covariance += np.einsum("im,ijm,jm->ij", carried[:, n:], left, slope[:, n:])
+        covariance = np.where(of[:, None] <= of, covariance, covariance.T)
+        for own, i in zip(rows, places, strict=True):
+            covariance[own, own] += records[i].noise
+        return np.concatenate([records[i].innovation for i in places]), slope, covariance, rows

@@ -1,0 +1,69 @@
+"""The joint density of some of several records, and how it changes with each record more or less."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.estimate.online import log_density
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv
+
+
+@dataclass(frozen=True)
+class Density:
+    """A log density, and the squared Mahalanobis distance in it."""
+
+    log_density: float
+    nis: float
+
+
+@dataclass(frozen=True)
+class JointDensity:
+    """Innovations of records (m), their joint covariance (m x m), and the rows of each record."""
+
+    innovation: Array
+    covariance: Array
+    rows: Sequence[slice]
+
+    def log_densities(self, chosen: NDArray[np.bool_], freedom: float) -> tuple[Density, Array]:
+        """The density of chosen records, and what it becomes with each record taken out of them, or put to them (n).
+
+        Both come from one factorisation: a record less divides by its density given the others, which the blocks of
+        the inverse give [Rasmussen2006]; a record more multiplies by it.
+
+        Raises:
+            LinAlgError: the covariance is not positive definite.
+        """
+        inside = np.flatnonzero(np.repeat(chosen, [own.stop - own.start for own in self.rows]))
+        covariance, innovation = self.covariance[np.ix_(inside, inside)], self.innovation[inside]
+        inverse: Array = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+        weighted = inverse @ innovation
+        nis, log_determinant = _solved(covariance, innovation)
+        changed, start = np.zeros(len(self.rows)), 0
+        for i, own in enumerate(self.rows):
+            size = own.stop - own.start
+            if chosen[i]:
+                at = slice(start, start + size)
+                start += size
+                distance, log_volume = _solved(inverse[at, at], weighted[at])
+                parts = nis - distance, log_determinant + log_volume, len(inside) - size
+            else:
+                across = self.covariance[own, inside]
+                given = self.covariance[own, own] - across @ inverse @ across.T
+                distance, log_volume = _solved(given, self.innovation[own] - across @ weighted)
+                parts = nis + distance, log_determinant + log_volume, len(inside) + size
+            changed[i] = log_density(*parts, freedom)
+        return Density(log_density(nis, log_determinant, len(inside), freedom), nis), changed
+
+
+def _solved(covariance: Array, innovation: Array) -> tuple[float, float]:
+    """Squared Mahalanobis distance, and the covariance's log determinant."""
+    if not len(innovation):
+        return 0.0, 0.0
+    root, weighted, fault = dposv(covariance, innovation)
+    if fault:
+        raise np.linalg.LinAlgError("a covariance is not positive definite")
+    return float(innovation @ weighted), 2 * float(np.log(np.diag(root)).sum())
