@@ -245,11 +245,13 @@ def test_what_is_not_an_event_is_counted_and_never_hurts() -> None:
         history.take(parsed(raw))
     assert history.unreadable == 7 and history.unknown > 0
     json.dumps(history.state(), allow_nan=False)
-    Console(file=io.StringIO(), width=80).print(picture({**_empty_state(), **history.state()}))
+    Console(file=io.StringIO(), width=80).print(picture(_whole_state(history)))
 
 
-def _empty_state() -> dict[str, Any]:
-    return {"folder": "x", "waiting": None, "heard_s": 0.0, "status": {}}
+def _whole_state(history: History) -> dict[str, Any]:
+    """What a feed adds to a history."""
+    first = {"situation": history.situation("x", {}), "over_time": history.over_time(None)}
+    return {**history.state(), **first, "folder": "x", "waiting": None, "heard_s": 0.0, "status": {}}
 
 
 def test_numbers_that_json_cannot_hold_and_texts_that_act_on_terminals_are_made_harmless() -> None:
@@ -265,7 +267,7 @@ def test_numbers_that_json_cannot_hold_and_texts_that_act_on_terminals_are_made_
     history.take({"event": "record", "verdict": "accepted", "id": "[bold]\x1b[2Jx[/]"})
     console = Console(width=100, force_terminal=True)
     with console.capture() as shown:
-        console.print(picture({**_empty_state(), **history.state()}))
+        console.print(picture(_whole_state(history)))
     assert "[bold]" in shown.get() and "\x1b[2J" not in shown.get()
 
 
@@ -316,7 +318,7 @@ def test_the_present_state_is_printed_once(tmp_path: Path) -> None:
 
 
 def test_what_has_finished_is_not_shown_as_if_it_went_on(tmp_path: Path) -> None:
-    folder, said = made_up_folder(tmp_path / "dir", 20), "The recalibration has finished."
+    folder, said = made_up_folder(tmp_path / "dir", 20), "The recalibration has ended"
     (folder / "status.json").write_text(json.dumps({"level": "nominal", "finished": False}))
     going = CliRunner().invoke(cli, ["watch", str(folder), "--once"])
     (folder / "status.json").write_text(json.dumps({"level": "nominal", "finished": True}))

@@ -124,7 +124,7 @@ def test_hostile_text_is_shown_as_text(browser: Browser, tmp_path: Path) -> None
         browser.wait_for("document.querySelectorAll('.parameter').length >= 20")
         browser.value("Innovations.choose(4)")
         assert HOSTILE in content(browser, "last-id") and HOSTILE in content(browser, "events")
-        assert HOSTILE in content(browser, "parameters") and HOSTILE in content(browser, "readout")
+        assert HOSTILE in content(browser, "parameters-others") and HOSTILE in content(browser, "readout")
         assert browser.value("document.querySelectorAll('script').length") == 1
         assert browser.value("document.querySelectorAll('img').length") == 0
         assert browser.value("document.title") != "taken"

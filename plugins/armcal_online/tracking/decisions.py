@@ -8,9 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from armcal_online.tracking.health import Level
+if TYPE_CHECKING:  # the watcher reads this table, and has no need of numpy
+    from armcal_online.tracking.health import Level
 
 
 @dataclass(frozen=True)
@@ -193,8 +194,12 @@ def log_odds_of(by_chance: float) -> float:
 
 
 def sure(log_odds: float) -> str:
+    """How sure, in words."""
+    return sure_to(per_cent(log_odds))
+
+
+def sure_to(known: float) -> str:
     """How sure, in words; never ``100 %``."""
-    known = per_cent(log_odds)
     if known > 99.9:
         return "More than 99.9 % sure"
     return f"{known:.1f} % sure" if known > 99 else f"{known:.0f} % sure"

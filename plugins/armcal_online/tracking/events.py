@@ -63,7 +63,7 @@ def judged(
     name = setup.problem.kernels[recent.readings[0].factor].factor.name
     event = {
         **_record(incoming, state, verdict),
-        "why": f"Its NIS {recent.nis:.3g} is {relation} the limit {limit:.3g}.",
+        "why": f"Its NIS {_figure(recent.nis)} is {relation} the limit {limit:.3g}.",
         "nis": recent.nis,
         "limit": limit,
         "dof": recent.dof,
@@ -92,7 +92,8 @@ def decided(state: State, decision: Decision, tip: TipError | None, calm: int) -
     """
     first, good = state.known(decision.since), state.good_before(decision.since)
     log_odds = min(max(decision.log_odds, -_MOST_LOG_ODDS), _MOST_LOG_ODDS)
-    event = _event("decision", state, kind=decision.kind, what=f"{decision.what}.", since=decision.since)
+    event = _event("decision", state, kind=decision.kind, level=decision.level, what=f"{decision.what}.")
+    event["since"] = decision.since
     if first is not None:
         event |= {"since_id": first.record_id, "since_at": first.at}
     event |= {"sure_percent": per_cent(log_odds), "log_odds": log_odds, "why": f"{decision.why}."}
@@ -132,9 +133,10 @@ def last_good(state: State) -> dict[str, Any] | None:
 
 def level_changed(state: State, before: str, health: Health, calm: int) -> dict[str, Any]:
     """Health got better or worse; what to do, and the last good record."""
-    good = state.good_before(state.sequence)
+    good, newest = state.good_before(state.sequence), state.known(state.sequence)
     return {
         **_event("level", state),
+        "since_id": None if newest is None else newest.record_id,
         "from": before,
         "to": health.level,
         "do": LEVEL_ADVICE[health.level].format_map(_names(good, calm)),
@@ -150,7 +152,12 @@ def rolled_back(state: State, sequence: int, to: int, calm: int) -> dict[str, An
     sentence = f"The estimate was set back to what it was after {there}."
     texts = advice("rollback", _names(None, calm))
     event = _event("decision", state, kind="rollback", to=to, what=sentence, **texts, sentence=sentence)
-    return {**event, "sequence": sequence, "last_good": last_good(state) if is_there else None}
+    return {
+        **event,
+        "sequence": sequence,
+        "level": state.health.level,
+        "last_good": last_good(state) if is_there else None,
+    }
 
 
 def record_name(sequence: int, arrival: Arrival | None) -> str:
@@ -181,6 +188,10 @@ def _named(arrival: Arrival | None) -> dict[str, Any] | None:
 def estimated(state: State, parameters: Mapping[str, list[float]]) -> dict[str, Any]:
     """What is believed: value and standard deviation by entry (SI)."""
     return _event("estimate", state, parameters=dict(parameters))
+
+
+def _figure(number: float) -> str:
+    return f"{number:,.0f}" if 1000 <= number < 1e9 else f"{number:.3g}"
 
 
 def _event(kind: str, state: State, /, **content: Any) -> dict[str, Any]:

@@ -27,10 +27,17 @@ function digits(x, significant = 3) {
 }
 const signed = (x, significant = 3) => (x > 0 ? "+" : "") + digits(x, significant);
 const count = (x) => (isNumber(x) ? x.toLocaleString("en") : "-");
+// Unix seconds as a date; seconds of a clock that began elsewhere as they are.
 const when = (seconds) => {
-  const date = new Date(seconds * 1000);
-  return isNumber(seconds) && !Number.isNaN(date.getTime()) ? date.toISOString().slice(0, 19).replace("T", " ") + " UTC" : "";
+  if (!isNumber(seconds)) return "";
+  if (seconds < 1e8 || seconds > 1e11) return `at ${digits(seconds, 6)} s`;
+  return new Date(seconds * 1000).toISOString().slice(0, 19).replace("T", " ") + " UTC";
 };
+function span(seconds) {
+  if (seconds < 120) return `${Math.round(seconds)} s`;
+  if (seconds < 7200) return `${Math.round(seconds / 60)} min`;
+  return seconds < 172800 ? `${Math.round(seconds / 3600)} h` : `${Math.round(seconds / 86400)} d`;
+}
 
 function niceStep(rough) {
   if (!(rough > 0) || !Number.isFinite(rough)) return 1;

@@ -16,7 +16,11 @@ VERDICTS = ("accepted", "rejected", "ignored")
 LEVELS = ("nominal", "watch", "suspect", "lost")
 LISTED = ("started", "decision", "level", "calibration", "control", "alarm", "finished")
 """Events that are listed with their sentence."""
-_ALONG = ("joint", "measurement", "kind", "from", "to", "path", "why", "command", "calibration", "evaluator")
+_TEXTS = (
+    *("joint", "measurement", "kind", "from", "to", "path", "why", "command", "calibration", "evaluator"),
+    *("level", "what", "do", "confirm", "since_id", "tip_error_is"),
+)
+_NUMBERS = ("size_deg", "size_mm", "sure_percent", "tip_error_mm", "tip_error_mrad")
 Message = dict[str, Any]
 
 
@@ -98,13 +102,22 @@ def record_of(event: Mapping[str, Any]) -> Message | None:
     for key in ("residual_mm", "measured_mm", "predicted_mm"):
         values = vector(event.get(key))
         message[key] = values and [rounded(value) for value in values]
+    message["off_mm"] = message["residual_mm"] and rounded(math.hypot(*message["residual_mm"]), 4)
     message["inputs"] = {name: rounded(value, 9) for name, value in numbers(event.get("inputs")).items()}
     return {key: value for key, value in message.items() if value not in (None, {})}
 
 
+def named_record(value: Any) -> Message | None:
+    """A record by number, its own name and time, as far as they are given; None without a number."""
+    if not isinstance(value, Mapping) or whole(value.get("sequence")) is None:
+        return None
+    record = {"sequence": whole(value["sequence"]), "id": text(value.get("id")), "at": number(value.get("at"))}
+    return {key: known for key, known in record.items() if known is not None}
+
+
 def shortened(record: Message) -> Message:
     """What is kept of a record that is no longer one of the newest."""
-    keys = ("event", "sequence", "at", "verdict", "nis", "limit", "id")
+    keys = ("event", "sequence", "at", "verdict", "nis", "limit", "id", "level", "off_mm")
     return {key: record[key] for key in keys if key in record}
 
 
@@ -115,8 +128,10 @@ def message_of(event: Mapping[str, Any]) -> Message | None:
         return None
     at = number(event.get("at")) or None  # 0: before the first record
     message: Message = {"event": kind, "sequence": whole(event.get("sequence")), "at": at}
-    message |= {key: text(event.get(key)) for key in _ALONG}
-    message |= {key: rounded(number(event.get(key))) for key in ("size_deg", "size_mm")}
+    message |= {key: text(event.get(key)) for key in _TEXTS}
+    message |= {key: rounded(number(event.get(key))) for key in _NUMBERS}
+    message |= {"since": whole(event.get("since")), "since_at": number(event.get("since_at"))}
+    message["last_good"] = named_record(event.get("last_good"))
     message["resumed"] = event.get("resumed") is True or None
     message = {key: value for key, value in message.items() if value is not None}
     message["sentence"] = text(event.get("sentence")) or _sentence(message)

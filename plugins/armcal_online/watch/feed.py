@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shlex
 import threading
 import time
 from collections import deque
@@ -15,8 +16,9 @@ from typing import Any
 from armcal.errors import ArmcalError
 from armcal.io.event_file import EVENTS, EventTail
 
-from armcal_online.watch.events import VERDICTS, Message, numbers, parsed, scalar, text
+from armcal_online.watch.events import VERDICTS, Message, named_record, numbers, parsed, scalar, text
 from armcal_online.watch.history import History
+from armcal_online.watch.hours import MISSION, Truth, truth_beside
 from armcal_online.watch.shape import Shape
 
 STATUS, CALIBRATION = "status.json", "calibration.yaml"
@@ -48,6 +50,9 @@ class Feed:
         self._status: dict[str, Any] = {}
         self._status_time = 0
         self._units_after = 0.0
+        self._truth: Truth | None = None
+        self._truth_time = 0
+        self._situation: Message | None = None
         self._arm: Message | None = None
         self._drawn: int | None = None
         self._messages: deque[tuple[int, str]] = deque(maxlen=MOST_MESSAGES)
@@ -76,6 +81,8 @@ class Feed:
                 if estimates.add_units(units_of(path)):
                     messages.append({"event": "reset"})  # pages begin anew, with the units
             messages += self._new_status()
+            if messages or self._situation:
+                messages += self._new_situation()
             self._publish(messages)
         return messages
 
@@ -106,7 +113,10 @@ class Feed:
         with self._changed:
             return {
                 **self.history.state(),
+                "situation": self.history.situation(str(self.folder), self._status),
+                "over_time": self.history.over_time(self._truth),
                 "folder": str(self.folder),
+                "control": f"armcal control {shlex.quote(str(self.folder))}",
                 "waiting": self.waiting,
                 "too_long": self._tail.too_long,
                 "heard_s": self._since(self._event_at),
@@ -162,6 +172,20 @@ class Feed:
         """Seconds; none where clocks disagree."""
         return round(max(0.0, time.time() - moment), 1)
 
+    def _new_situation(self) -> list[Message]:
+        """What the first screen says, where that changed, and what became of the newest hour."""
+        with contextlib.suppress(OSError):
+            written = (self.folder.parent / MISSION).stat().st_mtime_ns
+            if written != self._truth_time:
+                self._truth, self._truth_time = truth_beside(self.folder), written
+        now = {"event": "situation", "situation": self.history.situation(str(self.folder), self._status)}
+        if now == self._situation:
+            return []
+        self._situation = now
+        over_time = self.history.over_time(self._truth)
+        newest = {key: over_time[key] for key in ("usual_mm", "limit_mm", "off", "checked")}
+        return [{**now, "over_time": {**newest, "rows": over_time["rows"][-1:]}}]
+
     def _new_status(self) -> list[Message]:
         path = self.folder / STATUS
         try:
@@ -178,6 +202,8 @@ class Feed:
         counts = numbers(status.get("counts"))
         if all(verdict in counts for verdict in VERDICTS):
             self._status["counts"] = {verdict: counts[verdict] for verdict in VERDICTS}
+        if (good := named_record(status.get("last_good"))) is not None:
+            self._status["last_good"] = good
         return [{"event": "status", "status": self._status}]
 
 

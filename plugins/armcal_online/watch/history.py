@@ -8,10 +8,14 @@ from typing import Any
 
 from armcal_online.watch.estimates import Estimates, Thinned
 from armcal_online.watch.events import LEVELS, VERDICTS, Message, message_of, number, record_of, shortened, text, whole
+from armcal_online.watch.hours import Hours, Truth, over_time
+from armcal_online.watch.situation import AFTER_THE_END, Trouble, situation
 
 RECENT_RECORDS = 2000
 """The newest records, kept whole."""
 OLDER_ACCEPTED, OLDER_OTHERS = 2000, 1000
+NEWEST = 60
+"""The newest records, from which it is seen how far off the predictions are now."""
 MOST_EVENTS = 400
 """Events in the list; the oldest are forgotten."""
 
@@ -37,6 +41,10 @@ class History:
         self.level, self.level_sentence = "unknown", ""
         self.calibration: str | None = None
         self.gate: float | None = None
+        self.trouble, self.hours = Trouble(), Hours()
+        self._newest: deque[Message] = deque(maxlen=NEWEST)
+        self._good: Message | None = None
+        self.finished: Message | None = None
 
     def take(self, event: Mapping[str, Any] | None) -> list[Message]:
         """Add an event (None: a line that could not be read); returns the messages to pages about it.
@@ -50,22 +58,7 @@ class History:
         if kind == "record":
             return self._record(event)
         if kind == "started":
-            message = message_of(event)
-            messages: list[Message] = []
-            if event.get("resumed") is not True and (self.last or self._listed):
-                self._begin()
-                messages.append({"event": "reset"})
-            self.calibration = text(event.get("calibration")) or self.calibration
-            gate = event.get("gate")
-            self.gate = number(gate.get("probability")) if isinstance(gate, Mapping) else self.gate
-            first = whole(event.get("sequence"))
-            self._sequence = self._sequence if first is None else first - 1
-            row = self.estimates.start(event)
-            self._set_level(text(event.get("level")), None)
-            if message:
-                self._listed.append(message)
-                messages.append(message)
-            return [*messages, *([row] if row else [])]
+            return self._start(event)
         if kind == "estimate":
             row = self.estimates.take(event)
             return [row] if row else []
@@ -75,11 +68,28 @@ class History:
             return []
         if message["event"] == "level":
             self._set_level(message.get("to"), message["sentence"])
+        if message["event"] in ("level", "decision"):
+            self.trouble.take(message)
+        if message.get("kind") == "rollback":
+            self._set_level(message.get("level"), message["sentence"])
+            self._good = message.get("last_good", self._good)
+        if message["event"] == "finished":
+            self.finished = message
         if message["event"] == "calibration":
             self.written = message
         else:
             self._listed.append(message)
         return [message]
+
+    def situation(self, folder: str, status: Mapping[str, Any]) -> dict[str, Any]:
+        """The first screen; ``status`` is the newest of the recalibration, or empty."""
+        level = self.level if self.level in LEVELS else str(status.get("level", "unknown"))
+        known = situation(level, self.trouble, tuple(self._newest), self._good or status.get("last_good"), folder)
+        return {**known, "do": AFTER_THE_END} if level == "nominal" and status.get("finished") else known
+
+    def over_time(self, truth: Truth | None) -> dict[str, Any]:
+        """How far off, hour by hour."""
+        return over_time(self.hours, truth)
 
     def state(self) -> dict[str, Any]:
         """Everything, for a page that begins; numbers are SI unless their key says otherwise."""
@@ -95,9 +105,29 @@ class History:
             "estimates": self.estimates.state(),
             "told": list(self._listed),
             "written": self.written,
+            "finished": self.finished,
             "unknown": self.unknown,
             "unreadable": self.unreadable,
         }
+
+    def _start(self, event: Mapping[str, Any]) -> list[Message]:
+        message = message_of(event)
+        messages: list[Message] = []
+        if event.get("resumed") is not True and (self.last or self._listed):
+            self._begin()
+            messages.append({"event": "reset"})
+        self.calibration = text(event.get("calibration")) or self.calibration
+        gate = event.get("gate")
+        self.gate = number(gate.get("probability")) if isinstance(gate, Mapping) else self.gate
+        first = whole(event.get("sequence"))
+        self._sequence = self._sequence if first is None else first - 1
+        row = self.estimates.start(event)
+        self._set_level(text(event.get("level")), None)
+        self.finished = None
+        if message:
+            self._listed.append(message)
+            messages.append(message)
+        return [*messages, *([row] if row else [])]
 
     def _record(self, event: Mapping[str, Any]) -> list[Message]:
         record = record_of(event)
@@ -111,6 +141,10 @@ class History:
         if self._first is None:
             self._first = record["sequence"]
         self.last = record
+        self._newest.append({key: record[key] for key in ("sequence", "off_mm") if key in record})
+        self.hours.take(record)
+        if record["verdict"] == "accepted" and record.get("level") == "nominal":
+            self._good = {key: record[key] for key in ("sequence", "id", "at") if key in record}
         record = {key: value for key, value in record.items() if key != "inputs"}
         (self._accepted if record["verdict"] == "accepted" else self._others).add(record)
         self._set_level(record.get("level"), None)

@@ -22,58 +22,109 @@ function redraw() {
   const due = new Set(Known.due), state = Known.state;
   Known.due.clear();
   if (due.has("health")) drawHealth(state);
+  if (due.has("hours")) Hours.draw(state.over_time, state.told);
   if (due.has("innovations")) Innovations.draw(state.records, state.told);
   if (due.has("events")) drawEvents(state);
   if (due.has("arm")) Arm.draw(state.records, state.arm || {}, state.tips);
   if (due.has("parameters")) Parameters.draw(state.estimates, state.told);
 }
-const redrawAll = () => ask("health", "innovations", "events", "arm", "parameters");
+const redrawAll = () => ask("health", "hours", "innovations", "events", "arm", "parameters");
 
 function drawHealth(state) {
-  const status = state.status || {};
+  const status = state.status || {}, now = state.situation || {};
   const level = state.level === "unknown" && status.level ? status.level : state.level;
   byId("health").dataset.level = level;
   say("level", level);
-  say("sentence", state.level_sentence || (status.level === level && status.why) || "");
+  say("do", now.do || "");
+  say("sentence", now.what ? now.what : state.level_sentence || (status.level === level && status.why) || "");
+  say("confirm", now.confirm ? `To confirm: ${now.confirm}` : "");
   byId("waiting").hidden = !state.waiting;
   say("waiting", state.waiting || "");
   say("folder", state.folder);
-  const counts = status.counts || state.counts;
-  const total = counts.accepted + counts.rejected + counts.ignored;
-  for (const verdict of ["accepted", "rejected", "ignored"]) say(verdict, count(counts[verdict]));
-  for (const verdict of ["accepted", "rejected"]) say(`${verdict}-share`, total ? `${digits(100 * counts[verdict] / total)} %` : "");
-  say("counted-from", !status.counts && isNumber(state.first_sequence) ? `counted from record ${count(state.first_sequence)}` : "");
-  drawAlive(state);
+  drawOff(now, state.last || {}, level);
+  drawCounts(state, status);
   document.title = `${level}, armcal watch`;
-  const last = state.last;
-  if (!last) return;
-  say("last-id", last.id || `record ${last.sequence}`);
+}
+
+function drawOff(now, last, level) {
+  say("off", isNumber(now.off_mm) ? `${digits(now.off_mm, 2)} mm` : "not known in mm");
+  say("off-of", now.off_of ? (now.off_of > 1 ? `median of the last ${now.off_of} readings from their predictions` : "the newest reading from its prediction") : "");
+  say("off-before", isNumber(now.off_before_mm) ? `${digits(now.off_before_mm, 2)} mm before this was decided` : "");
+  const since = now.since;
+  say("since", since ? named(since) : level === "nominal" ? "the start" : "-");
+  say("since-at", since ? placed(since, last) : "");
+  say("good", now.last_good ? named(now.last_good) : "none yet");
+  say("good-at", now.last_good ? placed(now.last_good, last) : "");
+  byId("back").hidden = !now.rollback || level === "nominal";
+  say("rollback", now.rollback || "");
+  if (!isNumber(last.sequence)) return;
+  say("last-id", named(last));
   say("last-verdict", last.verdict);
   byId("last-verdict").className = `verdict-${last.verdict}`;
   say("last-why", last.why || "");
-  say("last-when", `record ${count(last.sequence)}${isNumber(last.at) ? `, ${when(last.at)}` : ""}`);
+  say("last-when", placed(last, {}));
   say("last-nis", digits(last.nis));
-  say("last-limit", isNumber(last.limit) ? `gate ${digits(last.limit)}${isNumber(last.dof) ? `, ${last.dof} degrees of freedom` : ""}` : "");
+  say("last-limit", isNumber(last.limit) ? `(gate ${digits(last.limit)}${isNumber(last.dof) ? `, ${last.dof} degrees of freedom` : ""})` : "");
+}
+
+const named = (record) => record.id || `entry ${count(record.sequence)}`;
+function placed(record, newest) {
+  const parts = [when(record.at), record.id ? `entry ${count(record.sequence)}` : ""];
+  const ago = newest.at - record.at;
+  if (ago > 0) parts.push(`${span(ago)} before the newest record`);
+  return parts.filter(Boolean).join(", ");
+}
+
+function drawCounts(state, status) {
+  const counts = status.counts || state.counts;
+  const total = counts.accepted + counts.rejected + counts.ignored;
+  for (const verdict of ["accepted", "rejected", "ignored"]) say(verdict, count(counts[verdict]));
+  for (const verdict of ["accepted", "rejected"]) say(`${verdict}-share`, total ? `(${digits(100 * counts[verdict] / total)} %)` : "");
+  say("counted-from", !status.counts && isNumber(state.first_sequence) ? `counted from entry ${count(state.first_sequence)}` : "");
 }
 
 function drawEvents(state) {
-  const newest = [...state.told].reverse();
-  byId("events").replaceChildren(...newest.map((event) => {
-    const where = [isNumber(event.sequence) ? `record ${count(event.sequence)}` : "", when(event.at)].filter(Boolean).join(", ");
-    const kind = event.event === "decision" && event.kind ? event.kind.replaceAll("_", " ")
-      : event.event === "level" ? `level ${event.to || ""}` : event.event;
-    return html("li", { class: event.event }, html("span", { class: "kind" }, kind), " ",
-      html("span", { class: "where" }, where), html("span", { class: "said" }, event.sentence));
-  }));
+  const names = new Map(state.records.map((record) => [record.sequence, record.id]));
+  const decided = new Set(state.told.filter((event) => event.event === "decision").map((event) => event.sequence));
+  byId("events").replaceChildren(...[...state.told].reverse().map((event) => eventItem(state, event, names, decided)));
   const faults = [];
   if (state.unreadable) faults.push(`${count(state.unreadable)} lines could not be read.`);
   if (state.unknown) faults.push(`${count(state.unknown)} events are of kinds that this page does not know.`);
-  say("unread", newest.length ? faults.join(" ") : ["No events yet.", ...faults].join(" "));
+  say("unread", state.told.length ? faults.join(" ") : ["No events yet.", ...faults].join(" "));
+}
+
+function eventItem(state, event, names, decided) {
+  const id = names.get(event.sequence);
+  const entry = isNumber(event.sequence) ? (id ? `record ${id} (entry ${count(event.sequence)})` : `entry ${count(event.sequence)}`) : "";
+  const kind = event.event === "decision" && event.kind ? event.kind.replaceAll("_", " ")
+    : event.event === "level" ? `level ${event.to || ""}` : event.event;
+  const follows = event.event === "level" && decided.has(event.sequence);
+  const lines = [html("span", { class: "said" }, follows ? `By the decision at this record; it was ${event.from || "unknown"}.` : event.sentence)];
+  if (event.event === "decision") {
+    if (event.do) lines.push(html("span", { class: "more" }, html("b", {}, "Do: "), event.do));
+    if (event.confirm) lines.push(html("span", { class: "more" }, html("b", {}, "Confirm: "), event.confirm));
+    if (event.why) lines.push(html("span", { class: "more" }, html("b", {}, "Because: "), event.why));
+    if (event.last_good && event.kind !== "rollback")
+      lines.push(html("span", { class: "more" }, html("b", {}, "Undo: "), html("code", {}, `${state.control} rollback ${event.last_good.sequence}`)));
+  }
+  return html("li", { class: event.event }, html("span", { class: "kind" }, kind), " ",
+    html("span", { class: "where" }, [entry, when(event.at)].filter(Boolean).join(", ")), ...lines);
+}
+
+function takeSituation(state, message) {
+  state.situation = message.situation;
+  const { rows, ...rest } = message.over_time, known = state.over_time.rows, newest = rows[rows.length - 1];
+  if (newest) {
+    if (known.length && known[known.length - 1].at === newest.at) known.pop();
+    known.push(newest);
+  }
+  Object.assign(state.over_time, rest);
+  ask("health", "hours");
 }
 
 function took(message) {
   const state = Known.state;
-  if (message.event !== "status" && message.event !== "arm") Known.heard = performance.now();
+  if (!["status", "arm", "situation"].includes(message.event)) Known.heard = performance.now();
   state.waiting = null;
   if (message.event === "record") takeRecord(state, message);
   else if (message.event === "estimate") takeEstimate(state, message);
@@ -81,8 +132,9 @@ function took(message) {
   else if (message.event === "status") {
     state.status = message.status;
     Known.status = performance.now();
-    ask("health");
+    age();
   } else if (message.event === "calibration") { state.written = message; ask("health"); }
+  else if (message.event === "situation") takeSituation(state, message);
   else if (message.event === "reset") begin();
   else takeTold(state, message);
 }
@@ -110,6 +162,7 @@ function takeEstimate(state, row) {
 
 function takeTold(state, event) {
   if (event.event === "level") { state.level = event.to; state.level_sentence = event.sentence; }
+  if (event.event === "started" || event.event === "finished") state.finished = event.event === "finished" ? event : null;
   state.told.push(event);
   if (state.told.length > MOST_EVENTS) state.told.shift();
   ask("health", "innovations", "events", "parameters");
@@ -154,34 +207,43 @@ function connection(state, text) {
   age();
 }
 
-function spoken(since) {
-  const seconds = Math.round((performance.now() - since) / 1000);
-  if (seconds < 120) return `${seconds} s`;
-  return seconds < 7200 ? `${Math.round(seconds / 60)} min` : `${Math.round(seconds / 3600)} h`;
+const ago = (since) => span((performance.now() - since) / 1000);
+
+// Of the recalibration, not of the connection to this page's server.
+function life(state) {
+  const status = state.status || {};
+  if (status.finished) return "ended";
+  return Object.keys(status).length && performance.now() - Known.status > 1000 * SILENT_S ? "silent" : "live";
 }
 
 function age() {
-  const state = Known.state;
-  const known = state && (state.last || state.told.length);
-  const ended = Known.connection === "live" && state && (state.status || {}).finished;
-  const connection = ended ? "ended" : Known.connection || "loading";
-  if (Known.connection === "live") byId("connection").dataset.state = connection;
-  say("connection", known ? `${connection}; newest event ${spoken(Known.heard)} ago` : connection);
-  if (state) drawAlive(state);
+  const state = Known.state, host = byId("connection");
+  if (!state || Known.connection !== "live") {
+    say("connection", Known.connection || "loading");
+    return;
+  }
+  const now = life(state), known = state.last || state.told.length;
+  host.dataset.state = now;
+  const ended = state.finished ? ` ${when(state.finished.at)}` : "";
+  const words = { ended: `ended${ended}, level ${state.level}`, silent: `silent for ${ago(Known.status)}`, live: "live" }[now];
+  say("connection", known && now === "live" ? `${words}; newest event ${ago(Known.heard)} ago` : words);
+  byId("health").dataset.life = now;
+  say("level-when", { ended: `at its end${ended}`, silent: `${ago(Known.status)} ago; nothing was heard since`, live: "" }[now]);
+  drawAlive(state);
+  ask("health");
 }
 
 function drawAlive(state) {
-  const status = state.status || {}, parts = [];
-  const known = Object.keys(status).length > 0;
-  const silent = known && !status.finished && performance.now() - Known.status > 1000 * SILENT_S;
-  if (silent) parts.push(`No status for ${spoken(Known.status)}: the recalibration may have stopped.`);
-  if (status.finished) parts.push("The recalibration has finished.");
+  const status = state.status || {}, now = life(state), parts = [];
+  const over = "nothing follows the arm until it is started again. Roll-back works all the same.";
+  if (now === "silent") say("alive", `No status for ${ago(Known.status)}: the recalibration may have been killed; then ${over}`);
+  else say("alive", now === "ended" ? `The recalibration has ended: ${over}` : "");
+  byId("alive").className = now === "silent" ? "stopped" : "";
   if (status.paused) parts.push("It is paused: records are passed over.");
   if (status.journal === "full") parts.push("Its journal is full: records wait.");
-  if (state.written) parts.push(`Calibration last written at record ${count(state.written.sequence)}, ${when(state.written.at)}.`);
+  if (state.written) parts.push(`Calibration last written at entry ${count(state.written.sequence)}, ${when(state.written.at)}.`);
   if (isNumber(status.records)) parts.push(`${count(status.records)} records taken in all.`);
-  say("alive", parts.join(" "));
-  byId("alive").className = silent ? "stopped" : "soft";
+  say("kept", parts.join(" "));
 }
 
 function turning() {
@@ -206,7 +268,6 @@ function turning() {
 for (const name of ["pointermove", "pointerdown"]) byId("innovations").addEventListener(name, (e) => Innovations.pointed(e));
 byId("window").addEventListener("change", () => ask("innovations"));
 byId("filter").addEventListener("input", () => ask("parameters"));
-byId("order").addEventListener("change", () => ask("parameters"));
 addEventListener("resize", redrawAll);
 setInterval(age, 1000);
 turning();

@@ -1,7 +1,7 @@
 "use strict";
 // Small multiples: each parameter's change since the start with its 95 % band, in the unit people read.
 
-const BAND = 1.96;
+const BAND = 1.96, MOVED = 3, LEAST = 6;
 
 const Parameters = {
   latest(rows, index) {
@@ -27,9 +27,15 @@ const Parameters = {
       return { parameter, index, change, sd: row ? row.sd[index] : null, ratio: this.moved(parameter, change) };
     });
     const chosen = all.filter((each) => each.parameter.name.toLowerCase().includes(wanted));
-    if (byId("order").value === "moved") chosen.sort((a, b) => b.ratio - a.ratio);
-    byId("parameter-count").textContent = all.length ? `${chosen.length} of ${all.length}` : "none known yet";
-    byId("parameters").replaceChildren(...chosen.map((each) => this.card(each, estimates.rows, told)));
+    chosen.sort((a, b) => b.ratio - a.ratio);
+    const first = wanted ? chosen.length : Math.max(LEAST, chosen.filter((each) => each.ratio > MOVED).length);
+    const cards = (some) => some.map((each) => this.card(each, estimates.rows, told));
+    const others = chosen.slice(first);
+    say("parameter-count", all.length ? `${chosen.length} of ${all.length}` : "none known yet");
+    byId("parameters").replaceChildren(...cards(chosen.slice(0, first)));
+    byId("others").hidden = !others.length;
+    say("others-count", `The other ${others.length}, which moved by less than ${MOVED} sd`);
+    byId("parameters-others").replaceChildren(...cards(others));
   },
 
   card(each, rows, told) {
@@ -41,7 +47,7 @@ const Parameters = {
     const now = isNumber(change) ? `${change >= 0 ? "+" : ""}${fixed(change)}${band}${unit}` : "not estimated yet";
     const value = `${isNumber(change) ? "now" : "start"} ${fixed(parameter.start + (change || 0))}${unit}${sized}`;
     const trace = this.trace(rows, index, told);
-    return html("div", { class: ratio > 3 ? "parameter moved" : "parameter" },
+    return html("div", { class: ratio > MOVED ? "parameter moved" : "parameter" },
       html("span", { class: "name" }, parameter.name),
       html("span", { class: "now" }, now), html("small", { class: "value" }, value),
       html("div", { class: "trace" }, trace.picture,

@@ -26,7 +26,7 @@ from armcal.errors import InputError, Location
 
 from armcal_online.watch.feed import Feed
 
-SCRIPTS = ("drawing.js", "innovations.js", "parameters.js", "arm.js", "page.js")
+SCRIPTS = ("drawing.js", "hours.js", "innovations.js", "parameters.js", "arm.js", "page.js")
 """In this order: each uses what those before it define."""
 MOST_STREAMS = 32
 """Pages that are open at once."""

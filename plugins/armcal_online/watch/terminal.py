@@ -16,7 +16,8 @@ LEVEL_STYLES = {"nominal": "green", "watch": "blue", "suspect": "yellow", "lost"
 VERDICT_STYLES = {"accepted": "cyan", "rejected": "red", "ignored": "dim"}
 _BARS = " ▁▂▃▄▅▆▇█"
 _BAND = 1.96
-_RECORDS, _PARAMETERS, _EVENTS = 6, 12, 6
+_RECORDS, _PARAMETERS, _EVENTS = 6, 6, 6
+_SILENT_S = 15.0
 
 
 def picture(state: Mapping[str, Any], width: int = 80) -> RenderableType:
@@ -39,7 +40,7 @@ def picture(state: Mapping[str, Any], width: int = 80) -> RenderableType:
 def line(message: Mapping[str, Any]) -> str | None:
     """One message as a line of plain text; None for estimates, drawings and states, which have none."""
     kind = message["event"]
-    if kind in ("estimate", "arm", "status"):
+    if kind in ("estimate", "arm", "status", "situation"):
         return None
     if kind == "reset":
         return "A new recalibration begins."
@@ -52,19 +53,75 @@ def line(message: Mapping[str, Any]) -> str | None:
 
 
 def _health(state: Mapping[str, Any]) -> Panel:
-    level, counts = state["level"], state["status"].get("counts", state["counts"])
+    level, counts, now = state["level"], state["status"].get("counts", state["counts"]), state["situation"]
     sentence = state["level_sentence"] or (state["status"].get("why") if state["status"].get("level") == level else "")
     style = LEVEL_STYLES.get(level, "dim")
-    text = Text()
-    text.append(level, style=f"bold {style}")
-    if sentence:
-        text.append(f"  {sentence}")
-    text.append("\n" + ", ".join(f"{count:,.0f} {verdict}" for verdict, count in counts.items()))
     if state["status"].get("finished"):
-        text.append("\nThe recalibration has finished.")
-    if state["last"]:
-        text.append(f"\nlast record {_name(state['last'])}, {_when(state['last'])}, heard {state['heard_s']:.0f} s ago")
-    return Panel(text, title=Text(str(state["folder"])), title_align="left", border_style=style)
+        style = "dim" if level == "nominal" else style  # no green for what nothing follows
+    shown = Table.grid(padding=(0, 2))
+    shown.add_column(style="dim")
+    shown.add_column(overflow="fold")
+    shown.add_row("level", Text.assemble((level, f"bold {style}"), _life(state)))
+    for name, words in (
+        ("do now", now["do"]),
+        ("what", now.get("what") or sentence),
+        ("confirm", now.get("confirm")),
+        ("off now", _off(now)),
+        ("since", _known(now.get("since"))),
+        ("last good", _known(now.get("last_good"))),
+        ("roll back", now.get("rollback") if level != "nominal" else None),
+        ("newest", state["last"] and f"{_known(state['last'])}, heard {_span(state['heard_s'])} ago"),
+        ("records", ", ".join(f"{count:,.0f} {verdict}" for verdict, count in counts.items())),
+        ("at nominal", _off_at_nominal(state["over_time"])),
+    ):
+        if words:
+            shown.add_row(name, Text(str(words), style="bold" if name == "do now" else ""))
+    return Panel(shown, title=Text(str(state["folder"])), title_align="left", border_style=style)
+
+
+def _life(state: Mapping[str, Any]) -> str:
+    """Whether anything follows the arm, where nothing may."""
+    if state["status"].get("finished"):
+        ended = f" at {_when(state['finished'])}" if state.get("finished") else ""
+        return f"  The recalibration has ended{ended}: nothing follows the arm until it is started again."
+    if state["status"] and (state.get("status_s") or 0) > _SILENT_S:
+        return f"  No status for {_span(state['status_s'])}: the recalibration may have been killed."
+    return ""
+
+
+def _off(now: Mapping[str, Any]) -> str:
+    if now["off_mm"] is None:
+        return ""
+    before = f"; {now['off_before_mm']:.2g} mm before this was decided" if now.get("off_before_mm") else ""
+    return f"{now['off_mm']:.2g} mm (median of the last {now['off_of']} readings from their predictions{before})"
+
+
+def _off_at_nominal(known: Mapping[str, Any]) -> str:
+    """The hours in which the level was nominal, and the tip off all the same."""
+    spans = known["off"]
+    if not spans:
+        return ""
+    hours = round(sum(span["to"] - span["from"] for span in spans) / 3600)
+    newest = f"{_when({'at': spans[-1]['from']})}, {spans[-1]['mm']:.2g} mm"
+    return f"the {known['by']} show{'s' if known['by'] == 'truth' else ''} it off in {hours} h, the newest {newest}"
+
+
+def _known(record: Mapping[str, Any] | None) -> str:
+    """A record by its own name, its time and its entry."""
+    if not record:
+        return ""
+    own = [str(record["id"])] if "id" in record else []
+    return ", ".join(part for part in (*own, _when(record), f"entry {record.get('sequence')}") if part)
+
+
+def _span(seconds: float) -> str:
+    return (
+        f"{seconds:.0f} s"
+        if seconds < 120
+        else f"{seconds / 60:.0f} min"
+        if seconds < 7200
+        else f"{seconds / 3600:.0f} h"
+    )
 
 
 def _strip(records: Sequence[Mapping[str, Any]], width: int) -> Text:
@@ -133,10 +190,10 @@ def _place(message: Mapping[str, Any]) -> str:
 
 
 def _when(message: Mapping[str, Any]) -> str:
-    try:
-        return f"{datetime.fromtimestamp(message['at'], UTC):%Y-%m-%d %H:%M:%S} UTC"
-    except (KeyError, ValueError, OverflowError, OSError):
-        return ""
+    at = message.get("at")
+    if at is None or not 1e8 < at < 1e11:
+        return "" if at is None else f"at {at:g} s"
+    return f"{datetime.fromtimestamp(at, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def _number(value: float | None) -> str:

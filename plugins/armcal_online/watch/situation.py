@@ -1,0 +1,123 @@
+"""What whoever is called at night has to know: what to do, how far off, since when, and where to roll back to."""
+
+from __future__ import annotations
+
+import shlex
+from collections import deque
+from collections.abc import Mapping, Sequence
+from statistics import median
+from typing import Any
+
+from armcal_online.tracking.decisions import KINDS, LEVEL_ADVICE, sure_to
+from armcal_online.watch.events import LEVELS, Message
+
+_NEWEST = 20
+"""So many of the last readings show how far off the predictions are now."""
+_MOST = 60
+AFTER_THE_END = "Start the recalibration again before the arm's next work."
+"""What to do once a recalibration has ended, and nothing was wrong."""
+_CALM = "some"
+"""In the advice for a level of which no event told how many records it takes."""
+
+
+class Trouble:
+    """Decisions and levels since the level was last nominal; bounded.
+
+    Attributes:
+        first: the event with which it began.
+        over: the change to nominal with which the last one ended.
+    """
+
+    def __init__(self) -> None:
+        self.first: Message | None = None
+        self.over: Message | None = None
+        self._events: deque[Message] = deque(maxlen=_MOST)
+
+    def take(self, message: Message) -> None:
+        """A decision or a change of level, in order."""
+        level = meant_level(message)
+        if (message["event"] == "level" and level == "nominal") or message.get("kind") == "rollback":
+            self.first, self.over = None, message
+            self._events.clear()
+        if level in LEVELS[1:]:
+            self.first = self.first or message
+            self._events.append(message)
+
+    def cause(self, level: str) -> Message | None:
+        """The newest decision that means this level."""
+        decisions = (message for message in reversed(self._events) if message["event"] == "decision")
+        return next((message for message in decisions if meant_level(message) == level), None)
+
+    def advice(self, level: str) -> str | None:
+        """What to do at this level: what the newest event that led to it says, a decision before a change of level."""
+        leading = [message for message in self._events if meant_level(message) == level and message.get("do")]
+        newest = [message for message in leading if message.get("sequence") == leading[-1].get("sequence")]
+        decided = [message for message in newest if message["event"] == "decision"]
+        return str((decided or newest)[-1]["do"]) if newest else None
+
+
+def meant_level(message: Message) -> str | None:
+    """The level that an event means; None where it means none."""
+    if message["event"] == "level":
+        return message.get("to")
+    if "level" in message:
+        return str(message["level"])
+    kind = KINDS.get(message.get("kind", ""))
+    return kind.level if kind else None
+
+
+def situation(
+    level: str,
+    trouble: Trouble,
+    records: Sequence[Mapping[str, Any]],
+    good: Mapping[str, Any] | None,
+    folder: str,
+) -> dict[str, Any]:
+    """The first screen.
+
+    Args:
+        level: now.
+        trouble: since it was last nominal.
+        records: the newest, in order.
+        good: the last good record, by what is newest of it.
+        folder: of the recalibration.
+
+    Returns:
+        ``do``, ``what`` (with how sure that is), ``confirm``; ``off_mm`` now, from ``off_of`` readings, and
+        ``off_before_mm`` before the last decision; ``since`` and ``last_good``, each a record; ``rollback``, a command.
+    """
+    first, cause = trouble.first, trouble.cause(level)
+    good = good if first is None else first.get("last_good")
+    off = [record["off_mm"] for record in _after(records, cause)]
+    known: dict[str, Any] = {
+        "do": trouble.advice(level) or _general_advice(level, good),
+        "off_mm": median(off) if off else None,
+        "off_of": len(off),
+        "last_good": good,
+        "rollback": None if good is None else f"armcal control {shlex.quote(folder)} rollback {good['sequence']}",
+    }
+    if cause is not None:
+        sure = f" {sure_to(cause['sure_percent'])}." if cause.get("sure_percent") is not None else ""
+        known |= {"what": f"{cause.get('what') or cause['sentence']}{sure}", "confirm": cause.get("confirm")}
+        known["off_before_mm"] = cause.get("tip_error_mm")
+    start = cause or first or trouble.over
+    if start is not None:
+        since = {"sequence": start.get("since", start.get("sequence"))}
+        named = {"id": start.get("since_id"), "at": start.get("since_at", start.get("at"))}
+        known["since"] = since | {key: value for key, value in named.items() if value is not None}
+    return known
+
+
+def _after(records: Sequence[Mapping[str, Any]], cause: Message | None) -> Sequence[Mapping[str, Any]]:
+    """The newest records after the last decision; the newest alone where that decision is the newest event."""
+    known = [record for record in records if record.get("off_mm") is not None]
+    place = -1 if cause is None else cause.get("sequence") or 0
+    return [record for record in known if record["sequence"] > place][-_NEWEST:] or known[-1:]
+
+
+def _general_advice(level: str, good: Mapping[str, Any] | None) -> str:
+    words = {str(name): words for name, words in LEVEL_ADVICE.items()}
+    if level not in words:
+        return "Wait for the first record."
+    there = f"record {good.get('id', good['sequence'])}" if good else "the calibration that it began from"
+    return words[level].format_map({"calm": _CALM, "good": there})
