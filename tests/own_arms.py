@@ -114,6 +114,11 @@ class OwnArm:
         return int(self.run.experiment.settings.bench["tracker"]["port"])  # type: ignore[index]
 
 
+def said_by(result: Result) -> str:
+    """What a command printed, on one line."""
+    return " ".join(result.output.split())
+
+
 def _config(kind: dict[str, Any]) -> dict[str, Any]:
     rows = [{"alpha_deg": alpha, "a_mm": a, "theta_deg": 0, "d_mm": d} for d, a, alpha in kind["lengths"]]
     links = {

@@ -29,6 +29,8 @@ class DTrackSenderSettings(Settings):
     ``bodies`` gives each body its number in the datagrams (from 0). A body is ``occluded`` for a fraction of the time,
     for ``occlusion`` on average each time. ``lost_frames`` is the fraction of datagrams that never arrive. A datagram
     arrives ``latency`` after its moment. The tracker's clock is ahead by ``clock_offset``, and gains ``clock_skew_ppm``.
+    A tracker that was set up wrong gives positions ``length_gain`` times too large, or in a left-handed frame: with its
+    axis ``mirrored``.
     """  # noqa: E501
 
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 60.0
@@ -42,6 +44,8 @@ class DTrackSenderSettings(Settings):
     latency: Annotated[Duration, Field(ge=0)] = 0.0
     clock_offset: Duration = 0.0
     clock_skew_ppm: Annotated[float, Field(ge=-1e5, le=1e5)] = 0.0
+    length_gain: Annotated[float, Field(gt=0)] = 1.0
+    mirrored: Literal["none", "x", "y", "z"] = "none"
     first_frame: Annotated[int, Field(ge=0, lt=2**32)] = 1
 
     @model_validator(mode="after")
@@ -153,6 +157,11 @@ class DTrackSender:
         disturbed = np.array(pose, dtype=float)
         disturbed[:3, 3] += self._settings.noise * noise[:3]
         disturbed[:3, :3] = disturbed[:3, :3] @ turn
+        disturbed[:3, 3] *= self._settings.length_gain
+        if (axis := self._settings.mirrored) != "none":
+            mirror = np.diag([-1.0 if name == axis else 1.0 for name in "xyz"])
+            disturbed[:3, :3] = mirror @ disturbed[:3, :3] @ mirror
+            disturbed[:3, 3] = mirror @ disturbed[:3, 3]
         return disturbed
 
 

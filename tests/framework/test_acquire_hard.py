@@ -21,7 +21,7 @@ from armcal.devices.faults import DeviceError, DeviceRefusedError
 from armcal.errors import ArmcalError, InputError
 from armcal.io.journal.journal import Journal, JournalFailedError, JournalFullError
 from armcal.run.experiment import Experiment
-from armcal_bench.acquisition.acquisition_run import Arrival
+from armcal_bench.acquisition.arrival import Arrival
 from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.path_planner import PathPlanner
 from armcal_bench.acquisition.schedule import Rest

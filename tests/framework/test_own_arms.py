@@ -14,9 +14,8 @@ import pytest
 import yaml
 from armcal.devices.clock import SimulatedClock
 from armcal_bench.waiting import Waits
-from click.testing import Result
 
-from tests.own_arms import POST, POST_SERVOS, TOWER, TOWER_SERVOS, OwnArm
+from tests.own_arms import POST, POST_SERVOS, TOWER, TOWER_SERVOS, OwnArm, said_by
 
 FEW = ("bench.servo.joints=[c]", "bench.servo.step_deg=80")
 """A calibration of a few poses."""
@@ -168,10 +167,6 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> OwnArm:
 def either(request: pytest.FixtureRequest, tmp_path: Path) -> OwnArm:
     """One of the two arms; its bench does not run yet."""
     return OwnArm(tmp_path, request.param)
-
-
-def said_by(result: Result) -> str:
-    return " ".join(result.output.split())
 
 
 def dangers(arm: OwnArm, plan: Path, *sets: str) -> dict[str, Any]:

@@ -85,6 +85,7 @@ _SPELLINGS: Mapping[str, str] = MappingProxyType(
         "1/K": "per_K",
     }
 )
+_NEAR_UNIT = 0.1
 _LONGEST_FIRST = tuple(sorted((n for n in UNITS if n != "1"), key=len, reverse=True))
 _QUANTITY = re.compile(r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*(\S.*?)?\s*", re.DOTALL)
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?[0-9]+,[0-9]+")
@@ -114,6 +115,20 @@ def si_unit(dimension: str) -> Unit:
 def display_unit(dimension: str) -> Unit:
     """The unit in which people are shown values of that dimension: mm, deg, g, otherwise the SI unit."""
     return UNITS[_DISPLAY[dimension]] if dimension in _DISPLAY else si_unit(dimension)
+
+
+def length_mistake(gain: float) -> tuple[str, str] | None:
+    """Which lengths were taken for which others where values came out so many times too large.
+
+    ``("mm", "m")`` for 1000: millimetres for metres. None where no two units of length explain it within a tenth.
+    """
+    names = ("m", "mm", "inch", "cm", "um")
+    for expected in names:
+        for given in names:
+            ratio = gain * UNITS[given].factor / UNITS[expected].factor
+            if given != expected and abs(ratio - 1) < _NEAR_UNIT:
+                return given, expected
+    return None
 
 
 def split_suffix(name: str, dimension: str | None = None) -> tuple[str, Unit] | None:

@@ -7,86 +7,37 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
-import numpy as np
 from armcal.base.domains import Array
 from armcal.devices.device import DeviceIdentity
 
 from armcal_bench.acquisition import run_log as entry
+from armcal_bench.acquisition.arrival import Arrival
 from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.heat import ThermalLimit
 from armcal_bench.acquisition.recovery import DeviceLost, Recovery
 from armcal_bench.acquisition.run_log import Progress, RunLog
 from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler
-from armcal_bench.acquisition.settings import ArrivalSettings
 from armcal_bench.acquisition.tracker_monitor import MotionGate, StopRequested, TrackerLost, unguarded
 from armcal_bench.settling import Settled, pose_of
 
-_ENOUGH = 5
 T = TypeVar("T")
 _TRIES = 2
 _AS_IT_IS = "its pulses go on as they are, unless the board parks the arm by itself"
 
 
-@dataclass(frozen=True)
-class Arrival:
-    """Compares how far apart the target stood in two poses, and by how much it was turned, with the nominal arm.
-
-    Neither depends on where the tracker's frame, the base body and the tool body are. What is not known of the arm, and
-    a target that is not at its nominal place, make them differ as well: the limits have to be generous.
-
-    Attributes:
-        expected: ``base_T_tool`` of the nominal, rigid arm in each pose of the plan (N x 4 x 4, m).
-        settings: the limits.
-    """
-
-    expected: Array
-    settings: ArrivalSettings
-
-    def doubt(self, pose: int, seen: Array, measured: Mapping[int, Array]) -> str:
-        """Why the arm is not where it was commanded to be, a sentence; empty if it may be there.
-
-        Args:
-            pose: its index.
-            seen: ``base_T_target`` (4 x 4, m); the rotation is NaN where it is not known.
-            measured: those of other poses by index. The one that fits worst decides, or the next where there are five
-                or more: one of them may be wrong itself.
-        """
-        others = [other for other in measured if other != pose]
-        if not others:
-            return ""
-        before, expected = np.array([measured[other] for other in others]), self.expected[others]
-        far = _worst(_distances(before, seen) - _distances(expected, self.expected[pose]))
-        turned = _worst(_turns(before, seen) - _turns(expected, self.expected[pose]))
-        if far <= self.settings.astray and not turned > self.settings.astray_turned:
-            return ""
-        angle = "" if np.isnan(turned) else f" and {np.rad2deg(turned):.0f} deg"
-        return (
-            f"the arm is not where it was commanded to be: measured {1000 * far:.0f} mm{angle} off, as seen from other "
-            f"poses (allowed: {1000 * self.settings.astray:.0f} mm, {np.rad2deg(self.settings.astray_turned):.0f} deg)"
-        )
+EndedHow = Literal["done", "held", "parked", "refused"]
+"""``refused``: parked, since what the tracker gives cannot be the arm's poses in the units and frame expected."""
 
 
-def _distances(poses: Array, pose: Array) -> Array:
-    return np.asarray(np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1))
-
-
-def _turns(poses: Array, pose: Array) -> Array:
-    """By which angle each is turned from one (rad), whatever frames they are given in."""
-    traces = np.einsum("nij,ij->n", poses[:, :3, :3], pose[:3, :3])
-    return np.asarray(np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0)))
-
-
-def _worst(differences: Array) -> float:
-    """The largest, or the next where there are enough; NaN where nothing is known."""
-    known = np.sort(np.abs(differences[~np.isnan(differences)]))[::-1]
-    return float(known[1 if len(known) >= _ENOUGH else 0]) if len(known) else np.nan
+class FrameRefused(StopRequested):
+    """The tracker's units or handedness are not those that are expected."""
 
 
 @dataclass(frozen=True)
 class Ending:
     """How a run ended, and a sentence why."""
 
-    how: Literal["done", "held", "parked"]
+    how: EndedHow
     sentence: str
 
 
@@ -124,6 +75,7 @@ class AcquisitionRun:
         self._ids, self._settings = scheduler.ids, drive.settings
         self._tries: dict[int, int] = {}
         self._astray = 0
+        self._doubted: dict[int, Mapping[str, Any]] = {}
         done = {*progress.measured, *progress.left_out}
         self._left = [i for i, name in enumerate(self._ids) if name not in done]
 
@@ -141,6 +93,8 @@ class AcquisitionRun:
                 left_out, total = len(self.progress.left_out), len(self._ids)
                 some = f"{total - left_out} of {total} poses are measured, {left_out} were left out"
                 return self._park_and_end("done", some if left_out else "all poses are measured")
+            except FrameRefused as refusal:
+                return self._park_and_end("refused", str(refusal))
             except StopRequested as request:
                 return self._park_and_end("parked", str(request))
             except DeviceLost as loss:
@@ -215,7 +169,7 @@ class AcquisitionRun:
 
         Raises:
             DeviceError: its pulses are not those that were commanded.
-            StopRequested: it stood elsewhere several times in a row.
+            StopRequested: it stood elsewhere several times in a row, or in other units or another frame than expected.
         """
         drive, measured = self._drive, self.progress.measured
         record = {
@@ -231,13 +185,38 @@ class AcquisitionRun:
         }
         others = {i: pose_of(measured[name]) for i, name in enumerate(self._ids) if name in measured}
         doubt = self._arrival.doubt(pose, settled.base_T_target, others) if self._arrival else ""
+        self._check_frame({**self._doubted, pose: record}, others)
         if doubt:
             self._astray += 1
+            self._doubted[pose] = record
             self._try_later(pose, doubt)
             if self._astray >= self._settings.arrival.in_a_row:
                 raise StopRequested(f"{doubt}, {self._astray} times in a row; look at servos, gears and bodies")
             return
         self._astray = 0
+        self._doubted.pop(pose, None)
+        self._keep(pose, record)
+
+    def _check_frame(self, news: Mapping[int, Mapping[str, Any]], others: Mapping[int, Array]) -> None:
+        """Refuse other units or another frame than expected; poses that seemed astray in it are kept as measured.
+
+        Args:
+            news: what is not yet written of poses, by their index.
+            others: ``base_T_target`` of measured poses, by their index.
+
+        Raises:
+            FrameRefused: they are others.
+        """
+        seen = {**others, **{pose: pose_of(record) for pose, record in news.items()}}
+        mistake = self._arrival.mistake(seen) if self._arrival else None
+        if mistake is None:
+            return
+        for pose, record in news.items():
+            if pose in self._left:
+                self._keep(pose, record)
+        raise FrameRefused(f"{mistake.sentence}. {mistake.mend} The poses that were measured are kept as they came")
+
+    def _keep(self, pose: int, record: Mapping[str, Any]) -> None:
         self._record(entry.MEASURED, record)
         self._left.remove(pose)
         self._on_progress(self.progress)
@@ -263,7 +242,7 @@ class AcquisitionRun:
         self._left.remove(pose)
         self._on_progress(self.progress)
 
-    def _park_and_end(self, how: Literal["done", "parked"], why: str) -> Ending:
+    def _park_and_end(self, how: EndedHow, why: str) -> Ending:
         """Park, and release the servos where the settings ask for it; the arm holds where no path home is found."""
         try:
             if not self._persist(self._park):

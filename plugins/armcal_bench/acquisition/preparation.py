@@ -20,7 +20,7 @@ from armcal.run.plan_clearance import clearance_check
 from armcal.run.plan_poses import JointSpace, commands_of, read_poses
 from numpy.typing import NDArray
 
-from armcal_bench.acquisition.acquisition_run import Arrival
+from armcal_bench.acquisition.arrival import Arrival
 from armcal_bench.acquisition.heat import HeatModel, Torques, holding_torques
 from armcal_bench.acquisition.path_planner import PathPlanner
 from armcal_bench.acquisition.schedule import Scheduler

@@ -44,7 +44,7 @@ class Progress:
         angles: the angles that were commanded last (rad, by joint); empty before the first.
         thermal_state: of winding and case, by joint, when ``angles`` were written.
         at: unix s of that.
-        ended: how it ended, if it did: ``done``, ``held`` or ``parked``.
+        ended: how it ended, if it did: ``done``, ``held``, ``parked`` or ``refused``.
     """
 
     measured: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)

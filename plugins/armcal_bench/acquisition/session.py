@@ -25,6 +25,7 @@ from armcal_bench.acquisition.run_log import OURS, Progress, RunLog, in_order, m
 from armcal_bench.acquisition.tracker_monitor import MotionGate, TrackerMonitor
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.journal_folder import Start, opened_journal
+from armcal_bench.settling import pose_of
 from armcal_bench.waiting import Waits
 from armcal_bench.wiring import check_wiring
 
@@ -78,6 +79,7 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
     with prepared.bench.clock() as clock, opened as journal:
         log = RunLog(journal)
         progress, identity = log.progress, log.identity
+        _check_frame(prepared, progress, options.folder)
         is_done = {*progress.measured, *progress.left_out} >= set(prepared.scheduler.ids)
         if identity is not None and is_done and progress.ended in ("done", "parked"):  # nothing needs to be there
             ending = Ending("done", "it was done before")
@@ -99,6 +101,23 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
         }
         write_outputs(options.folder, experiment, progress, summary)
         return Outcome(ending, summary)
+
+
+def _check_frame(prepared: Prepared, progress: Progress, folder: Path) -> None:
+    """Refuse to go on with poses of which it is known that their units or their frame are wrong.
+
+    Raises:
+        InputError: they are.
+    """
+    seen = {
+        i: pose_of(progress.measured[name]) for i, name in enumerate(prepared.plan.ids) if name in progress.measured
+    }
+    if (mistake := prepared.arrival.mistake(seen)) is not None:
+        raise InputError(
+            f"{mistake.sentence}; nothing was moved.",
+            where=Location(str(folder)),
+            hint=f"{mistake.mend} Then begin anew with another --out.",
+        )
 
 
 def _header(prepared: Prepared, plan: Path) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 import numpy as np
 from armcal.cli.common import Console
-from armcal.errors import EXIT_DONE, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
+from armcal.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
 from armcal.io.signals import Signals
 
 from armcal_bench.acquisition.preparation import Prepared, prepare
@@ -66,7 +66,9 @@ def acquire_command(
 
 
 def exit_code_of(outcome: Outcome) -> int:
-    """Done, done without some of the poses, or stopped before the end."""
+    """Done, done without some of the poses, refused, or stopped before the end."""
+    if outcome.ending.how == "refused":
+        return EXIT_BAD_INPUT
     if outcome.ending.how != "done":
         return EXIT_STOPPED
     return EXIT_INCOMPLETE if outcome.summary["left_out"] else EXIT_DONE
@@ -121,6 +123,9 @@ def show_outcome(console: Console, outcome: Outcome, config: Path, out: Path) ->
     console.line(text)
     for name, why in summary["left_out"].items():
         console.warn(f"pose {name} was left out: {why}.")
+    if ending.how == "refused":
+        console.line("Mend that, and begin anew with another --out.")
+        return
     if ending.how != "done":
         console.line("Go on with --resume.")
         return

@@ -1,0 +1,241 @@
+"""Whether measured poses are the model's in another frame, or come in other units or from a left-handed frame.
+
+Neither the frame of the measurements nor the target's place on the tool has to be known. Relative rotations show how
+the frame is turned, whatever its lengths; positions then show how much too large those are, and whether the frame is
+left-handed: a reflection reverses lengths along the axes of rotations. So three poses suffice where rotations are
+measured; positions alone show the gain by three, and the handedness by five.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.base.units import length_mistake
+from armcal.diagnose.permuted_axes import FITS, MISSES, MUCH_BETTER
+from armcal.problem.tool_motion import rigid_fit, spread_of
+
+FEWEST = 3
+"""Poses: fewer show neither a gain nor a reflection."""
+_MOST = 30
+_FEWEST_FOR_TARGET = 5
+_ROUNDS = 12
+_TARGET_WEIGHT = 0.2
+"""A metre that the target lies off its place on the model's tool counts as much as this many that are left over."""
+_MOST_TARGET_M = 0.3
+_LEVER_M = 0.1
+_GAIN_OFF, _LEAST_GAIN = 2.0, 1e-6
+_ROUGHLY = 3.0
+"""A gain shows in each distance, a reflection in all of them together."""
+_TINY = 1e-9
+
+
+@dataclass(frozen=True)
+class MeasuredFrame:
+    """How measured poses lie to the model's: ``p = gain turn mirror (e + R_e target) + shift``.
+
+    Attributes:
+        gain: measured lengths, in lengths of the model.
+        is_mirrored: whether the frame is left-handed; ``mirror`` is -1 then, else 1.
+        with_rotations: whether the measured rotations agree with the model's in this frame; False where none are.
+        turn: ``frame_R_base`` (3 x 3, proper).
+        shift: of the base's origin (3, m, measured lengths).
+        target: where the target is on the model's tool (3, m).
+        left: what is not explained, root mean square with the numbers that were fitted taken into account (m, by the
+            model's lengths).
+    """
+
+    gain: float
+    is_mirrored: bool
+    with_rotations: bool
+    turn: Array
+    shift: Array
+    target: Array
+    left: float
+
+
+@dataclass(frozen=True)
+class FrameMistake:
+    """A frame that is not what was configured.
+
+    Attributes:
+        sentence: what is off, by how much, and by how many poses, without its full stop.
+        mend: what to do, a full sentence.
+        frame: that explains the poses.
+    """
+
+    sentence: str
+    mend: str
+    frame: MeasuredFrame
+
+
+def frame_mistake(expected: Array, seen: Array) -> FrameMistake | None:
+    """What is wrong with the units or the handedness of measured poses; None where nothing is, or too few tell.
+
+    Args:
+        expected: ``base_T_tool`` by the model (N x 4 x 4, m).
+        seen: as measured, in any frame (N x 4 x 4, m); rotations are NaN where they are not measured.
+    """
+    if len(seen) < FEWEST:
+        return None
+    expected, seen = expected[-_MOST:], seen[-_MOST:]
+    spread = spread_of(expected[:, :3, 3].T)
+    straight = {with_rotations: _fitted(expected, seen, _Reading(1.0, 1.0, with_rotations)) for with_rotations in _BOTH}
+    if straight[True].left <= MISSES * spread:
+        return None
+    fitting: list[MeasuredFrame] = []
+    for reading in _READINGS:
+        if reading.is_possible(seen):
+            other = _fitted(expected, seen, reading)
+            enough = min(FITS * spread, straight[reading.with_rotations].left / MUCH_BETTER)
+            if _differs(other, reading) and other.left <= enough * (1 if other.is_mirrored else _ROUGHLY):
+                fitting.append(other)
+    if not fitting:
+        return None
+    fitting.sort(key=lambda other: other.left)
+    plain = next((other for other in fitting if not other.is_mirrored), fitting[0])
+    best = fitting[0] if fitting[0].left < plain.left / MUCH_BETTER else plain
+    return _mistake(best, len(seen))
+
+
+def frame_of(expected: Array, seen: Array) -> MeasuredFrame | None:
+    """In which frame, with lengths as they should be, measured poses are those of the model; None where it is not one.
+
+    See ``frame_mistake``.
+    """
+    if len(seen) < FEWEST:
+        return None
+    frame = _fitted(expected, seen, _Reading(1.0, with_rotations=True))
+    return frame if frame.left <= FITS * spread_of(expected[:, :3, 3].T) else None
+
+
+_BOTH = (True, False)
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """What is assumed of a frame: its gain (None: any), its handedness, and whether rotations are of it as well."""
+
+    gain: float | None = None
+    mirror: float = 1.0
+    with_rotations: bool = False
+
+    def is_possible(self, seen: Array) -> bool:
+        """Whether enough was measured of it: without rotations three points lie in one plane, four almost."""
+        has_rotations = self.with_rotations and not bool(np.isnan(seen[:, 0, 0]).any())
+        return self.mirror > 0 or has_rotations or len(seen) >= _FEWEST_FOR_TARGET
+
+
+_READINGS = tuple(
+    _Reading(gain, mirror, with_rotations)
+    for gain in (None, 1.0)
+    for mirror in (1.0, -1.0)
+    for with_rotations in _BOTH
+    if gain is None or mirror < 0
+)
+
+
+def _differs(frame: MeasuredFrame, reading: _Reading) -> bool:
+    """Whether a gain that was fitted is one."""
+    return reading.gain is not None or (frame.gain > _LEAST_GAIN and not 1 / _GAIN_OFF < frame.gain < _GAIN_OFF)
+
+
+def _fitted(expected: Array, seen: Array, reading: _Reading) -> MeasuredFrame:
+    """Turn, shift, target and gain by turns, each the least squares of all others."""
+    places, goals, count = expected[:, :3, 3], seen[:, :3, 3], len(seen)
+    has_rotations = reading.with_rotations and not bool(np.isnan(seen[:, 0, 0]).any())
+    pairs = list(combinations(range(count), 2)) if has_rotations else []
+    fits_target = has_rotations or count >= _FEWEST_FOR_TARGET
+    axes, seen_axes = _sines(expected, pairs), _sines(seen, pairs)
+    lever, gain, target = spread_of(places.T), reading.gain or 1.0, np.zeros(3)
+    turn, shift, points = np.eye(3), np.zeros(3), places
+    for _ in range(_ROUNDS):
+        before = target
+        centred, seen_centred = points - points.mean(axis=0), goals - goals.mean(axis=0)
+        size = max(spread_of(goals.T), _TINY)
+        both = np.vstack([reading.mirror * lever * centred, lever**2 * axes]).T
+        others = np.vstack([lever * seen_centred * (spread_of(points.T) / size), lever**2 * seen_axes]).T
+        turn = _turned(both, others)
+        moved = reading.mirror * centred @ turn.T
+        if reading.gain is None:
+            gain = max(float(np.sum(moved * seen_centred) / max(np.sum(moved**2), _TINY**2)), _TINY)
+        shift = goals.mean(axis=0) - gain * reading.mirror * turn @ points.mean(axis=0)
+        if not fits_target:
+            break
+        target = _target(expected, reading.mirror * (goals / gain) @ turn)
+        points = places + expected[:, :3, :3] @ target
+        if np.linalg.norm(target - before) < _TINY:
+            break
+    fitted = MeasuredFrame(gain, reading.mirror < 0, has_rotations, turn, shift, target, 0.0)
+    numbers = 6 + (reading.gain is None) + 3 * fits_target
+    return replace(fitted, left=_left(fitted, points, goals, (expected, seen), pairs, numbers))
+
+
+def _turned(points: Array, others: Array) -> Array:
+    """The turn (3 x 3) that brings vectors (3 x N) nearest to others. [Umeyama1991]"""
+    origin = np.zeros((3, 1))
+    doubled = [np.hstack([vectors, -vectors, origin]) for vectors in (points, others)]
+    return rigid_fit(*doubled)[0]
+
+
+def _sines(poses: Array, pairs: Sequence[tuple[int, int]]) -> Array:
+    """The axis of the rotation from one pose to another times the sine of its angle (pairs x 3): near half a turn no
+    direction is known, and there it is zero."""
+    if not pairs:
+        return np.zeros((0, 3))
+    one, other = (poses[[pair[i] for pair in pairs], :3, :3] for i in (0, 1))
+    relative = other @ np.swapaxes(one, 1, 2)
+    skew = (relative - np.swapaxes(relative, 1, 2)) / 2
+    return np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
+
+
+def _target(expected: Array, goals: Array) -> Array:
+    """Where the target is on the tool (3, m), by positions in the base's axes (N x 3, m) up to one shift."""
+    rotations, off = expected[:, :3, :3], goals - expected[:, :3, 3]
+    rows = (rotations - rotations.mean(axis=0)).reshape(-1, 3)
+    sizes = (off - off.mean(axis=0)).ravel()
+    weak = _TARGET_WEIGHT * np.eye(3)
+    target = np.linalg.lstsq(np.vstack([rows, weak]), np.concatenate([sizes, np.zeros(3)]), rcond=None)[0]
+    return np.asarray(target * min(1.0, _MOST_TARGET_M / max(float(np.linalg.norm(target)), _TINY)))
+
+
+def _left(
+    frame: MeasuredFrame,
+    points: Array,
+    goals: Array,
+    poses: tuple[Array, Array],
+    pairs: Sequence[tuple[int, int]],
+    numbers: int,
+) -> float:
+    mirror = -1.0 if frame.is_mirrored else 1.0
+    off = (goals - frame.shift) / frame.gain - mirror * points @ frame.turn.T
+    squares, equations = float(np.sum(off**2)), 3 * len(goals)
+    if pairs:
+        one, other = (np.array([pair[i] for pair in pairs]) for i in (0, 1))
+        shown, seen = ((p[other, :3, :3] @ np.swapaxes(p[one, :3, :3], 1, 2)) for p in poses)
+        traces = np.einsum("nij,nij->n", frame.turn @ shown @ frame.turn.T, seen)
+        angles = np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0))
+        # as many independent rotations as poses but one, shared among the pairs
+        squares += _LEVER_M**2 * float(np.mean(angles**2)) * 3 * (len(goals) - 1)
+        equations += 3 * (len(goals) - 1)
+    return float(np.sqrt(3 * squares / max(equations - numbers, 1)))
+
+
+def _mistake(frame: MeasuredFrame, count: int) -> FrameMistake:
+    parts, mends = [], []
+    if not 1 / _GAIN_OFF < frame.gain < _GAIN_OFF:
+        names = length_mistake(frame.gain)
+        unit = f", as if {names[0]} came where {names[1]} are expected" if names else ", which is no usual unit"
+        parts.append(f"measured distances are {frame.gain:.4g} times those of the model{unit}")
+        mends.append("State the unit in which the tracker gives positions, or let it give the expected one.")
+    if frame.is_mirrored:
+        of = "positions and rotations are" if frame.with_rotations else "positions are"
+        parts.append(
+            f"measured {of} mirrored: the frame is left-handed (one axis points the other way, or two are exchanged)"
+        )
+        mends.append("Reverse one axis of the tracker's frame, or exchange two, so that it is right-handed.")
+    return FrameMistake(f"{', and '.join(parts)} (by {count} poses)", " ".join(mends), frame)

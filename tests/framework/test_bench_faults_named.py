@@ -1,0 +1,39 @@
+"""What armcal names of what is wrong at a bench, on arms of nobody's, by the commands that a user gives."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from tests.own_arms import POST, TOWER, OwnArm, said_by
+
+TOWER_POSES = ((0, 30, -40, 0), (60, -20, 50, 40), (-70, 60, -60, -50), (30, -60, 20, 70), (90, 10, -30, -20))
+POST_POSES = ((0, 30, -40), (50, -20, 50), (-60, 50, -60), (30, -50, 20), (80, 10, -30))
+
+
+def acquired(arm: OwnArm, *more: str) -> tuple[int, str]:
+    """The exit code and what was said."""
+    plan = arm.plan(*(TOWER_POSES if arm.kind is TOWER else POST_POSES))
+    done = arm.armcal("acquire", "--plan", plan, "--out", arm.out, "--yes", "--unchecked", *more)
+    return done.exit_code, said_by(done)
+
+
+class TestAFrameThatIsNotTheArms:
+    def test_a_left_handed_tracker_ends_the_run_at_the_third_pose_and_it_is_not_resumed(self, tmp_path: Path) -> None:
+        arm = OwnArm(tmp_path, TOWER, **{"bench.simulator.tracker.mirrored": "z"})
+        with arm.run.simulated() as clock:
+            code, said = acquired(arm)
+            assert code == 2 and "the frame is left-handed" in said and "(by 3 poses)" in said
+            assert "3 of 5 poses measured" in said
+            assert len((arm.out / "dataset.csv").read_text().splitlines()) == 4  # nothing measured is lost
+            moves = clock.ask({"state": True})["events"]
+            code, said = acquired(arm, "--resume")
+            assert code == 2 and "nothing was moved" in said and "another --out" in said
+            assert clock.ask({"state": True})["events"] == moves
+
+    def test_metres_for_millimetres_are_named_with_their_gain(self, tmp_path: Path) -> None:
+        arm = OwnArm(tmp_path, POST, **{"bench.simulator.tracker.length_gain": 0.001})
+        with arm.run.simulated():
+            code, said = acquired(arm)
+        assert code == 2 and "as if m came where mm are expected" in said and "3 of 5 poses measured" in said
+        assert json.loads((arm.out / "summary.json").read_text())["how"] == "refused"
