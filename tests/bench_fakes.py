@@ -111,6 +111,9 @@ class FakeTrackerMonitor:
     def begin(self) -> None:
         self.begun = self.clock.now()
 
+    def stand(self) -> None:
+        return None
+
     def settled(self) -> Settled | str:
         if self.clock.now() - self.begun < 1.0 or self.blind_since is not None:
             return "too early"

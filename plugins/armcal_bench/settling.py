@@ -10,16 +10,20 @@ from typing import Any
 import numpy as np
 from armcal.base.domains import Array
 from armcal.devices.tracker import TrackerFrame
+from scipy.spatial.transform import Rotation
 
 from armcal_bench.acquisition.settings import SettleSettings
 from armcal_bench.bodies import BodySettings, in_base, repeats
-from armcal_bench.stillness import deviations_of_mean, judged, mean_pose
+from armcal_bench.stillness import deviations_of_mean, judged, mean_pose, turns_from
 
 FROZEN = "the tracker is frozen: it gives the same frame again"
 _MOST_FRAMES = 20_000
 _GAP = 0.25
 """A part of the window that may pass without a usable frame."""
 _SLACK_S = 1e-9
+_LONGEST_STAND_S, _FEWEST = 30.0, 4
+_LEAST_RATE = 1e-7
+"""m/s and rad/s: what is rounded more coarsely than its noise has no deviation."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,23 @@ class Settled:
         return {"position": position.tolist(), "rotation": None if np.isnan(rotation).any() else rotation.tolist()}
 
 
+@dataclass(frozen=True)
+class Stand:
+    """How the target moved while the arm was commanded to stand.
+
+    Attributes:
+        base_T_target: in the middle of that time (4 x 4, m); the rotation is NaN where it is not known.
+        rates: along x, y, z (m/s) and about x, y, z (rad/s) of the base frame; NaN where the rotation is not known.
+        sds: standard deviations of these.
+        seconds: how long it was seen.
+    """
+
+    base_T_target: Array
+    rates: Array
+    sds: Array
+    seconds: float
+
+
 def pose_of(record: Mapping[str, Any]) -> Array:
     """What was written of a pose (4 x 4, m); NaN for a rotation that is not known."""
     pose = np.eye(4)
@@ -75,11 +96,15 @@ class Settling:
         self._frames.clear()
 
     def feed(self, frames: Iterable[TrackerFrame]) -> None:
-        """Take in frames as they come; what is older than a window is forgotten."""
+        """Take in frames as they come; what is older than a window, and than this stand, is forgotten."""
         for frame in frames:
             self._frames.append((frame, repeats(frame, self._last, self._bodies)))
             self._last = frame
-        while self._frames and self._frames[0][0].arrived <= self._frames[-1][0].arrived - self._settings.window:
+        last = self._frames[-1][0].arrived if self._frames else 0.0
+        oldest = last - self._settings.window
+        if np.isfinite(self._begun):
+            oldest = min(oldest, max(self._begun, last - _LONGEST_STAND_S))
+        while self._frames and self._frames[0][0].arrived <= oldest:
             self._frames.popleft()
 
     def state(self, now: float) -> Settled | str:
@@ -108,6 +133,18 @@ class Settling:
         rejected = int((~stillness.kept).sum())
         return Settled(mean, deviations_of_mean(poses, mean), len(kept), rejected, kept[0].arrived, kept[-1].arrived)
 
+    def stand(self) -> Stand | None:
+        """How the target has moved since the arm was commanded to stand; None where it was hardly seen."""
+        frames = [
+            frame for frame, again in self._frames if frame.arrived > self._begun + self._settings.wait and not again
+        ]
+        capture = in_base(frames, self._bodies)
+        usable = np.array([not fault for fault in capture.faults], dtype=bool)
+        if usable.sum() < max(self._settings.frames, _FEWEST):
+            return None
+        times = np.array([frame.arrived for frame in frames])[usable]
+        return drift_of(times, capture.poses[usable])
+
     def _too_few(self, times: list[float], faults: list[str], start: float, now: float) -> str:
         """Why the usable frames do not cover the window; empty if they do."""
         s = self._settings
@@ -119,3 +156,25 @@ class Settling:
         if longest > _GAP * s.window + _SLACK_S:
             return f"no usable frame for {longest:.2f} s within the last {s.window:g} s; {reason}"
         return ""
+
+
+def drift_of(times: Array, poses: Array) -> Stand | None:
+    """By straight lines of least squares through poses (N x 4 x 4, m) at times (N, s, rising); None for one moment."""
+    middle, mean = times - times.mean(), mean_pose(poses)
+    weights = middle / max(float(middle @ middle), 1e-12)
+    span = float(times[-1] - times[0])
+    if span <= 0:
+        return None
+    rates = np.full(6, np.nan)
+    rates[:3] = weights @ poses[:, :3, 3]
+    moved = poses.copy()
+    moved[:, :3, 3] -= np.outer(middle, rates[:3])
+    if not np.isnan(poses[:, 0, 0]).any():
+        rotation = mean[:3, :3]
+        in_target = weights @ turns_from(rotation, poses[:, :3, :3])
+        rates[3:] = rotation @ in_target
+        moved[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(-np.outer(middle, in_target)).as_matrix()
+    sds = deviations_of_mean(moved, mean) * np.sqrt(12.0) / span  # of a slope, from that of a mean
+    if not np.isnan(rates[3:]).any():
+        sds[3:] = np.sqrt(np.diag(mean[:3, :3] @ np.diag(sds[3:] ** 2) @ mean[:3, :3].T))
+    return Stand(mean, rates, np.maximum(sds, _LEAST_RATE), span)

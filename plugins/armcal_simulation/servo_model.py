@@ -27,13 +27,15 @@ class ServoJointSettings(Settings):
     ``travel`` where its stops are. A load above ``stall`` turns it; unpowered it gives way to torques above
     ``friction``, at ``fall_deg_per_s``. Steadily under ``continuous`` torque its winding reaches its limit; beyond
     that it fails. ``winding_share`` of that rise lies between winding and case. ``winding_time`` and ``case_time`` are
-    the time constants of each node against what it gives its heat to.
+    the time constants of each node against what it gives its heat to. Under its load the horn slips on the gear by
+    ``creep_deg_per_min`` for each N m, as with a loose screw.
     """
 
     speed_deg_per_s: Positive = 300.0
     dead_band: Annotated[Angle, Field(ge=0)] = 0.0
     backlash: Annotated[Angle, Field(ge=0)] = 0.0
     travel: tuple[Angle, Angle] = (-2.4, 2.4)
+    creep_deg_per_min: Annotated[float, Field(ge=0)] = 0.0
     stall: Annotated[Torque, Field(gt=0)] = 4.0
     friction: Annotated[Torque, Field(ge=0)] = 0.05
     fall_deg_per_s: Positive = 60.0
@@ -72,6 +74,7 @@ class ServoModel:
     def __init__(self, settings: ServoJointSettings, table: PulseTable, angle: float) -> None:
         self.settings, self.angle, self.approach, self.failed = settings, angle, 0, False
         self.target: float | None = None
+        self._horn, self._slipped, self._creep = angle, 0.0, math.radians(settings.creep_deg_per_min) / 60.0
         self._gear = angle  # where the gear stands, without its backlash (rad)
         self._driving = False
         self._speed, self._fall_speed = math.radians(settings.speed_deg_per_s), math.radians(settings.fall_deg_per_s)
@@ -106,8 +109,9 @@ class ServoModel:
 
     def advance(self, seconds: float, torque: float) -> bool:
         """Let time pass under a torque of its load (N m, turning towards larger angles); whether it moved."""
+        slips = self._slip(seconds, torque)
         if self.rests(torque):
-            return False
+            return slips
         before = self._gear
         if self.holds(torque):
             error = (self.target or 0.0) - before
@@ -123,8 +127,17 @@ class ServoModel:
             self.approach = 1 if moved > 0 else -1
         # the gear pushes the horn at one end of the gap
         half = self.settings.backlash / 2
-        self.angle = min(max(self.angle, self._gear - half), self._gear + half)
-        return bool(moved)
+        self._horn = min(max(self._horn, self._gear - half), self._gear + half)
+        self.angle = self._horn + self._slipped
+        return bool(moved) or slips
+
+    def _slip(self, seconds: float, torque: float) -> bool:
+        """Let the horn slip on the gear; whether it did."""
+        if not self._creep or not self.powered or not torque:
+            return False
+        self._slipped += self._creep * torque * seconds
+        self.angle = self._horn + self._slipped
+        return True
 
     def holds(self, torque: float) -> bool:
         """Whether it is strong enough for a torque (N m), as it is powered now."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 from tests.own_arms import POST, TOWER, OwnArm, said_by
@@ -31,9 +32,38 @@ class TestAFrameThatIsNotTheArms:
             assert code == 2 and "nothing was moved" in said and "another --out" in said
             assert clock.ask({"state": True})["events"] == moves
 
+    def test_poses_that_noise_never_lets_settle_show_the_unit_too(self, tmp_path: Path) -> None:
+        arm = OwnArm(tmp_path, POST, **{"bench.simulator.tracker.length_gain": 1000})
+        with arm.run.simulated():
+            code, said = acquired(arm, "--set", "bench.acquisition.settle.longest_s=3")
+        assert code == 2 and "as if mm came where m are expected (by 3 poses)" in said
+
     def test_metres_for_millimetres_are_named_with_their_gain(self, tmp_path: Path) -> None:
         arm = OwnArm(tmp_path, POST, **{"bench.simulator.tracker.length_gain": 0.001})
         with arm.run.simulated():
             code, said = acquired(arm)
         assert code == 2 and "as if m came where mm are expected" in said and "3 of 5 poses measured" in said
         assert json.loads((arm.out / "summary.json").read_text())["how"] == "refused"
+
+
+class TestAJointThatGivesWay:
+    def test_one_that_no_pose_settles_with_is_named_and_the_run_failed(self, tmp_path: Path) -> None:
+        arm = OwnArm(tmp_path, TOWER, **{"bench.simulator.joints.lift.creep_deg_per_min": 100})
+        with arm.run.simulated():
+            code, said = acquired(arm, "--set", "bench.acquisition.settle.longest_s=4")
+        assert code == 1 and re.search(r"failed: lift .*sinks by [23]\d deg/min while it should stand", said)
+        assert "Look at the screw of lift's horn" in said and "done" not in said
+
+    def test_one_that_is_too_slow_to_keep_poses_from_settling_is_named_at_the_end(self, tmp_path: Path) -> None:
+        arm = OwnArm(tmp_path, TOWER, **{"bench.simulator.joints.lift.creep_deg_per_min": 10})
+        with arm.run.simulated():
+            code, said = acquired(arm)
+        assert code == 3 and re.search(r"done: .*warning: lift sinks by [345]\.?\d* deg/min", said)
+        gives_way = json.loads((arm.out / "summary.json").read_text())["gives_way"]
+        assert gives_way["joints"] == ["lift"] and 5 < gives_way["mm_per_min"] < 30
+
+    def test_none_is_named_where_none_does(self, tmp_path: Path) -> None:
+        arm = OwnArm(tmp_path, TOWER)
+        with arm.run.simulated():
+            code, said = acquired(arm)
+        assert code == 0 and "should stand" not in said

@@ -10,7 +10,7 @@ from armcal.devices.tracker import REPEATED, TrackerFrame
 from armcal_bench.acquisition.settings import SettleSettings
 from armcal_bench.acquisition.tracker_monitor import TrackerHealth
 from armcal_bench.bodies import BodySettings
-from armcal_bench.settling import Settled, Settling
+from armcal_bench.settling import Settled, Settling, drift_of
 from armcal_bench.stillness import deviations_of_mean, mean_pose
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -243,6 +243,10 @@ def test_memory_is_bounded() -> None:
     for frame in frames(lambda t: at(0.3), 60.0):
         settling.feed([frame])
     assert len(settling._frames) <= RATE + 1
+    settling.begin(60.0)
+    for frame in frames(lambda t: at(0.3), 100.0):
+        settling.feed([frame])
+    assert len(settling._frames) <= 30 * RATE + 1
 
 
 def health(seen: Iterable[TrackerFrame], refused: dict[str, int] | None = None) -> TrackerHealth:
@@ -284,3 +288,22 @@ def test_a_still_base_may_be_out_of_sight_once_it_was_seen() -> None:
     unseen = TrackerHealth(bodies, 0.0)
     unseen.feed(without(seen, "base", 0.0, 2.0), {})
     assert unseen.trouble(2.0)[1].startswith("body lost")
+
+
+def test_the_drift_of_a_stand_and_its_deviations() -> None:
+    """Of 400 stands of one drift the estimates spread as their stated deviations."""
+    random, times = np.random.default_rng(4), np.arange(0, 1, 1 / 60)
+    rates, turns, found, sds = np.array([1e-3, -2e-3, 0.0]), np.array([0.0, 5e-3, -3e-3]), [], []
+    for _ in range(400):
+        poses = np.tile(np.eye(4), (len(times), 1, 1))
+        poses[:, :3, 3] = np.outer(times, rates) + random.normal(0, 5e-5, (len(times), 3))
+        noise = Rotation.from_rotvec(random.normal(0, 3e-4, (len(times), 3)))
+        turned = Rotation.from_rotvec(np.outer(times, turns)) * noise
+        poses[:, :3, :3] = turned.as_matrix()
+        stand = drift_of(times, poses)
+        assert stand is not None
+        found.append(stand.rates)
+        sds.append(stand.sds)
+    assert np.mean(found, axis=0) == pytest.approx([*rates, *turns], abs=1e-4)
+    assert np.std(found, axis=0) == pytest.approx(np.sqrt(np.mean(np.square(sds), axis=0)), rel=0.2)
+    assert drift_of(times[:1], poses[:1]) is None

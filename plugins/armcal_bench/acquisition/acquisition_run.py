@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 from armcal.base.domains import Array
 from armcal.devices.device import DeviceIdentity
@@ -13,9 +13,11 @@ from armcal.devices.device import DeviceIdentity
 from armcal_bench.acquisition import run_log as entry
 from armcal_bench.acquisition.arrival import Arrival
 from armcal_bench.acquisition.drive import Drive
+from armcal_bench.acquisition.evidence import Evidence, FrameRefused, JointGivesWay
 from armcal_bench.acquisition.heat import ThermalLimit
 from armcal_bench.acquisition.recovery import DeviceLost, Recovery
-from armcal_bench.acquisition.run_log import Progress, RunLog
+from armcal_bench.acquisition.run_log import EndedHow, Progress, RunLog
+from armcal_bench.acquisition.sag import SagJudge
 from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler
 from armcal_bench.acquisition.tracker_monitor import MotionGate, StopRequested, TrackerLost, unguarded
 from armcal_bench.settling import Settled, pose_of
@@ -23,14 +25,6 @@ from armcal_bench.settling import Settled, pose_of
 T = TypeVar("T")
 _TRIES = 2
 _AS_IT_IS = "its pulses go on as they are, unless the board parks the arm by itself"
-
-
-EndedHow = Literal["done", "held", "parked", "refused"]
-"""``refused``: parked, since what the tracker gives cannot be the arm's poses in the units and frame expected."""
-
-
-class FrameRefused(StopRequested):
-    """The tracker's units or handedness are not those that are expected."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +47,11 @@ class AcquisitionRun:
         progress: of an earlier part of the run.
         on_progress: called after each pose.
         arrival: whether the arm stands where it was commanded to; None checks nothing.
+        sag: names a joint that gives way; None names none.
 
     Attributes:
         progress: where the run stands now.
+        evidence: of what is wrong with the tracker's frame, or with a joint.
     """
 
     def __init__(
@@ -68,6 +64,7 @@ class AcquisitionRun:
         progress: Progress,
         on_progress: Callable[[Progress], None],
         arrival: Arrival | None = None,
+        sag: SagJudge | None = None,
     ) -> None:
         self._drive, self._scheduler, self._gate = drive, scheduler, gate
         self._recovery = Recovery(drive.device, identity, gate, drive.settings.lost.park, self._notice)
@@ -75,7 +72,8 @@ class AcquisitionRun:
         self._ids, self._settings = scheduler.ids, drive.settings
         self._tries: dict[int, int] = {}
         self._astray = 0
-        self._doubted: dict[int, Mapping[str, Any]] = {}
+        judges = arrival, sag, drive.settings.arrival.in_a_row
+        self.evidence = Evidence(scheduler.poses, *judges)
         done = {*progress.measured, *progress.left_out}
         self._left = [i for i, name in enumerate(self._ids) if name not in done]
 
@@ -90,11 +88,11 @@ class AcquisitionRun:
                 self._persist(self._energise)
                 while self._left:
                     self._persist(self._step)
-                left_out, total = len(self.progress.left_out), len(self._ids)
-                some = f"{total - left_out} of {total} poses are measured, {left_out} were left out"
-                return self._park_and_end("done", some if left_out else "all poses are measured")
+                return self._park_and_end(*self.progress.at_the_end(len(self._ids)))
             except FrameRefused as refusal:
                 return self._park_and_end("refused", str(refusal))
+            except JointGivesWay as fault:
+                return self._park_and_end("failed", str(fault))
             except StopRequested as request:
                 return self._park_and_end("parked", str(request))
             except DeviceLost as loss:
@@ -150,10 +148,20 @@ class AcquisitionRun:
             if not self._persist(self._park) or not self._sees_again():
                 raise
             settled = str(loss)
+        assert gate.monitor is not None
+        self.evidence.stood(step.pose, gate.monitor.stand())
         if isinstance(settled, str):
             self._try_later(step.pose, settled)
+            self._check_frame()
+            self.evidence.failed(self.known)
         else:
             self._accept(step.pose, settled)
+
+    @property
+    def known(self) -> dict[int, Array]:
+        """``base_T_target`` (4 x 4, m) of measured poses, by their index."""
+        measured = self.progress.measured
+        return {i: pose_of(measured[name]) for i, name in enumerate(self._ids) if name in measured}
 
     def _sees_again(self) -> bool:
         """Whether the tracker is well, or soon, while the arm rests."""
@@ -171,7 +179,7 @@ class AcquisitionRun:
             DeviceError: its pulses are not those that were commanded.
             StopRequested: it stood elsewhere several times in a row, or in other units or another frame than expected.
         """
-        drive, measured = self._drive, self.progress.measured
+        drive = self._drive
         record = {
             "pose": self._ids[pose],
             **self._here(),
@@ -183,38 +191,33 @@ class AcquisitionRun:
             "standing": self._drive.standing(),
             "approach": dict(zip(drive.angles, drive.approach.tolist(), strict=True)),
         }
-        others = {i: pose_of(measured[name]) for i, name in enumerate(self._ids) if name in measured}
-        doubt = self._arrival.doubt(pose, settled.base_T_target, others) if self._arrival else ""
-        self._check_frame({**self._doubted, pose: record}, others)
+        doubt = self._arrival.doubt(pose, settled.base_T_target, self.known) if self._arrival else ""
+        self.evidence.doubted[pose] = record
+        self._check_frame()
         if doubt:
             self._astray += 1
-            self._doubted[pose] = record
             self._try_later(pose, doubt)
+            self.evidence.failed(self.known)
             if self._astray >= self._settings.arrival.in_a_row:
                 raise StopRequested(f"{doubt}, {self._astray} times in a row; look at servos, gears and bodies")
             return
         self._astray = 0
-        self._doubted.pop(pose, None)
+        self.evidence.succeeded(pose)
         self._keep(pose, record)
 
-    def _check_frame(self, news: Mapping[int, Mapping[str, Any]], others: Mapping[int, Array]) -> None:
+    def _check_frame(self) -> None:
         """Refuse other units or another frame than expected; poses that seemed astray in it are kept as measured.
-
-        Args:
-            news: what is not yet written of poses, by their index.
-            others: ``base_T_target`` of measured poses, by their index.
 
         Raises:
             FrameRefused: they are others.
         """
-        seen = {**others, **{pose: pose_of(record) for pose, record in news.items()}}
-        mistake = self._arrival.mistake(seen) if self._arrival else None
-        if mistake is None:
-            return
-        for pose, record in news.items():
-            if pose in self._left:
-                self._keep(pose, record)
-        raise FrameRefused(f"{mistake.sentence}. {mistake.mend} The poses that were measured are kept as they came")
+        try:
+            self.evidence.check_frame(self.known)
+        except FrameRefused:
+            for pose, record in self.evidence.doubted.items():
+                if pose in self._left:
+                    self._keep(pose, record)
+            raise
 
     def _keep(self, pose: int, record: Mapping[str, Any]) -> None:
         self._record(entry.MEASURED, record)

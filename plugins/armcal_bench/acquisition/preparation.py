@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from armcal_bench.acquisition.arrival import Arrival
 from armcal_bench.acquisition.heat import HeatModel, Torques, holding_torques
 from armcal_bench.acquisition.path_planner import PathPlanner
+from armcal_bench.acquisition.sag import SagJudge
 from armcal_bench.acquisition.schedule import Scheduler
 from armcal_bench.acquisition.settings import AcquisitionSettings
 from armcal_bench.bench import Bench
@@ -40,6 +41,7 @@ class Prepared:
         plan: joint commands and the plan's ids, in its order.
         scheduler: over the angles that the device can set nearest to them; with the planner and the heat model.
         arrival: whether the arm stands where it was commanded to.
+        sag: names a joint that gives way.
         judge: of what is dangerous in the first motions and the last.
     """
 
@@ -48,6 +50,7 @@ class Prepared:
     plan: Dataset
     scheduler: Scheduler
     arrival: Arrival
+    sag: SagJudge
     judge: HazardJudge
 
     @property
@@ -98,9 +101,13 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
         capture=settings.settle.wait + settings.settle.window + 0.5,
         order=settings.order,
     )
-    expected = tool_poses(arm.nominal_chain, np.stack(arm.joint_commands(list(poses.T)), axis=1))
+
+    def rigid(angles: Array) -> Array:
+        return tool_poses(arm.nominal_chain, np.stack(arm.joint_commands(list(angles.T)), axis=1))
+
+    arrival = Arrival(rigid(poses), settings.arrival)
     judge = HazardJudge(device.joint_names, device.joint_names, limits, torques, park)
-    return Prepared(bench, device, commands, scheduler, Arrival(expected, settings.arrival), judge)
+    return Prepared(bench, device, commands, scheduler, arrival, SagJudge(device.joint_names, rigid, torques), judge)
 
 
 def run_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> Array:

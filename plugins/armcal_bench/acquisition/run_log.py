@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from armcal.base.dataset import Dataset
@@ -34,6 +34,11 @@ OURS = (DATASET, SUMMARY, JOURNAL, BENCH)
 _POSITION, _QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 
 
+EndedHow = Literal["done", "held", "parked", "refused", "failed"]
+"""``refused``: parked, since what the tracker gives cannot be the arm's poses in the units and frame expected.
+``failed``: parked, since a joint gives way, or at the end, with most poses left out."""
+
+
 @dataclass(frozen=True)
 class Progress:
     """Where a run stands.
@@ -44,7 +49,7 @@ class Progress:
         angles: the angles that were commanded last (rad, by joint); empty before the first.
         thermal_state: of winding and case, by joint, when ``angles`` were written.
         at: unix s of that.
-        ended: how it ended, if it did: ``done``, ``held``, ``parked`` or ``refused``.
+        ended: how it ended, if it did: see ``EndedHow``.
     """
 
     measured: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -69,6 +74,14 @@ class Progress:
         if kind == ENDED:
             return replace(self, ended=content["how"])
         return self
+
+    def at_the_end(self, total: int) -> tuple[EndedHow, str]:
+        """How a run of so many poses ends that are all measured or left out, and why."""
+        left_out = len(self.left_out)
+        some = f"{total - left_out} of {total} poses are measured, {left_out} were left out"
+        if 2 * left_out > total:
+            return "failed", f"most poses are missing: {some}"
+        return "done", some if left_out else "all poses are measured"
 
 
 def progress_of(entries: tuple[Entry, ...]) -> Progress:

@@ -22,6 +22,7 @@ from armcal_bench.acquisition.acquisition_run import AcquisitionRun, Ending
 from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.preparation import Prepared
 from armcal_bench.acquisition.run_log import OURS, Progress, RunLog, in_order, measured_by, write_outputs
+from armcal_bench.acquisition.sag import Sag
 from armcal_bench.acquisition.tracker_monitor import MotionGate, TrackerMonitor
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.journal_folder import Start, opened_journal
@@ -81,19 +82,22 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
         progress, identity = log.progress, log.identity
         _check_frame(prepared, progress, options.folder)
         is_done = {*progress.measured, *progress.left_out} >= set(prepared.scheduler.ids)
-        if identity is not None and is_done and progress.ended in ("done", "parked"):  # nothing needs to be there
-            ending = Ending("done", "it was done before")
+        sag: Sag | None = None
+        if identity is not None and is_done and progress.ended in ("done", "parked", "failed"):
+            how, why = progress.at_the_end(len(prepared.scheduler.ids))  # nothing needs to be there
+            ending = Ending(how, "it was done before" if how == "done" else why)
         else:
             with _opened(prepared, options, clock, log) as (gate, identity):
                 log.record(entry.STARTED, {"at": clock.wall(), "device": identity.digest, "name": identity.name})
                 run = _prepared_run(prepared, options, log, gate, identity)
-                ending, progress = run.run(), run.progress
+                ending, progress, sag = run.run(), run.progress, run.evidence.gives_way(run.known)
         summary = {
             "how": ending.how,
             "why": ending.sentence,
             "poses": len(prepared.plan),
             "measured": len(progress.measured),
             "left_out": dict(progress.left_out),
+            "gives_way": None if sag is None else sag.content,
             "set_aside": {set_aside.record_id: set_aside.reason for set_aside in prepared.plan.set_aside},
             "times": "written" if in_order(progress) else "left out: the clock was set back during the run",
             "board": identity.name,
@@ -182,4 +186,5 @@ def _prepared_run(
     if not options.may_energise(start) or (options.asked_to_end() and not before):
         raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
     progress = replace(progress, ended="")
-    return AcquisitionRun(drive, identity, scheduler, gate, log, progress, options.on_progress, prepared.arrival)
+    judges = prepared.arrival, prepared.sag
+    return AcquisitionRun(drive, identity, scheduler, gate, log, progress, options.on_progress, *judges)

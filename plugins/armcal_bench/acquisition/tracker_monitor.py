@@ -12,7 +12,7 @@ from armcal.devices.tracker import REPEATED, TrackerFrame
 from armcal_bench.acquisition.settings import LostSettings
 from armcal_bench.bench import Bench
 from armcal_bench.bodies import BodySettings, base_fault, repeats, tool_fault
-from armcal_bench.settling import Settled, Settling
+from armcal_bench.settling import Settled, Settling, Stand
 from armcal_bench.waiting import Waits
 
 _WELL_S = 0.1
@@ -117,6 +117,10 @@ class TrackerMonitor:
     def settled(self) -> Settled | str:
         """The mean, once the arm stands; else why it is not known to stand."""
         return self._settling.state(self._clock.now())
+
+    def stand(self) -> Stand | None:
+        """How the target has moved since ``begin``; None where it was hardly seen."""
+        return self._settling.stand()
 
     def close(self) -> None:
         """Stop listening."""

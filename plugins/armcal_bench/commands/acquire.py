@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 import numpy as np
 from armcal.cli.common import Console
-from armcal.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
+from armcal.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_FAULT, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
 from armcal.io.signals import Signals
 
 from armcal_bench.acquisition.preparation import Prepared, prepare
@@ -66,12 +66,14 @@ def acquire_command(
 
 
 def exit_code_of(outcome: Outcome) -> int:
-    """Done, done without some of the poses, refused, or stopped before the end."""
+    """Done, done with something missing or a joint that gives way, failed, refused, or stopped before the end."""
     if outcome.ending.how == "refused":
         return EXIT_BAD_INPUT
+    if outcome.ending.how == "failed":
+        return EXIT_FAULT
     if outcome.ending.how != "done":
         return EXIT_STOPPED
-    return EXIT_INCOMPLETE if outcome.summary["left_out"] else EXIT_DONE
+    return EXIT_INCOMPLETE if outcome.summary["left_out"] or outcome.summary["gives_way"] else EXIT_DONE
 
 
 def schedule_forecast(prepared: Prepared) -> ScheduleForecast:
@@ -126,7 +128,9 @@ def show_outcome(console: Console, outcome: Outcome, config: Path, out: Path) ->
     if ending.how == "refused":
         console.line("Mend that, and begin anew with another --out.")
         return
-    if ending.how != "done":
+    if (sag := summary["gives_way"]) and "should stand" not in ending.sentence:
+        console.warn(sag["what"])
+    if ending.how in ("held", "parked") or len(summary["left_out"]) + summary["measured"] < summary["poses"]:
         console.line("Go on with --resume.")
         return
     if summary["left_out"]:
