@@ -6,6 +6,8 @@ import json
 import re
 from pathlib import Path
 
+import pytest
+
 from tests.own_arms import POST, TOWER, OwnArm, said_by
 
 TOWER_POSES = ((0, 30, -40, 0), (60, -20, 50, 40), (-70, 60, -60, -50), (30, -60, 20, 70), (90, 10, -30, -20))
@@ -44,6 +46,18 @@ class TestAFrameThatIsNotTheArms:
             code, said = acquired(arm)
         assert code == 2 and "as if m came where mm are expected" in said and "3 of 5 poses measured" in said
         assert json.loads((arm.out / "summary.json").read_text())["how"] == "refused"
+
+    @pytest.mark.parametrize(
+        ("setting", "value", "named"), [("length_gain", 1000, "mm came"), ("mirrored", "x", "left-")]
+    )
+    def test_the_check_of_servos_names_them_and_checks_nothing_off(
+        self, tmp_path: Path, setting: str, value: object, named: str
+    ) -> None:
+        arm = OwnArm(tmp_path, POST, **{f"bench.simulator.tracker.{setting}": value})
+        with arm.run.simulated():
+            done = arm.armcal("servo", "--check", "--yes", sets=("bench.acquisition.settle.longest_s=3",))
+        assert done.exit_code == 2 and named in said_by(done)
+        assert not (tmp_path / "servos.yaml.checked").exists()
 
 
 class TestAJointThatGivesWay:

@@ -72,7 +72,7 @@ class Evidence:
             return None
         seen = np.array(list(measured.values())).reshape(-1, 4, 4)
         angles = self._poses[[pose for pose, _ in stands]]
-        return self._sag.found(angles, [stand for _, stand in stands], (self._poses[list(measured)], seen))
+        return self._sag.sag_of(angles, [stand for _, stand in stands], (self._poses[list(measured)], seen))
 
     def check_frame(self, measured: Mapping[int, Array]) -> None:
         """Refuse other units or another frame than expected, by everything that was seen. See ``failed``.

@@ -99,7 +99,7 @@ class SagJudge:
     poses: Poses
     torques: Callable[[Array], Array]
 
-    def found(self, angles: Array, stands: Sequence[Stand], known: tuple[Array, Array]) -> Sag | None:
+    def sag_of(self, angles: Array, stands: Sequence[Stand], known: tuple[Array, Array]) -> Sag | None:
         """The motion, where it is beyond doubt.
 
         Args:
@@ -137,17 +137,17 @@ class SagJudge:
         return self._together(columns, rates[:, :used], sds[:, :used])
 
     def _one_by_one(self, columns: Array, rates: Array, pulls: Array, tip: float) -> Sag | None:
-        """Motions that each stand shows: the joint whose rate is fitted to each leaves least."""
-        each = np.einsum("njk,nk->nj", columns, rates) / np.maximum(np.sum(columns**2, axis=2), 1e-12)
-        off = rates[:, None, :] - each[:, :, None] * columns
+        """Motions that every stand shows: the joint whose rate is fitted to every stand leaves least."""
+        speeds = np.einsum("njk,nk->nj", columns, rates) / np.maximum(np.sum(columns**2, axis=2), 1e-12)
+        off = rates[:, None, :] - speeds[:, :, None] * columns
         left = np.sum(off**2, axis=(0, 2)) / float(np.sum(rates**2))
         order = np.argsort(left)
-        best, typical = int(order[0]), float(np.median(np.abs(each[:, int(order[0])])))
+        best, typical = int(order[0]), float(np.median(np.abs(speeds[:, int(order[0])])))
         if left[best] > _LEFT:
             return None
         alike = tuple(self.joints[j] for j in order if left[j] <= max(2 * left[best], _LEFT / 2))
-        sinks = bool(np.sum(each[:, best] * pulls[:, best]) > 0)
-        return Sag(alike, typical if sinks else float(np.median(each[:, best])), tip, sinks, len(rates))
+        sinks = bool(np.sum(speeds[:, best] * pulls[:, best]) > 0)
+        return Sag(alike, typical if sinks else float(np.median(speeds[:, best])), tip, sinks, len(rates))
 
     def _together(self, columns: Array, rates: Array, sds: Array) -> Sag | None:
         """A motion that only all stands together show: one joint gives way in proportion to its load."""

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
+from armcal.base.domains import Array
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceIdentity
+from armcal.diagnose.measured_frame import FEWEST, frame_mistake
 from armcal.errors import InputError, Location
 
 from armcal_bench.acquisition.recovery import DeviceLost
@@ -26,6 +29,7 @@ from armcal_bench.servo.trial import Move, Verdict, answered, judged, wrapped
 from armcal_bench.waiting import Waits
 from armcal_bench.wiring import note_checked
 
+_Glimpse = tuple[Mapping[str, float], Array]
 _AS_IT_IS = "its pulses go on as they are, unless the board brings the arm to its base pose"
 
 
@@ -205,19 +209,49 @@ def _go_on_warm(mover: Mover, record: Record) -> None:
 
 def _tracked(mover: Mover) -> list[Verdict]:
     setup, base, moves, unseen = mover.setup, mover.angles, [], []
+    glimpses: list[_Glimpse] = []
     longest = setup.bench.settings.acquisition.settle.longest
     for joint in setup.joints:
         turn, at = _small_turn(setup, joint), mover.counts[joint]
         before = mover.gate.settled(mover.tick, longest)
+        glimpses += _glimpse(mover, base)
         mover.go(joint, mover.counts_at(joint, setup.base[joint] + turn))
         after = mover.gate.settled(mover.tick, longest)
+        glimpses += _glimpse(mover, {**base, joint: base[joint] + turn})
         mover.go(joint, at)
         if isinstance(before, str) or isinstance(after, str):
             why = before if isinstance(before, str) else after
             unseen.append(Verdict(joint, "unclear", f"{joint}: it was not seen to stand ({why})."))
         else:
             moves.append(Move(joint, turn, before.base_T_target, after.base_T_target))
-    return [*judged(moves, base, setup.nominal), *unseen]
+        _check_frame(setup, glimpses, ())
+    verdicts = judged(moves, base, setup.nominal)
+    _check_frame(setup, glimpses, [*verdicts, *unseen])
+    return [*verdicts, *unseen]
+
+
+def _glimpse(mover: Mover, pose: Mapping[str, float]) -> list[_Glimpse]:
+    """A commanded pose (rad) and where the target was seen, whether it stood or not; nothing where it was not seen."""
+    stand = None if mover.gate.monitor is None else mover.gate.monitor.stand()
+    return [] if stand is None else [(pose, stand.base_T_target)]
+
+
+def _check_frame(
+    setup: Setup, glimpses: Sequence[tuple[Mapping[str, float], Array]], verdicts: Sequence[Verdict]
+) -> None:
+    """Refuse other units than expected, or a left-handed frame, which reversed servos resemble.
+
+    Raises:
+        InputError: it is one, and not every joint turned as commanded.
+    """
+    if len(glimpses) < 2 * FEWEST or (verdicts and all(verdict.kind == "right" for verdict in verdicts)):
+        return
+    expected = np.array([setup.nominal.tool(pose) for pose, _ in glimpses])
+    mistake = frame_mistake(expected, np.array([seen for _, seen in glimpses]))
+    if mistake is None or (mistake.frame.is_mirrored and not verdicts):
+        return
+    other = "Or servos of several joints are reversed: look which way each turns." if mistake.frame.is_mirrored else ""
+    raise InputError(f"{mistake.sentence}.", hint=f"{mistake.mend} {other}".rstrip())
 
 
 def _by_eye(mover: Mover, joint: str, talk: Conversation, wishes: Wishes) -> Verdict:
