@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -81,13 +82,7 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
     )
     check = clearance_of(experiment, arm)
     planner = PathPlanner(check, settable, np.vstack([park, poses]), settings.path_step, settings.seed)
-    for row, pose in enumerate(poses):
-        if not planner.allowed(pose):
-            raise DataError(
-                f"pose {commands.ids[row]} is too near to something.",
-                where=_row(plan, commands, row),
-                hint="Nothing was moved. Plan anew with this clearance, or take the pose out.",
-            )
+    _check_clear(planner, poses, plan, commands)
     model, torques = heat_of(experiment, settings, arm)
     _check_park(experiment, planner, (model, torques), park, device.joint_names)
     scheduler = Scheduler(
@@ -101,13 +96,25 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
         capture=settings.settle.wait + settings.settle.window + 0.5,
         order=settings.order,
     )
-
-    def rigid(angles: Array) -> Array:
-        return tool_poses(arm.nominal_chain, np.stack(arm.joint_commands(list(angles.T)), axis=1))
-
-    arrival = Arrival(rigid(poses), settings.arrival)
     judge = HazardJudge(device.joint_names, device.joint_names, limits, torques, park)
-    return Prepared(bench, device, commands, scheduler, arrival, SagJudge(device.joint_names, rigid, torques), judge)
+    arrival = Arrival(_rigid_poses(arm, poses), settings.arrival)
+    sag = SagJudge(device.joint_names, partial(_rigid_poses, arm), torques)
+    return Prepared(bench, device, commands, scheduler, arrival, sag, judge)
+
+
+def _check_clear(planner: PathPlanner, poses: Array, plan: Path, commands: Dataset) -> None:
+    for row, pose in enumerate(poses):
+        if not planner.allowed(pose):
+            raise DataError(
+                f"pose {commands.ids[row]} is too near to something.",
+                where=_row(plan, commands, row),
+                hint="Nothing was moved. Plan anew with this clearance, or take the pose out.",
+            )
+
+
+def _rigid_poses(arm: Arm, angles: Array) -> Array:
+    """``base_T_tool`` (N x 4 x 4, m) of the nominal, rigid arm at joint angles (N x joints, rad)."""
+    return tool_poses(arm.nominal_chain, np.stack(arm.joint_commands(list(angles.T)), axis=1))
 
 
 def run_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> Array:
