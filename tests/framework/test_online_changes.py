@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from dataclasses import dataclass
 from functools import cache
@@ -220,6 +221,36 @@ def test_a_slipped_joint_is_named_and_recovered(seeds: int, outliers: float) -> 
     )
     assert named >= 0.95 if seeds > 1 else named == 1
     assert soon >= (0.95 if seeds > 1 else 0.8)
+
+
+@pytest.mark.parametrize("seeds", [1, pytest.param(6, marks=pytest.mark.slow)])
+def test_two_joints_that_slip_at_once_are_both_named(seeds: int) -> None:
+    """Within five records; a refit of the last 40 records would need 39 to 42."""
+    found = []
+    for seed in range(seeds):
+        bench, random = Bench(seed, outliers=0.05), np.random.default_rng(seed)
+        undisturbed = bench.after()
+        every = list(itertools.combinations(range(1, 7), 2))
+        for one, other in every if seeds > 1 else every[3:4]:
+            sizes = random.uniform(4, 15, 2) * random.choice([-1, 1], 2)
+
+            def change(arm: World, both=((one, sizes[0]), (other, sizes[1]))) -> None:
+                for joint, size in both:
+                    _step(joint, size)(arm)
+
+            ran = bench.after(change)
+            named = {(kind, who) for k, kind, who in ran.decisions if kind in NAMING}
+            right = {who for _, who in named} == {f"arm.q{one}", f"arm.q{other}"}
+            last = max((k for k, kind, _ in ran.decisions if kind in NAMING), default=99)
+            found.append((right, last, ran.errors[-1] / undisturbed.errors[-1]))
+    right, last, ratio = np.array(found).T
+    print(
+        f"\ntwo slips at once, {len(found)} cases: both named and no other in {100 * right.mean():.0f} %, after "
+        f"{np.median(last):.0f} records ({last.max():.0f} at most); error after 20 records {np.median(ratio):.2f} "
+        f"times that without (median)"
+    )
+    assert right.mean() >= 0.9 and np.median(last) <= 5
+    assert np.median(ratio) < 1.3
 
 
 def _bump(shift_mm: tuple[float, float, float], turn_deg: tuple[float, float, float]):

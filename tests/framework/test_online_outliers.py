@@ -16,7 +16,7 @@ from armcal_online.tracking.outliers import log_density_of_outlier
 from online_arm import AXES, World, begun, told
 from scipy.stats import multivariate_normal
 
-SETTLED = 60
+SETTLED = 40
 
 
 def test_outliers_of_30_to_500_mm_cost_about_the_same() -> None:
@@ -94,7 +94,7 @@ def test_a_slip_is_named_among_large_outliers() -> None:
     arm = World.drawn(6, outliers=0.1, outlier=0.3)
     records = [arm.record() for _ in range(SETTLED)]
     arm.moved("arm.mdh.theta2", math.radians(6))
-    records += [arm.record() for _ in range(12)]
+    records += [arm.record() for _ in range(6)]
     first = decisions_of(records)[0]
     assert (first["kind"], first["joint"]) == ("joint_slipped", "arm.q2")
     assert first["size_deg"] == pytest.approx(6, abs=0.3)

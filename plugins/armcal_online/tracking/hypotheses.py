@@ -29,14 +29,15 @@ _SCALES = (1.0, 0.1)
 """A change is of the stated size, or small: to a prior wide enough for a slipped tooth a small step is unlikely."""
 _MOST_ONSETS = 5
 """So many of the last records with a large NIS are tried as the first after a change."""
-Kind = Literal["none", "joint_slipped", "joint_replaced", "sensor_moved", "general_change"]
+Kind = Literal["none", "joint_slipped", "joint_replaced", "sensor_moved", "general_change", "two_changes"]
 
 
 @dataclass(frozen=True)
 class Hypothesis:
     """A change: its kind, joint or measurement, what it reopens (N x k; a column a standard deviation), its prior.
 
-    ``scale`` is 1 for one of the stated size, less for a small one; ``step`` (n) is a step of 1 rad or m.
+    ``scale`` is 1 for one of the stated size, less for a small one; ``step`` (n) is a step of 1 rad or m; ``parts`` are
+    those of which it is made, if they are two.
     """
 
     kind: Kind
@@ -46,6 +47,12 @@ class Hypothesis:
     log_prior: float
     step: Array
     scale: float = 1.0
+    parts: tuple[Hypothesis, ...] = ()
+
+    @property
+    def singles(self) -> tuple[Hypothesis, ...]:
+        """The single changes in it."""
+        return self.parts or (self,)
 
 
 @dataclass(frozen=True)
@@ -143,11 +150,14 @@ class HypothesisFilter:
         self.is_model_wrong = any(state.instance for state in observer.gauss_markov.states)
 
     def compare(
-        self, recent: Sequence[Recent], large: Sequence[int], changes: Sequence[Hypothesis]
+        self, recent: Sequence[Recent], large: Sequence[int], changes: Sequence[Hypothesis], least: int = 1
     ) -> list[Explanation]:
-        """Every hypothesis from its likeliest onset, the likeliest first; ``large`` are records that do not fit."""
+        """Every hypothesis from its likeliest onset, the likeliest first.
+
+        ``large`` are records that do not fit; an onset has at least ``least`` of them from it on.
+        """
         likeliest: dict[int, Explanation] = {}
-        for onset in large[-_MOST_ONSETS:]:
+        for onset in large[-_MOST_ONSETS : len(large) + 1 - least]:
             records = recent[onset:]
             since = self._records_since(records)
             none = since.weigh(np.zeros((self._observer.size, 0))).log_likelihood

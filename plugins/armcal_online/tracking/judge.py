@@ -16,6 +16,7 @@ from armcal_online.tracking.decisions import EXPLAINED, Decision, log_odds_of
 from armcal_online.tracking.directions import Steps
 from armcal_online.tracking.health import Health, improbability, many_outliers, nis_limit
 from armcal_online.tracking.hypotheses import Candidate, Explanation, Hypothesis, HypothesisFilter
+from armcal_online.tracking.pairs import LEAST_RECORDS, is_enough, pairs
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.state import State
 from armcal_online.tracking.state_space import StateSpace
@@ -53,9 +54,9 @@ class Judge:
         """What is decided after a record, the last of ``state.recent``; the state follows it."""
         state, naming = self._name_suspect(state)
         state, change = self._detect_change(state)
-        if change is None and state.recent and not state.recent[-1].rejected:
+        if not change and state.recent and not state.recent[-1].rejected:
             state, change = self._detect_drift(state)
-        return state, tuple(decision for decision in (naming, change) if decision is not None)
+        return state, (*naming, *change)
 
     def health(self, state: State, decisions: Sequence[Decision], first: Linearised) -> Health:
         """Health after a record, the last of ``state.recent`` before the decisions; ``first`` is at its prior mean."""
@@ -83,7 +84,7 @@ class Judge:
                 return health.troubled("watch", text)
         return health.calmed(settings.levels.calm)
 
-    def _detect_change(self, state: State) -> tuple[State, Decision | None]:
+    def _detect_change(self, state: State) -> tuple[State, tuple[Decision, ...]]:
         """Whether the last records indicate a change."""
         large = [
             i
@@ -91,40 +92,54 @@ class Judge:
             if record.rejected or record.nis > nis_limit(record.dof, 1 - _LARGE, self._filter.freedom(record))
         ]
         if len(large) < 2 or not (state.wary or large[-1] == len(state.recent) - 1):
-            return (replace(state, wary=False) if len(large) < 2 else state), None
-        explanations = self._filter.compare(state.recent, large, self._changes)
+            return (replace(state, wary=False) if len(large) < 2 else state), ()
+        explanations = self._weighed(state, large)
         if not explanations:
-            return state, None
+            return state, ()
         best, gate, settings = explanations[0], self._settings.gate, self._settings.changes
         alike = self._indistinguishable(explanations)
-        subjects = {explanation.hypothesis.subject for explanation in alike}
-        others = [explanation for explanation in explanations if explanation.hypothesis.subject not in subjects]
+        others = _others(explanations, alike)
         total = float(logsumexp([explanation.log_odds for explanation in alike]))
         margin = best.log_odds - others[0].log_odds if others else math.inf
         is_named = len(large) >= gate.window - 1 or margin >= math.log(settings.naming_odds)
-        # Where the model is slightly wrong, as neighbours that err alike show, large NIS alone are no evidence.
-        agreeing = best.rejected if self._filter.is_model_wrong else best.large
-        explains = agreeing >= _AGREEING and best.share >= _SHARE
-        if total > math.log(settings.odds) and is_named and explains:
+        if total > math.log(settings.odds) and is_named and self._is_explaining(best):
             return self._follow_change(state, alike, others)
         state = replace(state, wary=bool(best.log_odds > 0))
         rejected = sum(record.rejected for record in state.recent)
         by_chance = many_outliers(rejected, gate.window, self._settings.outliers.fraction)
         if rejected >= gate.window - 1 and len(state.recent) >= gate.window:
             text = f"{rejected} of the last {len(state.recent)} records do not fit"
-            return state, sentences.no_longer_fits(state, self._steps, text, log_odds_of(by_chance))
+            return state, (sentences.no_longer_fits(state, self._steps, text, log_odds_of(by_chance)),)
         if rejected < gate.rejected or by_chance >= settings.probability:
-            return state, None
-        return state, sentences.unexplained(state, rejected, by_chance, best)
+            return state, ()
+        return state, (sentences.unexplained(state, rejected, by_chance, best),)
+
+    def _weighed(self, state: State, large: Sequence[int]) -> list[Explanation]:
+        """All changes, the likeliest first; two at once where one does not explain what the records say."""
+        singles = self._filter.compare(state.recent, large, self._changes)
+        if len(large) < LEAST_RECORDS or not singles:
+            return singles
+        if is_enough(singles[0], sum(i >= singles[0].onset for i in large)):
+            return singles
+        double = self._filter.compare(state.recent, large, pairs(singles, self._changes), LEAST_RECORDS)
+        return sorted([*singles, *double], key=lambda explanation: -explanation.log_odds)
+
+    def _is_explaining(self, best: Explanation) -> bool:
+        """Whether enough records agree on a change, and it explains enough of their misfit."""
+        # Where the model is slightly wrong, as neighbours that err alike show, large NIS alone are no evidence.
+        agreeing = best.rejected if self._filter.is_model_wrong else best.large
+        return agreeing >= (LEAST_RECORDS if best.hypothesis.parts else _AGREEING) and best.share >= _SHARE
 
     def _indistinguishable(self, explanations: Sequence[Explanation]) -> list[Explanation]:
         """The likeliest, and if it is a joint's the other joints that these records cannot distinguish from it."""
-        best = explanations[0]
+        best, odds = explanations[0], math.log(self._settings.changes.naming_odds)
+        if best.hypothesis.parts:
+            return [e for e in explanations if e.hypothesis.parts and best.log_odds - e.log_odds < odds]
         if not best.hypothesis.kind.startswith("joint"):
             return [best]
         near: dict[str, Explanation] = {}
         for explanation in explanations:
-            close = best.log_odds - explanation.log_odds < math.log(self._settings.changes.naming_odds)
+            close = best.log_odds - explanation.log_odds < odds
             if close and explanation.hypothesis.kind.startswith("joint"):
                 # A slip is the simpler explanation; later records distinguish a new servo from it, if it is one.
                 known = near.setdefault(explanation.hypothesis.subject, explanation)
@@ -134,10 +149,11 @@ class Judge:
 
     def _follow_change(
         self, state: State, alike: Sequence[Explanation], others: Sequence[Explanation]
-    ) -> tuple[State, Decision]:
+    ) -> tuple[State, tuple[Decision, ...]]:
         """The state with what a change reopens, from before it on."""
         best, since = alike[0], state.recent[alike[0].onset :]
-        directions = np.hstack([explanation.hypothesis.directions for explanation in alike])
+        reopened = {id(change): change for explanation in alike for change in explanation.hypothesis.singles}
+        directions = np.hstack([change.directions for change in reopened.values()])
         belief = self._filter.follow(-1, since, directions, best.hypothesis.factor).belief
         suspects: tuple[Candidate, ...] = ()
         if best.hypothesis.kind.startswith("joint"):
@@ -161,21 +177,23 @@ class Judge:
             suspected=since[0].sequence,
             before_change=since[0].before if suspects else None,
         )
-        size = self._size(since[0].before, belief, best.hypothesis)
-        decision = sentences.change(state, self._steps, alike, others, size)
+        sizes = [self._size(since[0].before, belief, change) for change in best.hypothesis.singles]
+        if best.hypothesis.parts:
+            return after, sentences.together(state, self._steps, alike, others, sizes)
+        decision = sentences.change(state, self._steps, alike, others, sizes[0])
         if best.hypothesis.kind == "general_change":
             late = tuple(s for s in state.changes if state.sequence - s < 10 * self._settings.gate.window)
             after = replace(after, changes=(*late, state.sequence)[-_UNEXPLAINED:])
             if len(after.changes) >= _UNEXPLAINED:
                 text = f"{len(after.changes)} changes that nothing explains came within a short time"
                 first = after.changes[0]
-                return after, sentences.no_longer_fits(state, self._steps, text, decision.log_odds, first)
-        return after, decision
+                return after, (sentences.no_longer_fits(state, self._steps, text, decision.log_odds, first),)
+        return after, (decision,)
 
-    def _name_suspect(self, state: State) -> tuple[State, Decision | None]:
+    def _name_suspect(self, state: State) -> tuple[State, tuple[Decision, ...]]:
         """Which of several joints it was, and whether its servo is another one, once the records determine it."""
         if not state.suspects or not state.recent:
-            return state, None
+            return state, ()
         followed = [self._filter.step(suspect, state.recent[-1]) for suspect in state.suspects]
         followed.sort(key=lambda candidate: -candidate.log_evidence)
         best, change = followed[0], self._changes[followed[0].place]
@@ -184,12 +202,12 @@ class Judge:
         margin = best.log_evidence - rivals[0].log_evidence if rivals else math.inf
         settled = replace(state, suspects=(), before_change=None)
         if state.sequence - state.suspected > _LONGEST_NAMING:
-            return settled, None
+            return settled, ()
         changes = self._settings.changes
         if margin < math.log(changes.naming_odds if others else changes.odds):
-            return replace(state, suspects=tuple(followed)), None
+            return replace(state, suspects=tuple(followed)), ()
         if not others and change.kind == "joint_slipped":
-            return settled, None
+            return settled, ()
         left = tuple(candidate for candidate in followed if candidate not in others) if others else ()
         after = replace(settled, belief=best.belief, anchor=best.belief, held=(), recent=(), wary=False)
         if len(left) > 1:
@@ -197,29 +215,29 @@ class Judge:
         size = self._size(state.before_change or best.belief, best.belief, change)
         if others:
             names = tuple(dict.fromkeys(self._changes[other.place].subject for other in others))
-            return after, sentences.named(state, self._steps, change, names, margin, size)
-        return after, sentences.replaced(state, self._steps, change, margin, size)
+            return after, (sentences.named(state, self._steps, change, names, margin, size),)
+        return after, (sentences.replaced(state, self._steps, change, margin, size),)
 
-    def _detect_drift(self, state: State) -> tuple[State, Decision | None]:
+    def _detect_drift(self, state: State) -> tuple[State, tuple[Decision, ...]]:
         """Whether the NIS as a whole is too large, though no record's is."""
         settings = self._settings.levels
         if len(state.nis_window) < settings.window:
-            return state, None
+            return state, ()
         known = min(map(self._filter.freedom, state.recent), default=math.inf)
         by_chance = improbability(state.nis_window, known)
         if by_chance >= settings.probability:
-            return replace(state, drifted=0, nis_window=state.nis_window[settings.window // 2 :]), None
+            return replace(state, drifted=0, nis_window=state.nis_window[settings.window // 2 :]), ()
         total, freedom = (float(sum(column)) for column in zip(*state.nis_window, strict=True))
         ratio, count = total / freedom, len(state.nis_window)
         state = replace(state, nis_window=(), drifted=state.drifted + 1)
         if state.drifted >= _UNEXPLAINED:
             text = f"the NIS of {count} records is {ratio:.1f} times what chance makes it, again and again"
             since = sentences.first_of(state, _UNEXPLAINED * count)
-            return state, sentences.no_longer_fits(state, self._steps, text, log_odds_of(by_chance), since)
+            return state, (sentences.no_longer_fits(state, self._steps, text, log_odds_of(by_chance), since),)
         factor = min(math.sqrt(ratio), _MOST_WIDENING)
         belief = state.belief.widened(len(self._space.scales), factor)
         decision = sentences.drift(state, count, ratio, by_chance, factor)
-        return replace(state, belief=belief, anchor=belief, held=()), decision
+        return replace(state, belief=belief, anchor=belief, held=()), (decision,)
 
     def _size(self, before: Belief, after: Belief, hypothesis: Hypothesis) -> tuple[float, float]:
         """How far a joint stepped (rad or m), and its standard deviation."""
@@ -230,3 +248,14 @@ class Judge:
         along = step / float(step @ step)
         covariance = after.gaussian.covariance[:n, :n]
         return float(along @ moved), math.sqrt(max(float(along @ covariance @ along), 0.0))
+
+
+def _others(explanations: Sequence[Explanation], alike: Sequence[Explanation]) -> list[Explanation]:
+    """What else it may have been; a change with another one beside it is nothing else."""
+    subjects = {explanation.hypothesis.subject for explanation in alike}
+    return [
+        explanation
+        for explanation in explanations
+        if explanation.hypothesis.subject not in subjects
+        and not (explanation.hypothesis.parts and subjects & {part.subject for part in explanation.hypothesis.parts})
+    ]

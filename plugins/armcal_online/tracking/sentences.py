@@ -48,6 +48,41 @@ def change(
     return Decision(kind, f"Joint {subject} {what}", why, log_odds, onset, subject, names, size[0], dimension)
 
 
+def together(
+    state: State,
+    steps: Steps,
+    alike: Sequence[Explanation],
+    others: Sequence[Explanation],
+    sizes: Sequence[tuple[float, float]],
+) -> tuple[Decision, ...]:
+    """Two changes at once that are followed from now on: a decision each, or one where several pairs are as likely."""
+    best, since = alike[0], state.recent[alike[0].onset :]
+    log_odds, onset = _against(alike, others), since[0].sequence
+    why = (
+        f"{sum(record.rejected for record in since)} of the {len(since)} records since do not fit the estimate before; "
+        f"two changes together explain {100 * best.share:.0f} % of their misfit, and no single one does"
+    )
+    parts = best.hypothesis.parts
+    if len(alike) > 1:
+        names = tuple(dict.fromkeys(part.subject for pair in alike for part in pair.hypothesis.parts))
+        joints = tuple(name for name in names if any(joint.joint == name for joint in steps.joints)) or names
+        what = f"Two of {', '.join(names)} have changed at once"
+        why += "; poses since do not distinguish them, and the variance of their offsets is open"
+        return (Decision("joint_stepped", what, why, log_odds, onset, joints[0], joints),)
+    decisions = []
+    for part, other, size in zip(parts, reversed(parts), sizes, strict=True):
+        dimension = next((joint.dimension for joint in steps.joints if joint.joint == part.subject), "")
+        beside = f"; {_named(other)} changed at the same time"
+        if part.kind == "sensor_moved":
+            what = f"The frame of {part.subject} has moved{beside}"
+            decisions.append(Decision(part.kind, what, why, log_odds, onset, part.subject))
+        else:
+            what = f"Joint {part.subject} slipped by {_shown(size, dimension)}{beside}"
+            names = (part.subject,)
+            decisions.append(Decision(part.kind, what, why, log_odds, onset, part.subject, names, size[0], dimension))
+    return tuple(decisions)
+
+
 def named(
     state: State,
     steps: Steps,
@@ -116,6 +151,8 @@ def first_of(state: State, count: int) -> int:
 
 
 def _named(hypothesis: Hypothesis) -> str:
+    if hypothesis.parts:
+        return " with ".join(_named(part) for part in hypothesis.parts)
     if hypothesis.kind == "general_change":
         return "a change of everything"
     return f"joint {hypothesis.subject}" if hypothesis.kind.startswith("joint") else f"a moved {hypothesis.subject}"

@@ -77,6 +77,7 @@ class RecordsSince:
         self._left = np.ones((len(passed), len(passed), len(gaussian.mean) - self._n))
         for i, j in combinations(range(len(passed)), 2):
             self._left[i, j] = np.prod(kept[i:j], axis=0)
+        self._unmoved = [one.at(mean) for one, mean in zip(observations, self._means, strict=True)]
         self._log_outliers = math.log(1 - share), math.log(share) + self._outlier_densities(outlier_covariances)
 
     def weigh(self, directions: Array, factor: float = 1.0) -> Weighed:
@@ -103,14 +104,15 @@ class RecordsSince:
     def _outlier_densities(self, stated: Sequence[Array]) -> Array:
         """Of each record by itself (records), whatever has changed: an outlier says nothing about the arm."""
         densities = []
-        for one, mean, prior, error in zip(self._observations, self._means, self._priors, stated, strict=True):
-            record = one.at(mean)
+        for record, prior, error in zip(self._unmoved, self._priors, stated, strict=True):
             expected = record.slope @ prior @ record.slope.T + record.noise
             densities.append(log_density_of_outlier(record.innovation, expected, error, self._freedom))
         return np.array(densities)
 
     def _records(self, directions: Array, shift: Array) -> list[Linearised]:
-        moved = directions @ shift if len(shift) else 0.0
+        if not shift.any():
+            return self._unmoved
+        moved = directions @ shift
         return [one.at(mean + moved) for one, mean in zip(self._observations, self._means, strict=True)]
 
     def _likeliest_shift(self, directions: Array, shift: Array, fits: NDArray[np.bool_], factor: float) -> Array:
