@@ -16,7 +16,7 @@ from typing import Any
 from armcal.base.domains import Array
 from armcal.calibration.calibration import Calibration
 from armcal.errors import ArmcalError, ConfigError, DataError, Location
-from armcal.estimate.online import OnlineEstimator, normalised_innovation_squared
+from armcal.estimate.online import Linearised, OnlineEstimator, normalised_innovation_squared
 from armcal.estimate.validation import error_unit
 from armcal.measure.reader import ReadRequest
 from armcal.plugins import PluginRegistry, discover
@@ -31,7 +31,9 @@ from armcal_online.tracking.evaluator import identity
 from armcal_online.tracking.health import nis_limit
 from armcal_online.tracking.hypotheses import HypothesisFilter, Recent, hypotheses
 from armcal_online.tracking.judge import Judge
+from armcal_online.tracking.net import Net
 from armcal_online.tracking.observer import Reading
+from armcal_online.tracking.refit import NetRecord
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.start import FilterSetup, filter_setup
 from armcal_online.tracking.state import Arrival, State, Tick, advanced, remembering, ticked
@@ -59,6 +61,7 @@ class Recalibrator:
         hypothesis_filter = HypothesisFilter(setup.observer, estimator, setup.process_noise, settings.outliers)
         changes = hypotheses(setup.space, steps, settings.changes, setup.observer.size)
         self._judge = Judge(setup.space, steps, hypothesis_filter, changes, settings)
+        self._net = Net(setup, changes) if settings.net == settings.gating == "on" else None
         self.state = State(setup.belief, setup.belief)
 
     @classmethod
@@ -171,25 +174,23 @@ class Recalibrator:
         self, incoming: Incoming, state: State, readings: tuple[Reading, ...], passed: Mapping[str, float]
     ) -> tuple[dict[str, Any], ...]:
         """Gate a record, take it in if it is accepted, and judge what the last records mean now."""
-        process_noise, observer, space = self.setup.process_noise, self.setup.observer, self.setup.space
+        process_noise, observer = self.setup.process_noise, self.setup.observer
         before = process_noise.faded(state.belief, passed)
         anchor = process_noise.faded(state.anchor, passed) if state.held else before
         state = replace(state, belief=before, anchor=anchor)
         try:
-            noise = observer.joint_noise(space.inside(before.values(space)), readings)
-            first = observer.observation(before, readings, noise).at(before.gaussian.mean)
-            covariance = first.slope @ before.gaussian.covariance @ first.slope.T + first.noise
-            nis, dof = normalised_innovation_squared(first.innovation, covariance), len(first.innovation)
-            limit = nis_limit(dof, self._settings.gate.probability, observer.freedom(readings))
-            rejected = self._settings.gating == "on" and not nis <= limit
-            recent = Recent(state.sequence, readings, noise, passed, before, rejected, nis, dof)
-            nis_window = self._settings.levels.window
-            after = state if rejected else advanced(state, recent, self.setup, self._estimator, nis_window)
+            gated, first, limit = self._gated(state, readings, passed)
+            state, decisions = self._judge.after(gated) if self._settings.gating == "on" else (gated, ())
         except ArmcalError as fault:
-            return self._ignored(incoming, state, fault.message)
-        counted = _counted(after, "rejected" if rejected else "accepted")
-        gated = replace(counted, recent=(*counted.recent, recent)[-self._settings.gate.window :])
-        state, decisions = self._judge.after(gated) if self._settings.gating == "on" else (gated, ())
+            return self._without_filter(incoming, state, readings, passed, fault.message)
+        recent = gated.recent[-1]
+        if self._net is not None:
+            record, corrected = (
+                NetRecord(recent.sequence, readings, recent.joint_noise),
+                state.belief is not gated.belief,
+            )
+            state, taken_over = self._net.after(state, record, before, passed, corrected)
+            decisions = (*decisions, *taken_over)
         health, level = self._judge.health(gated, decisions, first), self.state.health.level
         record_events = [events.judged(incoming, state, recent, first, limit, self.setup)]
         calm = self._settings.levels.calm
@@ -201,13 +202,52 @@ class Recalibrator:
                 record_events.append(events.decided(state, decision, tip, calm))
         if health.level != level:
             record_events.append(events.level_changed(state, level, health, calm))
-        is_good = not rejected and not decisions and health.level == "nominal"
+        is_good = not recent.rejected and not decisions and health.level == "nominal"
         newest = replace(state.ids[-1], is_good=is_good)
         self.state = replace(state, health=health, ids=(*state.ids[:-1], newest))
         every = self._settings.output.estimate_every_records
         if decisions or (state.counts["accepted"] % every == 0 and not recent.rejected):
             record_events.append(events.estimated(self.state, self.estimate))
         return tuple(record_events)
+
+    def _gated(
+        self, state: State, readings: tuple[Reading, ...], passed: Mapping[str, float]
+    ) -> tuple[State, Linearised, float]:
+        """The state with a record, accepted or rejected; the record at its prior mean, and the limit of its NIS.
+
+        Raises:
+            ArmcalError: the filter cannot use it where it has come to.
+        """
+        observer, space, before = self.setup.observer, self.setup.space, state.belief
+        noise = observer.joint_noise(space.inside(before.values(space)), readings)
+        first = observer.observation(before, readings, noise).at(before.gaussian.mean)
+        covariance = first.slope @ before.gaussian.covariance @ first.slope.T + first.noise
+        nis, dof = normalised_innovation_squared(first.innovation, covariance), len(first.innovation)
+        limit = nis_limit(dof, self._settings.gate.probability, observer.freedom(readings))
+        rejected = self._settings.gating == "on" and not nis <= limit
+        recent = Recent(state.sequence, readings, noise, passed, before, rejected, nis, dof)
+        nis_window = self._settings.levels.window
+        after = state if rejected else advanced(state, recent, self.setup, self._estimator, nis_window)
+        counted = _counted(after, "rejected" if rejected else "accepted")
+        return replace(counted, recent=(*counted.recent, recent)[-self._settings.gate.window :]), first, limit
+
+    def _without_filter(
+        self, incoming: Incoming, state: State, readings: tuple[Reading, ...], passed: Mapping[str, float], why: str
+    ) -> tuple[dict[str, Any], ...]:
+        """A record that the filter cannot use where it has come to: the net takes it all the same."""
+        if self._net is None:
+            return self._ignored(incoming, state, why)
+        try:
+            noise = self.setup.observer.joint_noise(self.setup.belief.origin, readings)
+        except ArmcalError:
+            return self._ignored(incoming, state, why)
+        record = NetRecord(state.sequence, readings, noise)
+        state, decisions = self._net.after(state, record, state.belief, passed, corrected=False)
+        ignored, calm = self._ignored(incoming, state, why), self._settings.levels.calm
+        for decision in decisions:
+            health = self.state.health.troubled(decision.level, decision.sentence)
+            self.state = replace(self.state, health=health)
+        return (*ignored, *(events.decided(self.state, decision, None, calm) for decision in decisions))
 
     def started_event(self, resumed: bool) -> dict[str, Any]:
         """The first event of a process."""

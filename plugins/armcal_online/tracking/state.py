@@ -18,6 +18,7 @@ from armcal.estimate.online import Gaussian, OnlineEstimator, kalman_update
 from armcal_online.tracking.belief import Belief, most_likely
 from armcal_online.tracking.health import Health
 from armcal_online.tracking.hypotheses import Candidate, Recent
+from armcal_online.tracking.net_state import NetState
 from armcal_online.tracking.settings import ClockSettings
 from armcal_online.tracking.start import FilterSetup
 
@@ -121,6 +122,7 @@ class State:
         changes: sequence numbers of the last changes that nothing explained.
         sequence: of the last entry.
         at: time of the last record (unix seconds, or as records count it).
+        net: the windows of records that are refitted beside the filter.
     """
 
     belief: Belief
@@ -142,6 +144,7 @@ class State:
     changes: tuple[int, ...] = ()
     sequence: int = 0
     at: float = 0.0
+    net: NetState = field(default_factory=NetState)
 
     def known(self, sequence: int) -> Arrival | None:
         """The record of a number, if it is remembered."""
@@ -167,7 +170,8 @@ class State:
             KeyError, TypeError, ValueError, AttributeError, IndexError: it is no state.
         """
         anchor = content["belief"] if content["anchor"] is None else content["anchor"]
-        state: State = _decoded(cls, {**content, "anchor": anchor, "nis_window": content["nis"]})
+        before_nets = {"net": _encoded(NetState())}  # a state of an earlier version has none
+        state: State = _decoded(cls, {**before_nets, **content, "anchor": anchor, "nis_window": content["nis"]})
         if set(state.counts) != {"accepted", "rejected", "ignored"}:
             raise ValueError(f"counts of {', '.join(state.counts)}")
         return state
@@ -180,6 +184,8 @@ class State:
             hashed.update(array.astype("<f8").tobytes())
         rest = [asdict(self.health), dict(self.counts), asdict(self.clock), self.sequence, self.drifted]
         hashed.update(json.dumps(rest, sort_keys=True).encode())
+        if self.net.taken:
+            hashed.update(json.dumps(_encoded(self.net), sort_keys=True).encode())
         return hashed.hexdigest()[:16]
 
 
