@@ -15,10 +15,13 @@ from armcal.cli.console import columned
 from armcal.cli.outlet import say
 from armcal.errors import ProblemError
 from armcal.estimate.identifiability import Identifiability
+from armcal.estimate.start import Start, pose_words
 from armcal.estimate.structure import identify, require_solvable
 from armcal.run.data_checks import gravity_findings
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Prepared, Stopwatch, assemble
+
+_MM = 1000.0
 
 
 @click.command()
@@ -56,6 +59,8 @@ def check(console: Console, config: Path, data: Path | None, overrides: tuple[st
     for joint, seen in content["excitation_rad_or_m"].items():
         table.add_row(joint, f"{seen['min']:.3f}", f"{seen['max']:.3f}", str(seen["levels"]))
     out.print(table)
+    for line in _alignment_lines(ready.start):
+        out.print(line, soft_wrap=True)
     condition = parameters["scaled_condition"]
     shown = "infinite" if condition is None else f"{condition:.3g}"
     out.print(f"rank {parameters['rank']} of {len(parameters['free'])}, scaled condition {shown}.")
@@ -95,5 +100,37 @@ def _content(experiment: Experiment, ready: Prepared, known: Identifiability) ->
             channel: {"min": float(values.min()), "max": float(values.max()), "levels": len(np.unique(values))}
             for channel, values in angles.items()
         },
+        "alignment": _alignment(ready.start),
         "warnings": list(ready.warnings),
     }
+
+
+def _alignment(start: Start) -> dict[str, Any] | None:
+    """Where the base and the target were found, in SI; nothing where they are not looked for."""
+    found = start.found
+    if found is None:
+        return None
+    return {
+        "tracker_T_base": [[*row, x] for row, x in zip(found.turn.tolist(), found.shift.tolist(), strict=True)],
+        "target_moved_m": found.offset.tolist(),
+        "typical_error_as_configured_m": start.configured,
+        "typical_error_aligned_m": found.left,
+        "undetermined": list(start.gauges),
+        "start": "aligned" if start.taken else "configured",
+    }
+
+
+def _alignment_lines(start: Start) -> list[str]:
+    """The same as people read it."""
+    if start.found is None:
+        return []
+    target = ", ".join(f"{x * _MM:.1f}" for x in start.found.offset)
+    lines = [
+        f"alignment of the nominal arm with the positions: its base frame stands at {pose_words(start.found)} in the "
+        f"instrument's frame, the target is ({target}) mm from its configured place on the tool.",
+        f"typical error of the nominal arm: {start.configured * _MM:.3g} mm as configured, "
+        f"{start.found.left * _MM:.3g} mm aligned; the fit starts from "
+        f"{'the alignment' if start.taken else 'the configuration'}.",
+    ]
+    lines += [f"not determined by these positions: {gauge}." for gauge in start.gauges]
+    return lines

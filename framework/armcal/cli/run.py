@@ -25,7 +25,9 @@ from armcal.run.result import RunResult
 @click.argument("config", type=FILE)
 @data
 @click.option("--out", type=FILE, help="Where the results go [default: runs/NAME of CONFIG].")
-@click.option("--accept", is_flag=True, help="Write calibration.yaml although its verdict is bad.")
+@click.option(
+    "--accept", is_flag=True, help="Write calibration.yaml although its verdict is bad, or the data look mixed up."
+)
 @overrides
 @parallel
 @speaking
@@ -45,7 +47,7 @@ def run(
     registry = console.registry()
     experiment = Experiment.load(config, overrides, data, registry)
     with console.progress() as progress:
-        result = calibrate(experiment, command_line(), progress, watch, parallel)
+        result = calibrate(experiment, command_line(), progress, watch, parallel, accept)
     _show_details(console, result)
     result.seconds["total"] = watch.total()
     sections = plugin_sections(result, registry)

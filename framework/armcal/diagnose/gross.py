@@ -54,7 +54,7 @@ class Figure:
     Attributes:
         reach_mm: largest distance of the nominal tool from the first joint, over the poses.
         size: extent of the calibrated tool positions by that of the nominal ones; nan where they do not move.
-        moved_mm, turned_deg: how the calibrated arm as a whole stands away from the nominal one.
+        moved_mm, turned_deg: how the calibrated arm as a whole stands away from where the configuration has it.
         displaced: parameters beyond what their priors say, the farthest first.
     """
 
@@ -96,8 +96,9 @@ def figure_of(problem: Problem, estimate: Estimate, records: Sequence[FactorReco
 
 
 def _both(problem: Problem, estimate: Estimate, poses: Sequence[FactorRecords]) -> tuple[Array, Array]:
-    """Places of the first tool, nominal and calibrated (3 x N, m)."""
-    at_nominal, at_estimate = (tools(problem, v, poses)[0] for v in (problem.parameters.nominal(), estimate.values))
+    """Places of the first tool, as configured and calibrated (3 x N, m)."""
+    configured = problem.blueprint.parameters.nominal()
+    at_nominal, at_estimate = (tools(problem, v, poses)[0] for v in (configured, estimate.values))
     return at_nominal[0], at_estimate[0]
 
 

@@ -128,11 +128,11 @@ def hopeless(problem: Problem, records: Sequence[FactorRecords], dataset: Datase
     chosen = np.arange(0, len(dataset), max(1, -(-len(dataset) // _MOST_RECORDS)))
     some = problem.subset(records, chosen)
     try:
-        if not problem.increments or _off(problem, some, dataset.subset(chosen), start) <= HOPELESS:
+        if not problem.increments or typical_off(problem, some, dataset.subset(chosen), start) <= HOPELESS:
             return None
         posed = PosedProblem(problem, some)
         values = posed.values(descended(posed, posed.x(start), _SEARCH_STEPS, _SEARCH_DAMPING))
-        off = _off(problem, some, dataset.subset(chosen), values)
+        off = typical_off(problem, some, dataset.subset(chosen), values)
     except NotConvergedError:
         return None
     if off <= HOPELESS:
@@ -142,7 +142,7 @@ def hopeless(problem: Problem, records: Sequence[FactorRecords], dataset: Datase
     return Solution(start, SolverVerdict("the first search", status, False, _SEARCH_STEPS, seconds))
 
 
-def _off(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, values: Array) -> float:
+def typical_off(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, values: Array) -> float:
     """Median residual by the spread of the measured positions, the worst of all measurements that read positions."""
     worst = 0.0
     for kernel, record, residual in zip(problem.kernels, records, problem.residuals(values, records), strict=True):

@@ -10,7 +10,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.config.system import System
 from armcal.diagnose.noise_findings import Finding
-from armcal.diagnose.permuted_axes import find_permuted_axes
+from armcal.diagnose.permuted_axes import MUCH_BETTER, find_permuted_axes
 from armcal.errors import DataError, Location
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -59,23 +59,30 @@ def _check_rows(name: str, dataset: Dataset, ratio: Array) -> None:
             )
 
 
-def check_permuted_axes(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> None:
-    """Positions that do not fit the model, but do once one exchange is undone.
+def check_permuted_axes(
+    problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, accept: bool = False
+) -> list[Finding]:
+    """Positions that do not fit the model, but do once one exchange is undone; with ``accept`` a bad finding.
 
     Raises:
-        DataError: they are such; it names what looks mixed up.
+        DataError: they are such, and not accepted; it names what looks mixed up.
     """
     reading = find_permuted_axes(problem, records, dataset)
     if reading is None:
-        return
-    raise DataError(
+        return []
+    text = (
         f"{reading.measurement}: as they stand, the data are typically {reading.as_given_mm:.3g} mm off the model, "
         f"however its free parameters adapt; with {', or with '.join(reading.readings)}, they are "
-        f"{reading.left_mm:.3g} mm off.",
-        where=Location(dataset.source),
-        hint=f"Mend these columns in the file or by data.columns, or {_MEND[reading.of_joints]}. "
-        "If the data are right, the model's nominal values are far off: give better ones.",
+        f"{reading.left_mm:.3g} mm off."
     )
+    hint = f"Check the unit in the column names; mend columns in the file or by data.columns, or {_MEND[reading.of_joints]}."
+    if accept:
+        return [Finding("bad", text, f"limit {MUCH_BETTER:g} times", hint)]
+    hint += (
+        " If the data are right, the model's nominal values are far off: give better ones, or calibrate as it "
+        "stands: armcal run --accept."
+    )
+    raise DataError(text, where=Location(dataset.source), hint=hint)
 
 
 def gravity_findings(system: System, dataset: Dataset) -> list[Finding]:

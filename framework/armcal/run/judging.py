@@ -41,16 +41,21 @@ _AT_REST = ", as in a new recording (its drift not known)"
 
 
 def verdict_of(
-    run: FittedRecords, errors: RecordErrors, intervals: IntervalResult, system: System, limit: float | None
+    run: FittedRecords,
+    errors: RecordErrors,
+    intervals: IntervalResult,
+    system: System,
+    limit: float | None,
+    known: Sequence[Finding] = (),
 ) -> tuple[Verdict, Evidence]:
     """The verdict on a fit, and what it rests on.
 
     Args:
         run: the fit and its records.
-        errors: of every record.
-        intervals: whether prediction intervals cover their share.
+        errors, intervals: of every record; whether prediction intervals cover their share.
         system: the arms.
         limit: above which the error of a judged record is explained (m); None for the default.
+        known: what was found before the fit.
     """
     problem, fitted, train, held = run.problem, run.fitted, run.split.train, len(run.split.holdout)
     estimate, acting = fitted.estimate, run.problem.weighted(fitted.records, fitted.weights)
@@ -76,7 +81,7 @@ def verdict_of(
         run.dataset.ids,
         suggestions,
         fitted,
-        [*gross, *worse, *intervals.findings(), *moved, *gravity_findings(system, run.dataset)],
+        [*known, *gross, *worse, *intervals.findings(), *moved, *gravity_findings(system, run.dataset)],
         evidence,
     )
     return verdict, evidence

@@ -13,6 +13,7 @@ from armcal.base.domains import Array
 from armcal.errors import ConfigError, DataError, Location
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.simulation import SimulationRequest, with_channels
+from armcal.estimate.start import aligned_start
 from armcal.estimate.structure import require_solvable
 from armcal.estimate.validation import (
     Indices,
@@ -144,11 +145,13 @@ def _prepared(experiment: Experiment, dataset: Dataset, groups: Sequence[Indices
     system, parameters = experiment.system, experiment.parameters
     choice = interpreted_first(experiment).evaluator
     problem = Problem.build(system.arms, system.measurements, parameters, system.environment, dataset, choice)
-    records = with_drift(problem, problem.records(dataset), dataset, parameters.nominal())
+    start = aligned_start(problem, problem.records(dataset), dataset)
+    problem, nominal = start.problem, start.problem.parameters.nominal()
+    records = with_drift(problem, problem.records(dataset), dataset, nominal)
     for group in groups:
-        require_solvable(problem, problem.subset(records, group), parameters.nominal())
+        require_solvable(problem, problem.subset(records, group), nominal)
     every = np.arange(len(dataset), dtype=np.intp)
-    return Prepared(dataset, problem, records, Split(every, every), ())
+    return Prepared(dataset, problem, records, Split(every, every), start.warnings, start)
 
 
 def _plan(name: str, groups: Sequence[Indices], settings: LoadTransferSettings) -> list[_Fit]:

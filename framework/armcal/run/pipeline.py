@@ -11,12 +11,14 @@ from armcal.base.dataset import Dataset, SetAside
 from armcal.calibration.intervals import PredictionRecord, covariance_rows, recording_record, stretch_records
 from armcal.diagnose.clustered import widened
 from armcal.diagnose.coverage import fit_and_predict
+from armcal.diagnose.noise_findings import Finding
 from armcal.errors import ConfigError, ProblemError
 from armcal.estimate.bootstrap import Bootstrap, bootstrap
 from armcal.estimate.estimator import Progress, no_progress, spread
 from armcal.estimate.nuisance import restricted, started
-from armcal.estimate.polish import hopeless
+from armcal.estimate.polish import hopeless, typical_off
 from armcal.estimate.profile import Profile, profiled, profiles
+from armcal.estimate.start import FAR, Start, aligned_start
 from armcal.estimate.structure import require_solvable
 from armcal.estimate.validation import (
     CrossValidation,
@@ -74,6 +76,8 @@ class Prepared:
     records: tuple[FactorRecords, ...]
     split: Split
     warnings: tuple[str, ...]
+    start: Start
+    findings: tuple[Finding, ...] = ()
 
     @property
     def training(self) -> tuple[FactorRecords, ...]:
@@ -81,20 +85,22 @@ class Prepared:
         return self.problem.subset(self.records, self.split.train)
 
 
-def prepare(experiment: Experiment, watch: Stopwatch) -> Prepared:
-    """Everything that can be done and refused before solving.
+def prepare(experiment: Experiment, watch: Stopwatch, accept: bool = False) -> Prepared:
+    """Everything that can be done and refused before solving; see ``assemble``.
 
     Raises:
         InputError: data, units, counts or rank do not allow a calibration.
     """
-    ready = assemble(experiment, watch)
+    ready = assemble(experiment, watch, accept)
     with watch.stage("check"):
         problems = require_solvable(ready.problem, ready.training, ready.problem.parameters.nominal())
     return replace(ready, warnings=(*ready.warnings, *problems))
 
 
-def assemble(experiment: Experiment, watch: Stopwatch) -> Prepared:
+def assemble(experiment: Experiment, watch: Stopwatch, accept: bool = False) -> Prepared:
     """Data read and checked, and the problem that it makes, whether or not it can be solved.
+
+    With ``accept``, data that look mixed up are not refused, but a bad finding.
 
     Raises:
         InputError: data, units or counts do not allow a calibration.
@@ -113,12 +119,13 @@ def assemble(experiment: Experiment, watch: Stopwatch) -> Prepared:
             experiment.settings.evaluator,
         )
         records = problem.records(dataset)
-        problem = started(problem, records)
+        start = aligned_start(problem, records, dataset)
+        problem = started(start.problem, records)
         records = with_joint_noise(problem, records, problem.parameters.nominal())
         records = with_drift(problem, records, dataset, problem.parameters.nominal())
     with watch.stage("check"):
+        mixed_up = check_permuted_axes(problem, records, dataset, accept)
         check_reach(problem, records, dataset)
-        check_permuted_axes(problem, records, dataset)
         split = _split(experiment, dataset)
         if not len(split.train):
             raise ProblemError("no record is left to train on.", hint="Hold fewer out, or measure more poses.")
@@ -130,7 +137,8 @@ def assemble(experiment: Experiment, watch: Stopwatch) -> Prepared:
             raise ConfigError("it is a length, and nothing that is measured is one.", where=where, hint=hint)
         problem = restricted(problem, problem.subset(records, split.train))
         profiled(problem, experiment.settings.uncertainty.profile)
-    return Prepared(dataset, problem, records, split, (*experiment.warnings, *dataset.warnings))
+    texts = (*experiment.warnings, *dataset.warnings, *start.warnings)
+    return Prepared(dataset, problem, records, split, texts, start, tuple(mixed_up))
 
 
 def calibrate(
@@ -139,21 +147,21 @@ def calibrate(
     progress: Progress = no_progress,
     watch: Stopwatch | None = None,
     executor: Executor | None = None,
+    accept: bool = False,
 ) -> RunResult:
-    """Calibrate (see ``outputs.write``), starts and folds by ``executor``; InputError where refused before solving."""
+    """Calibrate (see ``outputs.write``), starts and folds by ``executor``; InputError if refused (see ``assemble``)."""
     watch, registry = watch or Stopwatch(), experiment.registry
-    ready = prepare(experiment, watch)
+    ready = prepare(experiment, watch, accept)
     dataset, split, validation = ready.dataset, ready.split, experiment.settings.validation
-    faults = registry.notify("armcal_run_started", name=experiment.name, records=len(dataset))
-    faults += _notify_rejected(registry, dataset.set_aside)
+    faults = _notify_started(registry, experiment.name, dataset)
     fitted = _fitted(experiment, ready, progress, executor, watch)
     faults += registry.notify("armcal_estimate_changed", estimate=fitted.estimate)
     run = FittedRecords(ready.problem, ready.records, dataset, split, fitted)
     resampled, profiled_result = _uncertainty(experiment, ready, fitted, progress, executor, watch)
     errors, intervals = _validated(experiment, run, ready.training, progress, executor, watch)
-    progress("judging", 0.0)
     with watch.stage("judge"):
-        verdict, evidence = verdict_of(run, errors, intervals, experiment.system, validation.limit)
+        progress("judging", 0.0)
+        verdict, evidence = verdict_of(run, errors, intervals, experiment.system, validation.limit, ready.findings)
     progress("judging", 1.0)
     noise = noise_result(ready.problem, fitted, dataset, split, errors.calibrated_mm)
     faults += _notify_rejected(registry, noise.set_aside)
@@ -210,14 +218,34 @@ def _fitted(
 ) -> WeighedFit:
     """The fit to the training records, as sure as records that may err alike allow."""
     problem, train = ready.problem, ready.split.train
-    estimator, nominal = spread(experiment.estimator, executor), problem.parameters.nominal()
+    estimator, data = spread(experiment.estimator, executor), ready.dataset.subset(train)
     with watch.stage("fit"):
-        given_up = hopeless(problem, ready.training, ready.dataset.subset(train), nominal)
-        if given_up is not None:
-            return plain_fit(problem, ready.training, given_up)
-        fitted = fit(problem, ready.training, estimator, nominal, progress)
+        starts = ready.start.values(problem)
+        given_up = [hopeless(problem, ready.training, data, start) for start in starts]
+        left = [start for start, hopeless_from in zip(starts, given_up, strict=True) if hopeless_from is None]
+        if not left:
+            return plain_fit(problem, ready.training, next(given for given in given_up if given is not None))
+        fitted = fit(problem, ready.training, estimator, left[0], progress)
+        for start in left[1:]:
+            if fitted.solution.verdict.converged and _near(problem, ready, data, fitted):
+                break
+            other = fit(problem, ready.training, estimator, start, progress)
+            costs = [problem.cost(each.solution.values, ready.training) for each in (fitted, other)]
+            better = other.solution.verdict.converged and costs[1] < costs[0]
+            fitted = other if better or not fitted.solution.verdict.converged else fitted
         acting, position = problem.weighted(fitted.records, fitted.weights), recorded_position(ready.dataset)[train]
         return replace(fitted, estimate=widened(problem, acting, fitted.estimate, position))
+
+
+def _near(problem: Problem, ready: Prepared, data: Dataset, fitted: WeighedFit) -> bool:
+    """Whether a fit ends where positions are, so that no other start can be much better."""
+    return typical_off(problem, ready.training, data, fitted.solution.values) <= FAR
+
+
+def _notify_started(registry: PluginRegistry, name: str, dataset: Dataset) -> list[str]:
+    """Observers hear of a run, and of the records that were set aside before it; their faults."""
+    faults = registry.notify("armcal_run_started", name=name, records=len(dataset))
+    return [*faults, *_notify_rejected(registry, dataset.set_aside)]
 
 
 def _notify_rejected(registry: PluginRegistry, records: Sequence[SetAside | SuspiciousRecord]) -> list[str]:

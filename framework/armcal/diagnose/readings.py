@@ -1,0 +1,93 @@
+"""Other readings of recorded joints and positions: exchanged, reversed, of another unit, a row early or late."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations, permutations, product
+
+import numpy as np
+
+from armcal.arm.assembly import Arm
+from armcal.base.domains import Array
+
+Wires = Mapping[str, tuple[str, float]]
+"""Channels, each read as another one times a factor."""
+_DEGREES, _TURN = 180 / np.pi, 360.0
+_MOST_SIGNS = 8
+_AXES = "xyz"
+_INCH = 25.4
+LENGTHS = (10.0, 0.1, 1000.0, 0.001, _INCH, 1 / _INCH, 1000 / _INCH, _INCH / 1000)
+"""What lengths are off by that were read in mm, cm, m or inches and taken for another of these."""
+_AXIS_LENGTHS = (10.0, 0.1, 1000.0, 0.001)
+LEFT_HANDED = "a left-handed frame made right-handed (one axis reversed, or two exchanged)"
+
+
+def single_joints(arm: Arm) -> list[tuple[str, Wires]]:
+    """Each joint's sign, each two joints of a kind exchanged, and all angles in another unit."""
+    joints = tuple(arm.commanded)
+    angles = {joint: joint for joint, dimension in arm.commanded.items() if dimension == "angle"}
+    readings: list[tuple[str, Wires]] = [
+        (f"the sign of {joint} reversed", _wires(arm, {joint: joint}, -1.0)) for joint in joints
+    ]
+    for one, other in combinations(joints, 2):
+        if arm.commanded[one] == arm.commanded[other]:
+            readings.append((f"{one} and {other} exchanged", _wires(arm, {one: other, other: one}, 1.0)))
+    for factor in (_DEGREES, 1 / _DEGREES, _TURN):
+        readings.append((f"joint angles {factor:.3g} times as large", _wires(arm, angles, factor)))
+    return readings
+
+
+def several_joints(arm: Arm) -> Iterator[tuple[str, Wires]]:
+    """The signs of several joints, and joints in reverse order or shifted."""
+    joints = tuple(arm.commanded)
+    for size in range(2, len(joints) + 1) if len(joints) <= _MOST_SIGNS else ():
+        for chosen in combinations(joints, size):
+            words = f"the signs of {', '.join(chosen[:-1])} and {chosen[-1]} reversed"
+            yield words, _wires(arm, {joint: joint for joint in chosen}, -1.0)
+    if len(set(arm.commanded.values())) == 1:
+        orders = [joints[::-1], *(joints[step:] + joints[:step] for step in range(1, len(joints)))]
+        for order in orders if len(joints) > 2 else ():
+            yield (
+                f"({', '.join(order)}) taken for ({', '.join(joints)})",
+                _wires(arm, dict(zip(joints, order, strict=True)), 1.0),
+            )
+
+
+def axes_words(order: Sequence[int], signs: Sequence[float]) -> str:
+    """Axes in this order, with these signs."""
+    moved = [i for i in range(3) if order[i] != i]
+    negative = [_AXES[order[i]] for i in range(3) if signs[i] < 0]
+    if len(moved) == 2 and not negative:
+        return f"{_AXES[moved[0]]} and {_AXES[moved[1]]} exchanged"
+    if not moved:
+        return f"the sign{'s' * (len(negative) > 1)} of {' and '.join(negative)} reversed"
+    taken = (f"{'-' if sign < 0 else ''}{_AXES[axis]}" for axis, sign in zip(order, signs, strict=True))
+    return f"({', '.join(taken)}) taken for (x, y, z)"
+
+
+def _wires(arm: Arm, joints: Mapping[str, str], factor: float) -> dict[str, tuple[str, float]]:
+    """Commands and approaches of some joints read as those of others, times a factor; of approaches, times its sign."""
+    return {
+        f"{arm.name}.{part}{joint}": (f"{arm.name}.{part}{other}", scale)
+        for joint, other in joints.items()
+        for part, scale in (("", factor), ("approach.", float(np.sign(factor))))
+    }
+
+
+def turned_axes() -> Iterator[tuple[str, Array]]:
+    """All exchanges and signs of axes but none (3 x 3), in words."""
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            turn = np.zeros((3, 3))
+            turn[range(3), order] = signs
+            if not np.array_equal(turn, np.eye(3)):
+                yield axes_words(order, signs), turn
+
+
+def scaled_positions() -> Iterator[tuple[str, Array]]:
+    """Positions, or one axis of them, in another unit (3 x 3), in words."""
+    for factor in LENGTHS:
+        yield f"positions {factor:.3g} times as large", factor * np.eye(3)
+    for axis, factor in product(range(3), _AXIS_LENGTHS):
+        scale = np.diag([factor if i == axis else 1.0 for i in range(3)])
+        yield f"{_AXES[axis]} {factor:.3g} times as large", scale

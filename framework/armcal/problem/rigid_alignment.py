@@ -1,0 +1,217 @@
+"""Where a frame stands and where a target sits on a tool, from positions that the nominal arm should show.
+
+Measured positions m_i = B (p_i + R_i o) + b: R_i and p_i are the tool's rotation and the target's nominal place in the
+base frame, B and b the pose of that frame in the instrument's, o what the target is off on the tool. For a known o,
+B and b are a Procrustes problem [Umeyama1991]; for a known B all else is linear. Many starts, each led to rest by
+Gauss-Newton steps whose weights fall with the distance [Huber1981], so that a few wrong records decide nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from armcal.base.domains import Array
+from armcal.problem.tool_motion import rigid_fit, spread_of
+
+FEWEST = 8
+"""Records: with fewer, nine numbers explain anything."""
+_STARTS, _SHORT, _LONG, _KEPT, _FEW = 8, 8, 20, 2, 60
+_SEED = 3
+_AT_REST, _SINGULAR = 1e-6, 1e-12
+_SAME = 0.02
+"""Of the spread of the positions: two alignments that show targets so near to each other are one."""
+_UNSEEN, _PART = 1e-3, 0.3
+"""Of the best determined direction: what is not determined; of a direction's largest part: what belongs to it."""
+_STRIDES, _MOST_PAIRS = (1, 2, 3, 5), 600
+_LONGEST_TURN_RAD = 2.6
+"""Beyond it a rotation vector may jump to the other end of its axis."""
+
+
+@dataclass(frozen=True)
+class Tools:
+    """What the nominal arm shows, in the base frame: places of targets (3 x N, m), rotations of tools (N x 3 x 3)."""
+
+    places: Array
+    rotations: Array
+
+    def subset(self, chosen: NDArray[np.intp]) -> Tools:
+        """Some of them."""
+        return Tools(self.places[:, chosen], self.rotations[chosen])
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """A pose of the base frame in the instrument's, and a place of the target.
+
+    Attributes:
+        turn, shift: of the base frame (3 x 3; 3, m).
+        offset: by which the target is moved, in the tool's axes (3, m).
+        left: typical distance that is left (median, m).
+    """
+
+    turn: Array
+    shift: Array
+    offset: Array
+    left: float
+
+    def moved(self, tools: Tools) -> Array:
+        """Where targets are then, in the instrument's frame (3 x N, m)."""
+        places = tools.places + np.einsum("nij,j->in", tools.rotations, self.offset)
+        return np.asarray(self.turn @ places + self.shift[:, None])
+
+    def back(self, measured: Array) -> Array:
+        """Measured positions in the base frame (3 x N, m)."""
+        return np.asarray(self.turn.T @ (measured - self.shift[:, None]))
+
+
+def alignments(tools: Tools, measured: Array, basis: Array, turned: Array | None = None) -> tuple[Alignment, ...]:
+    """Alignments that no step improves on, the best first; empty with too few records.
+
+    Args:
+        tools: of the nominal arm.
+        measured: positions in the instrument's frame (3 x N, m).
+        basis: directions in the tool's axes along which the target may be elsewhere (3 x k).
+        turned: measured rotations of a body on the tool (N x 3 x 3), if any.
+    """
+    if measured.shape[1] < FEWEST:
+        return ()
+    few = np.arange(0, measured.shape[1], max(1, measured.shape[1] // _FEW))
+    some, seen = tools.subset(few), measured[:, few]
+    starts = [_started(some, seen, *start) for start in _starts(tools, measured, basis, turned)]
+    short = sorted((_led(some, seen, basis, start, _SHORT) for start in starts), key=lambda found: found.left)
+    near, apart = _SAME * spread_of(measured), list[Alignment]()
+    for start in short:
+        if len(apart) < _KEPT and all(_between(tools, start, other) > near for other in apart):
+            found = _led(tools, measured, basis, start, _LONG)
+            if all(_between(tools, found, other) > near for other in apart):
+                apart.append(found)
+    return tuple(sorted(apart, key=lambda found: found.left))
+
+
+def nearest(tools: Tools, measured: Array, basis: Array) -> Alignment:
+    """The better one of two quick alignments: from the target as configured, and from the linear problem's."""
+    few = np.arange(0, measured.shape[1], max(1, measured.shape[1] // _FEW))
+    some, seen = tools.subset(few), measured[:, few]
+    starts = [(np.zeros(3), None), *([_relaxed(some, seen, basis)] if basis.shape[1] else [])]
+    found = [_led(some, seen, basis, _started(some, seen, *start), _SHORT) for start in starts]
+    return _led(tools, measured, basis, min(found, key=lambda one: one.left), 1)
+
+
+def _between(tools: Tools, one: Alignment, other: Alignment) -> float:
+    """How far targets lie apart by two alignments (median, m)."""
+    return float(np.median(np.linalg.norm(one.moved(tools) - other.moved(tools), axis=0)))
+
+
+def undetermined(tools: Tools, found: Alignment, basis: Array) -> tuple[str, ...]:
+    """Combinations of base and target that such positions do not determine, in words."""
+    slopes, _ = _slopes(tools, found, basis)
+    size = spread_of(found.moved(tools))
+    slopes[:, :, :3] /= max(size, _SINGULAR)
+    _, sizes, directions = np.linalg.svd(slopes.reshape(-1, slopes.shape[2]), full_matrices=False)
+    words = [f"the base {how} {axis}" for how in ("about", "along") for axis in "xyz"]
+    words += [f"the target along {_axis_words(column)}" for column in basis.T]
+    parts = [
+        [word for word, part in zip(words, np.abs(direction), strict=True) if part > _PART * np.abs(direction).max()]
+        for direction in directions[sizes < _UNSEEN * sizes.max()]
+    ]
+    return tuple(" with ".join(part) for part in parts)
+
+
+def hand_eye(rotations: Array, turned: Array) -> tuple[Array, Array]:
+    """B and X (3 x 3 each) of rotations M_i = B R_i X (N x 3 x 3 each), by turns between records. [Park1994]"""
+    index = np.arange(len(rotations))
+    pairs = [(index[:-step], index[step:]) for step in _STRIDES if step < len(index)]
+    first, second = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
+    every = slice(None, None, max(1, -(-len(first) // _MOST_PAIRS)))
+    first, second = first[every], second[every]
+    both = [np.swapaxes(of[first], 1, 2) @ of[second] for of in (rotations, turned)]
+    nominal, seen = (Rotation.from_matrix(turn).as_rotvec() for turn in both)
+    usable = np.linalg.norm(nominal, axis=1) < _LONGEST_TURN_RAD
+    mounted = nearest_turn(nominal[usable].T @ seen[usable])
+    return nearest_turn(np.einsum("nij,kj,nlk->il", turned, mounted, rotations)), mounted
+
+
+def nearest_turn(matrix: Array) -> Array:
+    """The rotation nearest to a matrix (3 x 3). [Umeyama1991]"""
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))]) @ right)
+
+
+def _starts(tools: Tools, measured: Array, basis: Array, turned: Array | None) -> Iterator[tuple[Array, Array | None]]:
+    """Offsets of the target (3, m), and turns of the base where they are known; the first as configured."""
+    yield np.zeros(3), None
+    if turned is not None:
+        yield np.zeros(3), hand_eye(tools.rotations, turned)[0]
+    if not basis.shape[1]:
+        return
+    yield _relaxed(tools, measured, basis)
+    random = np.random.default_rng(_SEED)
+    for _ in range(_STARTS):
+        yield basis @ random.normal(scale=0.5 * spread_of(measured), size=basis.shape[1]), None
+
+
+def _relaxed(tools: Tools, measured: Array, basis: Array) -> tuple[Array, Array]:
+    """Offset and turn of the linear problem m = M p + N vec(R) + b: M is near B, N[i, 3 j + k] near B[i, j] o[k]."""
+    columns = np.vstack([tools.places, tools.rotations.reshape(-1, 9).T])
+    columns = columns - columns.mean(axis=1, keepdims=True)
+    solved = np.linalg.lstsq(columns.T, (measured - measured.mean(axis=1, keepdims=True)).T, rcond=1e-6)[0].T
+    turn = nearest_turn(solved[:, :3])
+    return basis @ (basis.T @ np.einsum("ijk,ij->k", solved[:, 3:].reshape(3, 3, 3), turn) / 3), turn
+
+
+def _started(tools: Tools, measured: Array, offset: Array, turn: Array | None) -> Alignment:
+    """The pose of the base that goes with an offset."""
+    points = tools.places + np.einsum("nij,j->in", tools.rotations, offset)
+    if turn is None:
+        turn, shift = rigid_fit(points, measured)
+    else:
+        shift = np.median(measured - turn @ points, axis=1)
+    return Alignment(turn, shift, offset, np.inf)
+
+
+def _led(tools: Tools, measured: Array, basis: Array, found: Alignment, steps: int) -> Alignment:
+    """An alignment after Gauss-Newton steps, to rest or so many; the base turns about the middle of the targets."""
+    size = max(spread_of(measured), _SINGULAR)
+    for _ in range(steps):
+        slopes, shown = _slopes(tools, found, basis)
+        slopes[:, :, :3] /= size
+        off = (measured - shown).T
+        distance = np.sqrt(np.einsum("ni,ni->n", off, off))
+        root = np.repeat(1 / np.sqrt(np.maximum(distance, 1.5 * np.median(distance) + _SINGULAR)), 3)[:, None]
+        weighted = slopes.reshape(len(root), -1) * root
+        step = np.linalg.lstsq(weighted.T @ weighted, weighted.T @ (off.reshape(-1, 1) * root), rcond=_SINGULAR)[0][
+            :, 0
+        ]
+        turn, middle = Rotation.from_rotvec(step[:3] / size).as_matrix(), shown.mean(axis=1)
+        shift = turn @ (found.shift - middle) + middle + step[3:6]
+        found = Alignment(turn @ found.turn, shift, found.offset + basis @ step[6:], found.left)
+        if np.linalg.norm(step) < _AT_REST * size:
+            break
+    left = float(np.median(np.linalg.norm(measured - found.moved(tools), axis=0)))
+    return Alignment(found.turn, found.shift, found.offset, left)
+
+
+def _slopes(tools: Tools, found: Alignment, basis: Array) -> tuple[Array, Array]:
+    """How targets move (N x 3 x 6+k) by a turn about their middle, a shift and the offset; and where they are."""
+    shown = found.moved(tools)
+    arm = (shown - shown.mean(axis=1, keepdims=True)).T
+    slopes = np.zeros((len(arm), 3, 6 + basis.shape[1]))
+    for axis in range(3):
+        after, last = (axis + 1) % 3, (axis + 2) % 3
+        slopes[:, after, axis], slopes[:, last, axis] = -arm[:, last], arm[:, after]
+    slopes[:, :, 3:6] = np.eye(3)
+    slopes[:, :, 6:] = found.turn @ tools.rotations @ basis
+    return slopes, shown
+
+
+def _axis_words(direction: Array) -> str:
+    """An axis by its name, another direction by its numbers."""
+    axis = int(np.argmax(np.abs(direction)))
+    if np.abs(direction[axis]) > 1 - _UNSEEN:
+        return "xyz"[axis]
+    return f"({', '.join(f'{x:.2g}' for x in direction)})"

@@ -1,0 +1,124 @@
+"""Measured positions of one instrument beside what the nominal arm should show in the same records."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.measure.partners import OTHER
+from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.rigid_alignment import Tools
+from armcal.problem.tool_motion import spread_of
+
+_SAME_M = 1e-6
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_TOOL_ROWS = 12
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """Records of a measurement that reads positions in a frame, all of one arm.
+
+    Attributes:
+        kernel: which measurement.
+        chosen: places of its records (n).
+        measured: positions (3 x n, m).
+        turned: rotations of the body that was measured (n x 3 x 3); None where only positions are.
+    """
+
+    kernel: int
+    chosen: NDArray[np.intp]
+    measured: Array
+    turned: Array | None = None
+
+    @property
+    def size(self) -> float:
+        """How far the positions are spread (m)."""
+        return spread_of(self.measured)
+
+    def subset(self, places: NDArray[np.intp]) -> Sighting:
+        """Some of its records."""
+        turned = None if self.turned is None else self.turned[places]
+        return Sighting(self.kernel, self.chosen[places], self.measured[:, places], turned)
+
+    def thinned(self, most: int) -> Sighting:
+        """At most so many of the records, evenly."""
+        return self.subset(np.arange(0, len(self.chosen), max(1, -(-len(self.chosen) // most))))
+
+    def off(self, tools: Tools) -> float:
+        """Typical distance from what an arm shows (m); turns count at the distance of the spread."""
+        squares = np.sum((self.measured - tools.places) ** 2, axis=0)
+        if self.turned is not None:
+            turns = Rotation.from_matrix(np.swapaxes(tools.rotations, 1, 2) @ self.turned).magnitude()
+            squares = squares + (self.size * turns) ** 2
+        return float(np.sqrt(np.median(squares)))
+
+
+def sighting_of(
+    problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, number: int, most: int
+) -> Sighting | None:
+    """At most so many records of a measurement; None of one that reads no positions of a single arm in a frame."""
+    factor = problem.kernels[number].factor
+    channels = factor.position_channels
+    if not channels or factor.dimensions[:3] != ("length",) * 3 or not all(map(dataset.has, channels)):
+        return None
+    if any(OTHER in name for name in factor.channels) or len(problem.blueprint.measurements[factor.name].arms) != 1:
+        return None
+    whole = np.flatnonzero(records[number].measured)
+    chosen = whole[:: max(1, -(-len(whole) // most))] if len(whole) else whole
+    if not len(chosen):
+        return None
+    some, values = problem.subset(records, chosen), problem.parameters.nominal()
+    measured, shown = dataset.stacked(channels)[:, chosen], problem.predict(values, some)[number][:3]
+    if not np.allclose(problem.residuals(values, some)[number][:3], measured - shown, atol=_SAME_M):
+        return None
+    return Sighting(number, chosen, measured, _turned(factor.name, factor.output_channels, dataset, chosen))
+
+
+def _turned(name: str, outputs: Sequence[str], dataset: Dataset, chosen: NDArray[np.intp]) -> Array | None:
+    """Measured rotations (n x 3 x 3), where the measurement reads a quaternion."""
+    channels = [f"{name}.{part}" for part in _QUATERNION]
+    if not set(channels) <= set(outputs) or not all(map(dataset.has, channels)):
+        return None
+    return _rotations(dataset.stacked(channels)[:, chosen])
+
+
+def tools_of(problem: Problem, values: Array, record: FactorRecords, number: int) -> Tools:
+    """What a measurement's arm shows in each of its records: of the body where its rotation is read, else of the tool.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at these values.
+    """
+    outputs = problem.kernels[number].factor.output_channels
+    shown = problem.grouped[number].predict(values, record)[:, : record.count]
+    parts = [channel.rpartition(".")[2] for channel in outputs]
+    if set(_QUATERNION) <= set(parts):
+        return Tools(shown[:3], _rotations(shown[[parts.index(part) for part in _QUATERNION]]))
+    axes = shown[len(outputs) : len(outputs) + _TOOL_ROWS].reshape(4, 3, -1)[:3]
+    return Tools(shown[:3], np.ascontiguousarray(np.transpose(axes, (2, 1, 0))))
+
+
+def _rotations(quaternions: Array) -> Array:
+    """Matrices (n x 3 x 3) of quaternions w, x, y, z (4 x n)."""
+    return np.asarray(Rotation.from_quat(quaternions[[1, 2, 3, 0]].T).as_matrix())
+
+
+def shown_instead(problem: Problem, record: FactorRecords, number: int, shown: Tools) -> FactorRecords:
+    """A measurement's records as if its instrument had seen this."""
+    factor, changed = problem.kernels[number].factor, record.record.copy()
+    turned = Rotation.from_matrix(shown.rotations).as_quat()[:, [3, 0, 1, 2]].T
+    readings = dict(zip((*"xyz", *_QUATERNION), (*shown.places, *turned), strict=True))
+    for row, channel in enumerate(factor.channels):
+        name, _, part = channel.rpartition(".")
+        if name == factor.name and part in readings and channel in factor.output_channels:
+            changed[row, : record.count] = readings[part]
+            changed[row, record.count :] = readings[part][-1]
+    return FactorRecords(
+        record.count, changed, record.weight, record.state.copy(), record.whitening, None, record.group, record.applies
+    )

@@ -1,0 +1,175 @@
+"""Base and target are found before the fit, whatever the tracker's frame; what is not free or has a prior is kept."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from armcal.base.dataset import Dataset
+from armcal.cli.main import cli
+from armcal.diagnose.permuted_axes import find_permuted_axes
+from armcal.estimate.placing import placings
+from armcal.estimate.start import aligned_start
+from armcal.problem.rigid_alignment import Alignment, Tools, alignments, hand_eye, undetermined
+from armcal.problem.sighting import sighting_of
+from armcal.run.experiment import Experiment
+from armcal.run.pipeline import Prepared, Stopwatch, assemble
+from click.testing import CliRunner
+from scipy.spatial.transform import Rotation
+
+ROOT = Path(__file__).resolve().parents[2]
+DEMO = ROOT / "configs" / "lrm_arm" / "demo.yaml"
+ANYWHERE = ["arm.mdh.base_*", "arm.mdh.theta[1-5]", "arm.mdh.tool_[yz]", "tracker.target_x"]
+AXES = ("x", "y", "z")
+
+
+def loaded(*overrides: str, free: list[str] = ANYWHERE) -> Prepared:
+    return assemble(Experiment.load(DEMO, [f"parameters.free={json.dumps(free)}", *overrides]), Stopwatch())
+
+
+@pytest.fixture(scope="module")
+def anywhere() -> Prepared:
+    return loaded("evaluator=interpreted")
+
+
+def seen_from(dataset: Dataset, turn: np.ndarray, shift: np.ndarray) -> Dataset:
+    """Positions as another frame has them."""
+    moved = turn @ dataset.stacked([f"tracker.{axis}" for axis in AXES]) + shift[:, None]
+    return replace(
+        dataset, channels={**dataset.channels, **{f"tracker.{a}": row for a, row in zip(AXES, moved, strict=True)}}
+    )
+
+
+def random_tools(random: np.random.Generator, count: int = 60) -> Tools:
+    return Tools(random.normal(size=(3, count)), Rotation.random(count, random_state=random).as_matrix())
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_any_frame_and_target_are_found_although_a_fifth_of_the_records_are_wrong(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    tools, turn = random_tools(random), Rotation.random(random_state=random).as_matrix()
+    truth = Alignment(turn, random.normal(scale=5, size=3), random.normal(scale=0.3, size=3), 0.0)
+    measured = truth.moved(tools)
+    measured[:, ::5] += random.normal(size=(3, 12))
+    found = alignments(tools, measured, np.eye(3))[0]
+    np.testing.assert_allclose(found.turn, truth.turn, atol=1e-4)
+    np.testing.assert_allclose(found.shift, truth.shift, atol=1e-3)
+    np.testing.assert_allclose(found.offset, truth.offset, atol=1e-4)
+
+
+def test_hand_eye_finds_base_and_body() -> None:
+    random = np.random.default_rng(1)
+    nominal = Rotation.random(40, random_state=random)
+    base, body = Rotation.random(random_state=random), Rotation.random(random_state=random)
+    found = hand_eye(nominal.as_matrix(), (base * nominal * body).as_matrix())
+    np.testing.assert_allclose(found, (base.as_matrix(), body.as_matrix()), atol=1e-9)
+
+
+def test_what_upright_axes_do_not_determine_is_named() -> None:
+    """A SCARA's axes are parallel: a target higher on the tool is a lower base."""
+    random = np.random.default_rng(2)
+    upright = Rotation.from_rotvec(random.uniform(-3, 3, (50, 1)) * [[0, 0, 1]]).as_matrix()
+    tools = Tools(random.uniform(-0.5, 0.5, (3, 50)), upright)
+    found = alignments(tools, tools.places, np.eye(3))[0]
+    assert found.left < 1e-9
+    assert undetermined(tools, found, np.eye(3)) == ("the base along z with the target along z",)
+    assert undetermined(random_tools(random), found, np.eye(3)) == ()
+
+
+def test_parameters_that_place_the_arm_are_known_by_what_they_move(anywhere: Prepared) -> None:
+    problem, records = anywhere.problem, anywhere.records
+    sighting = sighting_of(problem, records, anywhere.dataset, 0, 300)
+    assert sighting is not None
+    placing = placings(problem, records, sighting)[0]
+    assert placing.base == (*(f"arm.mdh.base_{of}" for of in ("x", "y", "z", "rx", "ry")), "arm.mdh.theta1")
+    assert placing.target == ("arm.mdh.tool_y", "arm.mdh.tool_z", "tracker.target_x")
+    assert placing.stands_anywhere and placing.basis.shape == (3, 3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_start_follows_the_frame(anywhere: Prepared, seed: int) -> None:
+    """From any frame the nominal arm lies as near to the positions as it can."""
+    random = np.random.default_rng(seed)
+    turn, shift = Rotation.random(random_state=random).as_matrix(), random.normal(scale=3, size=3)
+    dataset = seen_from(anywhere.dataset, turn, shift)
+    start = aligned_start(anywhere.problem, anywhere.problem.records(dataset), dataset)
+    assert start.taken and start.found is not None and start.configured > 0.5
+    assert start.left == pytest.approx(start.found.left, rel=0.01) and start.left < 0.015
+    assert not start.warnings
+
+
+def test_a_start_that_is_near_enough_is_kept(anywhere: Prepared) -> None:
+    """So that what is published of the nominal arm stays."""
+    assert not anywhere.start.taken
+    assert anywhere.problem.parameters.nominal()[0] == anywhere.problem.blueprint.parameters.nominal()[0]
+
+
+def test_a_base_that_may_not_move_everywhere_is_not_looked_for() -> None:
+    assert assemble(Experiment.load(DEMO), Stopwatch()).start.found is None
+
+
+def test_a_prior_is_kept_and_a_contradiction_said() -> None:
+    """Within its prior a base is a start; beyond it the user is told."""
+    random = np.random.default_rng(1)
+    turn, shift = Rotation.random(random_state=random).as_matrix(), random.normal(scale=3, size=3)
+    for prior, contradicts in (("100 m", False), ("10 mm", True)):
+        ready = loaded(f"parameters.priors={json.dumps({'arm.mdh.base_[xyz]': prior})}", "evaluator=interpreted")
+        dataset = seen_from(ready.dataset, turn, shift)
+        start = aligned_start(ready.problem, ready.problem.records(dataset), dataset)
+        assert start.taken is not contradicts
+        assert bool(start.warnings) is contradicts
+        held = start.problem.parameters["arm.mdh.base_x"].nominal
+        assert held == ready.problem.parameters["arm.mdh.base_x"].nominal
+        if contradicts:
+            assert "standard deviations) from its prior" in start.warnings[0]
+        else:
+            (first, *_), place = start.values(start.problem), start.problem.parameters.entries_of("arm.mdh.base_x")
+            assert abs(first[place] - held) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda p: p[[1, 0, 2]], "a left-handed frame"),
+        (lambda p: p * np.array([[1], [1], [-1]]), "a left-handed frame"),
+        (lambda p: np.roll(p, 1, axis=1), "the positions of the row after"),
+        (lambda p: np.roll(p, -1, axis=1), "the positions of the row before"),
+        (lambda p: p / 25.4, "positions 25.4 times as large"),
+        (lambda p: p * 1000, "positions 0.001 times as large"),
+    ],
+)
+def test_mistakes_are_named_in_any_frame(anywhere: Prepared, change, words: str) -> None:
+    turn, shift = Rotation.random(random_state=4).as_matrix(), np.array([1.0, -2.0, 0.5])
+    dataset = seen_from(anywhere.dataset, turn, shift)
+    wrong = change(dataset.stacked([f"tracker.{axis}" for axis in AXES]))
+    dataset = replace(
+        dataset, channels={**dataset.channels, **{f"tracker.{a}": r for a, r in zip(AXES, wrong, strict=True)}}
+    )
+    start = aligned_start(anywhere.problem, anywhere.problem.records(dataset), dataset)
+    found = find_permuted_axes(start.problem, start.problem.records(dataset), dataset)
+    assert found is not None and len(found.readings) == 1 and found.readings[0].startswith((words, f"the {words}"))
+    assert found.as_given_mm > 3 * found.left_mm
+
+
+def test_mixed_up_data_are_refused_until_accepted_and_then_a_bad_finding(tmp_path: Path) -> None:
+    header, *rows = DEMO.with_suffix(".csv").read_text().splitlines()
+    path = tmp_path / "swapped.csv"
+    path.write_text("\n".join([header.replace("x_mm,y_mm", "y_mm,x_mm"), *rows]))
+    settings = ["validation.folds=0", "evaluator=interpreted", f"parameters.free={json.dumps(ANYWHERE)}"]
+    run = ["run", str(DEMO), "--data", str(path), "--out", str(tmp_path / "run"), "--json"]
+    run += [word for text in settings for word in ("--set", text)]
+    refused = CliRunner().invoke(cli, run)
+    assert refused.exit_code == 2 and "--accept" in refused.stderr and "a left-handed frame" in refused.stderr
+    accepted = CliRunner().invoke(cli, [*run, "--accept"])
+    findings = json.loads(accepted.stdout)["verdict"]["findings"]
+    assert any(f["grade"] == "bad" and "a left-handed frame" in f["text"] for f in findings)
+
+
+def test_check_prints_where_the_base_stands(tmp_path: Path) -> None:
+    free = f"parameters.free={json.dumps(ANYWHERE)}"
+    checked = CliRunner().invoke(cli, ["check", str(DEMO), "--set", free, "--set", "evaluator=interpreted"])
+    assert checked.exit_code == 0, checked.output
+    assert "its base frame stands at (" in checked.stdout and "starts from the configuration" in checked.stdout
