@@ -75,7 +75,8 @@ def check_permuted_axes(
         f"however its free parameters adapt; with {', or with '.join(reading.readings)}, they are "
         f"{reading.left_mm:.3g} mm off."
     )
-    hint = f"Check the unit in the column names; mend columns in the file or by data.columns, or {_MEND[reading.of_joints]}."
+    mend = _MEND[reading.of_joints]
+    hint = f"Check the unit in the column names; mend columns in the file or by data.columns, or {mend}."
     if accept:
         return [Finding("bad", text, f"limit {MUCH_BETTER:g} times", hint)]
     hint += (
