@@ -96,8 +96,8 @@ def test_the_start_follows_the_frame(anywhere: Prepared, seed: int) -> None:
     turn, shift = Rotation.random(random_state=random).as_matrix(), random.normal(scale=3, size=3)
     dataset = seen_from(anywhere.dataset, turn, shift)
     start = aligned_start(anywhere.problem, anywhere.problem.records(dataset), dataset)
-    assert start.taken and start.found is not None and start.configured > 0.5
-    assert start.left == pytest.approx(start.found.left, rel=0.01) and start.left < 0.015
+    assert start.taken and start.alignment is not None and start.configured > 0.5
+    assert start.left == pytest.approx(start.alignment.left, rel=0.01) and start.left < 0.015
     assert not start.warnings
 
 
@@ -108,7 +108,7 @@ def test_a_start_that_is_near_enough_is_kept(anywhere: Prepared) -> None:
 
 
 def test_a_base_that_may_not_move_everywhere_is_not_looked_for() -> None:
-    assert assemble(Experiment.load(DEMO), Stopwatch()).start.found is None
+    assert assemble(Experiment.load(DEMO), Stopwatch()).start.alignment is None
 
 
 def test_a_prior_is_kept_and_a_contradiction_said() -> None:

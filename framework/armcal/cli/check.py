@@ -107,7 +107,7 @@ def _content(experiment: Experiment, ready: Prepared, known: Identifiability) ->
 
 def _alignment(start: Start) -> dict[str, Any] | None:
     """Where the base and the target were found, in SI; nothing where they are not looked for."""
-    found = start.found
+    found = start.alignment
     if found is None:
         return None
     return {
@@ -122,14 +122,15 @@ def _alignment(start: Start) -> dict[str, Any] | None:
 
 def _alignment_lines(start: Start) -> list[str]:
     """The same as people read it."""
-    if start.found is None:
+    if start.alignment is None:
         return []
-    target = ", ".join(f"{x * _MM:.1f}" for x in start.found.offset)
+    target = ", ".join(f"{x * _MM:.1f}" for x in start.alignment.offset)
     lines = [
-        f"alignment of the nominal arm with the positions: its base frame stands at {pose_words(start.found)} in the "
+        "alignment of the nominal arm with the positions: its base frame stands at "
+        f"{pose_words(start.alignment)} in the "
         f"instrument's frame, the target is ({target}) mm from its configured place on the tool.",
         f"typical error of the nominal arm: {start.configured * _MM:.3g} mm as configured, "
-        f"{start.found.left * _MM:.3g} mm aligned; the fit starts from "
+        f"{start.alignment.left * _MM:.3g} mm aligned; the fit starts from "
         f"{'the alignment' if start.taken else 'the configuration'}.",
     ]
     lines += [f"not determined by these positions: {gauge}." for gauge in start.gauges]

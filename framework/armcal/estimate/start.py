@@ -35,7 +35,7 @@ class Start:
         names: of the parameters that place the arm and the target.
         vectors: values at which they were found, the best first; other parameters are not theirs to say. Those with a
             prior keep their nominal value in ``problem``, and start where they were found.
-        found: the alignment; None where there is none.
+        alignment: of the nominal arm; None where there is none.
         tools: of the nominal arm as configured, in the records looked at.
         configured, left: typical distance (m) of the arm from the positions, before and after.
         taken: whether the start is elsewhere than the configuration has it.
@@ -46,7 +46,7 @@ class Start:
     problem: Problem
     names: tuple[str, ...] = ()
     vectors: tuple[Array, ...] = ()
-    found: Alignment | None = None
+    alignment: Alignment | None = None
     configured: float = 0.0
     left: float = 0.0
     taken: bool = False
@@ -80,8 +80,8 @@ def aligned_start(problem: Problem, records: Sequence[FactorRecords], dataset: D
         if not held.stands_anywhere:
             return as_configured
         chosen = placing if placing.stands_anywhere else held
-        found = alignments(tools, sighting.measured, chosen.basis, sighting.turned)
-        return _chosen(problem, records, sighting, tools, chosen, found) if found else as_configured
+        ranked = alignments(tools, sighting.measured, chosen.basis, sighting.turned)
+        return _chosen(problem, records, sighting, tools, chosen, ranked) if ranked else as_configured
     except NotConvergedError:
         return as_configured
 
@@ -102,15 +102,15 @@ def _chosen(
     sighting: Sighting,
     tools: Tools,
     placing: Placing,
-    found: Sequence[Alignment],
+    ranked: Sequence[Alignment],
 ) -> Start:
     """The best alignment that the free parameters reach, if it is much better than the configuration."""
     configured, some = sighting.off(tools), problem.subset(records, sighting.chosen)[sighting.kernel]
-    gauges = undetermined(tools, found[0], placing.basis)
-    start = Start(problem, placing.names, (), found[0], configured, configured, False, gauges)
+    gauges = undetermined(tools, ranked[0], placing.basis)
+    start = Start(problem, placing.names, (), ranked[0], configured, configured, False, gauges)
     if configured <= FAR * sighting.size:
         return start
-    reached = [placing.reached(problem, records, sighting, shown_by(a, tools, sighting)) for a in found]
+    reached = [placing.reached(problem, records, sighting, shown_by(a, tools, sighting)) for a in ranked]
     left = [sighting.off(tools_of(problem, values, some, sighting.kernel)) for values in reached]
     order = np.argsort(left)
     best, start = reached[order[0]], replace(start, vectors=tuple(reached[i] for i in order))
@@ -154,8 +154,8 @@ def _disagreement(beyond: Sequence[tuple[str, float]], configured: float, left: 
     )
 
 
-def pose_words(found: Alignment) -> str:
+def pose_words(alignment: Alignment) -> str:
     """Where the base frame stands in the instrument's, as people read it."""
-    x, y, z = found.shift * _MM
-    roll, pitch, yaw = Rotation.from_matrix(found.turn).as_euler("xyz", degrees=True)
+    x, y, z = alignment.shift * _MM
+    roll, pitch, yaw = Rotation.from_matrix(alignment.turn).as_euler("xyz", degrees=True)
     return f"({x:.1f}, {y:.1f}, {z:.1f}) mm, roll, pitch, yaw ({roll:.2f}, {pitch:.2f}, {yaw:.2f}) deg"

@@ -83,14 +83,14 @@ def alignments(tools: Tools, measured: Array, basis: Array, turned: Array | None
     few = np.arange(0, measured.shape[1], max(1, measured.shape[1] // _FEW))
     some, seen = tools.subset(few), measured[:, few]
     starts = [_started(some, seen, *start) for start in _starts(tools, measured, basis, turned)]
-    short = sorted((_led(some, seen, basis, start, _SHORT) for start in starts), key=lambda found: found.left)
+    short = sorted((_led(some, seen, basis, start, _SHORT) for start in starts), key=lambda alignment: alignment.left)
     near, apart = _SAME * spread_of(measured), list[Alignment]()
     for start in short:
         if len(apart) < _KEPT and all(_between(tools, start, other) > near for other in apart):
-            found = _led(tools, measured, basis, start, _LONG)
-            if all(_between(tools, found, other) > near for other in apart):
-                apart.append(found)
-    return tuple(sorted(apart, key=lambda found: found.left))
+            alignment = _led(tools, measured, basis, start, _LONG)
+            if all(_between(tools, alignment, other) > near for other in apart):
+                apart.append(alignment)
+    return tuple(sorted(apart, key=lambda alignment: alignment.left))
 
 
 def nearest(tools: Tools, measured: Array, basis: Array) -> Alignment:
@@ -98,8 +98,8 @@ def nearest(tools: Tools, measured: Array, basis: Array) -> Alignment:
     few = np.arange(0, measured.shape[1], max(1, measured.shape[1] // _FEW))
     some, seen = tools.subset(few), measured[:, few]
     starts = [(np.zeros(3), None), *([_relaxed(some, seen, basis)] if basis.shape[1] else [])]
-    found = [_led(some, seen, basis, _started(some, seen, *start), _SHORT) for start in starts]
-    return _led(tools, measured, basis, min(found, key=lambda one: one.left), 1)
+    alignment = [_led(some, seen, basis, _started(some, seen, *start), _SHORT) for start in starts]
+    return _led(tools, measured, basis, min(alignment, key=lambda one: one.left), 1)
 
 
 def _between(tools: Tools, one: Alignment, other: Alignment) -> float:
@@ -107,10 +107,10 @@ def _between(tools: Tools, one: Alignment, other: Alignment) -> float:
     return float(np.median(np.linalg.norm(one.moved(tools) - other.moved(tools), axis=0)))
 
 
-def undetermined(tools: Tools, found: Alignment, basis: Array) -> tuple[str, ...]:
+def undetermined(tools: Tools, alignment: Alignment, basis: Array) -> tuple[str, ...]:
     """Combinations of base and target that such positions do not determine, in words."""
-    slopes, _ = _slopes(tools, found, basis)
-    size = spread_of(found.moved(tools))
+    slopes, _ = _slopes(tools, alignment, basis)
+    size = spread_of(alignment.moved(tools))
     slopes[:, :, :3] /= max(size, _SINGULAR)
     _, sizes, directions = np.linalg.svd(slopes.reshape(-1, slopes.shape[2]), full_matrices=False)
     words = [f"the base {how} {axis}" for how in ("about", "along") for axis in "xyz"]
@@ -174,11 +174,11 @@ def _started(tools: Tools, measured: Array, offset: Array, turn: Array | None) -
     return Alignment(turn, shift, offset, np.inf)
 
 
-def _led(tools: Tools, measured: Array, basis: Array, found: Alignment, steps: int) -> Alignment:
+def _led(tools: Tools, measured: Array, basis: Array, alignment: Alignment, steps: int) -> Alignment:
     """An alignment after Gauss-Newton steps, to rest or so many; the base turns about the middle of the targets."""
     size = max(spread_of(measured), _SINGULAR)
     for _ in range(steps):
-        slopes, shown = _slopes(tools, found, basis)
+        slopes, shown = _slopes(tools, alignment, basis)
         slopes[:, :, :3] /= size
         off = (measured - shown).T
         distance = np.sqrt(np.einsum("ni,ni->n", off, off))
@@ -188,24 +188,24 @@ def _led(tools: Tools, measured: Array, basis: Array, found: Alignment, steps: i
             :, 0
         ]
         turn, middle = Rotation.from_rotvec(step[:3] / size).as_matrix(), shown.mean(axis=1)
-        shift = turn @ (found.shift - middle) + middle + step[3:6]
-        found = Alignment(turn @ found.turn, shift, found.offset + basis @ step[6:], found.left)
+        shift = turn @ (alignment.shift - middle) + middle + step[3:6]
+        alignment = Alignment(turn @ alignment.turn, shift, alignment.offset + basis @ step[6:], alignment.left)
         if np.linalg.norm(step) < _AT_REST * size:
             break
-    left = float(np.median(np.linalg.norm(measured - found.moved(tools), axis=0)))
-    return Alignment(found.turn, found.shift, found.offset, left)
+    left = float(np.median(np.linalg.norm(measured - alignment.moved(tools), axis=0)))
+    return Alignment(alignment.turn, alignment.shift, alignment.offset, left)
 
 
-def _slopes(tools: Tools, found: Alignment, basis: Array) -> tuple[Array, Array]:
+def _slopes(tools: Tools, alignment: Alignment, basis: Array) -> tuple[Array, Array]:
     """How targets move (N x 3 x 6+k) by a turn about their middle, a shift and the offset; and where they are."""
-    shown = found.moved(tools)
+    shown = alignment.moved(tools)
     arm = (shown - shown.mean(axis=1, keepdims=True)).T
     slopes = np.zeros((len(arm), 3, 6 + basis.shape[1]))
     for axis in range(3):
         after, last = (axis + 1) % 3, (axis + 2) % 3
         slopes[:, after, axis], slopes[:, last, axis] = -arm[:, last], arm[:, after]
     slopes[:, :, 3:6] = np.eye(3)
-    slopes[:, :, 6:] = found.turn @ tools.rotations @ basis
+    slopes[:, :, 6:] = alignment.turn @ tools.rotations @ basis
     return slopes, shown
 
 

@@ -230,7 +230,7 @@ def _fitted(
             if fitted.solution.verdict.converged and _near(problem, ready, data, fitted):
                 break
             other = fit(problem, ready.training, estimator, start, progress)
-            costs = [problem.cost(each.solution.values, ready.training) for each in (fitted, other)]
+            costs = [problem.cost(one.solution.values, ready.training) for one in (fitted, other)]
             better = other.solution.verdict.converged and costs[1] < costs[0]
             fitted = other if better or not fitted.solution.verdict.converged else fitted
         acting, position = problem.weighted(fitted.records, fitted.weights), recorded_position(ready.dataset)[train]
