@@ -107,14 +107,14 @@ def _content(experiment: Experiment, ready: Prepared, known: Identifiability) ->
 
 def _alignment(start: Start) -> dict[str, Any] | None:
     """Where the base and the target were found, in SI; nothing where they are not looked for."""
-    found = start.alignment
-    if found is None:
+    alignment = start.alignment
+    if alignment is None:
         return None
     return {
-        "tracker_T_base": [[*row, x] for row, x in zip(found.turn.tolist(), found.shift.tolist(), strict=True)],
-        "target_moved_m": found.offset.tolist(),
+        "tracker_T_base": [[*row, x] for row, x in zip(alignment.turn.tolist(), alignment.shift.tolist(), strict=True)],
+        "target_moved_m": alignment.offset.tolist(),
         "typical_error_as_configured_m": start.configured,
-        "typical_error_aligned_m": found.left,
+        "typical_error_aligned_m": alignment.left,
         "undetermined": list(start.gauges),
         "start": "aligned" if start.taken else "configured",
     }

@@ -150,11 +150,11 @@ def find_permuted_axes(problem: Problem, records: Sequence[FactorRecords], datas
         try:
             seen = _seen(problem, records, dataset, number)
             arms = problem.blueprint.measurements[kernel.factor.name].arms
-            found = None if seen is None else _of(problem, records, seen, problem.blueprint.arms[arms[0]])
+            permuted = None if seen is None else _of(problem, records, seen, problem.blueprint.arms[arms[0]])
         except NotConvergedError:
             continue
-        if found is not None:
-            return found
+        if permuted is not None:
+            return permuted
     return None
 
 
@@ -268,12 +268,12 @@ def _left(problem: Problem, seen: _Seen, read_as: Wires, measured: Array, enough
         positions = _positions(problem, seen, read_as, nominal)
         return np.inf if positions is None else positions.left(measured, enough)
     tools = tools_of(problem, nominal, _rewired(problem, seen, read_as), number)
-    found = nearest(tools, measured, placing.basis)
-    if found.left > _ROUGHLY * enough:
-        return found.left
-    values = placing.with_target(problem.parameters, nominal, found.offset)
+    alignment = nearest(tools, measured, placing.basis)
+    if alignment.left > _ROUGHLY * enough:
+        return alignment.left
+    values = placing.with_target(problem.parameters, nominal, alignment.offset)
     positions = _positions(problem, seen, read_as, values)
-    return np.inf if positions is None else positions.left(found.back(measured), enough)
+    return np.inf if positions is None else positions.left(alignment.back(measured), enough)
 
 
 def _of_axes(seen: _Seen, straight: _Positions) -> Iterator[tuple[str, Array]]:
