@@ -195,7 +195,7 @@ class Drive(Motion):
         self._guard(path[-1])
 
     def preload_backlash(self, sides: Array, may_move: MayMove) -> None:
-        """Come to the pose from the sides that are sides: a little away, and back. See ``go`` for what it raises.
+        """Come to the pose from the stated sides: a little away, and back. See ``go`` for what it raises.
 
         A joint that has had no direction since it was energised comes from either side: which side its play lies on is
         not known before. What limits or obstacles do not allow is left out.
