@@ -21,7 +21,8 @@ from armcal.estimate.simulation import DAY_S, Mission, SimulationRequest, measur
 from armcal_online.mission.errors import error_curve, random_poses
 from armcal_online.mission.figure import mission_figure
 from armcal_online.mission.files import curve_text, figures, schedule, truth_text, write_files
-from armcal_online.mission.judge import Judgement, MissionLog, judge
+from armcal_online.mission.judge import Judgement, judge
+from armcal_online.mission.log import MissionLog
 from armcal_online.mission.mission import (
     MissionResult,
     MissionSource,
@@ -45,6 +46,7 @@ SHORT = (
     f"simulation.events={EVENTS}",
     "simulation.power_cuts=[0.7, 1.55]",
     "mission.poses=20",
+    "mission.refit={records: 60, every: 100}",
 )
 INTERPRETED = ("evaluator=interpreted", "recalibrate.evaluator=interpreted")
 DECIDED_AFTER = 3
@@ -181,12 +183,13 @@ def test_who_knows_the_truth_has_no_error_until_the_camera_moves(knowing: tuple[
 
 def test_events_are_named_right_and_nothing_is_missed(knowing: tuple[MissionLog, Judgement]) -> None:
     log, judgement = knowing
-    assert [report.named for report in judgement.events] == ["right"] * 3
-    assert judgement.missed == 0 and judgement.false_alarms == ()
+    assert [report.finding.verdict for report in judgement.events] == ["right"] * 3
+    assert judgement.count("right") == 3 and judgement.count("missed") == 0 and judgement.false_alarms == ()
     made = mission()
     for report in judgement.events:
-        row = int(np.searchsorted(made.times, report.event.time)) + DECIDED_AFTER
-        assert report.decision is not None and report.decision.time == made.times[row]
+        row = int(np.searchsorted(made.times, report.occurrence.time)) + DECIDED_AFTER
+        decision = report.finding.decision
+        assert decision is not None and decision.time == made.times[row]
     counts = judgement.records
     assert counts["rejected"] == counts["outliers"] == made.outliers.sum() and counts["good_rejected"] == 0
     assert counts["accepted"] + counts["rejected"] + counts["ignored"] == counts["arrived"] == len(made.records)
@@ -200,9 +203,9 @@ def test_recovery_is_counted_in_records_that_arrived(start: Calibration) -> None
     _, judgement = judged(start, Knowing(lag, RIGHT), recovered=5.0)
     slip, swap, bump = judgement.events
     for report in (slip, swap):
-        row = int(np.searchsorted(mission().times, report.event.time))
+        row = int(np.searchsorted(mission().times, report.occurrence.time))
         assert report.records == lag + 1
-        assert report.seconds == pytest.approx(mission().times[row + lag] - report.event.time)
+        assert report.seconds == pytest.approx(mission().times[row + lag] - report.occurrence.time)
         assert report.worst > 5 * report.before
     assert bump.records is None and bump.seconds is None
 
@@ -210,10 +213,10 @@ def test_recovery_is_counted_in_records_that_arrived(start: Calibration) -> None
 def test_wrong_names_missed_events_and_false_alarms_are_told_apart(start: Calibration) -> None:
     wrong = {"slip": {"kind": "joint_slipped", "joint": "arm.q2"}, "swap": {"kind": "sensor_moved"}}
     _, judgement = judged(start, Knowing(0, wrong))
-    assert [report.named for report in judgement.events] == ["wrong", "wrong", "missed"]
-    assert judgement.missed == 1
+    assert [report.finding.verdict for report in judgement.events] == ["wrong", "wrong", "missed"]
+    assert judgement.count("missed") == 1
     _, judgement = judged(start, Knowing(0, {"bump": {"kind": "general_change"}}))
-    assert [report.named for report in judgement.events] == ["missed", "missed", "seen"]
+    assert [report.finding.verdict for report in judgement.events] == ["missed", "missed", "vague"]
     made, apart = mission(), Knowing(0, {})
     told = apart._told
 
@@ -260,7 +263,7 @@ def test_what_is_written_says_the_same_as_what_was_judged(knowing: tuple[Mission
 
 
 def test_the_figure_is_a_picture_of_fair_size(knowing: tuple[MissionLog, Judgement]) -> None:
-    picture = mission_figure(mission(), knowing[1], "Three days")
+    picture = mission_figure(mission(), knowing[1], "Three days", 30)
     assert picture.startswith(b"\x89PNG") and len(picture) > 20_000
     assert int.from_bytes(picture[16:20], "big") >= 1200
 
@@ -359,6 +362,9 @@ def test_the_recalibrated_arm_is_better_than_the_frozen_one(short: tuple[Path, d
     assert told["error_mm"]["recalibrated"]["median"] < 0.2 * told["error_mm"]["frozen"]["median"]
     slip = told["events"][0]
     assert slip["named"] == "right" and slip["recovered_after_records"] is not None
+    assert slip["decided_after_hours"] == pytest.approx(24 * (slip["decision"]["day"] - slip["day"]))
+    assert set(told["error_mm"]) == {"frozen", "refit", "refit_recent", "recalibrated"}
+    assert told["worst_ratio_to_recent_refit"]["ratio"] > 0
 
 
 def test_records_of_the_mission_are_what_was_simulated(short: tuple[Path, dict[str, Any]]) -> None:

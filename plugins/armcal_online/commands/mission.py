@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from armcal.io.folder import reserved
 from armcal.io.standard_output import StandardOutput
 from armcal.plugins import PluginRegistry
 from armcal.run.pipeline import Stopwatch
+from rich.table import Table
 
 from armcal_online.commands.recalibrate import setup_of
 from armcal_online.mission.files import SURPRISE, figures, write_files
@@ -38,8 +39,6 @@ TRUTH = ("truth.csv", "truth.json")
 FIGURES = ("mission.csv", "mission.json", "mission.png")
 OURS = (BENCH, RECORDS, CALIBRATION, RECALIBRATION, SURPRISE, *TRUTH, *FIGURES)
 """What a mission leaves; an earlier one's moves to ``earlier/N``."""
-
-_NAMED = {"right": "named right", "wrong": "named wrong", "seen": "seen but not named", "missed": "missed"}
 
 
 @click.command()
@@ -68,29 +67,55 @@ def mission(console: Console, config: Path, out: Path, seed: int | None, overrid
     content = {**figures(plan.experiment.name, result.mission, result.log, result.judgement), "seconds": watch.seconds}
     write_files(out, plan, result, content)
     console.result({**content, "folder": str(out)})
-    errors, counts = content["error_mm"], content["records"]
-    columns = ("mean", "median", "p95", "max", "last")
-    table = columned(f"Mean tip error over {content['days']:g} days, mm", ("calibration", *columns))
-    for name, summary in errors.items():
-        table.add_row(name, *(f"{summary[column]:.3f}" for column in columns))
-    console.out.print(table)
-    for event in content["events"]:
-        records = event["recovered_after_records"]
-        back = "not recovered" if records is None else f"recovered after {records} records"
-        console.line(f"day {event['day']:.2f}: {event['label']}: {_NAMED[event['named']]}, {back}")
-    console.line(
-        f"available {content['availability']:.1%} of the time (frozen: within {content['limit_mm']:g} mm "
-        f"{content['frozen_within_limit']:.1%}); {len(content['false_alarms'])} false alarms, "
-        f"{content['missed']} events missed",
-    )
-    console.line(
-        f"{counts['arrived']} records: {counts['accepted']} accepted, {counts['rejected']} rejected "
-        f"({counts['good_rejected_apart']} good ones apart from events), {counts['ignored']} ignored; "
-        f"{counts['outliers_accepted']} of {counts['outliers']} outliers accepted",
-    )
+    console.out.print(_error_table(content, plan.settings.refit.records))
+    for line in _lines(content):
+        console.line(line)
     for stage, seconds in watch.seconds.items():
         console.detail(f"{stage}: {seconds:.1f} s")
     console.line(f"figure: {out / 'mission.png'}  ({watch.total():.1f} s)")
+
+
+def _error_table(content: Mapping[str, Any], records: int) -> Table:
+    names = {
+        "frozen": "frozen at launch",
+        "refit": "robust refit of all",
+        "refit_recent": f"robust refit of the last {records}",
+        "recalibrated": "recalibrated",
+    }
+    columns = {"mean": "mean", "median": "median", "p95": "95 %", "max": "max", "last": "last"}
+    within = f"within {content['limit_mm']:g} mm"
+    title = f"Mean tip error over {content['days']:g} days, mm"
+    table = columned(title, ("calibration", *columns.values(), within))
+    for name, summary in content["error_mm"].items():
+        share = f"{content['within_limit'][name]:.1%}"
+        table.add_row(names[name], *(f"{summary[column]:.3f}" for column in columns), share)
+    return table
+
+
+def _lines(content: Mapping[str, Any]) -> Iterator[str]:
+    for event in content["events"]:
+        after = event["decided_after_hours"]
+        decided = f"{event['named']}" if after is None else f"{event['named']} after {after:.1f} h"
+        yield f"day {event['day']:.2f}: {event['label']}: {decided}, {event['aftermath']}"
+    for alarm in content["false_alarms"]:
+        yield f"day {alarm['day']:.2f}: false alarm: {alarm['sentence']}"
+    counts, decisions, worst = content["records"], content["decisions"], content["worst_ratio_to_recent_refit"]
+    yield (
+        f"decisions: {', '.join(f'{count} {verdict}' for verdict, count in decisions.items())}; "
+        f"{len(content['false_alarms'])} false alarms in {content['quiet_days']:.1f} quiet days"
+    )
+    if worst is not None:
+        yield (
+            f"worst day against the refit of recent records: {worst['ratio']:.2f} times its error, "
+            f"from day {worst['since_day']:.1f}"
+        )
+    yield f"available {content['availability']:.1%} of the time"
+    yield (
+        f"{counts['arrived']} records: {counts['accepted']} accepted, {counts['rejected']} rejected "
+        f"({counts['good_rejected_apart']} good ones apart from events), {counts['ignored']} ignored; "
+        f"{counts['outliers_accepted']} of {counts['outliers']} outliers and "
+        f"{counts['exchanged_accepted']} of {counts['exchanged']} exchanged records accepted"
+    )
 
 
 def loop_session(registry: PluginRegistry) -> Session:

@@ -13,7 +13,7 @@ from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.base.se3 import Expression
 from armcal.config.system import System
-from armcal.errors import ConfigError
+from armcal.errors import ConfigError, NotConvergedError
 from armcal.estimate.simulation import Mission, with_channels
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.measure.contact import Contact
@@ -21,7 +21,9 @@ from armcal.measure.measurement import Measurement
 from armcal.problem.factor_records import FactorRecords
 from armcal.problem.problem import Problem
 
-from armcal_online.mission.judge import ErrorCurve, MissionLog
+from armcal_online.mission.judge import ErrorCurve
+from armcal_online.mission.log import MissionLog, newest
+from armcal_online.mission.references import Series
 from armcal_online.mission.settings import MissionRunSettings
 
 _HOUR_S = 3600.0
@@ -35,11 +37,12 @@ def error_curve(
     log: MissionLog,
     settings: MissionRunSettings,
     evaluator: EvaluatorChoice = "auto",
+    references: Mapping[str, Series] | None = None,
 ) -> ErrorCurve:
     """Mean distance (m) between a calibration's tip and the true one, as the camera sees it, in fixed random poses.
 
     ``system`` is the arm on its mission, in the gravity of the level rover; nominal ``parameters`` are those of the
-    calibration before launch.
+    calibration before launch; ``references`` are other calibrations over time, by name.
 
     Raises:
         ConfigError: calibration and truth do not describe the same arm.
@@ -53,25 +56,47 @@ def error_curve(
     times = np.unique(np.concatenate([mission.times, hours]))
     frozen, true = parameters.nominal(), mission.truth.values_at(times)
     entries = dict(zip(parameters.entry_names, frozen.tolist(), strict=True))
-    estimated = [np.array(list((entries | {**values}).values())) for _, values in log.estimates]
+    estimates = tuple((time, np.array(list((entries | {**values}).values()))) for time, values in log.estimates)
+    series = {"frozen": ((0.0, frozen),), **(references or {}), "recalibrated": estimates}
+    estimated = [values for of_one in series.values() for _, values in of_one]
     differing = np.any(np.vstack([true, *estimated]) != frozen, axis=0)
     changing = [block.name for block in parameters.blocks if differing[parameters.entries_of(block.name)].any()]
     arm, instrument = next(iter(system.arms.values())), next(iter(system.measurements))
     poses = random_poses(mission.records, tuple(arm.commanded), arm.name, settings.poses, settings.seed)
     tips = Tips.of(system, instrument, parameters, changing, poses, evaluator)
-    recalibrated, start = tips.again(poses), tips.again(poses).at(frozen)
-    cameras, numbers = mission.truth.camera_T_base_at(times), log.estimate_numbers(times)
-    hung = mission.truth.payload_at(times)
-    loads, load_of = np.unique(hung, axis=0, return_inverse=True)
-    really = [tips.again(with_payload(poses, load)) for load in loads]
-    errors, now = np.zeros((2, len(times))), start
+    seen = _true_tips(tips, poses, mission, times, true)
+    errors = {name: _errors(tips.again(poses), of_one, times, seen) for name, of_one in series.items()}
+    is_record, is_hour = np.isin(times, mission.times), np.isin(times, hours)
+    return ErrorCurve(times, is_hour, is_record, errors, log.levels_at(times))
+
+
+def _true_tips(tips: Tips, poses: Dataset, mission: Mission, times: Array, values: Array) -> Array:
+    """Where the camera sees the tips (times x poses x 3, m), with whatever hangs on the tool."""
+    cameras = mission.truth.camera_T_base_at(times)
+    loads, load_of = np.unique(mission.truth.payload_at(times), axis=0, return_inverse=True)
+    loaded = [tips.again(with_payload(poses, load)) for load in loads]
+    seen = np.zeros((len(times), len(poses), 3))
+    for i, (load, camera) in enumerate(zip(load_of.ravel(), cameras, strict=True)):
+        seen[i] = loaded[load].at(values[i]) @ camera[:3, :3].T + camera[:3, 3]
+    return seen
+
+
+def _errors(tips: Tips, series: Series, times: Array, seen: Array) -> Array:
+    """Mean distance of a calibration's tips from those seen, at each time (m).
+
+    One whose springs do not hold the arm predicts nothing: it is off by as much as the tips lie apart.
+    """
+    numbers = newest([time for time, _ in series], times)
+    errors, now = np.zeros(len(times)), seen[0]
     for i in range(len(times)):
         if i == 0 or numbers[i] != numbers[i - 1]:
-            now = recalibrated.at(estimated[numbers[i]])
-        truth = really[load_of[i]].at(true[i]) @ cameras[i, :3, :3].T + cameras[i, :3, 3]
-        errors[:, i] = [float(np.linalg.norm(tip - truth, axis=1).mean()) for tip in (start, now)]
-    is_record, is_hour = np.isin(times, mission.times), np.isin(times, hours)
-    return ErrorCurve(times, is_hour, is_record, errors[0], errors[1], log.levels_at(times))
+            try:
+                now = tips.at(series[numbers[i]][1])
+            except NotConvergedError:
+                now = np.full_like(now, np.nan)
+        off = float(np.linalg.norm(now - seen[i], axis=1).mean())
+        errors[i] = off if np.isfinite(off) else float(np.linalg.norm(np.ptp(seen[i], axis=0)))
+    return errors
 
 
 class Seen(Contact):

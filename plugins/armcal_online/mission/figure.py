@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,17 +13,26 @@ from armcal.estimate.simulation import DAY_S, Mission
 from armcal_online.mission.judge import ErrorCurve, Judgement
 
 _MM = 1000.0
-_FROZEN, _RECALIBRATED, _INK, _GRID, _FAINT = "#b5542a", "#1f5fa8", "#333333", "#d9d9d9", "#6a6a6a"
+_INK, _GRID, _FAINT = "#333333", "#d9d9d9", "#6a6a6a"
+_CURVES = {
+    "frozen": ("#b5542a", 1.2, "calibration before launch, frozen"),
+    "refit": ("#7a9a3a", 1.0, "robust refit of all records"),
+    "refit_recent": ("#8b6fb3", 1.0, "robust refit of the last {records} records"),
+    "recalibrated": ("#1f5fa8", 1.5, "recalibrated"),
+}
+"""Colour, width and name of each curve, those above last."""
+_VERDICTS = {"right": "#2f7d4f", "vague": "#9a7a10", "wrong": "#b8322f", "missed": "#b8322f"}
 _LEVELS = {"nominal": "#4c9f70", "watch": "#e3c14b", "suspect": "#dd7f33", "lost": "#b8322f"}
 _LEAST_MM = 0.02
 _NIGHT = (18.0, 30.0)
 """Hours from the mission's midnight; evening to morning."""
-_WIDTH, _TURNED, _ROW = 0.24, 0.78, 25
-"""How much of the axes a label takes, from where on it stands to the left of its line, and its height in points."""
+_WIDTH, _TURNED, _LINE, _COLUMNS = 0.26, 0.76, 12.5, 42
+"""How much of the axes a label takes, from where on it stands to the left of its line, the height of a line in points,
+and its most characters."""
 
 
-def mission_figure(mission: Mission, judged: Judgement, title: str) -> bytes:
-    """A PNG."""
+def mission_figure(mission: Mission, judged: Judgement, title: str, records: int) -> bytes:
+    """A PNG; the robust refit is one of so many recent records."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -30,29 +40,31 @@ def mission_figure(mission: Mission, judged: Judgement, title: str) -> bytes:
     FigureCanvasAgg(figure)
     axes, band = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [16, 1], "hspace": 0.02})
     days = mission.seconds / DAY_S
-    _draw_curves(axes, judged, days)
-    rows = _draw_events(axes, mission, judged)
+    _draw_curves(axes, judged, days, records)
+    above = _draw_events(axes, mission, judged)
     _draw_levels(band, judged.curve, days)
     below = {"loc": "upper right", "bbox_to_anchor": (1.0, -2.0), "borderaxespad": 0.0}
     band.legend(*axes.get_legend_handles_labels(), ncols=2, fontsize=8.5, frameon=False, **below)
     for plot in (axes, band):
         plot.set_xlim(0, days)
         plot.spines[["top", "right"]].set_visible(False)
-    axes.set_title(title, loc="left", fontsize=12, color=_INK, pad=8 + _ROW * rows)
+    axes.set_title(title, loc="left", fontsize=12, color=_INK, pad=8 + above)
     stream = io.BytesIO()
     figure.savefig(stream, format="png")
     return stream.getvalue()
 
 
-def _draw_curves(axes: Any, judged: Judgement, days: float) -> None:
+def _draw_curves(axes: Any, judged: Judgement, days: float, records: int) -> None:
     curve = judged.curve
-    at, shown = curve.times / DAY_S, np.vstack([curve.frozen, curve.recalibrated]) * _MM
+    at, shown = curve.times / DAY_S, np.vstack(list(curve.errors.values())) * _MM
     low, high = max(float(shown.min()), _LEAST_MM) / 1.4, max(float(shown.max()), judged.limit * _MM) * 1.6
     for day in range(-1, int(np.ceil(days))):
         evening, morning = (day + hour / 24 for hour in _NIGHT)
         axes.axvspan(max(evening, 0.0), min(morning, days), color="#eef0f4", lw=0, zorder=0)
-    axes.plot(at, shown[0], color=_FROZEN, lw=1.2, label="calibration before launch, frozen")
-    axes.plot(at, shown[1], color=_RECALIBRATED, lw=1.4, label="recalibrated", zorder=4)
+    for height, (name, (color, width, label)) in enumerate(_CURVES.items(), 3):
+        if name in curve.errors:
+            text = label.format(records=records)
+            axes.plot(at, curve.errors[name] * _MM, color=color, lw=width, label=text, zorder=height)
     axes.axhline(judged.limit * _MM, color=_INK, lw=0.9, ls=(0, (5, 4)), zorder=2)
     axes.annotate(
         f"limit {judged.limit * _MM:g} mm",
@@ -75,23 +87,27 @@ def _draw_curves(axes: Any, judged: Judgement, days: float) -> None:
     axes.tick_params(labelsize=9, colors=_INK)
 
 
-def _draw_events(axes: Any, mission: Mission, judged: Judgement) -> int:
-    """Events as labelled lines, each label in the lowest free row; power cuts inside the axes. How many rows."""
+def _draw_events(axes: Any, mission: Mission, judged: Judgement) -> float:
+    """Events as labelled lines, each label in the lowest free row; power cuts inside the axes.
+
+    How high the labels reach, in points.
+    """
     labels = []
     for report in judged.events:
-        count = report.records
-        recovery = "not recovered" if count is None else f"recovered in {count} record{'' if count == 1 else 's'}"
-        labels.append((report.event.time / mission.seconds, f"{report.event.label}\n{recovery}"))
-    rows = _rows([place for place, _ in labels])
-    for (place, text), row in zip(labels, rows, strict=True):
+        place, verdict = report.occurrence.time / mission.seconds, report.finding.verdict
+        text = "\n".join([*textwrap.wrap(report.occurrence.label, _COLUMNS), f"{verdict}, {report.aftermath}"])
+        labels.append((place, text, _VERDICTS[verdict]))
+    rows = _rows([place for place, _, _ in labels])
+    height = _LINE * max((text.count("\n") + 1 for _, text, _ in labels), default=0)
+    for (place, text, color), row in zip(labels, rows, strict=True):
         day = place * mission.seconds / DAY_S
         axes.axvline(day, color=_INK, lw=1.0, zorder=3)
         side = "right" if place > _TURNED else "left"
-        _write(axes, day, text, xytext=(2 if side == "right" else -2, 4 + _ROW * row), ha=side, color=_INK)
+        _write(axes, day, text, xytext=(2 if side == "right" else -2, 4 + height * row), ha=side, color=color)
     for time in mission.power_cuts:
         axes.axvline(time / DAY_S, color=_FAINT, lw=0.9, ls=":", zorder=3)
         _write(axes, time / DAY_S, "power cut", xytext=(3, -4), rotation=90, va="top", color=_FAINT)
-    return max(rows, default=-1) + 1
+    return height * (max(rows, default=-1) + 1)
 
 
 def _write(axes: Any, day: float, text: str, **how: Any) -> None:

@@ -8,7 +8,7 @@ import json
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import yaml
@@ -20,8 +20,10 @@ from armcal.errors import InputError, Location
 from armcal.estimate.simulation import DAY_S, Mission
 from armcal.io.plain_files import check_output
 
+from armcal_online.mission.decisions import Verdict
 from armcal_online.mission.figure import mission_figure
-from armcal_online.mission.judge import Decision, ErrorCurve, Judgement, MissionLog
+from armcal_online.mission.judge import ErrorCurve, EventReport, Judgement
+from armcal_online.mission.log import Decision, MissionLog
 from armcal_online.mission.mission import MissionResult
 from armcal_online.mission.settings import MissionPlan
 
@@ -46,7 +48,7 @@ def write_files(folder: Path, plan: MissionPlan, result: MissionResult, content:
     if plan.planted:
         texts[SURPRISE] = surprise_text(plan)
     files = {name: text.encode() for name, text in texts.items()}
-    files["mission.png"] = mission_figure(result.mission, result.judgement, name)
+    files["mission.png"] = mission_figure(result.mission, result.judgement, name, plan.settings.refit.records)
     try:
         for name, data in files.items():
             check_output(folder / name, InputError)
@@ -112,13 +114,12 @@ def curve_text(curve: ErrorCurve, temperature: Array) -> str:
     rows = zip(
         (curve.times / DAY_S).round(6).tolist(),
         ["record" if is_record else "hour" for is_record in curve.is_record],
-        (curve.frozen * _MM).round(6).tolist(),
-        (curve.recalibrated * _MM).round(6).tolist(),
+        *((errors * _MM).round(6).tolist() for errors in curve.errors.values()),
         curve.levels,
         temperature.round(3).tolist(),
         strict=True,
     )
-    return _csv(["day", "moment", "frozen_mm", "recalibrated_mm", "level", "temperature_C"], rows)
+    return _csv(["day", "moment", *(f"{name}_mm" for name in curve.errors), "level", "temperature_C"], rows)
 
 
 def figures(name: str, mission: Mission, log: MissionLog, judged: Judgement) -> dict[str, Any]:
@@ -129,33 +130,41 @@ def figures(name: str, mission: Mission, log: MissionLog, judged: Judgement) -> 
         "mission": name,
         "days": mission.seconds / DAY_S,
         "limit_mm": judged.limit * _MM,
-        "error_mm": {
-            "frozen": _summary(curve.frozen[curve.is_hour]),
-            "recalibrated": _summary(curve.recalibrated[curve.is_hour]),
-        },
+        "error_mm": {name: _summary(errors[curve.is_hour]) for name, errors in curve.errors.items()},
+        "within_limit": {name: judged.within(name) for name in curve.errors},
+        "worst_ratio_to_recent_refit": (
+            None
+            if judged.worst is None
+            else {"ratio": judged.worst.ratio, "since_day": judged.worst.since / DAY_S, "days": 1}
+        ),
         "availability": judged.availability,
-        "frozen_within_limit": judged.frozen_within,
-        "events": [
-            {
-                "day": report.event.time / DAY_S,
-                "kind": report.event.kind,
-                "joint": report.event.joint or None,
-                "label": report.event.label,
-                "named": report.named,
-                "decision": _decision(report.decision) if report.decision else None,
-                "before_mm": report.before * _MM,
-                "worst_mm": report.worst * _MM,
-                "recovered_after_records": report.records,
-                "recovered_after_hours": None if report.seconds is None else report.seconds / 3600,
-            }
-            for report in judged.events
-        ],
-        "missed": judged.missed,
+        "events": [_event(report) for report in judged.events],
+        "decisions": {verdict: judged.count(verdict) for verdict in get_args(Verdict)},
         "false_alarms": [_decision(false_alarm) for false_alarm in judged.false_alarms],
+        "quiet_days": judged.quiet / DAY_S,
         "records": dict(judged.records),
         "power_cuts": [time / DAY_S for time in mission.power_cuts],
         "resumed": log.resumed,
         "hours_at_level": Counter(levels),
+    }
+
+
+def _event(report: EventReport) -> dict[str, Any]:
+    """What happened at one moment, and what became of it."""
+    occurrence, decision = report.occurrence, report.finding.decision
+    return {
+        "day": occurrence.time / DAY_S,
+        "kinds": [event.kind for event in occurrence.events],
+        "joints": [event.joint or None for event in occurrence.events],
+        "label": occurrence.label,
+        "named": report.finding.verdict,
+        "decision": _decision(decision) if decision else None,
+        "decided_after_hours": (decision.time - occurrence.time) / 3600 if decision else None,
+        "aftermath": report.aftermath,
+        "before_mm": report.before * _MM,
+        "worst_mm": report.worst * _MM,
+        "recovered_after_records": report.records,
+        "recovered_after_hours": None if report.seconds is None else report.seconds / 3600,
     }
 
 
@@ -164,6 +173,7 @@ def _decision(decision: Decision) -> dict[str, Any]:
         "day": decision.time / DAY_S,
         "kind": decision.kind,
         "joint": decision.joint or None,
+        "candidates": list(decision.candidates),
         "sentence": decision.sentence,
     }
 

@@ -1,107 +1,23 @@
-"""What a recalibration did in a mission, judged against the truth: errors, recovery, availability, alarms."""
+"""What a recalibration did in a mission, judged against the truth: errors, recovery, availability, decisions."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.estimate.simulation import DAY_S, Mission, MissionEvent
+from armcal.estimate.simulation import DAY_S, Mission
 from numpy.typing import NDArray
 
-NAMING = ("joint_slipped", "joint_replaced", "sensor_moved")
-"""Decisions that name what happened."""
-ALARMS = (*NAMING, "general_change", "model_no_longer_fits", "unexplained")
-"""Decisions that claim that something happened."""
+from armcal_online.mission.decisions import Finding, Occurrence, Verdict, findings, occurrences
+from armcal_online.mission.log import Decision, MissionLog
 
 Flags = NDArray[np.bool_]
 USABLE = ("nominal", "watch")
-EXPECTED = {
-    "slip": ("joint_slipped", "joint_replaced"),
-    "swap": ("joint_slipped", "joint_replaced"),
-    "bump": ("sensor_moved",),
-    "bias": ("sensor_moved",),
-    "bend": ("joint_slipped", "joint_replaced"),
-    "creep": ("joint_slipped", "joint_replaced"),
-    "play": ("joint_slipped", "joint_replaced"),
-}
-"""The decisions that name an event right."""
-_WINDOW_S = 2 * DAY_S
-"""A decision within this time after an event is about it."""
+FILTER, RECENT = "recalibrated", "refit_recent"
 _IN_A_ROW = 3
-
-
-@dataclass(frozen=True)
-class Decision:
-    """One decision: when (s since the mission began), what, of which joint, in words."""
-
-    time: float
-    kind: str
-    joint: str
-    sentence: str
-
-
-@dataclass(frozen=True)
-class MissionLog:
-    """What became of the records, and what was estimated and decided when (s since the mission began).
-
-    Attributes:
-        verdicts: by record id: accepted, rejected or ignored.
-        estimates: values by canonical entry, in order, each with its time; the first is where it began.
-        levels: each with the time at which it began.
-        decisions: in order.
-        resumed: how often it was resumed.
-    """
-
-    verdicts: Mapping[str, str]
-    estimates: tuple[tuple[float, Mapping[str, float]], ...]
-    levels: tuple[tuple[float, str], ...]
-    decisions: tuple[Decision, ...]
-    resumed: int
-
-    def estimate_numbers(self, times: Array) -> Array:
-        """The number of the newest estimate at each of these times (N)."""
-        known = np.array([time for time, _ in self.estimates])
-        return np.asarray(np.maximum(np.searchsorted(known, times, side="right") - 1, 0))
-
-    def levels_at(self, times: Array) -> tuple[str, ...]:
-        """The level at these times."""
-        known = np.array([time for time, _ in self.levels])
-        return tuple(self.levels[max(int(i) - 1, 0)][1] for i in np.searchsorted(known, times, side="right"))
-
-
-def read_mission_log(events: Iterable[Mapping[str, Any]], mission: Mission) -> MissionLog:
-    """The log of a mission from the events that a recalibration wrote, in order.
-
-    An event without a record of its own has the time of the last record before it.
-    """
-    times = dict(zip(mission.records.ids, mission.times.tolist(), strict=True))
-    verdicts: dict[str, str] = {}
-    estimates: dict[float, Mapping[str, float]] = {}
-    levels: list[tuple[float, str]] = []
-    decisions: list[Decision] = []
-    now, resumed = 0.0, 0
-    for event in events:
-        kind = event.get("event")
-        if kind == "started":
-            resumed += bool(event.get("resumed"))
-            estimates.setdefault(0.0, {p["name"]: float(p["value"]) for p in event.get("parameters", ())})
-            levels = levels or [(0.0, str(event.get("level", "nominal")))]
-        elif kind == "record":
-            now = times.get(str(event["id"]), now)
-            verdicts[str(event["id"])] = str(event["verdict"])
-        elif kind == "estimate":
-            estimates[now] = {name: float(pair[0]) for name, pair in event["parameters"].items()}
-        elif kind == "level":
-            levels.append((now, str(event["to"])))
-        elif kind == "decision":
-            fields = (str(event.get(key) or "") for key in ("kind", "joint", "sentence"))
-            decisions.append(Decision(now, *fields))
-    return MissionLog(
-        verdicts, tuple(estimates.items()), tuple(levels or [(0.0, "nominal")]), tuple(decisions), resumed
-    )
+_RATIO_WINDOW_S = DAY_S
 
 
 @dataclass(frozen=True)
@@ -112,57 +28,90 @@ class ErrorCurve:
         times: s since the mission began, in order (T): every record's, and every hour.
         is_hour: which of them are hours (T).
         is_record: which are records' (T).
-        frozen: of the calibration before launch, m (T).
-        recalibrated: of the recalibrated one, m (T).
+        errors: m (T), by name: ``frozen`` is the calibration before launch, ``refit`` and ``refit_recent`` robust fits
+            of all and of the most recent records where there are enough, ``recalibrated`` the filter.
         levels: T.
     """
 
     times: Array
     is_hour: Flags
     is_record: Flags
-    frozen: Array
-    recalibrated: Array
+    errors: Mapping[str, Array]
     levels: tuple[str, ...]
+
+    @property
+    def frozen(self) -> Array:
+        """Of the calibration before launch, m (T)."""
+        return self.errors["frozen"]
+
+    @property
+    def recalibrated(self) -> Array:
+        """Of the recalibrated one, m (T)."""
+        return self.errors[FILTER]
 
 
 @dataclass(frozen=True)
 class EventReport:
-    """What became of one event.
+    """What became of the events of one moment.
 
-    ``named``: ``right`` or ``wrong`` by the first decision that names anything, ``seen`` if a decision only said that
-    something changed, ``missed`` if there was none. ``before`` and ``worst`` are mean tip errors (m). Recovery is
-    counted in records that arrived and in s, None if it did not come about before the next event or the end.
+    ``before`` and ``worst`` are mean tip errors (m). Recovery is counted in records that arrived and in s, None if it
+    did not come about before the next events or the end, and from an event that grows.
     """
 
-    event: MissionEvent
-    named: str
-    decision: Decision | None
+    occurrence: Occurrence
+    finding: Finding
     before: float
     worst: float
     records: int | None
     seconds: float | None
+
+    @property
+    def aftermath(self) -> str:
+        """A few words: after how many records it was over, or how large the error became."""
+        if self.occurrence.grows:
+            return f"at worst {1000 * self.worst:.1f} mm"
+        if self.records is None:
+            return "not recovered"
+        return f"recovered in {self.records} record{'' if self.records == 1 else 's'}"
+
+
+@dataclass(frozen=True)
+class WorstRatio:
+    """The day on which the filter was worst against the robust refit of the most recent records.
+
+    Attributes:
+        ratio: of their mean errors on it.
+        since: when it begins, s since the mission began.
+    """
+
+    ratio: float
+    since: float
 
 
 @dataclass(frozen=True)
 class Judgement:
     """A mission's figures.
 
-    ``availability`` is the share of all hours in which the level allowed use and the error was within the limit;
-    ``frozen_within`` the share in which the calibration before launch was within it.
+    ``availability`` is the share of all hours in which the level allowed use and the error was within the limit.
+    ``quiet`` (s) is how long nothing was the matter: the time in which alarms are false.
     """
 
     curve: ErrorCurve
     events: tuple[EventReport, ...]
     false_alarms: tuple[Decision, ...]
+    quiet: float
     records: Mapping[str, int]
     availability: float
-    frozen_within: float
     limit: float
+    worst: WorstRatio | None
 
-    @property
-    def missed(self) -> int:
-        """How many events nothing was decided about."""
-        return sum(report.named == "missed" for report in self.events)
+    def within(self, name: str) -> float:
+        """The share of all hours in which the error of a calibration was within the limit."""
+        return float((self.curve.errors[name] <= self.limit)[self.curve.is_hour].mean())
+
+    def count(self, verdict: Verdict) -> int:
+        """How many moments have this verdict."""
+        return sum(report.finding.verdict == verdict for report in self.events)
 
 
 def judge(mission: Mission, log: MissionLog, curve: ErrorCurve, limit: float, recovered: float) -> Judgement:
@@ -175,69 +124,83 @@ def judge(mission: Mission, log: MissionLog, curve: ErrorCurve, limit: float, re
         limit: of the mean tip error for use, m.
         recovered: the error is back within so many times what it was before an event.
     """
-    times = [*sorted({event.time for event in mission.events}), mission.seconds]
-    ends = [times[times.index(event.time) + 1] for event in mission.events]
-    events = list(zip(mission.events, ends, strict=True))
-    reports = [_event_report(event, end, log, curve, recovered) for event, end in events]
-    windows = [(event.time, min(event.time + _WINDOW_S, end)) for event, end in events]
-    alarms = [decision for decision in log.decisions if decision.kind in ALARMS]
-    apart = tuple(alarm for alarm in alarms if not _within(alarm.time, windows))
+    happened = occurrences(mission.events)
+    decided, false_alarms = findings(happened, log.decisions)
+    ends = [*(occurrence.time for occurrence in happened), mission.seconds][1:]
+    reports = [
+        _event_report(occurrence, finding, end, curve, recovered)
+        for occurrence, finding, end in zip(happened, decided, ends, strict=True)
+    ]
     usable = np.array([level in USABLE for level in curve.levels]) & (curve.recalibrated <= limit)
+    quiet = np.array([not _is_open(happened, time) for time in curve.times[curve.is_hour].tolist()])
     return Judgement(
         curve=curve,
         events=tuple(reports),
-        false_alarms=apart,
-        records=_record_count(mission, log, windows),
+        false_alarms=false_alarms,
+        quiet=float(quiet.mean()) * mission.seconds,
+        records=_record_count(mission, log, happened),
         availability=float(usable[curve.is_hour].mean()),
-        frozen_within=float((curve.frozen <= limit)[curve.is_hour].mean()),
         limit=limit,
+        worst=_worst_ratio(curve),
     )
 
 
-def _within(time: float, windows: Sequence[tuple[float, float]]) -> bool:
-    return any(first <= time < last for first, last in windows)
+def _is_open(happened: Sequence[Occurrence], time: float) -> bool:
+    return any(occurrence.is_open(time) for occurrence in happened)
 
 
-def _event_report(event: MissionEvent, end: float, log: MissionLog, curve: ErrorCurve, recovered: float) -> EventReport:
-    day_before = (curve.times < event.time) & (curve.times >= event.time - DAY_S)
+def _event_report(
+    occurrence: Occurrence, finding: Finding, end: float, curve: ErrorCurve, recovered: float
+) -> EventReport:
+    day_before = (curve.times < occurrence.time) & (curve.times >= occurrence.time - DAY_S)
     before = float(np.median(curve.recalibrated[day_before if day_before.any() else slice(1)]))
-    after = (curve.times >= event.time) & (curve.times < end)
+    after = (curve.times >= occurrence.time) & (curve.times < end)
     following = np.flatnonzero(after & curve.is_record)
     good = curve.recalibrated[following] <= recovered * before
     runs = np.convolve(good, np.ones(_IN_A_ROW), "valid") == _IN_A_ROW if len(good) >= _IN_A_ROW else np.zeros(0)
-    first = int(np.argmax(runs)) if runs.any() else None
-    last = min(event.time + _WINDOW_S, end)
-    alarms = [d for d in log.decisions if d.kind in ALARMS and event.time <= d.time < last]
-    decision = next((alarm for alarm in alarms if alarm.kind in NAMING), alarms[0] if alarms else None)
-    named = "missed" if decision is None else "seen"
-    if decision is not None and decision.kind in NAMING:
-        right = decision.kind in EXPECTED.get(event.kind, ()) and decision.joint == event.joint
-        named = "right" if right else "wrong"
+    first = int(np.argmax(runs)) if runs.any() and not occurrence.grows else None
     return EventReport(
-        event=event,
-        named=named,
-        decision=decision,
+        occurrence=occurrence,
+        finding=finding,
         before=before,
         worst=float(curve.recalibrated[after].max(initial=0.0)),
         records=None if first is None else first + 1,
-        seconds=None if first is None else float(curve.times[following[first]] - event.time),
+        seconds=None if first is None else float(curve.times[following[first]] - occurrence.time),
     )
 
 
-def _record_count(mission: Mission, log: MissionLog, windows: Sequence[tuple[float, float]]) -> dict[str, int]:
-    """What became of the records; good ones are those that were not made outliers."""
+def _worst_ratio(curve: ErrorCurve) -> WorstRatio | None:
+    """Over the days from the first refit on; None without one."""
+    refit = curve.errors.get(RECENT)
+    if refit is None or np.array_equal(refit, curve.frozen):
+        return None
+    begins = curve.times[int(np.argmax(refit != curve.frozen))]
+    worst: WorstRatio | None = None
+    for since in np.arange(begins, curve.times[-1], _RATIO_WINDOW_S):
+        inside = curve.is_hour & (curve.times >= since) & (curve.times < since + _RATIO_WINDOW_S)
+        if inside.any():
+            ratio = float(curve.recalibrated[inside].mean() / refit[inside].mean())
+            worst = WorstRatio(ratio, float(since)) if worst is None or ratio > worst.ratio else worst
+    return worst
+
+
+def _record_count(mission: Mission, log: MissionLog, happened: Sequence[Occurrence]) -> dict[str, int]:
+    """What became of the records; good ones are those that were not made outliers, nor exchanged."""
     verdicts = np.array([log.verdicts.get(text, "ignored") for text in mission.records.ids])
-    apart = np.array([not _within(time, windows) for time in mission.times.tolist()], dtype=bool)
-    good, rejected, accepted = ~mission.outliers, verdicts == "rejected", verdicts == "accepted"
+    apart = np.array([not _is_open(happened, time) for time in mission.times.tolist()], dtype=bool)
+    bad = mission.outliers | mission.exchanged
+    rejected, accepted = verdicts == "rejected", verdicts == "accepted"
     return {
         "made": len(verdicts) + mission.lost,
         "lost": mission.lost,
         "arrived": len(verdicts),
         "outliers": int(mission.outliers.sum()),
+        "exchanged": int(mission.exchanged.sum()),
         "accepted": int(accepted.sum()),
         "rejected": int(rejected.sum()),
         "ignored": int((verdicts == "ignored").sum()),
-        "good_rejected": int((good & rejected).sum()),
-        "good_rejected_apart": int((good & rejected & apart).sum()),
+        "good_rejected": int((~bad & rejected).sum()),
+        "good_rejected_apart": int((~bad & rejected & apart).sum()),
         "outliers_accepted": int((mission.outliers & accepted).sum()),
+        "exchanged_accepted": int((mission.exchanged & accepted).sum()),
     }

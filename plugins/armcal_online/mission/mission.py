@@ -24,7 +24,9 @@ from armcal.run.pipeline import Stopwatch, calibrate
 from typing_extensions import override
 
 from armcal_online.mission.errors import error_curve
-from armcal_online.mission.judge import Judgement, MissionLog, judge, read_mission_log
+from armcal_online.mission.judge import Judgement, judge
+from armcal_online.mission.log import MissionLog, read_mission_log
+from armcal_online.mission.references import refits
 from armcal_online.mission.settings import MissionPlan
 from armcal_online.sources.source import Incoming, Source
 from armcal_online.tracking.settings import RecalibrateSettings
@@ -183,8 +185,11 @@ def run_mission(
     with watch.stage("recalibrate"):
         log = recalibrated(mission, path, plan.recalibrate, session, folder / RECALIBRATION)
     settings, experiment = plan.settings, plan.experiment
+    system, evaluator, start = experiment.system, experiment.settings.evaluator, calibration.parameters
+    with watch.stage("refit"):
+        at_launch = experiment.parameters.with_nominal(start.nominal())
+        references = refits(system, at_launch, mission, settings.refit, evaluator)
     with watch.stage("judge"):
-        evaluator = experiment.settings.evaluator
-        curve = error_curve(experiment.system, calibration.parameters, mission, log, settings, evaluator)
+        curve = error_curve(system, start, mission, log, settings, evaluator, references)
         judged = judge(mission, log, curve, settings.limit, settings.recovered)
     return MissionResult(mission, calibration, log, judged)

@@ -23,13 +23,21 @@ from armcal_online.tracking.settings import RecalibrateSettings
 SECTION = "mission"
 
 
+class RefitSettings(Settings):
+    """Robust fits that the recalibration is compared with: of the last ``records``, anew after ``every`` so many."""
+
+    records: Annotated[int, Field(ge=10, le=1000)] = 40
+    every: Annotated[int, Field(ge=1)] = 10
+
+
 class MissionRunSettings(Settings):
     """The calibration before launch, and the judge.
 
     ``experiment`` is a configuration whose simulated records are calibrated first; ``calibration`` a file that is
     there already. The judge compares tips in so many random ``poses``, within the span of the records, with the truth;
     the arm can be used while its level is nominal or watch and the mean error is within ``limit``. It has recovered
-    from an event when the error is back within ``recovered`` times what it was in the day before.
+    from an event when the error is back within ``recovered`` times what it was in the day before. ``refit`` says which
+    robust fits of many records at once the recalibration is compared with.
     """
 
     experiment: InputPath | None = None
@@ -38,6 +46,7 @@ class MissionRunSettings(Settings):
     poses: Annotated[int, Field(ge=1, le=5000)] = 200
     seed: Annotated[int, Field(ge=0)] = 0
     recovered: Annotated[float, Field(ge=1)] = 1.5
+    refit: RefitSettings = Field(default_factory=RefitSettings)
 
     @model_validator(mode="after")
     def _one_start(self) -> MissionRunSettings:

@@ -1,0 +1,166 @@
+"""How the filter fares in short missions with what it has no hypothesis for, against a robust refit of 40 records.
+
+Prints a table: ``python -m tests.mission_study [SEEDS] [CASE ...]``.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from armcal.estimate.simulation import DAY_S
+from armcal.plugins import discover
+from armcal_online.commands.mission import loop_session
+from armcal_online.mission.judge import Judgement
+from armcal_online.mission.mission import before_launch, run_mission
+from armcal_online.mission.settings import MissionPlan
+
+CONFIG = Path(__file__).resolve().parents[1] / "configs" / "lrm_arm" / "mission.yaml"
+DAYS, DAY = 10, 4.0
+SHORT = (
+    f"simulation.days={DAYS}",
+    "simulation.records.every_min=20",
+    "simulation.power_cuts=[]",
+    "mission.poses=50",
+    "mission.refit={records: 40, every: 10}",
+)
+
+
+def _size(random: np.random.Generator, low: float, high: float) -> float:
+    """Each factor as likely as every other; either sign."""
+    return float(np.exp(random.uniform(np.log(low), np.log(high))) * random.choice([-1, 1]))
+
+
+def _vector(random: np.random.Generator, low: float, high: float) -> list[float]:
+    direction = random.normal(size=3)
+    return [float(x) for x in direction / np.linalg.norm(direction) * abs(_size(random, low, high))]
+
+
+def two_slips(random: np.random.Generator) -> dict[str, Any]:
+    """Two horns slip by 1 to 15 deg at the same moment."""
+    joints = random.choice(6, 2, replace=False) + 1
+    slips = [{"kind": "slip", "day": DAY, "joint": f"arm.q{i}", "parameter": f"arm.mdh.theta{i}"} for i in joints]
+    return {"events": [{**slip, "angle_deg": _size(random, 1, 15)} for slip in slips]}
+
+
+def outliers(random: np.random.Generator) -> dict[str, Any]:
+    """A fifth of the records is off by 30 to 500 mm."""
+    return {"events": [], "outliers": {"fraction": 0.2, "size_mm": 30, "largest_mm": 500}}
+
+
+def tracker_bias(random: np.random.Generator) -> dict[str, Any]:
+    """The tracker's readings move away by 0.2 to 1 mm a day."""
+    return {"events": [{"kind": "bias", "day": DAY, "per_day_mm": _vector(random, 0.2, 1.0)}]}
+
+
+def creeping_joint(random: np.random.Generator) -> dict[str, Any]:
+    """A joint creeps by 0.1 to 0.6 deg a day."""
+    i, change = random.integers(1, 7), f"{_size(random, 0.1, 0.6):.3f} deg in 1 d"
+    creep = {"kind": "creep", "day": DAY, "joint": f"arm.q{i}", "parameter": f"arm.mdh.theta{i}", "change": change}
+    return {"events": [creep]}
+
+
+def untold_payload(random: np.random.Generator) -> dict[str, Any]:
+    """100 to 300 g, 10 to 80 mm from the tip, that no record reports."""
+    mass, lever = abs(_size(random, 100, 300)), _vector(random, 10, 80)
+    return {"events": [{"kind": "payload", "day": DAY, "mass_g": mass, "lever_mm": lever}]}
+
+
+def nothing(random: np.random.Generator) -> dict[str, Any]:
+    """What the configuration has: creep, temperature, tilts, 5 % outliers of 30 to 60 mm."""
+    return {"events": []}
+
+
+CASES: dict[str, Callable[[np.random.Generator], dict[str, Any]]] = {
+    case.__name__: case for case in (two_slips, outliers, tracker_bias, creeping_joint, untold_payload, nothing)
+}
+
+
+@lru_cache
+def launch() -> Path:
+    """One calibration before launch for all missions."""
+    folder = Path(tempfile.mkdtemp())
+    return before_launch(MissionPlan.load(CONFIG, (*SHORT, "simulation.events=[]")), folder)
+
+
+def flown(case: str, seed: int) -> Judgement:
+    """One mission through the loop that ``armcal recalibrate`` uses."""
+    plan = CASES[case](np.random.default_rng([seed, list(CASES).index(case)]))
+    texts = [
+        f"simulation.{key}={yaml.safe_dump(value, default_flow_style=True, width=9999)}" for key, value in plan.items()
+    ]
+    start = f"mission.calibration={launch()}"
+    loaded = MissionPlan.load(CONFIG, (*SHORT, "mission.experiment=null", start, f"simulation.seed={seed}", *texts))
+    registry = discover()
+    with tempfile.TemporaryDirectory() as folder:
+        return run_mission(loaded, Path(folder), loop_session(registry), registry).judgement
+
+
+@dataclass(frozen=True)
+class Row:
+    """One mission: mean errors from the event on (mm), the worst day's ratio, and decisions."""
+
+    filter_mm: float
+    recent_mm: float
+    frozen_mm: float
+    worst: float
+    alarms: int
+    quiet_days: float
+    verdicts: tuple[str, ...]
+
+    @property
+    def ratio(self) -> float:
+        """Of the filter's error to that of the refit of the last 40."""
+        return self.filter_mm / self.recent_mm
+
+
+def row(judged: Judgement) -> Row:
+    """From the event's moment on, or from the first refit on without one."""
+    curve = judged.curve
+    since = judged.events[0].occurrence.time if judged.events else judged.worst.since if judged.worst else 0.0
+    after = curve.is_hour & (curve.times >= since)
+    means = [float(1000 * curve.errors[name][after].mean()) for name in ("recalibrated", "refit_recent", "frozen")]
+    verdicts = tuple(report.finding.verdict for report in judged.events)
+    worst = judged.worst.ratio if judged.worst else np.nan
+    return Row(*means, worst, len(judged.false_alarms), judged.quiet / DAY_S, verdicts)
+
+
+def table(rows: dict[str, Sequence[Row]]) -> Iterator[str]:
+    """A line a case: ratios are medians over the missions, and the largest; alarms by 30 quiet days."""
+    yield (
+        "case            missions  filter  refit-40  frozen mm   ratio median  largest   worst day   "
+        "false alarms/30 d   right vague wrong missed"
+    )
+    for case, flown_rows in rows.items():
+        values = np.array([[r.filter_mm, r.recent_mm, r.frozen_mm, r.ratio] for r in flown_rows])
+        quiet = sum(r.quiet_days for r in flown_rows)
+        alarms = 30 * sum(r.alarms for r in flown_rows) / quiet if quiet else np.nan
+        verdicts = [verdict for r in flown_rows for verdict in r.verdicts]
+        counts = " ".join(f"{verdicts.count(verdict):5d}" for verdict in ("right", "vague", "wrong", "missed"))
+        yield (
+            f"{case:15s} {len(flown_rows):8d}  {values[:, 0].mean():6.2f}  {values[:, 1].mean():8.2f}  "
+            f"{values[:, 2].mean():9.2f}   {np.median(values[:, 3]):12.2f}  {values[:, 3].max():7.2f}   "
+            f"{max(r.worst for r in flown_rows):9.2f}   {alarms:17.1f}   {counts}"
+        )
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Fly, and print after each case."""
+    seeds = int(arguments[0]) if arguments else 10
+    for case in arguments[1:] or CASES:
+        rows = []
+        for seed in range(1, seeds + 1):
+            rows.append(row(flown(case, seed)))
+            print(f"# {case} seed {seed}: {rows[-1]}", file=sys.stderr, flush=True)
+        print("\n".join(table({case: rows})), flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
