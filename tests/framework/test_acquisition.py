@@ -46,7 +46,9 @@ class Run:
         settings, clock, device = self.settings, self.clock, self.device
         planner = PathPlanner(None, np.array([[-2.0, 2.0]] * 2), self.poses, 0.02)
         drive = Drive(device, clock, planner, settings, (self.model, torques), self.log)
-        scheduler = Scheduler(self.poses, IDS, drive.park, planner, self.model, torques, RATE, 2.0, settings.order)
+        scheduler = Scheduler(
+            self.poses, IDS, 0 * self.poses, drive.park, planner, self.model, torques, RATE, 2.0, settings.order
+        )
         gate = MotionGate(self.monitor, clock, settings.lost, lambda: self.asked)
         identity = device.open(clock)
         return AcquisitionRun(drive, identity, scheduler, gate, self.log, self.progress, lambda progress: None)

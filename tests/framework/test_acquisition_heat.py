@@ -26,7 +26,7 @@ def scheduler(poses: np.ndarray, order: str = "plan", model: HeatModel = HEAT, c
     park = np.zeros(2)
     planner = PathPlanner(check, limits, np.vstack([park, poses]), 0.02)
     names = tuple(f"p{i}" for i in range(len(poses)))
-    return Scheduler(poses, names, park, planner, model, torques, np.deg2rad(20), 8.0, order)
+    return Scheduler(poses, names, 0 * poses, park, planner, model, torques, np.deg2rad(20), 8.0, order)
 
 
 def test_heat_follows_its_differential_equations() -> None:

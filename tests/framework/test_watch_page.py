@@ -140,6 +140,7 @@ def test_a_page_that_is_opened_too_early_or_loses_its_server_comes_to_itself(bro
     try:
         browser.open(served.server.address)
         browser.wait_for("document.getElementById('waiting').textContent.startsWith('Waiting for a recal')")
+        browser.wait_for("document.getElementById('connection').textContent === 'waiting'")
         made_up_folder(folder, 10)
         browser.wait_for("document.getElementById('last-id').textContent === 'p10'")
         assert browser.value("document.getElementById('waiting').hidden")

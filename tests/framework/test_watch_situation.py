@@ -91,6 +91,7 @@ def test_when_the_level_improves_the_advice_is_that_of_the_new_level_and_the_way
     history.take(record(62, 1.5))
     now = history.situation("x", {})
     assert now["do"] == "Go on." and now["last_good"]["id"] == "r62" and now["since"]["id"] == "r62"
+    assert now["earlier"] == "It is model_no_longer_fits, in full." and "what" not in now
     assert history.situation("x", {"finished": True})["do"] == AFTER_THE_END
 
 
@@ -98,7 +99,11 @@ def test_a_rollback_ends_the_trouble() -> None:
     back = {"event": "decision", "kind": "rollback", "sequence": 20, "to": 9, "level": "nominal", "last_good": GOOD}
     history = seen(*LOST, {**back, "do": "Take 16 records.", "sentence": "The estimate was set back."})
     assert history.level == "nominal" and history.trouble.first is None
-    assert history.situation("x", {})["last_good"] == GOOD
+    now = history.situation("x", {})
+    assert now["last_good"] == GOOD and now["do"] == "Take 16 records."
+    assert now["off_mm"] is None  # those before were judged by another estimate
+    history.take(record(21, 1.25))
+    assert history.situation("x", {})["off_mm"] == 1.25
 
 
 def test_events_of_an_earlier_version_have_the_advice_of_their_level() -> None:

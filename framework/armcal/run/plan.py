@@ -20,6 +20,14 @@ from armcal.planning.planning import Plan, choose, value_of
 from armcal.planning.refinement import Allowed, refine
 from armcal.planning.relaxation import Task
 from armcal.run.experiment import Experiment
+from armcal.run.plan_approaches import (
+    PLANNED,
+    approach_channels,
+    come_from_both_sides,
+    depends_on_approach,
+    reachable,
+    with_approaches,
+)
 from armcal.run.plan_clearance import clearance_check
 from armcal.run.plan_context import (
     PlanContext,
@@ -49,7 +57,7 @@ class PlanResult:
     """A plan and what is known of it.
 
     Attributes:
-        dataset: the poses in the order of visit, each with the approach that this order gives.
+        dataset: the poses in the order of visit, each with the approach that was planned, else that this order gives.
         pool: the candidates.
         given: how many records were there before.
         equations: how many residual numbers the plan and the records before give.
@@ -104,6 +112,7 @@ def make_plan(
         check = clearance_check(settings.clearance, experiment.system.arms, experiment.source)
     progress("candidates", 0.0)
     pool = pool_of(experiment, settings, space, listed, check)
+    pool = _approached(experiment, space, parameters, pool, settings)
     given = None if records is None else given_records(experiment, records)
     if given is not None and settings.repeats == 1 and pool.kind != "continuous":
         again = same_poses(pool.dataset.stacked(space.channels), given.stacked(space.channels))
@@ -124,6 +133,15 @@ def make_plan(
         task, plan, pool, refined = _refined(context, task, plan, pool, allowed)
     progress("bound", 0.8)
     return _result(context, task, plan, pool, refined)
+
+
+def _approached(
+    experiment: Experiment, space: JointSpace, parameters: Parameters, pool: Pool, settings: PlanSettings
+) -> Pool:
+    """Candidates from either side, where something depends on it."""
+    both = come_from_both_sides(pool, space, space.limits(settings), settings.seed)
+    first = as_if_measured(experiment, both.dataset.subset([0]))
+    return both if depends_on_approach(problem_of(experiment, parameters, first)) else pool
 
 
 def _identifiability(task: Task, chosen: Indices, parameters: Parameters) -> Identifiability:
@@ -165,21 +183,30 @@ def _refined(
     context: PlanContext, task: Task, plan: Plan, pool: Pool, allowed: Allowed
 ) -> tuple[Task, Plan, Pool, int]:
     """The chosen poses moved through joint space, and chosen again from all candidates and these."""
-    channels, limits = context.space.channels, context.space.limits(context.settings)
+    space, limits = context.space, context.space.limits(context.settings)
+    sides = approach_channels(space) if pool.dataset.has(approach_channels(space)[0]) else ()
+    channels, count = (*space.channels, *sides), len(space.channels)
     before = pool.dataset.stacked(channels)[:, plan.chosen]
+    limits = np.vstack([limits, np.tile([-1.0, 1.0], (len(sides), 1))])
     problem = problem_of(context.experiment, context.parameters, as_if_measured(context.experiment, pool.dataset))
 
+    def dataset_at(poses: Array) -> Dataset:
+        plain = dataset_of(poses[:count], space)
+        return (
+            with_approaches(plain, space, reachable(poses[:count], poses[count:], limits[:count])) if sides else plain
+        )
+
     def rows(poses: Array) -> Array:
-        return over_draws(problem, context.draws, as_if_measured(context.experiment, dataset_of(poses, context.space)))
+        return over_draws(problem, context.draws, as_if_measured(context.experiment, dataset_at(poses)))
 
     known, by = task.candidates.known(), task.criterion
-    after = refine(before, limits, known, by, rows, allowed, context.settings.sweeps)
+    after = refine(before, limits, known, by, rows, lambda q: allowed(q[:count]), context.settings.sweeps)
     moved = np.flatnonzero(np.any(after != before, axis=0))
     if not len(moved):
         return task, plan, pool, 0
     number = task.candidates.count
     poses = np.concatenate([pool.dataset.stacked(channels), after[:, moved]], axis=1)
-    pool = replace(pool, dataset=dataset_of(poses, context.space))
+    pool = replace(pool, dataset=dataset_at(poses))
     together = np.concatenate([task.candidates.rows, rows(after[:, moved])], axis=2)
     task = replace(task, candidates=Candidates(context.base, together))
     begin = plan.chosen.copy()
@@ -201,7 +228,7 @@ def _result(context: PlanContext, task: Task, plan: Plan, pool: Pool, refined: i
     triangle = measured.candidates.triangles(everything)[0]
     given = 0 if context.given is None else len(context.given)
     equations = (task.count + given) * measured.candidates.rows.shape[1] + len(context.priors)
-    dataset, seconds, hottest = in_order_of_visit(context, chosen)
+    dataset, seconds, hottest = in_order_of_visit(context, chosen, keeps_approaches=pool.kind in PLANNED)
     return PlanResult(
         dataset=dataset,
         pool=pool,

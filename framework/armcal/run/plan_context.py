@@ -124,10 +124,12 @@ def plan_context(
     return context.about(tuple(parameter_draws(parameters, robust.draws, robust.seed)))
 
 
-def in_order_of_visit(context: PlanContext, chosen: Dataset) -> tuple[Dataset, float, float | None]:
+def in_order_of_visit(
+    context: PlanContext, chosen: Dataset, *, keeps_approaches: bool = False
+) -> tuple[Dataset, float, float | None]:
     """The poses in the order of visit, the time that takes (s), and the peak of the torque's moving average.
 
-    Ids are unique where a pose is repeated; approaches are what this order makes them.
+    Ids are unique where a pose is repeated; approaches are what this order makes them, unless planned ones are kept.
     """
     settings, space, environment = context.settings, context.space, context.experiment.system.environment
     angles = chosen.stacked(space.channels)
@@ -154,7 +156,8 @@ def in_order_of_visit(context: PlanContext, chosen: Dataset) -> tuple[Dataset, f
         copies[record] += 1
         ids.append(record if copies[record] == 1 else f"{record}_{copies[record]}")
     numbers = tuple(str(i) for i in range(1, len(ids) + 1))
-    channels = dict(visited.channels) | _approaches(visited, space)
+    by_order = _approaches(visited, space)
+    channels = by_order | dict(visited.channels) if keeps_approaches else dict(visited.channels) | by_order
     visited = replace(visited, ids=tuple(ids), channels=channels, extra={"order": numbers})
     return visited, path_time(times, order), peak(heats, order) if heats.any() else None
 

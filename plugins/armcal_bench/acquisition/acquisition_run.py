@@ -138,7 +138,7 @@ class AcquisitionRun:
         self._record(entry.GOING, {"pose": self._ids[step.pose], **self._here()})
         try:
             drive.go(step.path, gate.measuring)
-            drive.preload_backlash(gate.measuring)
+            drive.preload_backlash(self._scheduler.approaches[step.pose], gate.measuring)
             drive.note()
             settled = gate.settled(drive.tick, self._settings.settle.longest, drive.thermal_state.check)
         except ThermalLimit as limit:

@@ -194,15 +194,21 @@ class Drive(Motion):
                     commanded = standing
         self._guard(path[-1])
 
-    def preload_backlash(self, may_move: MayMove) -> None:
-        """Give joints a direction of approach that have none since they were energised: a little away, and back.
+    def preload_backlash(self, sides: Array, may_move: MayMove) -> None:
+        """Come to the pose from the stated sides: a little away, and back. See ``go`` for what it raises.
 
-        Which side a servo's play lies on is not known before it has moved. See ``go`` for what it raises.
+        A joint that has had no direction since it was energised comes from either side: which side its play lies on is
+        not known before. What limits or obstacles do not allow is left out.
+
+        Args:
+            sides: 1 from below, -1 from above, 0 as the path came (joints).
         """
         unknown, here = self.approach == 0, self.at
-        for away in (-_PLAY_RAD, _PLAY_RAD):
-            there = here + away * unknown
-            if unknown.any() and self._planner.within(there) and self._planner.clear(here, there):
+        wrong = (sides != 0) & (self.approach != sides)
+        signs = np.where(wrong, sides, 0.0)
+        for away in (signs + (unknown & ~wrong), signs - (unknown & ~wrong), 1.0 * unknown, -1.0 * unknown):
+            there = here - _PLAY_RAD * away
+            if away.any() and self._planner.within(there) and self._planner.clear(here, there):
                 self.go((here, there, here), may_move)
                 return
 

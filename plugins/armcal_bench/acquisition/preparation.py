@@ -17,6 +17,7 @@ from armcal.devices.device import JointDevice
 from armcal.devices.faults import DeviceRefusedError
 from armcal.errors import ConfigError, DataError, Location
 from armcal.run.experiment import Experiment
+from armcal.run.plan_approaches import approach_channels
 from armcal.run.plan_clearance import clearance_check
 from armcal.run.plan_poses import JointSpace, commands_of, read_poses
 from numpy.typing import NDArray
@@ -88,6 +89,7 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
     scheduler = Scheduler(
         poses=poses,
         ids=commands.ids,
+        approaches=_approaches(commands, space),
         park=park,
         planner=planner,
         model=model,
@@ -110,6 +112,12 @@ def _check_clear(planner: PathPlanner, poses: Array, plan: Path, commands: Datas
                 where=_row(plan, commands, row),
                 hint="Nothing was moved. Plan anew with this clearance, or take the pose out.",
             )
+
+
+def _approaches(commands: Dataset, space: JointSpace) -> Array:
+    """From which side each joint is to come (N x joints); 0 where the plan does not say."""
+    columns = [commands.column(c) if commands.has(c) else np.zeros(len(commands)) for c in approach_channels(space)]
+    return np.nan_to_num(np.array(columns).T.reshape(len(commands), -1))
 
 
 def _rigid_poses(arm: Arm, angles: Array) -> Array:

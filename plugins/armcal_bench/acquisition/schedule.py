@@ -56,6 +56,7 @@ class Scheduler:
     Attributes:
         poses: N x joints, rad.
         ids: of the poses.
+        approaches: from which side each joint of a pose is to come (N x joints): 1 from below, -1 from above, 0 either.
         park: where it rests (joints, rad).
         rate: of the fastest joint, rad/s.
         capture: how long it is expected to stand in a pose, s.
@@ -64,6 +65,7 @@ class Scheduler:
 
     poses: Array
     ids: tuple[str, ...]
+    approaches: Array
     park: Array
     planner: PathPlanner
     model: HeatModel

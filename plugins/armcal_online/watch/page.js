@@ -37,7 +37,7 @@ function drawHealth(state) {
   say("level", level);
   say("do", now.do || "");
   say("sentence", now.what ? now.what : state.level_sentence || (status.level === level && status.why) || "");
-  say("confirm", now.confirm ? `To confirm: ${now.confirm}` : "");
+  say("confirm", now.confirm ? `To confirm: ${now.confirm}` : now.earlier ? `The last decision: ${now.earlier}` : "");
   byId("waiting").hidden = !state.waiting;
   say("waiting", state.waiting || "");
   say("folder", state.folder);
@@ -47,8 +47,8 @@ function drawHealth(state) {
 }
 
 function drawOff(now, last, level) {
-  say("off", isNumber(now.off_mm) ? `${digits(now.off_mm, 2)} mm` : "not known in mm");
-  say("off-of", now.off_of ? (now.off_of > 1 ? `median of the last ${now.off_of} readings from their predictions` : "the newest reading from its prediction") : "");
+  say("off", isNumber(now.off_mm) ? `${digits(now.off_mm, 2)} mm` : "not known");
+  say("off-of", now.off_of ? (now.off_of > 1 ? `median of the last ${now.off_of} readings from their predictions` : "the newest reading from its prediction") : isNumber(last.sequence) ? "no reading in mm yet" : "");
   say("off-before", isNumber(now.off_before_mm) ? `${digits(now.off_before_mm, 2)} mm before this was decided` : "");
   const since = now.since;
   say("since", since ? named(since) : level === "nominal" ? "the start" : "-");
@@ -213,6 +213,7 @@ const ago = (since) => span((performance.now() - since) / 1000);
 function life(state) {
   const status = state.status || {};
   if (status.finished) return "ended";
+  if (!Object.keys(status).length && !state.last && !state.told.length) return "waiting";
   return Object.keys(status).length && performance.now() - Known.status > 1000 * SILENT_S ? "silent" : "live";
 }
 
@@ -225,10 +226,10 @@ function age() {
   const now = life(state), known = state.last || state.told.length;
   host.dataset.state = now;
   const ended = state.finished ? ` ${when(state.finished.at)}` : "";
-  const words = { ended: `ended${ended}, level ${state.level}`, silent: `silent for ${ago(Known.status)}`, live: "live" }[now];
+  const words = { ended: `ended${ended}, level ${state.level}`, silent: `silent for ${ago(Known.status)}`, live: "live", waiting: "waiting" }[now];
   say("connection", known && now === "live" ? `${words}; newest event ${ago(Known.heard)} ago` : words);
   byId("health").dataset.life = now;
-  say("level-when", { ended: `at its end${ended}`, silent: `${ago(Known.status)} ago; nothing was heard since`, live: "" }[now]);
+  say("level-when", { ended: `at its end${ended}`, silent: `${ago(Known.status)} ago; nothing was heard since`, live: "", waiting: "" }[now]);
   drawAlive(state);
   ask("health");
 }

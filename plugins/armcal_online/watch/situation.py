@@ -26,11 +26,13 @@ class Trouble:
     Attributes:
         first: the event with which it began.
         over: the change to nominal with which the last one ended.
+        decision: the last decision that meant trouble, also after it.
     """
 
     def __init__(self) -> None:
         self.first: Message | None = None
         self.over: Message | None = None
+        self.decision: Message | None = None
         self._events: deque[Message] = deque(maxlen=_MOST)
 
     def take(self, message: Message) -> None:
@@ -42,6 +44,7 @@ class Trouble:
         if level in LEVELS[1:]:
             self.first = self.first or message
             self._events.append(message)
+            self.decision = message if message["event"] == "decision" else self.decision
 
     def cause(self, level: str) -> Message | None:
         """The newest decision that means this level."""
@@ -83,14 +86,16 @@ def situation(
         folder: of the recalibration.
 
     Returns:
-        ``do``, ``what`` (with how sure that is), ``confirm``; ``off_mm`` now, from ``off_of`` readings, and
-        ``off_before_mm`` before the last decision; ``since`` and ``last_good``, each a record; ``rollback``, a command.
+        ``do``, ``what`` (with how sure that is), ``confirm``; ``earlier``, the last decision where none matters now;
+        ``off_mm`` now, from ``off_of`` readings, and ``off_before_mm`` before the last decision; ``since`` and
+        ``last_good``, each a record; ``rollback``, a command.
     """
     first, cause = trouble.first, trouble.cause(level)
     good = good if first is None else first.get("last_good")
-    off = [record["off_mm"] for record in _after(records, cause)]
+    back = None if trouble.over is None or trouble.over.get("kind") != "rollback" else trouble.over
+    off = [record["off_mm"] for record in _after(records, cause or back)]
     known: dict[str, Any] = {
-        "do": trouble.advice(level) or _general_advice(level, good),
+        "do": trouble.advice(level) or (back or {}).get("do") or _general_advice(level, good),
         "off_mm": median(off) if off else None,
         "off_of": len(off),
         "last_good": good,
@@ -100,6 +105,8 @@ def situation(
         sure = f" {sure_to(cause['sure_percent'])}." if cause.get("sure_percent") is not None else ""
         known |= {"what": f"{cause.get('what') or cause['sentence']}{sure}", "confirm": cause.get("confirm")}
         known["off_before_mm"] = cause.get("tip_error_mm")
+    elif trouble.decision is not None:
+        known["earlier"] = trouble.decision["sentence"]
     start = cause or first or trouble.over
     if start is not None:
         since = {"sequence": start.get("since", start.get("sequence"))}
@@ -109,10 +116,11 @@ def situation(
 
 
 def _after(records: Sequence[Mapping[str, Any]], cause: Message | None) -> Sequence[Mapping[str, Any]]:
-    """The newest records after the last decision; the newest alone where that decision is the newest event."""
+    """The newest records after the last decision; where none came yet, the newest alone, but after a roll-back none."""
     known = [record for record in records if record.get("off_mm") is not None]
     place = -1 if cause is None else cause.get("sequence") or 0
-    return [record for record in known if record["sequence"] > place][-_NEWEST:] or known[-1:]
+    after = [record for record in known if record["sequence"] > place][-_NEWEST:]
+    return after or ([] if cause is not None and cause.get("kind") == "rollback" else known[-1:])
 
 
 def _general_advice(level: str, good: Mapping[str, Any] | None) -> str:

@@ -66,6 +66,7 @@ def _health(state: Mapping[str, Any]) -> Panel:
         ("do now", now["do"]),
         ("what", now.get("what") or sentence),
         ("confirm", now.get("confirm")),
+        ("earlier", now.get("earlier")),
         ("off now", _off(now)),
         ("since", _known(now.get("since"))),
         ("last good", _known(now.get("last_good"))),
