@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.net_state import NetState
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.refit import NetRecord, Prior, Refit, Refitter
+from armcal_online.tracking.settings import load_settings
 from online_arm import NOISE_M, STATES, World, begun, begun_setup, settings, tip_error_mm, told
 
 
@@ -82,12 +84,19 @@ def test_a_filter_that_is_stuck_is_taken_over_by_a_refit(monkeypatch: pytest.Mon
 
 
 def test_without_a_net_it_stays_stuck(monkeypatch: pytest.MonkeyPatch) -> None:
-    recalibrator, arm = _blind(begun(settings(net="off")), monkeypatch), World.drawn(5, outliers=0.05)
+    recalibrator, arm = _blind(begun(settings(net=False)), monkeypatch), World.drawn(5, outliers=0.05)
     arm.moved("arm.mdh.theta2", np.radians(14.4))
     arm.moved("arm.mdh.theta4", np.radians(-14.4))
     assert not told(_run(recalibrator, arm, 40), "decision")
     assert tip_error_mm(arm.setup, recalibrator.values, arm.values) > 20
     assert recalibrator.state.net == NetState()
+
+
+def test_off_in_a_file_of_settings_leaves_it_out(tmp_path: Path) -> None:
+    path = tmp_path / "settings.yaml"
+    path.write_text("net: off\n", encoding="utf-8")
+    assert load_settings(path).net is False
+    assert load_settings(None).net is True
 
 
 def test_a_net_that_was_interrupted_goes_on_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,7 +119,7 @@ def test_a_net_that_was_interrupted_goes_on_to_the_last_bit(monkeypatch: pytest.
 
 
 def test_a_state_of_an_earlier_version_starts_an_empty_net() -> None:
-    recalibrator = begun(settings(net="off"))
+    recalibrator = begun(settings(net=False))
     earlier = recalibrator.snapshot()
     digest = recalibrator.digest()
     del earlier["net"]

@@ -61,7 +61,7 @@ class Recalibrator:
         hypothesis_filter = HypothesisFilter(setup.observer, estimator, setup.process_noise, settings.outliers)
         changes = hypotheses(setup.space, steps, settings.changes, setup.observer.size)
         self._judge = Judge(setup.space, steps, hypothesis_filter, changes, settings)
-        self._net = Net(setup, changes) if settings.net == settings.gating == "on" else None
+        self._net = Net(setup, changes) if settings.net and settings.gating == "on" else None
         self.state = State(setup.belief, setup.belief)
 
     @classmethod
