@@ -10,6 +10,7 @@ import yaml
 from armcal.run.experiment import Experiment
 from armcal.run.plan import make_plan
 from armcal.run.plan_approaches import APPROACH_ROOM, reachable
+from armcal.run.plan_between import with_poses_between
 
 from tests.own_arms import POST, OwnArm, said_by
 
@@ -38,6 +39,16 @@ def test_play_gain_and_zero_are_no_longer_held_by_priors_alone(tmp_path: Path) -
         angles, signs = plan.dataset.column(f"arm.{joint}"), plan.dataset.column(f"arm.approach.{joint}")
         inside = np.abs(angles) < np.abs(angles).max() - APPROACH_ROOM
         assert set(signs[inside]) == {-1.0, 1.0}, "levels within the range are come to from both sides"
+
+
+def test_some_poses_stand_between_the_angles_that_others_repeat() -> None:
+    random, limits = np.random.default_rng(1), np.array([[-1.0, 1.0], [-2.0, 2.0]])
+    ends = np.array([[-1.0, 1.0, -1.0, 1.0, 0.0], [-2.0, -2.0, 2.0, 2.0, 0.0]])
+    poses = np.hstack([ends, random.uniform(limits[:, :1], limits[:, 1:], (2, 60))])
+    plan = with_poses_between(poses, limits, np.arange(5))
+    assert len(plan) == 5 and plan[:4].tolist() == [0, 1, 2, 3] and plan[4] >= 5
+    assert (np.abs(poses[:, plan[4]]) < 0.8 * limits[:, 1]).all()
+    assert with_poses_between(ends, limits, np.arange(5)).tolist() == [0, 1, 2, 3, 4], "there are no others"
 
 
 def test_a_model_without_play_needs_no_sides(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from armcal.run.plan_approaches import (
     reachable,
     with_approaches,
 )
+from armcal.run.plan_between import with_poses_between
 from armcal.run.plan_clearance import clearance_check
 from armcal.run.plan_context import (
     PlanContext,
@@ -132,7 +133,7 @@ def make_plan(
         allowed = (lambda q: np.ones(q.shape[1], dtype=bool)) if check is None else (lambda q: check(q).allowed)
         task, plan, pool, refined = _refined(context, task, plan, pool, allowed)
     progress("bound", 0.8)
-    return _result(context, task, plan, pool, refined)
+    return _result(context, task, _between(context, task, plan, pool), pool, refined)
 
 
 def _approached(
@@ -213,6 +214,16 @@ def _refined(
     begin[moved] = number + np.arange(len(moved))
     plan = choose(task, 0, context.settings.seed, begin)
     return task, plan, pool, int(np.sum(plan.chosen >= number))
+
+
+def _between(context: PlanContext, task: Task, plan: Plan, pool: Pool) -> Plan:
+    """The plan with some poses between the levels of the others, where servos have play and poses can be anywhere."""
+    space = context.space
+    if pool.kind != "continuous" or not pool.dataset.has(approach_channels(space)[0]):
+        return plan
+    poses = pool.dataset.stacked(space.channels)
+    chosen = with_poses_between(poses, space.limits(context.settings), plan.chosen)
+    return replace(plan, chosen=chosen, value=value_of(task.candidates, task.criterion, chosen))
 
 
 def _result(context: PlanContext, task: Task, plan: Plan, pool: Pool, refined: int) -> PlanResult:
