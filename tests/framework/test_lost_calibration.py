@@ -58,7 +58,7 @@ def test_every_use_refuses_it(name: str, lost: Path) -> None:
     done = armcal(name, lost)
     assert done.exit_code == 2, done.output
     said = " ".join(done.stderr.split())
-    assert "its level is lost since record 17: 4 of the last 8 records do not fit." in said
+    assert "its level is lost, as of record 17: 4 of the last 8 records do not fit." in said
     assert not (lost.parent / "out").exists()
 
 
@@ -89,7 +89,7 @@ def test_a_server_answers_with_the_level_and_with_an_error_once_it_is_lost(
     }
     answer = ask(loaded(orders["suspect"][0], texts["suspect"].encode()), **request)
     assert answer["ok"] and answer["calibration"]["level"] == "suspect"
-    with pytest.raises(ConfigError, match="its level is lost since record 17"):
+    with pytest.raises(ConfigError, match="its level is lost, as of record 17"):
         loaded(orders["lost"][0], texts["lost"].encode())
     for kind in ("forward", "compensate"):
         asked = request if kind == "forward" else {"do": kind, "targets": [{"position_mm": [300, 0, 100]}]}

@@ -214,8 +214,9 @@ def lost_calibration(record: CalibrationFile, path: str | Path) -> ConfigError:
     recalibrated = record.recalibrated or {}
     reason = str(recalibrated.get("why", "")).rstrip(".")
     return ConfigError(
-        f"its level is lost since record {recalibrated.get('sequence')}: {reason}.",
+        f"its level is lost, as of record {recalibrated.get('record') or recalibrated.get('sequence')}: {reason}.",
         where=Location(str(path)),
-        hint="Calibrate on the bench again. To use it all the same: --accept of predict, compensate, "
+        hint="Roll its recalibration back to the last good record (armcal control DIR rollback good), or calibrate "
+        "again. To use it all the same: --accept of predict, compensate, "
         "correction-table, export and serve.",
     )

@@ -300,7 +300,10 @@ class Recalibrator:
         try:
             state = State.from_dict(snapshot)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as fault:
-            raise DataError(f"found no state of a recalibration in the journal ({fault}).") from fault
+            raise DataError(
+                f"found no state of a recalibration in the journal ({type(fault).__name__}: {fault}).",
+                hint="Read it with the version of armcal that wrote it, or begin a new --out from its calibration.",
+            ) from fault
         count, expected = len(state.belief.gaussian.mean), self.setup.observer.size
         if count != expected:
             raise DataError(
