@@ -82,6 +82,13 @@ def test_a_later_decision_that_means_less_does_not_say_go_on() -> None:
     assert now["do"] == ASK and now["since"]["id"] == "r10" and now["last_good"] == GOOD
 
 
+def test_of_two_changes_at_once_both_are_said() -> None:
+    both = [decision(11, "joint_slipped", "watch", "Go on."), decision(11, "sensor_moved", "watch", "Measure anew.")]
+    now = seen(*LOST[:11], *both, level(11, "nominal", "watch", "Go on.")).situation("x", {})
+    assert now["do"] == "Go on. Measure anew." and now["confirm"] == "Look again."
+    assert "joint_slipped. More than" in now["what"] and "sensor_moved. More than" in now["what"]
+
+
 def test_when_the_level_improves_the_advice_is_that_of_the_new_level_and_the_way_back_stays() -> None:
     history = seen(*LOST, level(30, "lost", "suspect", "Take 10 records."))
     now = history.situation("x", {})

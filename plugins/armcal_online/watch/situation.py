@@ -46,17 +46,17 @@ class Trouble:
             self._events.append(message)
             self.decision = message if message["event"] == "decision" else self.decision
 
-    def cause(self, level: str) -> Message | None:
-        """The newest decision that means this level."""
-        decisions = (message for message in reversed(self._events) if message["event"] == "decision")
-        return next((message for message in decisions if meant_level(message) == level), None)
+    def causes(self, level: str) -> list[Message]:
+        """The newest decisions that mean this level: two at once where two things changed."""
+        meant = [m for m in self._events if m["event"] == "decision" and meant_level(m) == level]
+        return [message for message in meant if message.get("sequence") == meant[-1].get("sequence")]
 
     def advice(self, level: str) -> str | None:
         """What to do at this level: what the newest event that led to it says, a decision before a change of level."""
         leading = [message for message in self._events if meant_level(message) == level and message.get("do")]
         newest = [message for message in leading if message.get("sequence") == leading[-1].get("sequence")]
         decided = [message for message in newest if message["event"] == "decision"]
-        return str((decided or newest)[-1]["do"]) if newest else None
+        return " ".join(dict.fromkeys(str(message["do"]) for message in decided or newest)) or None
 
 
 def meant_level(message: Message) -> str | None:
@@ -90,7 +90,8 @@ def situation(
         ``off_mm`` now, from ``off_of`` readings, and ``off_before_mm`` before the last decision; ``since`` and
         ``last_good``, each a record; ``rollback``, a command.
     """
-    first, cause = trouble.first, trouble.cause(level)
+    first, causes = trouble.first, trouble.causes(level)
+    cause = causes[-1] if causes else None
     good = good if first is None else first.get("last_good")
     back = None if trouble.over is None or trouble.over.get("kind") != "rollback" else trouble.over
     off = [record["off_mm"] for record in _after(records, cause or back)]
@@ -102,8 +103,8 @@ def situation(
         "rollback": None if good is None else f"armcal control {shlex.quote(folder)} rollback {good['sequence']}",
     }
     if cause is not None:
-        sure = f" {sure_to(cause['sure_percent'])}." if cause.get("sure_percent") is not None else ""
-        known |= {"what": f"{cause.get('what') or cause['sentence']}{sure}", "confirm": cause.get("confirm")}
+        known["what"] = " ".join(map(_what, causes))
+        known["confirm"] = " ".join(dict.fromkeys(m["confirm"] for m in causes if m.get("confirm"))) or None
         known["off_before_mm"] = cause.get("tip_error_mm")
     elif trouble.decision is not None:
         known["earlier"] = trouble.decision["sentence"]
@@ -113,6 +114,12 @@ def situation(
         named = {"id": start.get("since_id"), "at": start.get("since_at", start.get("at"))}
         known["since"] = since | {key: value for key, value in named.items() if value is not None}
     return known
+
+
+def _what(decision: Message) -> str:
+    """What was decided, and how sure that is."""
+    sure = f" {sure_to(decision['sure_percent'])}." if decision.get("sure_percent") is not None else ""
+    return f"{decision.get('what') or decision['sentence']}{sure}"
 
 
 def _after(records: Sequence[Mapping[str, Any]], cause: Message | None) -> Sequence[Mapping[str, Any]]:
