@@ -363,19 +363,19 @@ def test_up_is_an_axis_or_three_numbers(up: str, expected: tuple[float, ...] | N
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
-def test_somebody_at_a_terminal_is_asked_which_way_is_up_and_where_the_target_sits(here: Path) -> None:
+def test_somebody_at_a_terminal_is_asked_which_way_is_up_and_of_no_other_frame(here: Path) -> None:
     import pty
 
     rows = table(here, f"{HEADER},mass_g\n90,0,0,120,400\n0,200,0,0,900\n")
     master, slave = pty.openpty()
-    os.write(master, b"sideways\n-y\n30,0\n30,0,1 cm\n")
+    os.write(master, b"sideways\n-y\n")
     command = [sys.executable, "-m", "armcal.cli", "new", "robot", "arm", "--dh", rows, "--convention", "standard"]
     ran = subprocess.run(command, stdin=slave, capture_output=True, text=True, timeout=120, cwd=here)
     os.close(master), os.close(slave)
     assert "up in the tracker's base frame" in ran.stdout and "found 'sideways' for up" in ran.stdout
-    assert "found '30,0' for the target" in ran.stdout
+    assert "the target in the tool's frame" not in ran.stdout
     written = (here / "arm" / "arm.yaml").read_text(encoding="utf-8")
-    assert "gravity_m_s2: [0, 9.81, 0]" in written and "target_mm: [30, 0, 10]" in written
+    assert "gravity_m_s2: [0, 9.81, 0]" in written and "target_mm: [0, 0, 0]" in written
 
 
 # Where the target sits

@@ -50,7 +50,9 @@ def new_plugin(console: Console, name: str, kind: str, package: bool, out: Path 
 @click.option("--urdf", type=FILE, help="A URDF.")
 @click.option("--tip", metavar="LINK", help="The URDF's link at the arm's end, where there are several.")
 @click.option("--up", metavar="AXIS|X,Y,Z", help="Which way is up in the tracker's frame: z, -y, or three numbers.")
-@click.option("--target", metavar="X,Y,Z", help="Where the target sits in the tool's frame, roughly, in mm or as 2 cm.")
+@click.option(
+    "--target", metavar="X,Y,Z", help="Where the target sits in the tool's frame, in mm or as 2 cm [default: found]."
+)
 @click.option("--out", type=FILE, help="The folder to make [default: NAME].")
 @speaking
 def new_robot(console: Console, name: str, out: Path | None, **source: Any) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from armcal.cli.common import Console, command_line
 from armcal.cli.outlet import say
-from armcal.cli.robot_questions import ask_rows, ask_target, ask_up, direction, place
+from armcal.cli.robot_questions import ask_rows, ask_up, direction, place
 from armcal.errors import EXIT_FAULT, EXIT_NOT_CONVERGED, ConfigError
 from armcal.plugins import PluginRegistry
 from armcal.scaffold.dh_table import read_rows
@@ -40,8 +40,6 @@ def begin(console: Console, name: str, source: Source, folder: Path) -> None:
     up, target = source.up, source.target
     if up is None and robot.has_masses and sys.stdin.isatty():  # gravity bends the arm, and somebody is there to ask
         up = ask_up()
-    if target is None and sys.stdin.isatty():
-        target = ask_target()
     robot = replace(robot, up=direction(up) if up else robot.up, target=place(target) if target else robot.target)
     made = write_robot(robot, folder, registry)
     with console.progress() as progress:

@@ -73,17 +73,6 @@ def direction(text: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def ask_target() -> str:
-    """Where the target sits in the tool's frame, as ``place`` takes it."""
-    return str(
-        click.prompt(
-            "the target in the tool's frame, roughly, x,y,z in mm",
-            default="0,0,0",
-            value_proc=lambda text: _checked(place, text),
-        )
-    )
-
-
 def _checked(read: Callable[[str], object], text: str) -> str:
     """A text that can be read; else click asks again."""
     try:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from armcal.problem.tool_motion import rigid_fit, spread_of
 
 FEWEST = 8
 """Records: with fewer, nine numbers explain anything."""
-_STARTS, _SHORT, _LONG, _KEPT, _FEW = 8, 8, 20, 2, 60
+_STARTS, _SHORT, _LONG, _KEPT, _FEW, _QUICK = 8, 8, 20, 2, 60, 5
 _SEED = 3
 _AT_REST, _SINGULAR = 1e-6, 1e-12
 _SAME = 0.02
@@ -94,12 +95,12 @@ def alignments(tools: Tools, measured: Array, basis: Array, turned: Array | None
 
 
 def nearest(tools: Tools, measured: Array, basis: Array) -> Alignment:
-    """The better one of two quick alignments: from the target as configured, and from the linear problem's."""
+    """The best of few quick alignments."""
     few = np.arange(0, measured.shape[1], max(1, measured.shape[1] // _FEW))
     some, seen = tools.subset(few), measured[:, few]
-    starts = [(np.zeros(3), None), *([_relaxed(some, seen, basis)] if basis.shape[1] else [])]
-    alignment = [_led(some, seen, basis, _started(some, seen, *start), _SHORT) for start in starts]
-    return _led(tools, measured, basis, min(alignment, key=lambda one: one.left), 1)
+    starts = islice(_starts(some, seen, basis, None), _QUICK)
+    led = [_led(some, seen, basis, _started(some, seen, *start), _SHORT) for start in starts]
+    return _led(tools, measured, basis, min(led, key=lambda one: one.left), _QUICK)
 
 
 def _between(tools: Tools, one: Alignment, other: Alignment) -> float:
