@@ -295,10 +295,10 @@ def _single(
     smaller = _Smaller.than(straight.predicted)
     for words, measured in _of_axes(seen, straight):
         left = straight.left(measured) if seen.placing is None else _left(problem, seen, {}, measured, enough)
-        yield _Reading(left * smaller.times(measured), words, False)
+        yield _Reading(smaller.left(left, measured), words, False)
     for words, read_as in single_joints(arm):
         left = _left(problem, seen, read_as, seen.measured, enough)
-        yield _Reading(left * smaller.times(seen.measured), words, True)
+        yield _Reading(smaller.left(left, seen.measured), words, True)
 
 
 def _several(problem: Problem, seen: _Seen, arm: Arm, enough: float) -> Iterator[_Reading]:
@@ -312,13 +312,13 @@ def _several(problem: Problem, seen: _Seen, arm: Arm, enough: float) -> Iterator
         if seen.placing is not None:
             for own, moved in (("", seen.measured), *((f" and {LEFT_HANDED}", moved) for _, moved in axes[:1])):
                 left = _left(problem, seen, read_as, moved, enough)
-                yield _Reading(left * smaller.times(moved), f"{words}{own}", True)
+                yield _Reading(smaller.left(left, moved), f"{words}{own}", True)
             continue
         positions = _positions(problem, seen, read_as, problem.parameters.nominal())
         if positions is not None:
             for own, moved in (("", seen.measured), *((f" and {own}", moved) for own, moved in axes)):
                 left = positions.left(moved, enough)
-                yield _Reading(left * smaller.times(moved), f"{words}{own}", True)
+                yield _Reading(smaller.left(left, moved), f"{words}{own}", True)
 
 
 @dataclass(frozen=True)
@@ -331,6 +331,7 @@ class _Smaller:
     def than(cls, positions: Array) -> _Smaller:
         return cls(spread_of(positions))
 
-    def times(self, measured: Array) -> float:
-        """How many times less measured positions are spread, at least 1."""
-        return max(1.0, self.size / max(spread_of(measured), _SMALLEST))
+    def left(self, left: float, measured: Array) -> float:
+        """What a reading leaves, as many times more as its positions are spread less; infinite where it is no fit."""
+        spread = max(spread_of(measured), _SMALLEST)
+        return np.inf if left > FITS * spread else left * max(1.0, self.size / spread)
