@@ -17,26 +17,33 @@ LEVELS: tuple[Level, ...] = ("nominal", "watch", "suspect", "lost")
 
 @dataclass(frozen=True)
 class Health:
-    """A level, the number of records since the last trouble, and the reason of the level."""
+    """A level, the number of records since the last trouble, and the reason of the level.
+
+    It gets no better than ``best`` while a change is unexplained, however well the records fit.
+    """
 
     level: Level = "nominal"
     calm: int = 0
     sentence: str = "The records agree with the calibration."
+    best: Level = "nominal"
 
     def troubled(self, level: Level, sentence: str) -> Health:
         """After trouble: at least that bad, counting anew."""
         if LEVELS.index(level) > LEVELS.index(self.level):
-            return Health(level, 0, sentence)
+            return replace(self, level=level, calm=0, sentence=sentence)
         return replace(self, calm=0)
 
     def calmed(self, after: int) -> Health:
         """After a record without trouble: better by a level once ``after`` of them came in a row."""
-        if self.level == "nominal":
+        if LEVELS.index(self.level) <= LEVELS.index(self.best):
             return self
         if self.calm + 1 < after:
             return replace(self, calm=self.calm + 1)
         level = LEVELS[LEVELS.index(self.level) - 1]
-        return Health(level, 0, f"{after} records in a row agree with the calibration.")
+        text = f"{after} records in a row agree with the calibration"
+        if level == self.best != "nominal":
+            text += "; what changed it is not known"
+        return replace(self, level=level, calm=0, sentence=f"{text}.")
 
 
 def nis_limit(dof: int, probability: float, freedom: float = math.inf) -> float:

@@ -91,6 +91,7 @@ class Explanation:
         share: of the NIS of the records that it takes for good ones, how much it takes away.
         large: how many records with a large NIS it explains.
         rejected: how many of them had been rejected.
+        outliers: how many records since the onset it takes for wrong ones, and of how many.
     """
 
     hypothesis: Hypothesis
@@ -99,6 +100,7 @@ class Explanation:
     share: float
     large: int
     rejected: int
+    outliers: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -128,8 +130,10 @@ def hypotheses(space: StateSpace, steps: Steps, settings: ChangeSettings, size: 
         changes += [("sensor_moved", name, moved * scale, columns[:, 0], scale) for scale in _SCALES]
     prior = float(np.log(settings.probability / max(len(changes), 1)))
     listed = [Hypothesis(kind, subject, d, 1.0, prior, step, scale) for kind, subject, d, step, scale in changes]
-    rare = float(np.log(settings.probability / 10))
-    return *listed, Hypothesis("general_change", "", np.zeros((size, 0)), settings.factor, rare, np.zeros(n))
+    rare, none = float(np.log(settings.probability / 10)), np.zeros((size, 0))
+    general = Hypothesis("general_change", "", none, settings.factor, rare, np.zeros(n))
+    large = replace(general, factor=settings.factor**2)
+    return *listed, general, large
 
 
 def _columns(columns: Sequence[Array], size: int) -> Array:
@@ -173,7 +177,8 @@ class HypothesisFilter:
                 share = max(0.0, 1 - weighed.nis / misfit) if misfit > 0 else 0.0
                 if place not in likeliest or odds > likeliest[place].log_odds:
                     counts = int(weighed.fits[misfits].sum()), int(weighed.fits[rejected].sum())
-                    likeliest[place] = Explanation(change, onset, odds, share, *counts)
+                    wrong = int((~weighed.fits).sum()), len(records)
+                    likeliest[place] = Explanation(change, onset, odds, share, *counts, wrong)
         return sorted(likeliest.values(), key=lambda explanation: -explanation.log_odds)
 
     def _records_since(self, records: Sequence[Recent]) -> RecordsSince:

@@ -27,6 +27,8 @@ _AGREEING = 2
 """A change explains at least so many of the records that do not fit, and at least this share of the misfit: one wrong
 record alone is no evidence of it."""
 _SHARE = 0.5
+_LEFT = 0.01
+"""What explains the records leaves no more outliers among them than chance makes with this probability."""
 _MOST_WIDENING = 3.0
 _UNEXPLAINED = 3
 """So many changes that nothing explains, or windows of too large NIS: the model no longer fits."""
@@ -64,9 +66,12 @@ class Judge:
         for decision in decisions:
             if decision.kind in EXPLAINED and health.level != "lost":
                 # What was suspected is explained now.
-                health = Health(decision.level, 0, decision.sentence)
+                unknown = health.best if decision.kind == "drift" else "nominal"
+                health = Health(decision.level, 0, decision.sentence, unknown)
             else:
                 health = health.troubled(decision.level, decision.sentence)
+                if decision.kind == "general_change":
+                    health = replace(health, best="watch")
         if decisions:
             return health
         if recent.rejected:
@@ -102,7 +107,7 @@ class Judge:
         total = float(logsumexp([explanation.log_odds for explanation in alike]))
         margin = best.log_odds - others[0].log_odds if others else math.inf
         is_named = len(large) >= gate.window - 1 or margin >= math.log(settings.naming_odds)
-        if total > math.log(settings.odds) and is_named and self._is_explaining(best):
+        if total > math.log(settings.odds) and is_named and self._is_explaining(state, best):
             return self._follow_change(state, alike, others)
         state = replace(state, wary=bool(best.log_odds > 0))
         rejected = sum(record.rejected for record in state.recent)
@@ -124,10 +129,15 @@ class Judge:
         double = self._filter.compare(state.recent, large, pairs(singles, self._changes), LEAST_RECORDS)
         return sorted([*singles, *double], key=lambda explanation: -explanation.log_odds)
 
-    def _is_explaining(self, best: Explanation) -> bool:
+    def _is_explaining(self, state: State, best: Explanation) -> bool:
         """Whether enough records agree on a change, and it explains enough of their misfit."""
         # Where the model is slightly wrong, as neighbours that err alike show, large NIS alone are no evidence.
         agreeing = best.rejected if self._filter.is_model_wrong else best.large
+        late = state.changes and state.sequence - state.changes[-1] < 2 * self._settings.gate.window
+        if late and best.hypothesis.kind != "general_change":
+            return False  # what is left of a change that nothing explained is no joint's
+        if many_outliers(*best.outliers, self._settings.outliers.fraction) < _LEFT:
+            return False
         return agreeing >= (LEAST_RECORDS if best.hypothesis.parts else _AGREEING) and best.share >= _SHARE
 
     def _indistinguishable(self, explanations: Sequence[Explanation]) -> list[Explanation]:

@@ -13,13 +13,18 @@ from armcal_online.tracking.hypotheses import Explanation, Hypothesis
 LEAST_RECORDS = 3
 """So many records that do not fit are needed: two fit two changes of their own too easily."""
 _MOST = 7
-_TOGETHER = 1e-3
+_TOGETHER = 0.01
 """How probable it is that another certain change comes with one."""
 _ENOUGH = 0.9
 
 
 def is_enough(single: Explanation, large: int) -> bool:
-    """Whether one change explains all records since that do not fit, and most of their misfit."""
+    """Whether one change explains all records since that do not fit, and most of their misfit.
+
+    A change of everything is not enough: it would explain two changes as well.
+    """
+    if single.hypothesis.kind == "general_change":
+        return False
     return single.large >= large and single.share >= _ENOUGH
 
 
