@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from armcal.arm.model import Attachment as Attachment
     from armcal.arm.model import Chain as Chain
     from armcal.arm.model import Joint as Joint
+    from armcal.arm.pose_residual import ModelErrors as ModelErrors
+    from armcal.arm.pose_residual import PoseResidual as PoseResidual
+    from armcal.arm.pose_residual import Postures as Postures
     from armcal.base.dataset import Dataset as Dataset
     from armcal.base.domains import Interval as Interval
     from armcal.base.parameters import ParameterBlock as ParameterBlock
@@ -77,6 +80,7 @@ _FOR_PLUGINS = {
     "armcal.arm.assembly": "ArmState",
     "armcal.arm.effects": "Condition EffectSettings JointCommand JointEffect Spring XYZ chosen",
     "armcal.arm.model": "Attachment Chain Joint",
+    "armcal.arm.pose_residual": "ModelErrors PoseResidual Postures",
     "armcal.base.domains": "Interval",
     "armcal.base.parameters": "scalar",
     "armcal.base.settings": "Angle Compliance Force Length Length3 Mass Temperature Torque",

@@ -69,6 +69,11 @@ def armcal_register_effects(register: Register) -> None:
 
 
 @hookspec
+def armcal_register_residuals(register: Register) -> None:
+    """Pose residuals: what the physical model leaves of a tool's pose, learned from records."""
+
+
+@hookspec
 def armcal_register_measurements(register: Register) -> None:
     """Measurements: what an instrument or a contact says of the arm in one record, or in two."""
 
@@ -188,6 +193,11 @@ COMPONENTS: Mapping[str, ComponentKind] = MappingProxyType(
             "Effect(settings, joint_names)",
             "armcal.arm.effects:JointEffect",
             ("armcal.arm.servo:SteppedEffect",),
+        ),
+        "residual": ComponentKind(
+            "armcal_register_residuals",
+            "Residual(settings, joint_names)",
+            "armcal.arm.pose_residual:PoseResidual",
         ),
         "measurement": ComponentKind(
             "armcal_register_measurements",

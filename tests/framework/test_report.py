@@ -17,6 +17,7 @@ import pytest
 from armcal.base.dataset import Dataset, SetAside
 from armcal.base.domains import Interval, Pose, Semidefinite
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
+from armcal.config.system import StaticsSettings, System
 from armcal.diagnose.verdict import Verdict, judge
 from armcal.estimate.estimator import Estimate, SolverVerdict
 from armcal.estimate.identifiability import analyse
@@ -128,6 +129,7 @@ def result_of(
     return RunResult(
         name=name,
         command="armcal calibrate configs/picobot.yaml --out runs/picobot",
+        system=System({}, {}, StaticsSettings(), {}),
         dataset=_dataset(count, position, ids),
         split=split,
         estimate=found,

@@ -13,6 +13,7 @@ import casadi as ca
 from armcal.arm.effects import Condition, JointCommand, JointEffect, Spring
 from armcal.arm.elastic import deflections, elastic_sites, split_deflection
 from armcal.arm.model import ArmModel, Chain, forward
+from armcal.arm.pose_residual import OF_TOOL, PoseResidual, corrected
 from armcal.arm.statics import Load, Mass, joint_efforts, wrenches
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.pose_blocks import pose_transform
@@ -46,8 +47,8 @@ class MassiveModel(Protocol):
 class ArmInputs:
     """What one record says of one arm.
 
-    Commands and approaches (n x 1), the load, the deflection to start from, and what effects ask to know of the
-    surroundings.
+    Commands and approaches (n x 1), the load, the deflection to start from, what effects ask to know of the
+    surroundings, and corrections of tool and joints (6 + n x 1; see ``pose_residual``; None for nothing).
     """
 
     joint_angles: Expression
@@ -55,6 +56,7 @@ class ArmInputs:
     load: Load
     deflection: Expression
     conditions: Mapping[str, Expression] = field(default_factory=dict)
+    correction: Expression | None = None
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,7 @@ class Arm:
         placement: blocks of the pose of the model's base in the base frame (``placement_x`` and so on); none where
             the two are the same.
         joint_noise: standard deviation of what a turning joint reads against where it stands (rad).
+        residual: what corrects joints and tool where the rest leaves an error, once it is learned.
     """
 
     name: str
@@ -95,6 +98,7 @@ class Arm:
     masses: tuple[MassSpec, ...]
     placement: tuple[ParameterBlock, ...] = ()
     joint_noise: float = 0.0
+    residual: PoseResidual | None = None
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -190,11 +194,22 @@ class Arm:
         displacements = [
             joint.offset + along[i] + self.displacement(values, commands[i]) for i, joint in enumerate(chain.joints)
         ]
+        correction = self._correction(inputs)
+        if correction is not None:
+            of_joints = ca.vertsplit(correction[len(OF_TOOL) :])
+            displacements = [own + more for own, more in zip(displacements, of_joints, strict=True)]
         frames = forward(chain, displacements, rotations)
         acting = wrenches(chain, frames, self._masses(values), inputs.load)
         answer = deflections(chain, frames, acting, sites, commands)
         origins = tuple(site.origin for site in frames.sites)
-        return ArmState(frames.base_T_tool, frames.named, answer, joint_efforts(chain, frames, acting), origins)
+        tool = frames.base_T_tool if correction is None else corrected(frames.base_T_tool, correction)
+        return ArmState(tool, frames.named, answer, joint_efforts(chain, frames, acting), origins)
+
+    def _correction(self, inputs: ArmInputs) -> Expression | None:
+        if self.residual is None or not self.residual.is_learned:
+            return inputs.correction
+        learned = self.residual.correction(inputs.joint_angles, inputs.approach)
+        return learned if inputs.correction is None else learned + inputs.correction
 
     @property
     def conditions(self) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from pydantic import Field, field_validator
 from armcal.arm.assembly import PLACEMENT, Arm, MassiveModel, MassSpec, prefixed
 from armcal.arm.effects import JointEffect
 from armcal.arm.environment import STATICS, Environment, gravity_tilt
+from armcal.arm.pose_residual import PoseResidual
 from armcal.arm.statics import frame_names
 from armcal.base.parameters import FIT_NAME, ParameterBlock, Parameters
 from armcal.base.pose_settings import PoseSettings
@@ -26,7 +27,7 @@ from armcal.plugins import Component, PluginRegistry
 
 T = TypeVar("T")
 Path = tuple[str | int, ...]
-_BASES: Mapping[str, type] = MappingProxyType({"effect": JointEffect})
+_BASES: Mapping[str, type] = MappingProxyType({"effect": JointEffect, "residual": PoseResidual})
 """What a component of a kind derives from."""
 
 
@@ -48,7 +49,7 @@ class ArmSettings(Settings):
 
     ``placement`` is the pose of the model's base in the common base frame, for arms that stand side by side.
     ``joint_noise`` is the standard deviation of what a turning joint reads against where it stands: of contacts, whose
-    only readings are the joints', it is most of the noise.
+    only readings are the joints', it is most of the noise. ``residual`` learns what all that leaves of the tool's pose.
     """
 
     model: dict[str, Any]
@@ -56,6 +57,7 @@ class ArmSettings(Settings):
     placement: PoseSettings | None = None
     effects: dict[str, dict[str, Any]] = Field(default_factory=dict)
     links: dict[str, LinkSettings] = Field(default_factory=dict)
+    residual: dict[str, Any] | None = None
 
 
 class StaticsSettings(Settings):
@@ -207,7 +209,11 @@ def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm
     if isinstance(model, MassiveModel):
         masses = (*(mass for mass in model.masses() if mass.name not in settings.links), *masses)
     placement = settings.placement.blocks(PLACEMENT) if settings.placement else ()
-    parts = (model, effects, masses, placement, settings.joint_noise)
+    residual, described_residual = None, None
+    if settings.residual is not None:
+        place = (*at, "residual")
+        residual, described_residual = build_component(source, registry, "residual", place, model.joint_names)
+    parts = (model, effects, masses, placement, settings.joint_noise, residual)
     _part_names(source, (*at, "model"), "joint", model.joint_names)
     _part_names(source, (*at, "effects"), "effect", effects, (described_model["type"], "links"))
     _part_names(source, (*at, "links"), "link", [mass.name for mass in masses])
@@ -220,6 +226,8 @@ def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm
     described: dict[str, Any] = {"model": described_model, "effects": described_effects, "links": links}
     if settings.joint_noise:
         described["joint_noise_rad"] = settings.joint_noise
+    if described_residual is not None:
+        described["residual"] = described_residual
     if settings.placement:
         described["placement"] = settings.placement.to_config()
     return arm, described

@@ -92,9 +92,11 @@ class PredictedFit(JudgedFit):
 
     Attributes:
         held_residuals: raw residuals of the records that judge, by recording (``new`` only where something drifts).
+        unknown: covariance of these by what a pose residual did not know (N x n_r x n_r each); None without one.
     """
 
     held_residuals: Mapping[Recording, Residuals]
+    unknown: Residuals | None = None
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from scipy.special import fdtri, stdtrit
 
 from armcal.base.domains import Array
 from armcal.estimate.validation import error_dimension
+from armcal.problem.corrections import unexplained
 from armcal.problem.factor_records import noise_roots
 from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem
@@ -164,20 +165,27 @@ class Predictor:
             Spread(noise + values + drift, self.freedom) for noise, values, drift in self._parts_in_recording(records)
         )
 
-    def left_out_of_recording(self, fitted: Sequence[FactorRecords]) -> tuple[Spread, ...]:
-        """As ``in_recording`` of the fit's own records, each as if the fit had done without it."""
-        parts = zip(fitted, self._parts_in_recording(fitted), strict=True)
+    def left_out_of_recording(
+        self, fitted: Sequence[FactorRecords], unknown: Sequence[Array] | None = None
+    ) -> tuple[Spread, ...]:
+        """As ``in_recording`` of the fit's own records, each as if the fit had done without it.
+
+        ``unknown`` is what pose residuals that did not see them do not know (see ``unexplained``).
+        """
+        parts = zip(fitted, self._parts_in_recording(fitted, unknown), strict=True)
         return tuple(
             Spread(_without_itself(noise, values + drift, factor_records), self.freedom)
             for factor_records, (noise, values, drift) in parts
         )
 
-    def left_out_of_new_recording(self, fitted: Sequence[FactorRecords]) -> tuple[Spread, ...]:
+    def left_out_of_new_recording(
+        self, fitted: Sequence[FactorRecords], unknown: Sequence[Array] | None = None
+    ) -> tuple[Spread, ...]:
         """As ``in_new_recording`` of the fit's own records, each as if the fit had done without it.
 
         As if each record were evidence of the values alone, though neighbours share their drift: a little too narrow.
         """
-        parts = zip(fitted, self._parts_in_new_recording(fitted), strict=True)
+        parts = zip(fitted, self._parts_in_new_recording(fitted, unknown), strict=True)
         return tuple(
             Spread(_without_itself(noise + drift, values, factor_records), self.freedom)
             for factor_records, (noise, values, drift) in parts
@@ -213,20 +221,24 @@ class Predictor:
         part = len(judged) / len(near)
         return NewRecording(ratio[judged], part * freedom, part * independent)
 
-    def _parts_in_new_recording(self, records: Sequence[FactorRecords]) -> list[_Parts]:
+    def _parts_in_new_recording(
+        self, records: Sequence[FactorRecords], unknown: Sequence[Array] | None = None
+    ) -> list[_Parts]:
         """Covariances in a recording whose drift is not known."""
         slopes = self._slopes(records)
         blocks = self.problem.parameters.free
         drifting = np.array([0.0 if b.drift is None else b.drift.sd**2 for b in blocks for _ in range(b.size)])
         variance = self.noise_scale**2 * drifting
         drift = [np.einsum("rvn,v,svn->nrs", slope, variance, slope, optimize=True) for slope in slopes]
-        return self._parts(records, slopes, drift)
+        return self._parts(records, slopes, drift, unknown)
 
-    def _parts_in_recording(self, records: Sequence[FactorRecords]) -> list[_Parts]:
+    def _parts_in_recording(
+        self, records: Sequence[FactorRecords], unknown: Sequence[Array] | None = None
+    ) -> list[_Parts]:
         """Covariances in the recording of the fit, whose records determine its drift."""
         here, there = records[0].correlation, self.drift
         if here is None or there is None:
-            return self._parts_in_new_recording(records)
+            return self._parts_in_new_recording(records, unknown)
         slopes, spreads = [], []
         for i, slope in enumerate(self._slopes(records)):
             count = slope.shape[2]
@@ -234,15 +246,27 @@ class Predictor:
             by_state, left = here.raw[i][:, :count], there.covariance[here.node[:count]]
             spread = np.einsum("rnd,nde,sne->nrs", by_state, left, by_state, optimize=True)
             spreads.append(self.noise_scale**2 * spread)
-        return self._parts(records, slopes, spreads)
+        return self._parts(records, slopes, spreads, unknown)
 
-    def _parts(self, records: Sequence[FactorRecords], slopes: Sequence[Array], drift: Sequence[Array]) -> list[_Parts]:
-        """Covariances by noise, by values and by drift (N x n_r x n_r each), one of each a factor."""
+    def _parts(
+        self,
+        records: Sequence[FactorRecords],
+        slopes: Sequence[Array],
+        drift: Sequence[Array],
+        unknown: Sequence[Array] | None,
+    ) -> list[_Parts]:
+        """Covariances by noise, by values and by drift (N x n_r x n_r each), one of each a factor.
+
+        What pose residuals do not know counts as noise: it is the same whether or not a record was learned from.
+        """
         parts = []
-        for kernel, record, slope, moved in zip(self.problem.kernels, records, slopes, drift, strict=True):
+        unknown = unexplained(self.problem, self.values, records) if unknown is None else unknown
+        for kernel, record, slope, moved, own in zip(
+            self.problem.kernels, records, slopes, drift, unknown, strict=True
+        ):
             values = np.einsum("rvn,vw,swn->nrs", slope, self.covariance, slope, optimize=True)
             roots = noise_roots(kernel.factor, record)
-            parts.append((self.noise_scale**2 * (roots @ roots.transpose(0, 2, 1)), values, moved))
+            parts.append((self.noise_scale**2 * (roots @ roots.transpose(0, 2, 1)) + own, values, moved))
         return parts
 
     def _slopes(self, records: Sequence[FactorRecords]) -> list[Array]:

@@ -22,6 +22,7 @@ from typing_extensions import override
 from armcal.arm.assembly import Arm, ArmInputs, ArmState, scoped
 from armcal.arm.environment import STATICS, Environment, Vector3, tilted
 from armcal.arm.evaluator import ElasticPass
+from armcal.arm.pose_residual import correction_names
 from armcal.arm.statics import Load
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, Parameters
@@ -29,6 +30,9 @@ from armcal.base.se3 import Expression
 from armcal.errors import ProblemError
 from armcal.measure.measurement import GroupedMeasurement, Measurement, noise_channels, residual_dimensions
 from armcal.measure.partners import OTHER
+
+CORRECTION = "correction."
+"""Channels ``ARM.correction.shift_x`` and so on, where records carry them: see ``arm/pose_residual.py``."""
 
 
 @dataclass(frozen=True)
@@ -270,5 +274,8 @@ def _arm_states(
         approaches = [records.optional(f"{arm.name}.approach.{joint}{which}", 0.0) for joint in arm.commanded]
         angles, approach = ca.vertcat(*arm.joint_commands(commands)), ca.vertcat(*arm.joint_approaches(approaches))
         conditions = {channel: records.number(channel) for channel in arm.conditions if channel in available}
-        states[name] = arm.state(values, ArmInputs(angles, approach, load, deflections[-1], conditions))
+        corrections = [f"{arm.name}.{CORRECTION}{own}{which}" for own in correction_names(arm.joint_names)]
+        correction = ca.vertcat(*map(records.number, corrections)) if corrections[0] in available else None
+        inputs = ArmInputs(angles, approach, load, deflections[-1], conditions, correction)
+        states[name] = arm.state(values, inputs)
     return records, states, deflections

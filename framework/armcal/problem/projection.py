@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armcal.base.domains import Array
-from armcal.problem.factor import Factor
+from armcal.problem.factor import CORRECTION, Factor
 from armcal.problem.grouped_kernel import GroupedKernel
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -93,10 +93,12 @@ def fits(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> t
 
 
 def joint_channels(factor: Factor) -> tuple[int, ...]:
-    """Which rows of a record are commanded joint angles: those of an arm, approaches aside."""
+    """Which rows of a record are commanded joint angles: those of an arm, approaches and corrections aside."""
     own = f"{factor.name}."
     return tuple(
-        i for i, c in enumerate(factor.channels) if "." in c and not c.startswith(own) and ".approach." not in c
+        i
+        for i, c in enumerate(factor.channels)
+        if "." in c and not c.startswith(own) and ".approach." not in c and f".{CORRECTION}" not in c
     )
 
 

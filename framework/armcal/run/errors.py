@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -69,6 +69,10 @@ class RecordErrors:
     cross_validated_at_rest_mm: Array | None = None
     residual_columns: tuple[str, ...] = ()
     unit: str = "mm"
+
+    def with_nominal(self, other: RecordErrors) -> RecordErrors:
+        """With the nominal errors of others, which were made without what was learned since."""
+        return replace(self, nominal_mm=other.nominal_mm, nominal_residual_mm=other.nominal_residual_mm)
 
     def fold_warnings(self, folds: int) -> tuple[str, ...]:
         """That some of the folds did not converge."""

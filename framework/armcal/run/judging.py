@@ -55,7 +55,7 @@ def verdict_of(
         errors, intervals: of every record; whether prediction intervals cover their share.
         system: the arms.
         limit: above which the error of a judged record is explained (m); None for the default.
-        known: what was found before the fit.
+        known: what was found before.
     """
     problem, fitted, train, held = run.problem, run.fitted, run.split.train, len(run.split.holdout)
     estimate, acting = fitted.estimate, run.problem.weighted(fitted.records, fitted.weights)

@@ -131,6 +131,7 @@ def metrics(result: RunResult) -> dict[str, Any]:
         "experiment": result.name,
         "error_mm": _errors(result),
         "groups": result.groups.as_dict(),
+        **({"pose_residual": result.pose_residual.as_dict()} if result.pose_residual else {}),
         "records": {
             "used": len(result.dataset),
             "train": len(result.split.train),
@@ -193,7 +194,7 @@ def calibration_content(result: RunResult, experiment: Experiment, accepted: boo
             "data": provenance["data_sha256"],
             "source": provenance["data"],
         },
-        environment_columns=tuple(filter(result.dataset.has, surroundings(experiment.system.arms))),
+        environment_columns=tuple(filter(result.dataset.has, surroundings(result.system.arms))),
         noise=in_unit(_noise(result), unit),
         quality_mm=result.table.as_dict() if unit == "mm" else {},
         quality_mrad=result.table.as_dict() if unit == "mrad" else {},
@@ -203,15 +204,15 @@ def calibration_content(result: RunResult, experiment: Experiment, accepted: boo
             "accepted": accepted,
             "findings": [f.text for f in result.verdict.findings],
         },
-        arms=dict(experiment.system.description["arms"]),
-        measurements=dict(experiment.system.description["measurements"]),
-        statics=dict(experiment.system.description["statics"]),
+        arms=dict(result.system.description["arms"]),
+        measurements=dict(result.system.description["measurements"]),
+        statics=dict(result.system.description["statics"]),
         groups={owner: tuple(keys) for owner, keys in result.groups.keys.items()},
         parameters=parameter_records(estimate),
         prediction=result.prediction,
         information=information,
     )
-    system, registry = experiment.system, experiment.registry
+    system, registry = result.system, experiment.registry
     parameters = system.parameters(record.groups).with_nominal(estimate.values)
     calibration = Calibration(system, parameters, record)
     try:

@@ -7,8 +7,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from armcal.base.dataset import Dataset, SetAside
+from armcal.base.parameters import Parameters
 from armcal.calibration.intervals import PredictionRecord, covariance_rows, recording_record, stretch_records
+from armcal.config.system import System
 from armcal.diagnose.clustered import widened
 from armcal.diagnose.coverage import fit_and_predict
 from armcal.diagnose.noise_findings import Finding
@@ -31,9 +35,11 @@ from armcal.estimate.validation import (
     split_by_label,
 )
 from armcal.estimate.weighing import WeighedFit, fit, plain_fit
+from armcal.functions.batch_function import EvaluatorChoice
 from armcal.io.parallel import Executor
 from armcal.measure.id_list import read_ids
 from armcal.plugins import PluginRegistry
+from armcal.problem.corrections import correctable, postures_of
 from armcal.problem.drift import with_drift
 from armcal.problem.motion import recorded_position
 from armcal.problem.problem import FactorRecords, Problem
@@ -45,6 +51,7 @@ from armcal.run.groups import labels_of, run_groups
 from armcal.run.intervals import IntervalResult, interval_result
 from armcal.run.judging import verdict_of
 from armcal.run.noise import SuspiciousRecord, noise_result
+from armcal.run.pose_residual import ResidualOutcome, learned_residual, unlearned
 from armcal.run.result import RunResult
 
 
@@ -110,20 +117,13 @@ def assemble(experiment: Experiment, watch: Stopwatch, accept: bool = False) -> 
         experiment = experiment.of_records(dataset)
     system = experiment.system
     with watch.stage("build"):
-        problem = Problem.build(
-            system.arms,
-            system.measurements,
-            experiment.parameters,
-            system.environment,
-            dataset,
-            experiment.settings.evaluator,
-        )
+        problem = _built(experiment, system, dataset, experiment.parameters, experiment.settings.evaluator)
         records = problem.records(dataset)
         start = aligned_start(problem, records, dataset)
         problem = started(start.problem, records)
-        records = with_joint_noise(problem, records, problem.parameters.nominal())
-        records = with_drift(problem, records, dataset, problem.parameters.nominal())
+        records = _acting(problem, records, dataset)
     with watch.stage("check"):
+        unlearned(system)
         mixed_up = check_permuted_axes(problem, records, dataset, accept)
         check_reach(problem, records, dataset)
         split = _split(experiment, dataset)
@@ -141,6 +141,19 @@ def assemble(experiment: Experiment, watch: Stopwatch, accept: bool = False) -> 
     return Prepared(dataset, problem, records, split, texts, start, tuple(mixed_up))
 
 
+def _built(
+    experiment: Experiment, system: System, dataset: Dataset, parameters: Parameters, evaluator: EvaluatorChoice
+) -> Problem:
+    records, settings = correctable(dataset, system.arms), (parameters, system.environment)
+    return Problem.build(system.arms, system.measurements, *settings, records, evaluator)
+
+
+def _acting(problem: Problem, records: tuple[FactorRecords, ...], dataset: Dataset) -> tuple[FactorRecords, ...]:
+    """Records with the noise of joint readings and the drift that they share."""
+    records = with_joint_noise(problem, records, problem.parameters.nominal())
+    return with_drift(problem, records, dataset, problem.parameters.nominal())
+
+
 def calibrate(
     experiment: Experiment,
     command: str = "",
@@ -152,22 +165,43 @@ def calibrate(
     """Calibrate (see ``outputs.write``), starts and folds by ``executor``; InputError if refused (see ``assemble``)."""
     watch, registry = watch or Stopwatch(), experiment.registry
     ready = prepare(experiment, watch, accept)
-    dataset, split, validation = ready.dataset, ready.split, experiment.settings.validation
-    faults = _notify_started(registry, experiment.name, dataset)
+    faults = _notify_started(registry, experiment.name, ready.dataset)
     fitted = _fitted(experiment, ready, progress, executor, watch)
     faults += registry.notify("armcal_estimate_changed", estimate=fitted.estimate)
-    run = FittedRecords(ready.problem, ready.records, dataset, split, fitted)
-    resampled, profiled_result = _uncertainty(experiment, ready, fitted, progress, executor, watch)
-    errors, intervals = _validated(experiment, run, ready.training, progress, executor, watch)
+    before = FittedRecords(ready.problem, ready.records, ready.dataset, ready.split, fitted)
+    ready, fitted, outcome = _with_pose_residual(experiment, ready, fitted, progress, executor, watch)
+    run = replace(before, problem=ready.problem, records=ready.records, fitted=fitted)
+    uncertainty = _uncertainty(experiment, ready, fitted, progress, executor, watch)
+    validated = _validated(experiment, before, run, outcome, progress, executor, watch)
+    result = _judged(experiment, ready, run, outcome, validated, progress, watch)
+    faults += _notify_rejected(registry, result.noise.set_aside)
+    warnings = (*result.warnings, *dict.fromkeys(faults))
+    return replace(result, command=command, warnings=warnings, bootstrap=uncertainty[0], profiles=uncertainty[1])
+
+
+def _judged(
+    experiment: Experiment,
+    ready: Prepared,
+    run: FittedRecords,
+    outcome: ResidualOutcome | None,
+    validated: tuple[RecordErrors, IntervalResult],
+    progress: Progress,
+    watch: Stopwatch,
+) -> RunResult:
+    """What a run knows of its fit, with the verdict on it."""
+    dataset, split, fitted, (errors, intervals) = run.dataset, run.split, run.fitted, validated
+    system, validation = experiment.system, experiment.settings.validation
+    if outcome is not None:
+        system = outcome.system(system)
     with watch.stage("judge"):
         progress("judging", 0.0)
-        verdict, evidence = verdict_of(run, errors, intervals, experiment.system, validation.limit, ready.findings)
-    progress("judging", 1.0)
-    noise = noise_result(ready.problem, fitted, dataset, split, errors.calibrated_mm)
-    faults += _notify_rejected(registry, noise.set_aside)
+        verdict, evidence = verdict_of(run, errors, intervals, system, validation.limit, ready.findings)
+        progress("judging", 1.0)
     return RunResult(
         name=experiment.name,
-        command=command,
+        command="",
+        system=system,
+        pose_residual=outcome,
         dataset=dataset,
         split=split,
         estimate=fitted.estimate,
@@ -175,14 +209,12 @@ def calibrate(
         table=ErrorTable.of(errors, split),
         verdict=verdict,
         evidence=evidence,
-        warnings=(*ready.warnings, *fitted.warnings, *errors.fold_warnings(validation.folds), *dict.fromkeys(faults)),
-        backend=ready.problem.backend,
+        warnings=(*ready.warnings, *fitted.warnings, *errors.fold_warnings(validation.folds)),
+        backend=run.problem.backend,
         seconds=watch.seconds,
-        provenance=experiment.provenance(dataset),
-        noise=noise,
-        bootstrap=resampled,
+        provenance=replace(experiment, system=system).provenance(dataset),
+        noise=noise_result(run.problem, fitted, dataset, split, errors.calibrated_mm),
         intervals=intervals,
-        profiles=profiled_result,
         prediction=_prediction(experiment, run, intervals),
         groups=run_groups(experiment, run, errors),
     )
@@ -214,7 +246,11 @@ def _uncertainty(
 
 
 def _fitted(
-    experiment: Experiment, ready: Prepared, progress: Progress, executor: Executor | None, watch: Stopwatch
+    experiment: Experiment,
+    ready: Prepared,
+    progress: Progress,
+    executor: Executor | None,
+    watch: Stopwatch,
 ) -> WeighedFit:
     """The fit to the training records, as sure as records that may err alike allow."""
     problem, train = ready.problem, ready.split.train
@@ -233,8 +269,14 @@ def _fitted(
             costs = [problem.cost(one.solution.values, ready.training) for one in (fitted, other)]
             better = other.solution.verdict.converged and costs[1] < costs[0]
             fitted = other if better or not fitted.solution.verdict.converged else fitted
-        acting, position = problem.weighted(fitted.records, fitted.weights), recorded_position(ready.dataset)[train]
-        return replace(fitted, estimate=widened(problem, acting, fitted.estimate, position))
+        return _widened(ready, fitted)
+
+
+def _widened(ready: Prepared, fitted: WeighedFit) -> WeighedFit:
+    """A fit to the training records, as sure as records that may err alike allow."""
+    position = recorded_position(ready.dataset)[ready.split.train]
+    acting = ready.problem.weighted(fitted.records, fitted.weights)
+    return replace(fitted, estimate=widened(ready.problem, acting, fitted.estimate, position))
 
 
 def _near(problem: Problem, ready: Prepared, data: Dataset, fitted: WeighedFit) -> bool:
@@ -246,6 +288,39 @@ def _notify_started(registry: PluginRegistry, name: str, dataset: Dataset) -> li
     """Observers hear of a run, and of the records that were set aside before it; their faults."""
     faults = registry.notify("armcal_run_started", name=name, records=len(dataset))
     return [*faults, *_notify_rejected(registry, dataset.set_aside)]
+
+
+def _with_pose_residual(
+    experiment: Experiment,
+    ready: Prepared,
+    fitted: WeighedFit,
+    progress: Progress,
+    executor: Executor | None,
+    watch: Stopwatch,
+) -> tuple[Prepared, WeighedFit, ResidualOutcome | None]:
+    """The problem and the fit with the pose residual that is to be learned, where it is kept, and what became of it."""
+    arm, train = unlearned(experiment.system), ready.split.train
+    if arm is None or not fitted.estimate.verdict.converged:
+        return ready, fitted, None
+    with watch.stage("pose residual"):
+        training = ready.dataset.subset(train)
+        splits = _folds(experiment, ready.dataset, ready.split) if experiment.settings.validation.folds else ()
+        order = np.argsort(recorded_position(training), kind="stable")
+        own = (ready.problem, ready.training, fitted, postures_of(arm, training), splits, order)
+        outcome = learned_residual(experiment, arm, *own, progress, executor)
+        ready = replace(ready, findings=(*ready.findings, *outcome.findings()))
+        if outcome.residual is None:
+            return ready, fitted, outcome
+        # What was learned has thousands of terms: to compile them takes longer than the fits that are left.
+        choice = experiment.settings.evaluator
+        evaluator: EvaluatorChoice = "interpreted" if choice == "auto" else choice
+        system, parameters = outcome.system(experiment.system), ready.problem.parameters
+        problem = _built(experiment, system, ready.dataset, parameters, evaluator)
+        records = _acting(problem, problem.records(ready.dataset), ready.dataset)
+        ready = replace(ready, problem=problem, records=records)
+        estimator = spread(experiment.estimator, executor)
+        again = fit(problem, ready.training, estimator, fitted.estimate.values, progress)
+        return ready, _widened(ready, again), outcome
 
 
 def _notify_rejected(registry: PluginRegistry, records: Sequence[SetAside | SuspiciousRecord]) -> list[str]:
@@ -276,28 +351,33 @@ def _folds(experiment: Experiment, dataset: Dataset, split: Split) -> tuple[Spli
 
 def _validated(
     experiment: Experiment,
+    before: FittedRecords,
     run: FittedRecords,
-    training: tuple[FactorRecords, ...],
+    outcome: ResidualOutcome | None,
     progress: Progress,
     executor: Executor | None,
     watch: Stopwatch,
 ) -> tuple[RecordErrors, IntervalResult]:
     """Errors of all records and prediction intervals, by cross-validation over the training records if configured.
 
-    Nothing is predicted, nor cross-validated, by a fit that did not converge: its folds would not either, and each
-    would take as long.
+    Nominal errors are those ``before`` a pose residual was learned. Nothing is predicted, nor cross-validated, by a fit
+    that did not converge: its folds would not either, and each would take as long.
     """
     problem, estimator = run.problem, experiment.estimator
     crossed: tuple[CrossValidation, tuple[Split, ...]] | None = None
     with watch.stage("validate"):
         if not run.fitted.estimate.verdict.converged:
             return errors_of(run, None), IntervalResult()
-        if experiment.settings.validation.folds:
+        if outcome is not None and outcome.residual is not None and outcome.crossed is not None:
+            crossed = outcome.crossed, outcome.splits
+        elif experiment.settings.validation.folds:
             splits, start = _folds(experiment, run.dataset, run.split), problem.parameters.nominal()
+            training = problem.subset(run.records, run.split.train)
             parts = (training, splits, estimator, start, progress, executor, fit_and_predict)
             crossed = cross_validate(problem, *parts), splits
         intervals = interval_result(problem, run.fitted, run.records, run.split, estimator, crossed)
-        return errors_of(run, crossed and crossed[0]), intervals
+        errors = errors_of(run, crossed and crossed[0])
+        return errors if before.problem is problem else errors.with_nominal(errors_of(before, None)), intervals
 
 
 def _prediction(experiment: Experiment, run: FittedRecords, intervals: IntervalResult) -> PredictionRecord | None:

@@ -7,6 +7,7 @@ from typing import Any
 
 from armcal.base.dataset import Dataset
 from armcal.calibration.intervals import PredictionRecord
+from armcal.config.system import System
 from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.verdict import Verdict
 from armcal.estimate.bootstrap import Bootstrap
@@ -17,6 +18,7 @@ from armcal.run.errors import ErrorTable, RecordErrors
 from armcal.run.groups import RunGroups
 from armcal.run.intervals import IntervalResult
 from armcal.run.noise import NoiseResult
+from armcal.run.pose_residual import ResidualOutcome
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,7 @@ class RunResult:
     Attributes:
         name: of the experiment.
         command: how to repeat it.
+        system: arms, measurements and statics, with what was learned of pose residuals.
         dataset: the records used.
         split: which trained and which judged.
         estimate: what was found.
@@ -43,10 +46,12 @@ class RunResult:
         profiles: intervals by profile likelihood, of the numbers asked for.
         prediction: what predictions need of the run beyond the values; None if it did not converge.
         groups: of records, where a column separates them.
+        pose_residual: what became of one that was to be learned.
     """
 
     name: str
     command: str
+    system: System
     dataset: Dataset
     split: Split
     estimate: Estimate
@@ -64,6 +69,7 @@ class RunResult:
     profiles: tuple[Profile, ...] = ()
     prediction: PredictionRecord | None = None
     groups: RunGroups = field(default_factory=RunGroups)
+    pose_residual: ResidualOutcome | None = None
 
     @property
     def train(self) -> Indices:

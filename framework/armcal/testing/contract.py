@@ -24,6 +24,7 @@ from armcal.testing.measurement_checks import check_measurement
 from armcal.testing.model_checks import check_model
 from armcal.testing.online_checks import check_online
 from armcal.testing.reader_checks import check_reader
+from armcal.testing.residual_checks import check_residual
 from armcal.testing.results import CheckResult, ContractError, Recorder, expect
 from armcal.testing.settings_checks import Subject, check_settings
 from armcal.testing.simulator_checks import check_simulator
@@ -34,6 +35,7 @@ KNOWN_CHECKS: Mapping[str, int] = MappingProxyType(
     {
         "model": 28,
         "effect": 26,
+        "residual": 22,
         "measurement": 29,
         "reader": 23,
         "estimator": 22,
@@ -58,6 +60,7 @@ _CHECKS: Mapping[str, Callable[[Recorder, Subject], None]] = MappingProxyType(
     {
         "model": check_model,
         "effect": check_effect,
+        "residual": check_residual,
         "measurement": check_measurement,
         "reader": check_reader,
         "estimator": check_estimator,

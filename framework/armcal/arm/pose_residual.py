@@ -1,0 +1,122 @@
+"""Pose residuals: what an arm's physical model leaves, as a function of the commands that is learned from records.
+
+Corrections are of the joints, which then stand that much farther than the model has them, and of the tool, which
+stands at R Exp(turn), p + shift, where R and p are what the model says of it then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.base.se3 import Expression, Transform, small_rotation
+from armcal.base.settings import Settings
+
+OF_TOOL = ("shift_x", "shift_y", "shift_z", "turn_x", "turn_y", "turn_z")
+"""Corrections of a tool: shifts (m) in the arm's base frame, a rotation vector (rad) in the tool's."""
+_Settings = Settings
+
+
+def correction_names(joint_names: Sequence[str]) -> tuple[str, ...]:
+    """Of the tool, and of each joint (rad or m), in this order."""
+    return (*OF_TOOL, *(f"joint_{name}" for name in joint_names))
+
+
+@dataclass(frozen=True)
+class Postures:
+    """Where an arm was told to go: commands (rad or m) and directions of approach (-1, 0, 1), joints x N each."""
+
+    commands: Array
+    approaches: Array
+
+    def subset(self, chosen: Any) -> Postures:
+        """Some of them."""
+        return Postures(self.commands[:, chosen], self.approaches[:, chosen])
+
+
+@dataclass(frozen=True)
+class ModelErrors:
+    """What a model leaves, in units of the noise, and how corrections would change it.
+
+    Attributes:
+        postures: of the records (N).
+        dimensions: ``angle`` or ``length`` of each joint.
+        residuals: in units of their noise and the record's weight (N x rows).
+        slopes: of them by the corrections (N x rows x corrections).
+        taken: an orthonormal basis of what the model's parameters take up (N rows x k): what is learned is beside it.
+        of_tool: how many of the tool's corrections a record determines: 0, 3 (shifts) or 6.
+    """
+
+    postures: Postures
+    dimensions: tuple[str, ...]
+    residuals: Array
+    slopes: Array
+    of_tool: int
+    taken: Array
+
+    def apart(self, rows: Array) -> Array:
+        """Rows (N rows, or N rows x M) without what the model's parameters take up."""
+        return rows - self.taken @ (self.taken.T @ rows)
+
+
+class PoseResidual:
+    """Base of pose residuals. Learned, it corrects where joints and tools are; before that it changes nothing.
+
+    Attributes:
+        Settings: the class of its checked settings, which hold what was learned.
+        settings: its own, checked.
+        joint_names: of the arm, from the base to the tip.
+    """
+
+    Settings: ClassVar[type[_Settings]] = Settings
+
+    def __init__(self, settings: Any, joint_names: Sequence[str]) -> None:
+        self.settings = settings
+        self.joint_names = tuple(joint_names)
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether it corrects anything."""
+        raise NotImplementedError
+
+    def learned(self, errors: ModelErrors) -> PoseResidual | None:
+        """The same with what records say; None where they are too few."""
+        raise NotImplementedError
+
+    def correction(self, commands: Expression, approaches: Expression) -> Expression:
+        """Corrections (6 + joints x 1).
+
+        Args:
+            commands: of all joints (joints x 1; rad or m).
+            approaches: directions of approach (joints x 1; -1, 0, 1).
+        """
+        raise NotImplementedError
+
+    def deviations(self, postures: Postures) -> Array:
+        """Standard deviations of corrections (6 + joints x N): small near what was learned, large far from it."""
+        raise NotImplementedError
+
+    def corrections(self, postures: Postures) -> Array:
+        """Corrections (6 + joints x N)."""
+        return np.asarray(self._many(postures.commands, postures.approaches).full())
+
+    @cached_property
+    def _many(self) -> ca.Function:
+        commands, approaches = (ca.SX.sym(name, len(self.joint_names)) for name in ("commands", "approaches"))
+        correction = ca.densify(self.correction(commands, approaches))
+        return ca.Function("correction", [commands, approaches], [correction], {"cse": True})
+
+    def __reduce__(self) -> Any:
+        return type(self), (self.settings, self.joint_names)
+
+
+def corrected(base_T_tool: Transform, correction: Expression) -> Transform:
+    """A tool with corrections of the tool (6 x 1)."""
+    turned = ca.mtimes(base_T_tool.rotation, small_rotation(correction[3:6]))
+    return Transform(turned, base_T_tool.translation + correction[:3])

@@ -1,0 +1,321 @@
+"""The pose residual of a run: learned from what the physical fit leaves, kept only if records held out say so."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from armcal.arm.assembly import Arm
+from armcal.arm.pose_residual import OF_TOOL, ModelErrors, PoseResidual, Postures
+from armcal.base.domains import Array
+from armcal.config.system import System
+from armcal.diagnose.coverage import PredictedFit, missed, predictor, whitened_like
+from armcal.diagnose.noise_findings import Finding
+from armcal.errors import ConfigError, NotConvergedError
+from armcal.estimate.estimator import Progress
+from armcal.estimate.validation import (
+    CrossValidation,
+    FitTask,
+    Indices,
+    JudgedFit,
+    Split,
+    cross_validate,
+    error_unit,
+    failed_fit,
+    folds,
+    judged_fit,
+)
+from armcal.estimate.weighing import WeighedFit, fit
+from armcal.io.parallel import Executor
+from armcal.measure.contact import Contact
+from armcal.measure.partners import PairedMeasurement
+from armcal.problem.corrections import corrected_records, correction_channels, unexplained
+from armcal.problem.drift import residuals
+from armcal.problem.problem import FactorRecords, Problem
+from armcal.run.experiment import Experiment
+
+_FOLDS = 5
+_STRETCHES = 10
+_SURE = 2.6
+"""Standard errors, one in 200 by chance, by which errors of records held out must be smaller."""
+_LEAST_GAIN = 0.01
+_FEWEST = 20
+_DETERMINED = 1e-6
+_MM = 1000.0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Errors of records by fits that did not see them, without and with a pose residual.
+
+    Attributes:
+        without, with_it: mean errors (mm, or mrad).
+        sure: the difference in standard errors; above 0 where the pose residual is better.
+    """
+
+    without: float
+    with_it: float
+    sure: float
+
+    @classmethod
+    def of(cls, without: Array, with_it: Array, parts: tuple[Split, ...]) -> Comparison:
+        """Of records (N) that were held out together in parts; what a part has in common is one chance."""
+        gains = np.array([float(np.nanmean(without[p.holdout] - with_it[p.holdout])) for p in parts])
+        gains = gains[np.isfinite(gains)]
+        error = float(np.std(gains, ddof=1) / np.sqrt(len(gains))) if len(gains) > 1 else np.inf
+        return cls(
+            float(np.nanmean(without)), float(np.nanmean(with_it)), float(np.nanmean(gains)) / max(error, 1e-300)
+        )
+
+    @property
+    def gain(self) -> float:
+        """Share of the error that it takes away."""
+        return 1 - self.with_it / self.without
+
+
+@dataclass(frozen=True)
+class ResidualOutcome:
+    """What became of a pose residual.
+
+    Attributes:
+        arm: whose.
+        kind: its type.
+        unit: of errors.
+        folds: random ones; None where nothing was learned.
+        stretches: of records that were recorded one after another.
+        residual: as learned; None if it is not kept.
+        crossed: of the random folds, with it.
+        splits: these folds.
+    """
+
+    arm: str
+    kind: str
+    unit: str
+    folds: Comparison | None = None
+    stretches: Comparison | None = None
+    residual: PoseResidual | None = None
+    crossed: CrossValidation | None = None
+    splits: tuple[Split, ...] = ()
+
+    def system(self, system: System) -> System:
+        """With what was learned."""
+        if self.residual is None:
+            return system
+        arms = {**system.arms, self.arm: replace(system.arms[self.arm], residual=self.residual)}
+        section = {"type": self.kind, **self.residual.settings.to_config()}
+        described = {
+            **system.description["arms"],
+            self.arm: {**system.description["arms"][self.arm], "residual": section},
+        }
+        return replace(system, arms=arms, description={**system.description, "arms": described})
+
+    def findings(self) -> list[Finding]:
+        """What it does, and for which poses."""
+        if self.folds is None:
+            return [Finding("note", f"The pose residual of {self.arm} learned nothing: too few records.")]
+        test = f"{len(self.splits)} folds, and {_STRETCHES} stretches of the recording, held out of fit and learning"
+        numbers = f"{self.folds.without:.3g} to {self.folds.with_it:.3g} {self.unit}"
+        if self.residual is None:
+            text = f"The pose residual of {self.arm} is not kept: unseen errors went from {numbers}."
+            return [Finding("note", text, test)]
+        findings = [Finding("good", f"The pose residual of {self.arm} takes unseen errors from {numbers}.", test)]
+        own = self.stretches
+        if own is not None and own.gain < self.folds.gain / 2:
+            findings.append(
+                Finding(
+                    "note" if own.gain > 0 else "warning",
+                    f"The pose residual of {self.arm} holds for poses among the recorded ones: on stretches of "
+                    f"the recording that it did not see, errors go from {own.without:.3g} to {own.with_it:.3g} "
+                    f"{self.unit}.",
+                    test,
+                    "Do not rely on it for other poses; record poses like those that the arm will work in.",
+                )
+            )
+        return findings
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json."""
+        parts = {"folds": self.folds, "stretches": self.stretches}
+        named = {
+            name: {f"without_{self.unit}": p.without, f"with_{self.unit}": p.with_it, "standard_errors": p.sure}
+            for name, p in parts.items()
+            if p is not None
+        }
+        return {"arm": self.arm, "type": self.kind, "kept": self.residual is not None, **named}
+
+
+@dataclass(frozen=True)
+class LayeredFit(PredictedFit):
+    """A fit with a pose residual, and its errors without (m; at rest where something drifts)."""
+
+    without: Array = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """What a fold needs to learn: whose pose residual, and all records' postures."""
+
+    arm: Arm
+    residual: PoseResidual
+    postures: Postures
+
+    def learned(
+        self, problem: Problem, fitted: WeighedFit, records: tuple[FactorRecords, ...], places: Indices
+    ) -> PoseResidual | None:
+        """From what a fit leaves of its records."""
+        errors = model_errors(problem, fitted, records, self.arm, self.postures.subset(places))
+        return None if errors is None else self.residual.learned(errors)
+
+
+def unlearned(system: System) -> Arm | None:
+    """The arm whose pose residual is to be learned.
+
+    Raises:
+        ConfigError: there are several, or what is measured does not show where a tool is.
+    """
+    arms = [arm for arm in system.arms.values() if arm.residual is not None and not arm.residual.is_learned]
+    if not arms:
+        return None
+    if len(arms) > 1:
+        names = ", ".join(arm.name for arm in arms)
+        raise ConfigError(
+            f"found pose residuals of {names} to learn.", hint="Learn one at a time; leave the others out."
+        )
+    for name, measurement in system.measurements.items():
+        if isinstance(measurement, Contact | PairedMeasurement):
+            raise ConfigError(
+                f"a pose residual is learned from measured positions or poses, and {name} is a contact.",
+                hint=f"Leave out arms.{arms[0].name}.residual, or measure where the tool is.",
+            )
+    return arms[0]
+
+
+def learned_residual(
+    experiment: Experiment,
+    arm: Arm,
+    problem: Problem,
+    training: tuple[FactorRecords, ...],
+    fitted: WeighedFit,
+    postures: Postures,
+    splits: tuple[Split, ...],
+    order: Indices,
+    progress: Progress,
+    executor: Executor | None,
+) -> ResidualOutcome:
+    """Learn from the training records, and judge by folds of them, and by stretches of the ``order`` of recording.
+
+    ``postures`` are theirs; ``splits`` are the folds, if some are configured.
+    """
+    residual, unit, count = arm.residual, error_unit(problem), training[0].count
+    assert residual is not None
+    kind = str(experiment.system.description["arms"][arm.name]["residual"]["type"])
+    nothing = ResidualOutcome(arm.name, kind, unit)
+    layer = _Layer(replace(arm), residual, postures)
+    learned = layer.learned(problem, fitted, fitted.records, np.arange(count, dtype=np.intp))
+    if count < _FEWEST or learned is None:
+        return nothing
+    splits = splits or folds(count, _FOLDS, 0)
+    pieces = [np.sort(part) for part in np.array_split(order, _STRETCHES)]
+    stretches = tuple(Split(np.setdiff1d(np.arange(count), part), part) for part in pieces)
+    judge = partial(judged_with, layer=layer)
+    parts = (experiment.estimator, fitted.estimate.values, progress, executor, judge)
+    crossed = cross_validate(problem, training, splits, *parts)
+    along = cross_validate(problem, training, stretches, *parts)
+    single = tuple(Split(np.array([], dtype=np.intp), np.array([i])) for i in range(count))
+    at_random, in_stretches = _compared(crossed, splits, single), _compared(along, stretches, stretches)
+    kept = at_random.sure > _SURE and at_random.gain > _LEAST_GAIN
+    return replace(
+        nothing,
+        folds=at_random,
+        stretches=in_stretches,
+        residual=learned if kept else None,
+        crossed=crossed,
+        splits=splits,
+    )
+
+
+def _compared(crossed: CrossValidation, splits: tuple[Split, ...], chances: tuple[Split, ...]) -> Comparison:
+    """With and without; records of one of the ``chances`` may miss alike."""
+    without = np.full(len(crossed.errors), np.nan)
+    for split, own in zip(splits, crossed.fits, strict=True):
+        if isinstance(own, LayeredFit):
+            without[split.holdout] = own.without
+    return Comparison.of(_MM * without, _MM * crossed.at_rest, chances)
+
+
+def judged_with(task: FitTask, layer: _Layer) -> JudgedFit:
+    """Fit, learn from what the fit leaves, fit again with that, and judge."""
+    began, task = time.perf_counter(), task.trained()
+    try:
+        train, held = task.parts()
+        fitted = fit(task.problem, train, task.estimator, task.start)
+        plain = judged_fit(task, fitted.solution, train, held, began)
+        if not plain.converged:
+            return plain
+        learned = layer.learned(task.problem, fitted, fitted.records, task.split.train)
+        if learned is not None:
+            train, held = (
+                corrected_records(task.problem, own, layer.arm, learned.corrections(layer.postures.subset(places)))
+                for own, places in ((train, task.split.train), (held, task.split.holdout))
+            )
+            fitted = fit(task.problem, train, task.estimator, fitted.solution.values)
+        judged = judged_fit(task, fitted.solution, train, held, began)
+        alike = whitened_like(task.problem, fitted, held, task.estimator)
+        held_residuals = missed(predictor(task.problem, fitted), alike)
+        own = {} if learned is None else {layer.arm.name: learned}
+        unknown = tuple(unexplained(task.problem, fitted.solution.values, held, own))
+    except NotConvergedError:
+        return failed_fit(task, began)
+    return LayeredFit(
+        judged.errors, judged.at_rest, True, time.perf_counter() - began, held_residuals, unknown, plain.at_rest
+    )
+
+
+def model_errors(
+    problem: Problem, fitted: WeighedFit, records: tuple[FactorRecords, ...], arm: Arm, postures: Postures
+) -> ModelErrors | None:
+    """What a fit leaves of its records, the drift taken off; None where no record shows the tool."""
+    values = fitted.estimate.values
+    raw = problem.whitened(residuals(problem, values, records, records), records)
+    by_correction = problem.channel_slopes(values, records, correction_channels(arm))
+    count = len(correction_channels(arm))
+    columns = [problem.whitened([slope[:, i] for slope in by_correction], records) for i in range(count)]
+    acting = [np.sqrt(np.where(own.measured, weight, 0.0)) for own, weight in zip(records, fitted.weights, strict=True)]
+    left = np.vstack([own * root for own, root in zip(raw, acting, strict=True)]).T
+    moved = np.stack(
+        [np.vstack([own * root for own, root in zip(column, acting, strict=True)]).T for column in columns], axis=2
+    )
+    good = np.any(moved[:, :, :3] != 0, axis=(1, 2))
+    if good.sum() < _FEWEST:
+        return None
+    values_slopes = [np.moveaxis(own, 2, 0) for own in problem.jacobians(values, _bare(records))]
+    taken = np.concatenate(
+        [own * root[:, None, None] for own, root in zip(values_slopes, acting, strict=True)], axis=1
+    )[good]
+    of_tool = next((n for n in (len(OF_TOOL), 3) if _determined(moved[good][:, :, :n])), 0)
+    basis = _basis(taken.reshape(-1, taken.shape[2]))
+    return ModelErrors(postures.subset(good), arm.joint_dimensions, left[good], moved[good], of_tool, basis)
+
+
+def _bare(records: tuple[FactorRecords, ...]) -> list[FactorRecords]:
+    """Records without weights and what they share."""
+    return [replace(own, weight=np.ones_like(own.weight), correlation=None) for own in records]
+
+
+def _basis(columns: Array) -> Array:
+    """An orthonormal basis of columns (m x n), of what they determine."""
+    lengths = np.linalg.norm(columns, axis=0)
+    left, sizes, _ = np.linalg.svd(columns / np.where(lengths > 0, lengths, 1.0), full_matrices=False)
+    return np.asarray(left[:, sizes > _DETERMINED * max(sizes[0], 1e-300)] if len(sizes) else left)
+
+
+def _determined(slopes: Array) -> bool:
+    """Whether each record alone determines corrections (N x rows x corrections)."""
+    if slopes.shape[1] < slopes.shape[2]:
+        return False
+    sizes = np.linalg.svd(slopes / np.linalg.norm(slopes, axis=1, keepdims=True).clip(1e-300), compute_uv=False)
+    return bool(np.all(sizes[:, -1] > _DETERMINED * sizes[:, 0]))

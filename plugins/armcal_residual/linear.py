@@ -1,0 +1,220 @@
+"""Corrections that are linear in weights: what Gaussian processes at a few points and Fourier series have in common."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
+
+import casadi as ca
+import numpy as np
+from armcal.arm.pose_residual import OF_TOOL, ModelErrors, PoseResidual, Postures
+from armcal.base.domains import Array
+from armcal.base.se3 import Expression
+from armcal.base.settings import Settings
+from pydantic import Field
+from typing_extensions import override
+
+Numbers = Annotated[str, Field(min_length=1)]
+"""An array of little-endian doubles, row by row, in base64: exact, and short."""
+Positive = Annotated[float, Field(gt=0)]
+_ROUNDS = 40
+_SETTLED = 1e-2
+_LEAST_TAKEN = 1e-3
+_LEAST_KNOWN = 0.5
+"""Weights that records determine: a function of fewer is none."""
+_UNSEEN = 1e-6
+
+
+class PartSettings(Settings):
+    """What was learned of some corrections, as weights of M features.
+
+    ``first`` is the place of the first of them, one ``scale`` (m or rad) belongs to each. ``weights`` (M x corrections)
+    give the corrections; ``root`` (M x r) their variances: scale^2 times the features' prior variance less the squared
+    length of ``root``'s product with them.
+    """
+
+    first: Annotated[int, Field(ge=0)]
+    scales: Annotated[tuple[Positive, ...], Field(min_length=1)]
+    weights: Numbers
+    root: Numbers
+
+
+class LinearResidual(PoseResidual):
+    """A pose residual of features with weights."""
+
+    def features(self, part: Any, commands: Any, approaches: Any) -> Any:
+        """Of a part: expressions (M x 1) of expressions, or an array (M x N) of arrays."""
+        raise NotImplementedError
+
+    def prior_variance(self, part: Any, features: Array) -> Array:
+        """Of the function where features are these (M x N), in units of the squared scale (N)."""
+        raise NotImplementedError
+
+    @property
+    def parts(self) -> Sequence[PartSettings]:
+        """What was learned."""
+        return tuple(getattr(self.settings, "learned", ()))
+
+    @property
+    @override
+    def is_learned(self) -> bool:
+        return bool(self.parts)
+
+    def check(self) -> None:
+        """Refuse what was learned on another arm, or was damaged.
+
+        Raises:
+            ValueError: with what is wrong.
+        """
+        size = len(OF_TOOL) + len(self.joint_names)
+        zeros = np.zeros((len(self.joint_names), 1))
+        for part in self.parts:
+            if part.first + len(part.scales) > size:
+                raise ValueError(f"found a correction of place {part.first}: it was learned on an arm with more joints")
+            features = len(self.features(part, zeros, zeros))
+            unpacked(part.weights, features, len(part.scales))
+            unpacked(part.root, features, None)
+
+    @override
+    def correction(self, commands: Expression, approaches: Expression) -> Expression:
+        rows = [ca.SX(0)] * (len(OF_TOOL) + len(self.joint_names))
+        for part in self.parts:
+            features = self.features(part, commands, approaches)
+            weights = unpacked(part.weights, features.numel(), len(part.scales))
+            for i, moved in enumerate(ca.vertsplit(ca.mtimes(ca.DM(weights.T), features))):
+                rows[part.first + i] += moved
+        return ca.vertcat(*rows)
+
+    @override
+    def deviations(self, postures: Postures) -> Array:
+        variance = np.zeros((len(OF_TOOL) + len(self.joint_names), postures.commands.shape[1]))
+        for part in self.parts:
+            features = self.features(part, postures.commands, postures.approaches)
+            taken = np.sum((unpacked(part.root, len(features), None).T @ features) ** 2, axis=0)
+            left = np.maximum(self.prior_variance(part, features) - taken, 0.0)
+            for i, scale in enumerate(part.scales):
+                variance[part.first + i] += scale**2 * left
+        return np.asarray(np.sqrt(variance))
+
+
+@dataclass(frozen=True)
+class Regression:
+    """Weights of blocks of features, each block with a variance of its own. [MacKay1992]
+
+    Attributes:
+        weights: of each block.
+        variances: prior ones, by block.
+        left: of each block's covariance where what else explains the rows is known, in units of its prior variance.
+        known: how many weights of each block the rows determine.
+        evidence: logarithm of the marginal likelihood.
+        noise: variance.
+    """
+
+    weights: tuple[Array, ...]
+    variances: Array
+    left: tuple[Array, ...]
+    known: Array
+    evidence: float
+    noise: float
+
+    def is_known(self, block: int) -> bool:
+        """Whether the rows say anything of a block's weights."""
+        return bool(self.known[block] > _LEAST_KNOWN)
+
+
+@dataclass(frozen=True)
+class Products:
+    """Rows of features X (rows x M) and what is to be explained y (rows), as X'X, X'y, y'y and how many rows."""
+
+    matrix: Array
+    vector: Array
+    square: float
+    rows: int
+
+    @classmethod
+    def of(cls, features: Array, errors: Array) -> Products:
+        """From rows."""
+        return cls(features.T @ features, features.T @ errors, float(errors @ errors), len(errors))
+
+
+def regressed(products: Products, sizes: Sequence[int], whole: Array | None = None) -> Regression:
+    """The most likely variances of blocks of ``sizes`` features with independent weights of equal variance each.
+
+    ``whole`` is X'X of features from which nothing was taken off; by default that of ``products``.
+    """
+    edges = np.cumsum([0, *sizes])
+    blocks = [slice(a, b) for a, b in itertools.pairwise(edges)]
+    diagonal = np.diag(products.matrix)
+    spread = products.square / max(products.rows, 1)
+    total = max(spread * products.rows, 1e-300) / len(blocks)
+    precisions = np.array([max(float(diagonal[b].sum()), 1e-300) / total for b in blocks])
+    noise = spread / 2
+    for _ in range(_ROUNDS):
+        inverse, weights = _posterior(products, precisions, noise, sizes)
+        known = np.array([b.stop - b.start - precisions[i] * np.trace(inverse[b, b]) for i, b in enumerate(blocks)])
+        squares = np.array([max(float(weights[b] @ weights[b]), 1e-300) for b in blocks])
+        error = products.square - 2 * weights @ products.vector + weights @ products.matrix @ weights
+        following = np.clip(np.maximum(known, 1e-12) / squares, 1e-12, 1e30)
+        noise = max(error, 1e-9 * products.square) / max(products.rows - known.sum(), 1.0)
+        moved = np.max(np.abs(np.log(following / precisions)))
+        precisions = following
+        if moved < _SETTLED:
+            break
+    inverse, weights = _posterior(products, precisions, noise, sizes)
+    error = products.square - 2 * weights @ products.vector + weights @ products.matrix @ weights
+    size = float(np.linalg.slogdet(inverse)[1]) + float(np.sum(np.array(sizes) * np.log(precisions)))
+    squares = np.array([float(weights[b] @ weights[b]) for b in blocks])
+    evidence = (size - products.rows * np.log(noise) - error / noise - precisions @ squares) / 2
+    known = np.array([b.stop - b.start - precisions[i] * np.trace(inverse[b, b]) for i, b in enumerate(blocks)])
+    if whole is not None:
+        inverse, _ = _posterior(replace(products, matrix=whole), precisions, noise, sizes)
+    left = tuple(precisions[i] * inverse[b, b] for i, b in enumerate(blocks))
+    return Regression(tuple(weights[b] for b in blocks), 1 / precisions, left, known, float(evidence), float(noise))
+
+
+def _posterior(products: Products, precisions: Array, noise: float, sizes: Sequence[int]) -> tuple[Array, Array]:
+    """Covariance and mean of the weights."""
+    precise = np.repeat(precisions, sizes)
+    scale = 1 / np.sqrt(precise)
+    inner = np.linalg.inv(scale[:, None] * products.matrix * scale / noise + np.eye(len(scale)))
+    inverse = scale[:, None] * inner * scale
+    return inverse, inverse @ products.vector / noise
+
+
+def seen(errors: ModelErrors, joints: Sequence[int]) -> list[int]:
+    """Those of some joints (from 0) whose corrections residuals show."""
+    shown = {i: float(np.sum(errors.slopes[:, :, len(OF_TOOL) + i] ** 2)) for i in joints}
+    return [i for i, square in shown.items() if square > _UNSEEN * max(shown.values())]
+
+
+def taken_root(roots: Array, left: Array) -> Array:
+    """The root of what records took of the variance of features whose weights are ``roots`` times independent ones."""
+    values, axes = np.linalg.eigh(np.eye(len(left)) - (left + left.T) / 2)
+    kept = values > _LEAST_TAKEN
+    return np.asarray(roots @ (axes[:, kept] * np.sqrt(np.minimum(values[kept], 1.0))))
+
+
+def packed(array: Array) -> str:
+    """An array as settings hold it; an empty one too."""
+    return base64.b64encode(np.ascontiguousarray(array, dtype="<f8").tobytes()).decode("ascii") or "none"
+
+
+def unpacked(text: str, rows: int | None, columns: int | None) -> Array:
+    """The array that settings hold, of so many rows, or columns.
+
+    Raises:
+        ValueError: it is damaged.
+    """
+    try:
+        numbers = np.frombuffer(b"" if text == "none" else base64.b64decode(text, validate=True), dtype="<f8")
+        array = numbers.reshape(
+            -1 if rows is None else rows, len(numbers) // (rows or 1) if columns is None else columns
+        )
+    except ValueError as fault:
+        raise ValueError(f"found learned numbers that cannot be read ({fault}): the file was edited") from fault
+    if not np.isfinite(array).all():
+        raise ValueError("found learned numbers that are not finite: the file was edited")
+    return array

@@ -1,0 +1,214 @@
+"""Pose residuals: errors of joints that no effect models, learned, kept where they help, and used wherever arms are."""
+
+import json
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from armcal.arm.pose_residual import ModelErrors, Postures
+from armcal.base.dataset import Dataset
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.exporter import request_of
+from armcal.functions.compiler import find_compiler
+from armcal.run.experiment import Experiment
+from armcal.testing import assert_contract
+from armcal_residual.fourier import Fourier, FourierSettings
+from armcal_residual.gaussian_process import GaussianProcess, GaussianProcessSettings, _Likelihood, _squares
+from armcal_residual.linear import Products, packed, regressed, unpacked
+from compiled_arm import CompiledArm
+from outside import armcal
+
+ARM = """
+arms:
+  arm:
+    model: {type: mdh, convention: standard, rows: [{d_mm: 80, alpha_deg: 90}, {a_mm: 250}, {a_mm: 200, theta_deg: 10}]}
+    effects: {%s}
+    %s
+measurements: {tracker: {type: tip_position, noise_mm: 0.05, target_mm: [20, 0, 30]}}
+statics: {gravity_m_s2: [0, 0, -9.81], payload_g: 0}
+parameters:
+  free: ["arm.mdh.theta*", "arm.mdh.[ad]?", "tracker.*"]
+  priors: {"arm.mdh.theta*": 2 deg, "arm.mdh.[ad]?": 3 mm, "tracker.*": 5 mm}
+estimator: {type: cvxpy}
+"""
+SIMULATION = """
+simulation:
+  type: elastic_arm
+  truth: truth.yaml
+  seed: %d
+  noise_mm: 0.05
+  poses: {kind: random, count: %d, levels_deg: {q1: [-60, 60], q2: [-60, 60], q3: [-60, 60]}}
+"""
+GEARS = "arm.gears.sin2_1: 0.002 rad\narm.gears.cos2_2: -0.0015 rad\narm.gears.sin2_3: 0.002 rad\n"
+KINDS = ["gaussian_process", "fourier"]
+HELD = "validation: {holdout: 0.25, seed: 2}\n"
+
+
+def recorded(folder, truth=GEARS, count=240, seed=3):
+    """Records of an arm whose gears err."""
+    (folder / "sim.yaml").write_text(ARM % ("gears: {type: gear_error}", "") + SIMULATION % (seed, count))
+    (folder / "truth.yaml").write_text(truth or "arm.mdh.a2: 251 mm\n")
+    armcal("simulate", folder / "sim.yaml", "--out", folder / "data.csv")
+    return folder / "data.csv"
+
+
+def ran(folder, residual, data, more=HELD, code=0):
+    text = ARM % ("", f"residual: {residual}" if residual else "") + "data: {type: csv, path: data.csv}\n" + more
+    (folder / "run.yaml").write_text(text)
+    return armcal("run", folder / "run.yaml", "--data", data, "--out", folder / "run", "-q", code=code)
+
+
+@cache
+def learned_run(kind):
+    import tempfile
+    from pathlib import Path
+
+    folder = Path(tempfile.mkdtemp())
+    ran(folder, f"{{type: {kind}}}", recorded(folder))
+    metrics = json.loads((folder / "run/metrics.json").read_text())
+    calibration = Calibration.load(folder / "run/calibration.yaml")
+    return SimpleNamespace(folder=folder, metrics=metrics, calibration=calibration)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_contract(kind):
+    assert_contract({"fourier": Fourier, "gaussian_process": GaussianProcess}[kind], "residual")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_unseen_errors_fall_to_near_the_noise_and_the_run_says_so(kind):
+    run = learned_run(kind)
+    errors, outcome = run.metrics["error_mm"]["calibrated"], run.metrics["pose_residual"]
+    assert outcome["kept"] and outcome["folds"]["without_mm"] > 0.15
+    noise = 0.05 * np.sqrt(8 / np.pi)  # the mean length of three coordinates' noise
+    assert errors["holdout"]["mean"] < 1.4 * noise
+    assert outcome["folds"]["with_mm"] == pytest.approx(errors["cross_validated"]["mean"], rel=1e-6)
+    shares = run.metrics["prediction_intervals"]["same_recording"]["holdout"]["share"]
+    assert 0.82 <= shares["90"] <= 0.98  # folds have fewer records: rather too wide
+    log = (run.folder / "run/log.txt").read_text()
+    assert "The pose residual of arm takes unseen errors from" in log
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_calibration_predicts_what_the_run_found_and_compensates_to_the_same_arm(kind):
+    run = learned_run(kind)
+    commands = Experiment.load(run.folder / "run.yaml").read()
+    angles = commands.stacked(["arm.q1", "arm.q2", "arm.q3"]).T
+    read, tools = run.calibration.predict(commands)
+    missed = 1000 * np.stack([commands.column(f"tracker.{axis}") - read[f"tracker.{axis}"] for axis in "xyz"])
+    residuals = np.genfromtxt(run.folder / "run/residuals.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(missed, [residuals[f"d{axis}_mm"] for axis in "xyz"], atol=2e-5)
+    found = run.calibration.compensate(tools[0][:20, :3, 3], start=angles[:20] + 0.1)
+    back = run.calibration.forward(found.joint_angles)
+    np.testing.assert_allclose(back[:, :3, 3], tools[0][:20, :3, 3], atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_intervals_widen_where_nothing_was_measured(kind):
+    run = learned_run(kind)
+
+    def widths(angle_deg):
+        at = {f"arm.q{i}": np.full(1, np.radians(angle_deg if i == 1 else 20.0)) for i in (1, 2, 3)}
+        return max(run.calibration.plus_minus(Dataset(("a",), at)).half_widths[f"tracker.{axis}"][0] for axis in "xyz")
+
+    assert widths(170.0) > 3 * widths(20.0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_arm_without_such_errors_keeps_none(kind, tmp_path):
+    ran(tmp_path, f"{{type: {kind}}}", recorded(tmp_path, ""))
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    assert not metrics["pose_residual"]["kept"]
+    text = (tmp_path / "run/calibration.yaml").read_text()
+    assert "learned: []" in text or "learned: ()" in text
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("kind", KINDS)
+def test_c_code_stands_where_the_calibration_does(kind, tmp_path):
+    calibration = learned_run(kind).calibration
+    arm = CompiledArm(request_of(calibration, None, "arm.c"), tmp_path)
+    record = arm.defaults()
+    for angles in np.random.default_rng(0).uniform(-1, 1, (5, 3)):
+        record[:3] = angles
+        status, pose, _ = arm.forward(record)
+        assert status == 0
+        np.testing.assert_allclose(pose, calibration.forward(angles)[0, :3], atol=1e-12)
+
+
+def test_a_recalibration_holds_what_was_learned(tmp_path):
+    run = learned_run("fourier")
+    (tmp_path / "calibration.yaml").write_text((run.folder / "run/calibration.yaml").read_text())
+    armcal(
+        "recalibrate",
+        tmp_path / "calibration.yaml",
+        "--from",
+        run.folder / "data.csv",
+        "--out",
+        tmp_path / "out",
+        "-q",
+    )
+    after = Calibration.load(tmp_path / "out/calibration.yaml")
+    postures = Postures(np.random.default_rng(0).uniform(-1, 1, (3, 20)), np.zeros((3, 20)))
+    kept = [own.system.arms["arm"].residual.corrections(postures) for own in (run.calibration, after)]
+    np.testing.assert_array_equal(*kept)
+
+
+def test_contacts_have_nothing_to_learn_from(tmp_path):
+    config = ARM % ("", "residual: {type: fourier}")
+    config = config.replace("tip_position, noise_mm: 0.05, target_mm: [20, 0, 30]", "plane_contact, noise_mm: 0.05")
+    (tmp_path / "a.yaml").write_text(config.replace("tracker.*", "arm.mdh.alpha*").replace("5 mm}", "5 deg}"))
+    rows = "\n".join(f"{i},{10 * i},{-5 * i},{7 * i},table" for i in range(12))
+    (tmp_path / "data.csv").write_text(f"pose_id,q1_deg,q2_deg,q3_deg,plane\n{rows}\n")
+    done = armcal("run", tmp_path / "a.yaml", "--data", tmp_path / "data.csv", "--out", tmp_path / "out", code=2)
+    assert "a pose residual is learned from measured positions" in done.stderr
+
+
+@pytest.mark.parametrize("damage", ["cut", "text"])
+def test_what_was_learned_is_refused_when_it_is_damaged(damage):
+    section = dict(learned_run("gaussian_process").calibration.record.arms["arm"]["residual"])
+    section.pop("type")
+    own = GaussianProcessSettings.model_validate(section)
+    part = own.learned[0]
+    weights = part.weights[:-12] if damage == "cut" else "!" + part.weights[1:]
+    spoiled = own.model_copy(update={"learned": (part.model_copy(update={"weights": weights}),)})
+    with pytest.raises(ValueError, match="cannot be read"):
+        GaussianProcess(spoiled, ("q1", "q2", "q3"))
+    with pytest.raises(ValueError, match="more joints"):
+        GaussianProcess(own, ("q1", "q2"))
+
+
+def test_numbers_survive_to_the_last_bit():
+    numbers = np.random.default_rng(0).normal(size=(7, 3))
+    np.testing.assert_array_equal(unpacked(packed(numbers), 7, 3), numbers)
+    np.testing.assert_array_equal(unpacked(packed(numbers), None, 3), numbers)
+    assert unpacked(packed(np.zeros((5, 0))), 5, None).shape == (5, 0)
+
+
+def test_the_gradient_of_the_marginal_likelihood():
+    random = np.random.default_rng(1)
+    numbers = random.uniform(-2, 2, (2, 40))
+    likelihood = _Likelihood(_squares(numbers, [("angle", 0), ("length", 1)]), random.normal(size=(40, 3)))
+    at = np.array([0.2, -0.3, -0.5])
+    step = 1e-6
+    numeric = [(likelihood(at + step * e)[0] - likelihood(at - step * e)[0]) / (2 * step) for e in np.eye(3)]
+    np.testing.assert_allclose(likelihood(at)[1], numeric, rtol=1e-5)
+
+
+def test_the_evidence_finds_the_noise_and_leaves_out_what_is_not_there():
+    random = np.random.default_rng(2)
+    there, absent = random.normal(size=(2, 400, 10))
+    weights = random.normal(0, 0.5, 10)
+    found = regressed(Products.of(np.hstack([there, absent]), there @ weights + random.normal(0, 0.2, 400)), [10, 10])
+    assert np.sqrt(found.noise) == pytest.approx(0.2, rel=0.1)
+    assert np.sqrt(found.variances[0]) == pytest.approx(0.5, rel=0.5)
+    assert found.is_known(0) and not found.is_known(1)
+    np.testing.assert_allclose(found.weights[0], weights, atol=0.05)
+
+
+def test_few_records_teach_nothing():
+    postures = Postures(np.random.default_rng(0).uniform(-1, 1, (3, 8)), np.zeros((3, 8)))
+    errors = ModelErrors(postures, ("angle",) * 3, np.ones((8, 3)), np.ones((8, 3, 9)), 3, np.zeros((24, 0)))
+    assert GaussianProcess(GaussianProcessSettings(), ("a", "b", "c")).learned(errors) is None
+    assert Fourier(FourierSettings(orders=12), ("a", "b", "c")).learned(errors) is None
