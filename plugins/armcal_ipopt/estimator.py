@@ -8,7 +8,7 @@ would lower the cost by no more than its rounding errors.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
@@ -22,6 +22,7 @@ from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Progress, Solution, SolverVerdict, no_progress
 from armcal.estimate.polish import bounded_step, polish
 from armcal.io.parallel import Executor, Sequential
+from armcal.io.signals import Interrupts
 from armcal.problem.posed import PosedProblem
 from armcal.problem.problem import FactorRecords, NormalEquations, Problem
 from pydantic import Field
@@ -101,10 +102,11 @@ def _solve_once(settings: IpoptSettings, problem: Problem, records: tuple[Factor
     callbacks = [_Callback(name, objective) for name in ("cost", "gradient", "hessian")]
     watch = _Watch(objective)
     solver = _solver(settings, callbacks, watch, len(start))
-    answer = solver(x0=start, lbx=lower, ubx=upper)
+    with Interrupts() as interrupts:
+        answer = solver(x0=start, lbx=lower, ubx=upper)
     stats = solver.stats()
     stopped = stats["return_status"] == "User_Requested_Stop"
-    if objective.interrupted or (stopped and not (objective.stuck or watch.settled)):
+    if interrupts.came or (stopped and not (objective.stuck or watch.settled)):
         raise KeyboardInterrupt  # CasADi keeps it to itself, and the next start would go on
     # IPOPT stays inside its bounds by a rounding error; the model's domain wants it exactly.
     x = np.clip(np.asarray(answer["x"]).ravel(), lower, upper)
@@ -183,7 +185,7 @@ class _Objective:
         self._at: Array | None = None
         self._tried: tuple[Array, float] | None = None
         self._model = NormalEquations(np.nan, np.zeros(0), np.zeros((0, 0)))
-        self.size, self.unit, self.interrupted, self._refused = len(start), 1.0, False, 0
+        self.size, self.unit, self._refused = len(start), 1.0, 0
         at_start = float(self.cost(start))
         self.unit = at_start if np.isfinite(at_start) and at_start > _SMALLEST_UNIT else 1.0
 
@@ -192,7 +194,7 @@ class _Objective:
         if self._at is not None and np.array_equal(x, self._at):
             return np.array(self._model.cost / self.unit)
         if self._tried is None or not np.array_equal(x, self._tried[0]):
-            cost = self._interruptible(lambda: self._posed.cost(x))
+            cost = self._posed.cost(x)
             self._tried = x.copy(), cost if np.isfinite(cost) else np.nan
             self._refused = 0 if np.isfinite(cost) else self._refused + 1
         return np.array(self._tried[1] / self.unit)
@@ -230,18 +232,11 @@ class _Objective:
         if self._at is None or not np.array_equal(x, self._at):
             self._at = x.copy()
             try:
-                self._model = self._interruptible(lambda: self._posed.model(x))
+                self._model = self._posed.model(x)
             except NotConvergedError:
                 nowhere = np.full((len(x), len(x)), np.nan)
                 self._model = NormalEquations(np.nan, nowhere[0], nowhere)
         return self._model
-
-    def _interruptible(self, evaluate: Callable[[], T]) -> T:
-        try:
-            return evaluate()
-        except KeyboardInterrupt:
-            self.interrupted = True
-            raise
 
 
 class _Callback(ca.Callback):  # type: ignore[misc]

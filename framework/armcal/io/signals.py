@@ -42,3 +42,29 @@ class Signals:
         self.finish |= number in FINISH
         self.status |= number == STATUS
         self.rotate |= number == ROTATE
+
+
+class Interrupts:
+    """While it is entered it notes that Ctrl-C came, for whoever calls a library that may keep it to itself.
+
+    Outside the main thread there are none.
+    """
+
+    def __init__(self) -> None:
+        self.came = False
+        self._before: Any = None
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            self._before = signal.getsignal(signal.SIGINT)
+            if callable(self._before):
+                signal.signal(signal.SIGINT, self._take)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, at: TracebackType | None) -> None:
+        if callable(self._before):
+            signal.signal(signal.SIGINT, self._before)
+
+    def _take(self, number: int, frame: FrameType | None) -> None:
+        self.came = True
+        self._before(number, frame)
