@@ -53,10 +53,10 @@ def recorded(folder, truth=GEARS, count=240, seed=3):
     return folder / "data.csv"
 
 
-def ran(folder, residual, data, more=HELD, code=0):
-    text = ARM % ("", f"residual: {residual}" if residual else "") + "data: {type: csv, path: data.csv}\n" + more
+def ran(folder, residual, data, *words):
+    text = ARM % ("", f"residual: {residual}" if residual else "") + "data: {type: csv, path: data.csv}\n" + HELD
     (folder / "run.yaml").write_text(text)
-    return armcal("run", folder / "run.yaml", "--data", data, "--out", folder / "run", "-q", code=code)
+    return armcal("run", folder / "run.yaml", "--data", data, "--out", folder / "run", "-q", *words)
 
 
 @cache
@@ -65,7 +65,8 @@ def learned_run(kind):
     from pathlib import Path
 
     folder = Path(tempfile.mkdtemp())
-    ran(folder, f"{{type: {kind}}}", recorded(folder))
+    parallel = ("--parallel", "2") if kind == "fourier" else ()  # folds are sent to other processes
+    ran(folder, f"{{type: {kind}}}", recorded(folder), *parallel)
     metrics = json.loads((folder / "run/metrics.json").read_text())
     calibration = Calibration.load(folder / "run/calibration.yaml")
     return SimpleNamespace(folder=folder, metrics=metrics, calibration=calibration)

@@ -159,7 +159,7 @@ class LayeredFit(PredictedFit):
 class _Layer:
     """What a fold needs to learn: whose pose residual, and all records' postures."""
 
-    arm: Arm
+    arm: str
     residual: PoseResidual
     postures: Postures
 
@@ -167,7 +167,7 @@ class _Layer:
         self, problem: Problem, fitted: WeighedFit, records: tuple[FactorRecords, ...], places: Indices
     ) -> PoseResidual | None:
         """From what a fit leaves of its records."""
-        errors = model_errors(problem, fitted, records, self.arm, self.postures.subset(places))
+        errors = model_errors(problem, fitted, records, problem.blueprint.arms[self.arm], self.postures.subset(places))
         return None if errors is None else self.residual.learned(errors)
 
 
@@ -214,7 +214,7 @@ def learned_residual(
     assert residual is not None
     kind = str(experiment.system.description["arms"][arm.name]["residual"]["type"])
     nothing = ResidualOutcome(arm.name, kind, unit)
-    layer = _Layer(replace(arm), residual, postures)
+    layer = _Layer(arm.name, residual, postures)
     learned = layer.learned(problem, fitted, fitted.records, np.arange(count, dtype=np.intp))
     if count < _FEWEST or learned is None:
         return nothing
@@ -257,16 +257,17 @@ def judged_with(task: FitTask, layer: _Layer) -> JudgedFit:
         if not plain.converged:
             return plain
         learned = layer.learned(task.problem, fitted, fitted.records, task.split.train)
+        arm = task.problem.blueprint.arms[layer.arm]
         if learned is not None:
             train, held = (
-                corrected_records(task.problem, own, layer.arm, learned.corrections(layer.postures.subset(places)))
+                corrected_records(task.problem, own, arm, learned.corrections(layer.postures.subset(places)))
                 for own, places in ((train, task.split.train), (held, task.split.holdout))
             )
             fitted = fit(task.problem, train, task.estimator, fitted.solution.values)
         judged = judged_fit(task, fitted.solution, train, held, began)
         alike = whitened_like(task.problem, fitted, held, task.estimator)
         held_residuals = missed(predictor(task.problem, fitted), alike)
-        own = {} if learned is None else {layer.arm.name: learned}
+        own = {} if learned is None else {layer.arm: learned}
         unknown = tuple(unexplained(task.problem, fitted.solution.values, held, own))
     except NotConvergedError:
         return failed_fit(task, began)
