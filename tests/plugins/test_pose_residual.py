@@ -14,8 +14,9 @@ from armcal.functions.compiler import find_compiler
 from armcal.run.experiment import Experiment
 from armcal.testing import assert_contract
 from armcal_residual.fourier import Fourier, FourierSettings
-from armcal_residual.gaussian_process import GaussianProcess, GaussianProcessSettings, _Likelihood, _squares
+from armcal_residual.gaussian_process import GaussianProcess, GaussianProcessSettings
 from armcal_residual.linear import Products, packed, regressed, unpacked
+from armcal_residual.tool_processes import _Likelihood, _squares
 from compiled_arm import CompiledArm
 from outside import armcal
 

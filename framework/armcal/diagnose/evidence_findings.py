@@ -118,7 +118,7 @@ def structure_findings(structure: ResidualStructure | None, unit: str = _MM) -> 
             "the model lacks something that is not among them."
         )
         likelihood = f"marginal likelihood of a Gaussian process over the poses, odds of {np.exp(CLEAR):.0f} to 1"
-        advice = "Free more of the geometry; repeat some poses with a second payload."
+        advice = "Free more of the geometry; repeat some poses with a second payload; or learn it: arms.NAME.residual."
         findings.append(Finding("warning", text, likelihood, advice))
     if not findings:
         slight = f" {_plural(len(structure.structures), 'dependence', 'dependences')} found would not lower it by 1 %."

@@ -263,7 +263,8 @@ def _left(problem: Problem, seen: _Seen, read_as: Wires, measured: Array, enough
     Raises:
         NotConvergedError: a record has no elastic equilibrium.
     """
-    placing, number, nominal = seen.placing, seen.sighting.kernel, problem.parameters.nominal()
+    # As configured: where records that are mixed up put base and target says nothing of another reading of them.
+    placing, number, nominal = seen.placing, seen.sighting.kernel, problem.blueprint.parameters.nominal()
     if placing is None:
         positions = _positions(problem, seen, read_as, nominal)
         return np.inf if positions is None else positions.left(measured, enough)

@@ -1,0 +1,156 @@
+"""A process of the tool's shifts, and one of its turns, over all joints and directions of approach.
+
+Its length scales maximise the marginal likelihood of some of the records; it is held by its values at a few poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from armcal.arm.pose_residual import ModelErrors
+from armcal.base.domains import Array
+from scipy.linalg import cho_solve
+from scipy.optimize import minimize
+
+from armcal_residual.correlations import Correlations, Input, Kind, ProcessSettings, roots_of
+from armcal_residual.linear import packed, taken_root
+
+_FEWEST = 12
+"""Records an input of the process."""
+_STARTS = (0.4, 2.0)
+_FIRST, _SECOND = 250, 500
+"""Records by which its length scales are found, first from each start, then from the best of them."""
+_STEPS = 20
+_LENGTHS = (-2.3, 4.0)
+"""Bounds of the logarithm: a chord of 2 is half a turn."""
+_NOISE = (-3.0, 3.0)
+_GAIN = 3.0
+"""Logarithm of the odds, for each of its numbers, from which on a process is there."""
+_LEFT = 0.01
+"""Of the noise's variance: so little of the process may be left between its poses."""
+
+
+def of_tool(errors: ModelErrors, left: Array, most: int) -> list[ProcessSettings]:
+    """Processes of the tool's shifts, and turns, where what is left of the residuals (N x rows) follows one."""
+    inputs, tool = _inputs(errors), errors.of_tool
+    if not tool or len(left) < _FEWEST * len(inputs):
+        return []
+    own = -np.einsum("ncr,nr->nc", np.linalg.pinv(errors.slopes[:, :, :tool]), left)
+    processes = [_process(errors, own[:, i : i + 3], inputs, most, i) for i in range(0, tool, 3)]
+    return [part for part in processes if part is not None]
+
+
+def _inputs(errors: ModelErrors) -> list[tuple[Kind, int]]:
+    """Joints that moved, and approaches that differ."""
+    postures, joints = errors.postures, range(len(errors.dimensions))
+    moved: list[tuple[Kind, int]] = [
+        ("angle" if errors.dimensions[i] == "angle" else "length", i)
+        for i in joints
+        if np.ptp(postures.commands[i]) > 0
+    ]
+    return moved + [("approach", i) for i in joints if np.ptp(postures.approaches[i]) > 0]
+
+
+def _squares(numbers: Array, inputs: Sequence[tuple[Kind, int]], to: Array | None = None) -> Array:
+    """Squared chords and distances between records (inputs x N x N), or to some of them."""
+    apart = numbers[:, :, None] - (numbers if to is None else to)[:, None, :]
+    return np.array(
+        [2 - 2 * np.cos(d) if kind == "angle" else d**2 for d, (kind, _) in zip(apart, inputs, strict=True)]
+    )
+
+
+def _process(
+    errors: ModelErrors, own: Array, inputs: Sequence[tuple[Kind, int]], most: int, first: int
+) -> ProcessSettings | None:
+    """Of three corrections of the tool (N x 3)."""
+    postures = errors.postures
+    raw = np.array([(postures.approaches if kind == "approach" else postures.commands)[i] for kind, i in inputs])
+    spans = np.array([1.0 if kind == "angle" else np.ptp(row) for row, (kind, _) in zip(raw, inputs, strict=True)])
+    numbers, order = raw / spans[:, None], np.random.default_rng(0).permutation(len(own))
+    starts = [np.log(np.append(np.full(len(inputs), length), 0.7)) for length in _STARTS]
+    some = order[:_FIRST]
+    candidates = [_likeliest(_Likelihood(_squares(numbers[:, some], inputs), own[some]), start) for start in starts]
+    some = order[:_SECOND]
+    likelihood = _Likelihood(_squares(numbers[:, some], inputs), own[some])
+    best = _likeliest(likelihood, min(candidates, key=likelihood.cost))
+    nothing = len(some) / 2 * float(np.sum(np.log(np.mean(own[some] ** 2, axis=0))))
+    if nothing - likelihood.cost(best) < _GAIN * len(best):
+        return None
+    lengths, noise = np.exp(best[:-1]), float(np.exp(best[-1]))
+    kept = _poses(numbers, inputs, lengths, most, noise)
+    listed = [
+        Input(of=kind, joint=i + 1, scale=float(length * span))
+        for (kind, i), length, span in zip(inputs, lengths, spans, strict=True)
+    ]
+    features = Correlations.of(listed, raw[:, kept])(postures.commands, postures.approaches)
+    roots = roots_of(features[:, kept])
+    independent = features.T @ roots
+    left = np.linalg.inv(independent.T @ independent / noise**2 + np.eye(len(kept)))
+    return ProcessSettings(
+        first=first,
+        scales=tuple(likelihood.scales(best).tolist()),
+        weights=packed(roots @ (left @ (independent.T @ own / noise**2))),
+        root=packed(taken_root(roots, left)),
+        inputs=tuple(listed),
+        poses=packed(raw[:, kept].T),
+    )
+
+
+@dataclass(frozen=True)
+class _Likelihood:
+    """Negative logarithm of the marginal likelihood, each output's scale at its best, and the gradient."""
+
+    squares: Array
+    errors: Array
+
+    def cost(self, at: Array) -> float:
+        """At logarithms of length scales and of the noise."""
+        return self(at)[0]
+
+    def __call__(self, at: Array) -> tuple[float, Array]:
+        """With the gradient."""
+        (count, outputs), ratio = self.errors.shape, np.exp(2 * at[-1])
+        kernel, lower, inverse = self._factored(at)
+        solved = inverse @ self.errors
+        variances = np.maximum(np.mean(self.errors * solved, axis=0), 1e-300)
+        value = outputs * np.sum(np.log(np.diag(lower))) + count / 2 * np.sum(np.log(variances))
+        by_kernel = outputs / 2 * inverse - (solved / variances) @ solved.T / 2
+        slope = np.tensordot(self.squares, by_kernel * kernel, axes=2) * np.exp(-2 * at[:-1])
+        # the kernel falls with its squares by half, and weights are exp(-2 l)
+        return float(value), np.append(slope, 2 * ratio * np.trace(by_kernel))
+
+    def scales(self, at: Array) -> Array:
+        """Of the process, by output."""
+        solved = self._factored(at)[2] @ self.errors
+        return np.asarray(np.sqrt(np.maximum(np.mean(self.errors * solved, axis=0), 1e-24)))
+
+    def _factored(self, at: Array) -> tuple[Array, Array, Array]:
+        kernel = np.exp(-np.tensordot(np.exp(-2 * at[:-1]), self.squares, axes=1) / 2)
+        lower = np.linalg.cholesky(kernel + np.exp(2 * at[-1]) * np.eye(len(kernel)))
+        return kernel, lower, cho_solve((lower, True), np.eye(len(kernel)))
+
+
+def _likeliest(likelihood: _Likelihood, start: Array) -> Array:
+    """Where the marginal likelihood is largest, near a start."""
+    bounds = [_LENGTHS] * (len(start) - 1) + [_NOISE]
+    options = {"maxiter": _STEPS}
+    return np.asarray(minimize(likelihood, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x)
+
+
+def _poses(numbers: Array, inputs: Sequence[tuple[Kind, int]], lengths: Array, most: int, noise: float) -> list[int]:
+    """Records at which a process is held: each where the most is left, until little is. [Fine2001]"""
+    left, columns, kept = np.ones(numbers.shape[1]), list[Array](), list[int]()
+    while len(kept) < min(most, numbers.shape[1]):
+        place = int(np.argmax(left))
+        if left[place] < _LEFT * noise**2:
+            break
+        squares = _squares(numbers, inputs, numbers[:, [place]])[:, :, 0]
+        column = np.exp(-(lengths**-2 @ squares) / 2)
+        for before in columns:
+            column = column - before * before[place]
+        columns.append(column / np.sqrt(left[place]))
+        left = np.maximum(left - columns[-1] ** 2, 0.0)
+        kept.append(place)
+    return kept
