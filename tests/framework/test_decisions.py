@@ -155,6 +155,7 @@ def test_a_decision_names_its_record_its_cost_and_where_to_go_back(slipped: Any)
     assert level["to"] == "watch" and level["do"] and level["last_good"]["id"] == "p30"
 
 
+@pytest.mark.slow
 def test_records_that_nothing_explains_say_stop_and_where_to_go_back() -> None:
     """Readings that have nothing to do with the arm: the tip error is how far they lie off."""
     session, world = begun(), World.drawn(5)

@@ -82,6 +82,7 @@ def test_a_refit_from_a_start_far_off_goes_to_the_next_start() -> None:
     assert np.median(np.linalg.norm(made.residuals(values, records)[0], axis=0)) < 0.002
 
 
+@pytest.mark.slow
 def test_refits_come_every_so_many_records_and_follow_a_slip() -> None:
     made, known = mission(), series()
     recent, all_ = known["refit_recent"], known["refit"]
