@@ -49,6 +49,7 @@ class CExporter:
 
     Settings: ClassVar[type[CExportSettings]] = CExportSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"prefix": "left"}
+    holds_residual: ClassVar[bool] = True
 
     def __init__(self, settings: CExportSettings) -> None:
         self._settings = settings

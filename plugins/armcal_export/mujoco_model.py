@@ -13,7 +13,15 @@ from armcal.arm.assembly import scoped
 from armcal.arm.effects import JointCommand, reshapes
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
-from armcal.calibration.exporter import POSES, Exported, ExportRequest, changed_numbers, random_commands, rigid_tools
+from armcal.calibration.exporter import (
+    POSES,
+    Exported,
+    ExportRequest,
+    changed_numbers,
+    leaves_residual_out,
+    random_commands,
+    rigid_tools,
+)
 from armcal.calibration.rigid_chain import RigidChain, require_plain_axes, rigid_chain
 from armcal.errors import InputError, NotConvergedError, ProblemError
 from pydantic import Field
@@ -71,7 +79,8 @@ class MujocoExporter:
         _compare(loaded, rigid_tools(request.arm, request.values, commands), commands)
         reach = _reach(request, loaded, commands)
         left_out = _left_out(request, arm_description)
-        left_out = left_out or (("turns of second order in its springs",) if reach > TOLERANCE else ())
+        if not left_out and reach > TOLERANCE and not leaves_residual_out(self, request):
+            left_out = ("turns of second order in its springs",)
         return Exported(content, changed_numbers(request), left_out, reach=reach)
 
 

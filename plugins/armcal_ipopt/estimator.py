@@ -209,7 +209,7 @@ class _Objective:
         model, (lower, upper) = self._evaluate(x), self._posed.bounds()
         if not (np.isfinite(model.cost) and np.isfinite(model.hessian).all()):
             return False
-        # Most often one number alone can still lower it, which is told without the search for the best step of all.
+        # Most often one number alone can still lower it, which shows without the search for the best step of all.
         curvature = np.maximum(np.diag(model.hessian), _LEAST_CURVATURE)
         alone = np.clip(-model.gradient / curvature, lower - x, upper - x)
         if np.max(-(model.gradient + curvature * alone / 2) * alone) > _ROUNDING * model.cost:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import itertools
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
@@ -45,13 +46,13 @@ class PartSettings(Settings):
 class LinearResidual(PoseResidual):
     """A pose residual of features with weights."""
 
+    @abstractmethod
     def features(self, part: Any, commands: Any, approaches: Any) -> Any:
         """Of a part: expressions (M x 1) of expressions, or an array (M x N) of arrays."""
-        raise NotImplementedError
 
+    @abstractmethod
     def prior_variance(self, part: Any, features: Array) -> Array:
         """Of the function where features are these (M x N), in units of the squared scale (N)."""
-        raise NotImplementedError
 
     @property
     def parts(self) -> Sequence[PartSettings]:

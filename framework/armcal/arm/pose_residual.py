@@ -6,6 +6,7 @@ stands at R Exp(turn), p + shift, where R and p are what the model says of it th
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,7 +31,7 @@ def correction_names(joint_names: Sequence[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Postures:
-    """Where an arm was told to go: commands (rad or m) and directions of approach (-1, 0, 1), joints x N each."""
+    """Where an arm was commanded to go: commands (rad or m) and directions of approach (-1, 0, 1), joints x N each."""
 
     commands: Array
     approaches: Array
@@ -65,7 +66,7 @@ class ModelErrors:
         return rows - self.taken @ (self.taken.T @ rows)
 
 
-class PoseResidual:
+class PoseResidual(ABC):
     """Base of pose residuals. Learned, it corrects where joints and tools are; before that it changes nothing.
 
     Attributes:
@@ -81,14 +82,15 @@ class PoseResidual:
         self.joint_names = tuple(joint_names)
 
     @property
+    @abstractmethod
     def is_learned(self) -> bool:
         """Whether it corrects anything."""
-        raise NotImplementedError
 
+    @abstractmethod
     def learned(self, errors: ModelErrors) -> PoseResidual | None:
         """The same with what records say; None where they are too few."""
-        raise NotImplementedError
 
+    @abstractmethod
     def correction(self, commands: Expression, approaches: Expression) -> Expression:
         """Corrections (6 + joints x 1).
 
@@ -96,11 +98,10 @@ class PoseResidual:
             commands: of all joints (joints x 1; rad or m).
             approaches: directions of approach (joints x 1; -1, 0, 1).
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def deviations(self, postures: Postures) -> Array:
         """Standard deviations of corrections (6 + joints x N): small near what was learned, large far from it."""
-        raise NotImplementedError
 
     def corrections(self, postures: Postures) -> Array:
         """Corrections (6 + joints x N)."""

@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import casadi as ca
 import numpy as np
@@ -113,7 +113,12 @@ class Exported:
 
 
 class Exporter(Protocol):
-    """What a plugin provides to write a calibrated arm in a format of its own."""
+    """What a plugin provides to write a calibrated arm in a format of its own.
+
+    One whose files hold what was learned of the pose residual, as those of ``request.expression`` do, has the class
+    attribute ``holds_residual = True``. Of any other ``armcal export`` says that it is left out, and how far that moves
+    the tool.
+    """
 
     def export(self, request: ExportRequest) -> Exported:
         """The arm in the format, read again and compared before it is handed out.
@@ -172,8 +177,18 @@ def rigid_tools(arm: Arm, values: Mapping[str, Array], commands: Array) -> Array
     return tool_poses(chain, np.stack(arm.joint_commands([*commands]), axis=1))
 
 
-def effects_reach(calibration: Calibration, request: ExportRequest) -> float | None:
-    """How far the calibrated arm is from the same one without effects, at most over random poses (m).
+def leaves_residual_out(exporter: Exporter, request: ExportRequest) -> bool:
+    """Whether the arm has learned a pose residual that a format does not hold."""
+    residual = request.arm.residual
+    return residual is not None and residual.is_learned and not getattr(exporter, "holds_residual", False)
+
+
+def effects_reach(
+    calibration: Calibration, request: ExportRequest, of: Literal["everything", "residual"] = "everything"
+) -> float | None:
+    """How far the calibrated arm is from the same one without effects and pose residual, at most over random poses (m).
+
+    With ``of`` the residual from the same one without that alone.
 
     Under the configured gravity and load, no load where none is configured. None where an elastic arm does not
     settle in all poses.
@@ -188,9 +203,14 @@ def effects_reach(calibration: Calibration, request: ExportRequest) -> float | N
     alone = replace(calibration.system, arms={request.name: request.arm}, measurements={}, statics=statics)
     channels = {f"{request.name}.{joint}": row for joint, row in zip(request.arm.commanded, commands, strict=True)}
     poses = Dataset(tuple(str(i) for i in range(commands.shape[1])), channels)
+    bare = replace(alone, arms={request.name: replace(request.arm, residual=None)})
     try:
-        _, tools = replace(calibration, system=alone).predict(poses)
+        tools = replace(calibration, system=alone).predict(poses)[1][0]
+        if of == "residual":
+            others = replace(calibration, system=bare).predict(poses)[1][0]
+        else:
+            others = rigid_tools(request.arm, request.values, commands)
     except NotConvergedError:
         return None
-    apart = tools[0][:, :3, 3] - rigid_tools(request.arm, request.values, commands)[:, :3, 3]
+    apart = tools[:, :3, 3] - others[:, :3, 3]
     return float(np.linalg.norm(apart, axis=1).max())

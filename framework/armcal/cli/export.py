@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import click
 
 from armcal.calibration.calibration import Calibration
-from armcal.calibration.exporter import POSES, Exported, Exporter, ExportRequest, effects_reach, request_of
+from armcal.calibration.exporter import (
+    POSES,
+    Exported,
+    Exporter,
+    ExportRequest,
+    effects_reach,
+    leaves_residual_out,
+    request_of,
+)
 from armcal.cli.common import FILE, Console, accept, arm, speaking
 from armcal.config.options import settings_from
 from armcal.errors import InputError, Location, PluginError
@@ -63,13 +73,25 @@ def export(
     loaded = Calibration.load(calibration, registry, accept)
     request = request_of(loaded, arm, out.name)
     exported = exporter.export(request)
-    moved_m: float | None = 0.0  # by what is left out; None where the arm does not settle
-    if exported.left_out:
-        moved_m = effects_reach(loaded, request) if exported.reach is None else exported.reach
+    exported, moved_m = _with_what_is_left_out(exporter, loaded, request, exported)
     files = _files(out, exported, calibration)
     new = {file: content for file, content in files.items() if not _holds(file, content)}
     (write_over if force else write_new)(new)
     _show(console, request, exported, moved_m, list(files), kind)
+
+
+def _with_what_is_left_out(
+    exporter: Exporter, loaded: Calibration, request: ExportRequest, exported: Exported
+) -> tuple[Exported, float | None]:
+    """The same with the pose residual named where it is left out; how far all that is moves the tool (m)."""
+    without_residual = leaves_residual_out(exporter, request)
+    if not exported.left_out and not without_residual:
+        return exported, 0.0
+    of: Literal["everything", "residual"] = "everything" if exported.left_out else "residual"
+    moved_m = effects_reach(loaded, request, of) if exported.reach is None else exported.reach
+    if without_residual:
+        exported = replace(exported, left_out=(*exported.left_out, "the pose residual"))
+    return exported, moved_m
 
 
 def _not_the_calibration(out: Path, calibration: Path) -> None:

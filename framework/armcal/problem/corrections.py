@@ -42,7 +42,7 @@ def corrected_records(
 
 
 def postures_of(arm: Arm, dataset: Dataset) -> Postures:
-    """Where all joints were told to go, those that follow others too, and from where they came."""
+    """Where all joints were commanded to go, those that follow others too, and from where they came."""
     nothing = np.zeros(len(dataset))
 
     def column(channel: str) -> Array:

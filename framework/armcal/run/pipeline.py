@@ -39,7 +39,7 @@ from armcal.functions.batch_function import EvaluatorChoice
 from armcal.io.parallel import Executor
 from armcal.measure.id_list import read_ids
 from armcal.plugins import PluginRegistry
-from armcal.problem.corrections import correctable, postures_of
+from armcal.problem.corrections import correctable
 from armcal.problem.drift import with_drift
 from armcal.problem.motion import recorded_position
 from armcal.problem.problem import FactorRecords, Problem
@@ -51,7 +51,7 @@ from armcal.run.groups import labels_of, run_groups
 from armcal.run.intervals import IntervalResult, interval_result
 from armcal.run.judging import verdict_of
 from armcal.run.noise import SuspiciousRecord, noise_result
-from armcal.run.pose_residual import ResidualOutcome, learned_residual, unlearned
+from armcal.run.pose_residual import ResidualOutcome, layer_of, learned_residual, unlearned
 from armcal.run.result import RunResult
 
 
@@ -117,7 +117,7 @@ def assemble(experiment: Experiment, watch: Stopwatch, accept: bool = False) -> 
         experiment = experiment.of_records(dataset)
     system = experiment.system
     with watch.stage("build"):
-        problem = _built(experiment, system, dataset, experiment.parameters, experiment.settings.evaluator)
+        problem = built(system, dataset, experiment.parameters, experiment.settings.evaluator)
         records = problem.records(dataset)
         start = aligned_start(problem, records, dataset)
         problem = started(start.problem, records)
@@ -141,9 +141,8 @@ def assemble(experiment: Experiment, watch: Stopwatch, accept: bool = False) -> 
     return Prepared(dataset, problem, records, split, texts, start, tuple(mixed_up))
 
 
-def _built(
-    experiment: Experiment, system: System, dataset: Dataset, parameters: Parameters, evaluator: EvaluatorChoice
-) -> Problem:
+def built(system: System, dataset: Dataset, parameters: Parameters, evaluator: EvaluatorChoice) -> Problem:
+    """The problem of these records, which can carry corrections where a pose residual is to be learned."""
     records, settings = correctable(dataset, system.arms), (parameters, system.environment)
     return Problem.build(system.arms, system.measurements, *settings, records, evaluator)
 
@@ -299,15 +298,15 @@ def _with_pose_residual(
     watch: Stopwatch,
 ) -> tuple[Prepared, WeighedFit, ResidualOutcome | None]:
     """The problem and the fit with the pose residual that is to be learned, where it is kept, and what became of it."""
-    arm, train = unlearned(experiment.system), ready.split.train
-    if arm is None or not fitted.estimate.verdict.converged:
+    training = ready.dataset.subset(ready.split.train)
+    layer = layer_of(experiment.system, training)
+    if layer is None or not fitted.estimate.verdict.converged:
         return ready, fitted, None
     with watch.stage("pose residual"):
-        training = ready.dataset.subset(train)
         splits = _folds(experiment, ready.dataset, ready.split) if experiment.settings.validation.folds else ()
         order = np.argsort(recorded_position(training), kind="stable")
-        own = (ready.problem, ready.training, fitted, postures_of(arm, training), splits, order)
-        outcome = learned_residual(experiment, arm, *own, progress, executor)
+        own = (ready.problem, ready.training, fitted, splits, order)
+        outcome = learned_residual(experiment, layer, *own, progress, executor)
         ready = replace(ready, findings=(*ready.findings, *outcome.findings()))
         if outcome.residual is None:
             return ready, fitted, outcome
@@ -315,7 +314,7 @@ def _with_pose_residual(
         choice = experiment.settings.evaluator
         evaluator: EvaluatorChoice = "interpreted" if choice == "auto" else choice
         system, parameters = outcome.system(experiment.system), ready.problem.parameters
-        problem = _built(experiment, system, ready.dataset, parameters, evaluator)
+        problem = built(system, ready.dataset, parameters, evaluator)
         records = _acting(problem, problem.records(ready.dataset), ready.dataset)
         ready = replace(ready, problem=problem, records=records)
         estimator = spread(experiment.estimator, executor)

@@ -11,6 +11,7 @@ import numpy as np
 
 from armcal.arm.assembly import Arm
 from armcal.arm.pose_residual import OF_TOOL, ModelErrors, PoseResidual, Postures
+from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.config.system import System
 from armcal.diagnose.coverage import PredictedFit, missed, predictor, whitened_like
@@ -33,7 +34,7 @@ from armcal.estimate.weighing import WeighedFit, fit
 from armcal.io.parallel import Executor
 from armcal.measure.contact import Contact
 from armcal.measure.partners import PairedMeasurement
-from armcal.problem.corrections import corrected_records, correction_channels, unexplained
+from armcal.problem.corrections import corrected_records, correction_channels, postures_of, unexplained
 from armcal.problem.drift import residuals
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.run.experiment import Experiment
@@ -85,7 +86,8 @@ class ResidualOutcome:
         arm: whose.
         kind: its type.
         unit: of errors.
-        folds: random ones; None where nothing was learned.
+        folds: random ones; None where nothing could be compared.
+        why: in words, then.
         stretches: of records that were recorded one after another.
         residual: as learned; None if it is not kept.
         crossed: of the random folds, with it.
@@ -96,6 +98,7 @@ class ResidualOutcome:
     kind: str
     unit: str
     folds: Comparison | None = None
+    why: str = "the records are too few for it, or show no such error"
     stretches: Comparison | None = None
     residual: PoseResidual | None = None
     crossed: CrossValidation | None = None
@@ -116,7 +119,7 @@ class ResidualOutcome:
     def findings(self) -> list[Finding]:
         """What it does, and for which poses."""
         if self.folds is None:
-            return [Finding("note", f"The pose residual of {self.arm} learned nothing: too few records.")]
+            return [Finding("note", f"The pose residual of {self.arm} is not kept: {self.why}.")]
         test = f"{len(self.splits)} folds, and {_STRETCHES} stretches of the recording, held out of fit and learning"
         numbers = f"{self.folds.without:.3g} to {self.folds.with_it:.3g} {self.unit}"
         if self.residual is None:
@@ -156,7 +159,7 @@ class LayeredFit(PredictedFit):
 
 
 @dataclass(frozen=True)
-class _Layer:
+class Layer:
     """What a fold needs to learn: whose pose residual, and all records' postures."""
 
     arm: str
@@ -194,13 +197,22 @@ def unlearned(system: System) -> Arm | None:
     return arms[0]
 
 
+def layer_of(system: System, dataset: Dataset) -> Layer | None:
+    """What folds of these records need to learn; None where no pose residual is to be learned.
+
+    Raises:
+        ConfigError: see ``unlearned``.
+    """
+    arm = unlearned(system)
+    return None if arm is None or arm.residual is None else Layer(arm.name, arm.residual, postures_of(arm, dataset))
+
+
 def learned_residual(
     experiment: Experiment,
-    arm: Arm,
+    layer: Layer,
     problem: Problem,
     training: tuple[FactorRecords, ...],
     fitted: WeighedFit,
-    postures: Postures,
     splits: tuple[Split, ...],
     order: Indices,
     progress: Progress,
@@ -208,15 +220,12 @@ def learned_residual(
 ) -> ResidualOutcome:
     """Learn from the training records, and judge by folds of them, and by stretches of the ``order`` of recording.
 
-    ``postures`` are theirs; ``splits`` are the folds, if some are configured.
+    The ``layer`` is of theirs; ``splits`` are the folds, if some are configured.
     """
-    residual, unit, count = arm.residual, error_unit(problem), training[0].count
-    assert residual is not None
-    kind = str(experiment.system.description["arms"][arm.name]["residual"]["type"])
-    nothing = ResidualOutcome(arm.name, kind, unit)
-    layer = _Layer(arm.name, residual, postures)
+    count, kind = training[0].count, str(experiment.system.description["arms"][layer.arm]["residual"]["type"])
+    nothing = ResidualOutcome(layer.arm, kind, error_unit(problem))
     learned = layer.learned(problem, fitted, fitted.records, np.arange(count, dtype=np.intp))
-    if count < _FEWEST or learned is None:
+    if learned is None:
         return nothing
     splits = splits or folds(count, _FOLDS, 0)
     pieces = [np.sort(part) for part in np.array_split(order, _STRETCHES)]
@@ -224,6 +233,8 @@ def learned_residual(
     judge = partial(judged_with, layer=layer)
     parts = (experiment.estimator, fitted.estimate.values, progress, executor, judge)
     crossed = cross_validate(problem, training, splits, *parts)
+    if crossed.failed_folds:
+        return replace(nothing, why=f"{crossed.failed_folds} of {len(splits)} fits without a fold did not converge")
     along = cross_validate(problem, training, stretches, *parts)
     single = tuple(Split(np.array([], dtype=np.intp), np.array([i])) for i in range(count))
     at_random, in_stretches = _compared(crossed, splits, single), _compared(along, stretches, stretches)
@@ -247,7 +258,7 @@ def _compared(crossed: CrossValidation, splits: tuple[Split, ...], chances: tupl
     return Comparison.of(_MM * without, _MM * crossed.at_rest, chances)
 
 
-def judged_with(task: FitTask, layer: _Layer) -> JudgedFit:
+def judged_with(task: FitTask, layer: Layer) -> JudgedFit:
     """Fit, learn from what the fit leaves, fit again with that, and judge."""
     began, task = time.perf_counter(), task.trained()
     try:

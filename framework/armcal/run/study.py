@@ -22,6 +22,7 @@ from armcal.plugins import PluginRegistry, discover
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Prepared, Stopwatch
+from armcal.run.pose_residual import Layer, judged_with, layer_of
 from armcal.run.settings import ExperimentSettings, ValidationSettings
 
 R = TypeVar("R")
@@ -172,12 +173,20 @@ def judged_fits(
         executor.map(_compile, [ready[name].problem for name in chosen], lambda done: progress("compile", done))
         problems = {name: own.problem for name, own in ready.items()}
         problems |= {name: problems[name].evaluated_by("compiled") for name in chosen}
+    layers = {name: layer_of(study.experiments[name].system, own.dataset) for name, own in ready.items()}
     tasks = []
     for name, split in plan:
         start = problems[name].parameters.nominal()
-        tasks.append(FitTask(problems[name], study.experiments[name].estimator, start, ready[name].records, split))
+        task = FitTask(problems[name], study.experiments[name].estimator, start, ready[name].records, split)
+        tasks.append((task, layers[name]))
     with watch.stage("fits"):
-        return executor.map(fit_and_judge, tasks, lambda done: progress("fits", done))
+        return executor.map(_judged, tasks, lambda done: progress("fits", done))
+
+
+def _judged(judging: tuple[FitTask, Layer | None]) -> JudgedFit:
+    """A fit judged, with the pose residual that it learns where one is to be learned."""
+    task, layer = judging
+    return fit_and_judge(task) if layer is None else judged_with(task, layer)
 
 
 def _compile(problem: Problem) -> None:

@@ -17,7 +17,7 @@ _MOST = 60
 AFTER_THE_END = "Start the recalibration again before the arm's next work."
 """What to do once a recalibration has ended, and nothing was wrong."""
 _CALM = "some"
-"""In the advice for a level of which no event told how many records it takes."""
+"""In the advice for a level for which no event stated how many records it takes."""
 
 
 class Trouble:
