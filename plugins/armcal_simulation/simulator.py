@@ -6,6 +6,7 @@ The record has the given command; the arm stands at the nearest one that its ser
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -89,26 +90,28 @@ class ElasticArmSimulator:
         self._settings = settings
 
     def simulate(self, request: SimulationRequest) -> Dataset:
-        """Records of the first arm's joints in random or grid poses.
+        """Records of the first arm's joints in random or grid poses, or in those that are requested.
 
         Raises:
             ConfigError: the truth names unknown parameters, or a joint has no levels.
         """
         settings, random = self._settings, np.random.default_rng(self._settings.seed)
         arm = next(iter(request.arms.values()))
-        commands = settings.poses.commands(arm, random)
+        named = [f"{arm.name}.{joint}" for joint in arm.commanded]
+        given = request.poses
+        commands = settings.poses.commands(arm, random) if given is None else given.stacked(named)
         reached, step = commands.copy(), settings.quantisation
         if step:
             turning = [dimension == "angle" for dimension in arm.commanded.values()]
             reached[turning] = np.round(commands[turning] / step) * step
-        named = [f"{arm.name}.{joint}" for joint in arm.commanded]
         approach = approach_of(commands)
         channels = {f"{arm.name}.approach.{j}": approach[i] for i, j in enumerate(arm.commanded)}
-        standing = Dataset(
-            tuple(str(i) for i in range(1, commands.shape[1] + 1)),
-            {**dict(zip(named, reached, strict=True)), **channels},
-            source="simulation",
-        )
+        moved_to = dict(zip(named, reached, strict=True))
+        if given is None:
+            ids = tuple(str(i) for i in range(1, commands.shape[1] + 1))
+            standing = Dataset(ids, {**moved_to, **channels}, source="simulation")
+        else:
+            standing = replace(given, channels={**channels, **given.channels, **moved_to}, source="simulation")
         true = at_truth(request, settings.truth)
         read = disturbed(true, standing, measured_without_noise(true, standing), settings.noise, random)
         moved = {channel: values for channel, values in read.items() if not is_orientation(channel)}

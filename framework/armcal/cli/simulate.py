@@ -2,25 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
 
-from armcal.cli.common import FILE, Console, overrides, speaking
+from armcal.cli.common import FILE, Console, overrides, spare_inputs, speaking
+from armcal.errors import ConfigError
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
+from armcal.run.plan_poses import read_poses
 
 
 @click.command()
 @click.argument("config", type=FILE)
 @click.option("--out", required=True, type=FILE, help="The CSV to write.")
+@click.option("--poses", type=FILE, help="A CSV of poses to measure, such as a plan, in place of the configured ones.")
 @overrides
 @speaking
-def simulate(console: Console, config: Path, out: Path, overrides: tuple[str, ...]) -> None:
+def simulate(console: Console, config: Path, out: Path, poses: Path | None, overrides: tuple[str, ...]) -> None:
     """Simulate measurements as the simulation section of CONFIG says."""
+    spare_inputs(out, poses)
     registry = console.registry()
     experiment = Experiment.load(config, overrides, registry=registry)
-    dataset = experiment.simulator().simulate(experiment.simulation_request)
+    listed = None if poses is None else read_poses(experiment, poses)
+    dataset = experiment.simulator().simulate(replace(experiment.simulation_request, poses=listed))
+    if listed is not None and dataset.ids != listed.ids:
+        raise ConfigError(
+            f"the simulator made {len(dataset)} records of its own, expected the {len(listed)} poses of {poses}.",
+            where=experiment.source.where(("simulation", "type")),
+            hint="Leave --poses out, or use the simulator elastic_arm.",
+        )
     write_csv(out, dataset, experiment.request(measured=True).channels)
     console.result({"records": len(dataset), "out": str(out)})
     console.out.print(f"{len(dataset)} records written: {out}")

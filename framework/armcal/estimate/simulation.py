@@ -24,12 +24,16 @@ EventKind = Literal["slip", "swap", "bend", "creep", "play", "payload", "bump", 
 
 @dataclass(frozen=True)
 class SimulationRequest:
-    """What a simulator works on: the configured arms and measurements, and all parameters with their nominal values."""
+    """What a simulator works on: the configured arms and measurements, and all parameters with their nominal values.
+
+    ``poses`` are records to measure, in place of poses of the simulator's own.
+    """
 
     arms: Mapping[str, Arm]
     measurements: Mapping[str, Measurement]
     parameters: Parameters
     environment: Environment
+    poses: Dataset | None = None
 
 
 class Simulator(Protocol):
