@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,12 +10,13 @@ import numpy as np
 from armcal.base.domains import Array
 
 from armcal_capability.cells import Voxels
+from armcal_capability.drawing import GRID, INK, empty_figure, png_of, style
 from armcal_capability.quantities import BY_NAME
 from armcal_capability.settings import AreaSettings, CapabilitySettings
 from armcal_capability.survey import Survey
 
 _MM = 1000.0
-_INK, _GRID, _LIMIT, _ARM = "#222222", "#dddddd", "#555555", "#d95f02"
+_LIMIT, _ARM = "#555555", "#d95f02"
 _GOOD_LOW, _GOOD_HIGH, _COUNTS = "cividis_r", "cividis", "Greys"
 _DESIGN_COLOURS = ("#000000", "#e69f00", "#56b4e9", "#009e73", "#d55e00", "#cc79a7", "#0072b2", "#f0e442")
 """Distinct with any colour vision."""
@@ -74,7 +74,7 @@ def quantity_figure(survey: Survey, settings: CapabilitySettings, name: str) -> 
 def _figure(
     survey: Survey, settings: CapabilitySettings, cells: Array, how: Mapping[str, Any], label: str, title: str
 ) -> bytes:
-    figure = _empty((11.0, 5.0))
+    figure = empty_figure((11.0, 5.0))
     axes = figure.subplots(1, 2)
     mesh = None
     for axis, section in zip(axes, sections_of(survey, settings), strict=True):
@@ -86,22 +86,22 @@ def _figure(
         axis.plot(points[:, 0], points[:, 1], "-o", color=_ARM, lw=2.0, ms=3.5, zorder=6)
         axis.plot(points[-1, 0], points[-1, 1], "s", color=_ARM, mec="white", ms=6, zorder=6)
         where = f"{_NAMES[section.cut]} = {section.at * _MM:.0f} mm ± {survey.voxels.size * _MM:.0f} mm"
-        axis.set_title(f"section at {where}", fontsize=9.5, color=_INK)
+        axis.set_title(f"section at {where}", fontsize=9.5, color=INK)
         _plain_axes(axis, section)
     bar = figure.colorbar(mesh, ax=list(axes), shrink=0.85, pad=0.02, extend="max" if "vmax" in how else "neither")
-    bar.set_label(label, fontsize=9.5, color=_INK)
-    bar.ax.tick_params(labelsize=8.5, colors=_INK)
-    figure.suptitle(title, x=0.01, ha="left", fontsize=12, color=_INK)
+    bar.set_label(label, fontsize=9.5, color=INK)
+    bar.ax.tick_params(labelsize=8.5, colors=INK)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=12, color=INK)
     handles = [_line(_LIMIT, "-", "limit of the tool, at any depth"), _line(_ARM, "-o", "arm, joints at mid travel")]
     if settings.areas:
-        handles.append(_line(_INK, "--", "areas"))
+        handles.append(_line(INK, "--", "areas"))
     figure.legend(handles=handles, loc="outside lower left", ncols=3, fontsize=8.5, frameon=False)
-    return _png(figure)
+    return png_of(figure)
 
 
 def designs_figure(surveys: Mapping[str, Survey], tables: Mapping[str, Any], settings: CapabilitySettings) -> bytes:
     """Limits of the designs' tools in the x-z plane, and how much of each area each reaches and holds (PNG)."""
-    figure = _empty((11.0, 5.2))
+    figure = empty_figure((11.0, 5.2))
     side, bars = figure.subplots(1, 2, width_ratios=(1.15, 1.0))
     section = _Section(0, 2, 1, settings.sections.y)
     for (_, survey), colour in zip(surveys.items(), _colours(len(surveys)), strict=True):
@@ -109,12 +109,12 @@ def designs_figure(surveys: Mapping[str, Survey], tables: Mapping[str, Any], set
         points = survey.outline * _MM
         side.plot(points[:, 0], points[:, 2], "-o", color=colour, lw=1.2, ms=2.5, zorder=6)
     _areas(side, settings.areas, section)
-    side.set_title("limits of the tool, and the arms at mid travel", fontsize=9.5, color=_INK)
+    side.set_title("limits of the tool, and the arms at mid travel", fontsize=9.5, color=INK)
     _plain_axes(side, section)
     _bars(bars, tables, list(settings.areas))
     handles = [_line(c, "-", name) for name, c in zip(surveys, _colours(len(surveys)), strict=True)]
     figure.legend(handles=handles, loc="outside lower left", ncols=4, fontsize=8.5, frameon=False)
-    return _png(figure)
+    return png_of(figure)
 
 
 def _bars(axes: Any, tables: Mapping[str, Any], areas: Sequence[str]) -> None:
@@ -127,14 +127,14 @@ def _bars(axes: Any, tables: Mapping[str, Any], areas: Sequence[str]) -> None:
         if all(h is not None for h in held):
             axes.bar(at, held, width * 0.92, color=colour, lw=0)
         for x, height in zip(at, reached, strict=True):
-            axes.annotate(f"{height:.0f}", (x, height), ha="center", va="bottom", fontsize=8, color=_INK)
+            axes.annotate(f"{height:.0f}", (x, height), ha="center", va="bottom", fontsize=8, color=INK)
     axes.set_xticks(range(len(areas)), labels=list(areas))
     axes.set_ylim(0, 108)
-    axes.set_ylabel("share of the area, %", fontsize=9.5, color=_INK)
+    axes.set_ylabel("share of the area, %", fontsize=9.5, color=INK)
     held_text = any(area["held"] is not None for table in tables.values() for area in table.values())
     words = "reached" + ("; the dark part: held by the servos too" if held_text else "")
-    axes.set_title(words, fontsize=9.5, color=_INK)
-    _style(axes)
+    axes.set_title(words, fontsize=9.5, color=INK)
+    style(axes)
 
 
 def _map(axes: Any, voxels: Voxels, cells: Array, section: _Section, how: Mapping[str, Any]) -> Any:
@@ -174,7 +174,7 @@ def _areas(axes: Any, areas: Mapping[str, AreaSettings], section: _Section) -> N
 
     for name, area in areas.items():
         low, high = (np.array(corner)[[section.across, section.up]] * _MM for corner in (area.low, area.high))
-        box = Rectangle(tuple(low), *(high - low), fill=False, ls="--", lw=1.4, ec=_INK, zorder=7)
+        box = Rectangle(tuple(low), *(high - low), fill=False, ls="--", lw=1.4, ec=INK, zorder=7)
         axes.add_patch(box)
         halo = {"facecolor": "white", "alpha": 0.75, "lw": 0, "pad": 0.8}
         axes.annotate(
@@ -184,17 +184,10 @@ def _areas(axes: Any, areas: Mapping[str, AreaSettings], section: _Section) -> N
 
 def _plain_axes(axes: Any, section: _Section) -> None:
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel(f"{_NAMES[section.across]}, mm", fontsize=9.5, color=_INK)
-    axes.set_ylabel(f"{_NAMES[section.up]}, mm", fontsize=9.5, color=_INK)
-    axes.grid(color=_GRID, lw=0.6)
-    _style(axes)
-
-
-def _style(axes: Any) -> None:
-    axes.set_axisbelow(True)
-    axes.tick_params(labelsize=8.5, colors=_INK)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    axes.set_xlabel(f"{_NAMES[section.across]}, mm", fontsize=9.5, color=INK)
+    axes.set_ylabel(f"{_NAMES[section.up]}, mm", fontsize=9.5, color=INK)
+    axes.grid(color=GRID, lw=0.6)
+    style(axes)
 
 
 def _colours(count: int) -> list[str]:
@@ -206,18 +199,3 @@ def _line(colour: str, style: str, label: str) -> Any:
 
     mark = "o" if "o" in style else None
     return Line2D([], [], color=colour, ls=style.replace("o", ""), marker=mark, ms=3.5, label=label)
-
-
-def _empty(size: tuple[float, float]) -> Any:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _png(figure: Any) -> bytes:
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", metadata={"Software": None})
-    return stream.getvalue()

@@ -144,9 +144,14 @@ def _of_area(area: str, designs: Mapping[str, Any]) -> str:
     return text + "."
 
 
-def render_capability(
-    title: str, sentences: Sequence[str], tables: Sequence[Table], pictures: Sequence[Picture], facts: Mapping[str, str]
+def render_page(
+    kind: str,
+    title: str,
+    sentences: Sequence[str],
+    tables: Sequence[Table],
+    pictures: Sequence[Picture],
+    facts: Mapping[str, str],
 ) -> str:
-    """One self-contained HTML file."""
-    content = {"title": title, "sentences": sentences, "tables": tables, "pictures": pictures, "facts": facts}
-    return rendered("capability.html.j2", content | {"version": __version__}, Path(__file__).parent)
+    """One self-contained HTML file; ``kind`` is what it is a page of."""
+    content = {"kind": kind, "title": title, "sentences": sentences, "tables": tables, "pictures": pictures}
+    return rendered("capability.html.j2", content | {"facts": facts, "version": __version__}, Path(__file__).parent)

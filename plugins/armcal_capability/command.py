@@ -13,8 +13,6 @@ from armcal.base.config_text import as_json
 from armcal.cli.common import Console, command_line, overrides, speaking
 from armcal.io.folder import Reservation, reserved
 from armcal.run.pipeline import Stopwatch
-from rich.box import SIMPLE_HEAD
-from rich.table import Table as ScreenTable
 
 from armcal_capability import outputs
 from armcal_capability.capability_figures import DRAWN, designs_figure, quantity_figure, reach_figure
@@ -24,10 +22,11 @@ from armcal_capability.capability_page import (
     conclusions,
     design_table,
     quantity_table,
-    render_capability,
+    render_page,
 )
 from armcal_capability.loading import Task, load_task
 from armcal_capability.quantities import BY_NAME
+from armcal_capability.screen import show_table
 from armcal_capability.summary import design_summaries, summary_of
 from armcal_capability.survey import Survey, survey
 
@@ -71,16 +70,11 @@ def capability(console: Console, source: Path, out: Path, settings: Path | None,
     sentences = conclusions(task.subject.name, content, compared)
     facts = {"command": command_line(), "files": ", ".join(sorted({str(file) for file in task.files}))}
     facts |= {"samples": str(task.settings.samples), "seed": str(task.settings.seed)}
-    page = render_capability(task.subject.name, sentences, tables, pictures, facts)
+    page = render_page("Capability", task.subject.name, sentences, tables, pictures, facts)
     _write(kept, surveyed, designs, content, page, pictures)
     console.result({**content, "folder": str(out)})
     for table in tables:
-        on_screen = ScreenTable(title=table.caption, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-        for words, number in table.headings:
-            on_screen.add_column(words, justify="right" if number else "left")
-        for row in table.rows:
-            on_screen.add_row(*row)
-        console.out.print(on_screen)
+        show_table(console, table)
     for text in sentences:
         console.out.print(text, markup=False, soft_wrap=True)
     for stage, seconds in watch.seconds.items():

@@ -9,3 +9,8 @@ def armcal_register_commands(register: Register) -> None:
     register(
         "capability", "armcal_capability.command:capability", "What an arm can do where, and which design does it best."
     )
+    register(
+        "acceptance",
+        "armcal_capability.acceptance.command:acceptance",
+        "How accurate and repeatable an arm is, by the terms of ISO 9283.",
+    )
