@@ -83,7 +83,7 @@ def test_accuracy_repeatability_and_distances_are_those_of_a_calculation_by_hand
     assert distance["nominal"]["AD_mm"]["value"] == pytest.approx(np.mean(attained) - np.hypot(200, 200))
     assert distance["RD_mm"]["value"] == pytest.approx(3 * np.std(attained, ddof=1))
     assert told["frames"]["nominal"] == {
-        "found": False,
+        "aligned": False,
         "numbers_found": 0,
         "words": "as stated: nothing was fitted to these records",
     }
@@ -177,7 +177,7 @@ def test_where_the_frame_is_found_the_instruments_pose_changes_no_figure(tmp_pat
         (tmp_path / name).mkdir()
         told.append(judged(tmp_path / name, SPATIAL, _measured(rows, tools, base, shift)))
     near, far = told
-    assert near["frames"]["nominal"]["found"] and near["frames"]["nominal"]["numbers_found"] == 9
+    assert near["frames"]["nominal"]["aligned"] and near["frames"]["nominal"]["numbers_found"] == 9
     assert "(2000.0, -3000.0, 500.0)" not in near["frames"]["nominal"]["words"]
     for one, other in zip(near["poses"], far["poses"], strict=True):
         assert one["nominal"]["AP_mm"]["value"] == pytest.approx(other["nominal"]["AP_mm"]["value"], abs=1e-5)

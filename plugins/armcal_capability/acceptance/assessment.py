@@ -109,8 +109,8 @@ def _directions(visits: Visits, comparisons: Mapping[str, Comparison]) -> Iterat
         if len(groups) < 2:
             continue
         pairs = list(combinations(groups, 2))
-        found = [of.apart(first.attained[one.members], first.attained[other.members]) for one, other in pairs]
-        measured = {"vAP_mm": max(found, key=lambda figure: figure.value).times(MM)}
+        variations = [of.apart(first.attained[one.members], first.attained[other.members]) for one, other in pairs]
+        measured = {"vAP_mm": max(variations, key=lambda figure: figure.value).times(MM)}
         numbers = {}
         if first.turns is not None:
             means = np.array([first.turns[group.members].mean(axis=0) for group in groups])

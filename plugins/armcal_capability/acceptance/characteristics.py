@@ -36,7 +36,7 @@ def repeatability(positions: Array) -> Figure:
     The interval is a parametric bootstrap: how a repeatability from n visits varies about the true one where positions
     are normal, with the covariance found. Of few visits it is wide, and lies above the estimate, which is then small.
     """
-    found, count = _repeatability(positions[None])[0], len(positions)
+    estimate, count = float(_repeatability(positions[None])[0]), len(positions)
     values = np.linalg.eigvalsh(np.cov(positions.T))
     draws = max(_FEWEST_DRAWS, min(_DRAWS, _MOST_NUMBERS // count))
     random = np.random.default_rng(_SEED).standard_normal((draws, count, 3))
@@ -44,10 +44,10 @@ def repeatability(positions: Array) -> Figure:
     far = np.linalg.norm(drawn, axis=2)
     true = float(far.mean() + _TIMES * far.std())
     if true == 0.0:
-        return Figure(float(found), float(found), float(found))
+        return Figure(estimate, estimate, estimate)
     ratios = _repeatability(drawn) / true
     low, high = np.quantile(ratios, [_LOW, _HIGH])
-    return Figure(float(found), float(found / high), float(found / low) if low > 0 else np.inf)
+    return Figure(estimate, estimate / float(high), estimate / float(low) if low > 0 else np.inf)
 
 
 def turn_accuracy(turns: Array) -> tuple[Figure, ...]:

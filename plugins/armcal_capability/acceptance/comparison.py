@@ -33,13 +33,13 @@ class Frame:
     """Where what is commanded and what is attained are compared.
 
     Attributes:
-        found: whether these records placed the instrument, else the description or the calibration did.
+        aligned: whether these records placed the instrument, else the description or the calibration did.
         words: where the base is in the instrument's frame, and what was found beside it.
         fitted: how many numbers were found from the positions.
         axes: whether the mounting of the measured body was found from the orientations.
     """
 
-    found: bool
+    aligned: bool
     words: str
     fitted: int = 0
     axes: bool = False

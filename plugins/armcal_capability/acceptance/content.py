@@ -43,7 +43,7 @@ def content_of(
         "cycles_named_by": "the column cycle" if visits.numbered else "the order of the records",
         "commanded": {m: how if m == "nominal" else "the calibrated arm at the same positions" for m in comparisons},
         "frames": {
-            m: {"found": c.frame.found, "words": c.frame.words, "numbers_found": c.frame.fitted}
+            m: {"aligned": c.frame.aligned, "words": c.frame.words, "numbers_found": c.frame.fitted}
             for m, c in comparisons.items()
         },
         "summary": {model: _summary(assessment, model) for model in comparisons},

@@ -33,7 +33,7 @@ _OWN = (
     *(RequestedChannel(name, (name,), DIMENSIONLESS, required=False) for name in COMMANDED_TURN),
 )
 _REPEATS = "Records of one pose are held out together"
-"""In what readers warn of: repeats, which are wanted here."""
+"""In what readers warn of: repeats, which are rows here."""
 
 
 @dataclass(frozen=True)
@@ -186,14 +186,14 @@ def _require_visits(dataset: Dataset, groups: Sequence[Group], path: Path, delim
 
 def _lost_labels(dataset: Dataset, path: Path, delimiter: str) -> dict[str, list[int]]:
     """Lines of records that were set aside, by the pose that they name."""
-    wanted, lost = {aside.row for aside in dataset.set_aside}, dict[str, list[int]]()
-    if not wanted:
+    rows, lost = {aside.row for aside in dataset.set_aside}, dict[str, list[int]]()
+    if not rows:
         return lost
     with input_file(path, _MOST_BYTES, "a table of records") as stream:
         for number, raw in enumerate(stream, start=1):
             if number == 1:
                 place = _split(raw, delimiter).index(POSE)
-            elif number in wanted:
+            elif number in rows:
                 lost.setdefault(_split(raw, delimiter)[place].strip(), []).append(number)
     return lost
 
