@@ -19,7 +19,6 @@ from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.odds import UNLISTED
 from armcal.diagnose.outside import predicted_positions
 from armcal.diagnose.residual_structure import LEVEL, structure
-from armcal.diagnose.smooth import CLEAR
 from armcal.diagnose.verdict import _in_short
 from armcal.estimate.weighing import fit
 from armcal.problem.motion import Motion, recorded_position
@@ -131,20 +130,21 @@ def test_a_planted_cause_is_named_or_said_to_be_open(lrm, name):
 
 def test_what_is_not_among_the_causes_is_not_given_the_name_of_one(lrm):
     found = found_in(lrm, "smooth", 4)
-    assert graded(found, "smooth") != "wrong" and found.unlisted > CLEAR
-    assert "none of the" in said(found) or UNLISTED in said(found)
+    assert graded(found, "smooth") != "wrong" and found.is_predictable
+    assert "is no noise: other records predict it" in said(found)
 
 
 def test_in_short_nothing_is_left_only_where_no_function_of_the_pose_is(lrm):
     found = found_in(lrm, "smooth", 4)
     sure = SimpleNamespace(verdict=SimpleNamespace(converged=True), identifiability=SimpleNamespace(undetermined=()))
 
-    def short(unlisted):
-        left = replace(found, structures=(), lag_after_p=1.0, unlisted=unlisted)
+    def short(predicted):
+        left = replace(found, structures=(), lag_after_p=1.0, predictable=predicted)
         return " ".join(_in_short("", sure, Finding("good", ""), Evidence(left), (), ()))
 
-    assert "follow the pose in a way that no cause" in short(found.unlisted)
-    assert "Nothing that was looked for is left" in short(0.0)
+    assert "is no noise: other records predict it" in short(found.predictable)
+    assert "nothing" not in short(found.predictable) and "nothing" not in short(None)
+    assert "nothing that was recorded predicts them" in short(replace(found.predictable, p_value=0.5))
 
 
 def test_what_is_significant_but_less_likely_than_chance_is_no_finding(lrm):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.special import stdtrit
 
@@ -9,10 +11,11 @@ from armcal.base.domains import Array, Semidefinite, symmetric
 from armcal.base.parameters import ParameterBlock
 from armcal.diagnose.evidence import PriorsAlone
 from armcal.diagnose.large_errors import MEDIANS, LargeErrors
-from armcal.diagnose.noise_findings import Finding, first_few
-from armcal.diagnose.odds import UNLISTED
-from armcal.diagnose.residual_structure import ResidualStructure, Structure
-from armcal.diagnose.smooth import CLEAR, IMITATED
+from armcal.diagnose.noise_findings import Finding, Grade, first_few
+from armcal.diagnose.predictable import FEWEST_POSES, MOST_OF_MEDIAN, Predictable
+from armcal.diagnose.predictable import LEVEL as PREDICTED_LEVEL
+from armcal.diagnose.residual_structure import FEWEST_RECORDS, WORTHWHILE, ResidualStructure, Structure
+from armcal.diagnose.smooth import IMITATED
 from armcal.estimate.estimator import AT_BOUND, Estimate
 
 MOST_TOLD = 5
@@ -107,27 +110,71 @@ def worse_than_nominal(judged_mm: Array, nominal_mm: Array, unit: str = _MM) -> 
 def structure_findings(structure: ResidualStructure | None, unit: str = _MM) -> list[Finding]:
     """What residuals still depend on."""
     if structure is None:
-        return []
+        text = "The training records are too few to tell whether the model lacks anything."
+        return [Finding("note", text, f"at least {FEWEST_RECORDS} records", "Measure more poses.")]
     blocks = f", blocks of {structure.block} records" if structure.block > 1 else ""
     level = f"{100 * structure.level:g} % over all {structure.tested} dependences{blocks}"
     test, kept = f"score test, {level}, and likelier than chance", structure.worthwhile
     findings = [_structure_finding(s, structure, unit, test) for s in kept]
-    if structure.unlisted > CLEAR and not any(UNLISTED in s.alternatives for s in kept):
-        text = (
-            f"Residuals follow the pose smoothly in a way that none of the {structure.tested} causes tried explains: "
-            "the model lacks something that is not among them."
-        )
-        likelihood = f"marginal likelihood of a Gaussian process over the poses, odds of {np.exp(CLEAR):.0f} to 1"
-        advice = "Free more of the geometry; repeat some poses with a second payload; or learn it: arms.NAME.residual."
-        findings.append(Finding("warning", text, likelihood, advice))
-    if not findings:
+    if not findings and not structure.is_predictable:
         slight = f" {_plural(len(structure.structures), 'dependence', 'dependences')} found would not lower it by 1 %."
         text = f"Of {structure.tested} things that residuals might depend on none explains the error left."
         findings.append(Finding("good", text + (slight if structure.structures else ""), test))
     if kept and structure.more:
         text = "Residuals depend on more than these; model them first, then look again."
         findings.append(Finding("note", text, test))
-    return [*findings, *_scatter(structure)]
+    return [_predictable_finding(structure), *findings, *_scatter(structure)]
+
+
+def _predictable_finding(structure: ResidualStructure) -> Finding:
+    """What other records predict of the residuals, whatever its cause is."""
+    found = structure.predictable
+    if found is None:
+        text = "Whether the pose still predicts the residuals is not known: the distinct poses are too few."
+        return Finding("note", text, f"at least {FEWEST_POSES} distinct poses", "Measure more poses.")
+    test = (
+        f"{found.records} records of {found.poses} poses, each predicted by the poses of other folds; residuals with "
+        f"random signs, {100 * PREDICTED_LEVEL:g} %; an error beyond {MOST_OF_MEDIAN:g} times the median counts as that"
+    )
+    if not found.above_chance:
+        return Finding("good", "Other poses predict no more of the residuals than chance does.", test)
+    grade: Grade = "warning" if found.falls >= WORTHWHILE else "note"
+    listed = ", ".join(f"{carrier.words} ({percent(carrier.share)})" for carrier in found.carriers)
+    text = f"{predicted_in_short(found)} Of it: {listed}."
+    if found.is_in_order:
+        text += f" The poses were visited in an order: time alone predicts {percent(found.by_time)} as well."
+    first = "Model what is named beside this, then look again. " if structure.worthwhile else ""
+    return Finding(grade, text, test, first + " ".join(_remedies(found)))
+
+
+def predicted_in_short(found: Predictable) -> str:
+    """How much of the residuals is no noise."""
+    share = f"{percent(found.share)} of the variance of the residuals is no noise"
+    names = [carrier.words for carrier in found.carriers]
+    listed = " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+    return f"{share}: other records predict it, mostly from {listed} (chance: below {percent(max(found.chance, 0))})."
+
+
+def _remedies(found: Predictable) -> Iterator[str]:
+    """What takes up what each kind of carrier predicts."""
+    kinds = {carrier.kind for carrier in found.carriers}
+    if "joint" in kinds and found.learnable:
+        yield "Learn it: arms.NAME.residual: {type: gaussian_process}; or free more parameters of these joints."
+    elif "joint" in kinds:
+        yield "Free more parameters of these joints, or add effects to them; more poses show more of it."
+    if "time" in kinds or found.is_in_order:
+        yield "Let the base drift (parameters.drift); record the temperature, and repeat one pose from time to time."
+    if "temperature" in kinds:
+        yield "Add thermal_length, or measure at one temperature."
+    if "payload" in kinds:
+        yield "Weigh the payload; add or free compliance."
+    if "approach" in kinds:
+        yield "Add or free approach_backlash on these joints."
+
+
+def percent(share: float) -> str:
+    """In words."""
+    return f"{100 * share:.0f} %" if share >= 0.0995 else f"{100 * share:.1g} %" if share > 0.0005 else "0.1 %"
 
 
 def _structure_finding(s: Structure, structure: ResidualStructure, unit: str, test: str) -> Finding:

@@ -23,6 +23,7 @@ from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.noise_trend import NoiseTrend, noise_trend
 from armcal.diagnose.odds import Contest, Odds
 from armcal.diagnose.outside import outside, predicted_positions
+from armcal.diagnose.predictable import Predictable, predictable
 from armcal.diagnose.score_tests import FamilyTest, Fit, family_test, linear_fit, own_basis
 from armcal.diagnose.smooth import TimeOrPose, left_out, pose_kernels, smooth, time_kernels
 from armcal.estimate.blocks import automatic_block_length
@@ -82,7 +83,7 @@ class ResidualStructure:
         lag_p: its p-value, in the same family.
         lag_after, lag_after_p: the same once the structures found are modelled.
         alike: why neighbours resemble each other even then; None if they do not.
-        unlisted: logarithm of the odds that residuals follow the pose beside what was found, against noise.
+        predictable: what other records predict of them, whatever the cause; None where poses are too few.
         noise: what their scatter depends on; None if on nothing.
         mean_mm: mean residual of the training records.
         tested: how many dependences were tested.
@@ -98,13 +99,18 @@ class ResidualStructure:
     lag_after: float
     lag_after_p: float
     alike: TimeOrPose | None
-    unlisted: float
+    predictable: Predictable | None
     noise: NoiseTrend | None
     mean_mm: float
     tested: int
     records: int
     block: int
     level: float = LEVEL
+
+    @property
+    def is_predictable(self) -> bool:
+        """Whether other records predict some of a record's residuals."""
+        return self.predictable is not None and self.predictable.above_chance
 
     @property
     def worthwhile(self) -> tuple[Structure, ...]:
@@ -149,7 +155,7 @@ def structure(
         search.last.lag_one,
         search.last.lag_adjusted,
         _alike(residual, whole, rows, contest) if search.last.lag_adjusted <= LEVEL else None,
-        smooth(residual, whole, rows.by_record, contest.pose).evidence,
+        predictable(problem, rows, basis, motion, dataset),
         noise_trend(residual, whole, rows.by_record, Records(dataset, motion), place),
         rows.mean_error(fit.residual) * _MM,
         search.tested,

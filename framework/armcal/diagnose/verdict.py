@@ -16,12 +16,12 @@ from armcal.diagnose.evidence_findings import (
     determined_finding,
     large_error_findings,
     neighbour_findings,
+    predicted_in_short,
     shift_findings,
     structure_findings,
     what_neighbours_cost,
 )
 from armcal.diagnose.noise_findings import Finding, component_findings, first_few, suspect_findings
-from armcal.diagnose.smooth import CLEAR
 from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
 from armcal.estimate.identifiability import POOR_CONDITION, bound_together, correlated_pairs
 from armcal.estimate.prediction import NewRecording
@@ -85,7 +85,8 @@ def judge(
     suspicious = _suspicious(errors_mm[train], own, fitted)
     noise = component_findings(fitted.components) if fitted and fitted.components else [_size(estimate, seen)]
     findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
-    findings += [*shift_findings(estimate), *noise, *structure_findings(seen.structure, seen.unit)]
+    findings += [*shift_findings(estimate), *noise]
+    findings += structure_findings(seen.structure, seen.unit) if estimate.verdict.converged else []
     findings += neighbour_findings(seen.structure, estimate, seen.unit) or _neighbours(whitened, kept, estimate)
     findings += [*_correlated(estimate), *predicted, *large_error_findings(seen.large_errors, seen.unit)]
     findings += _outliers(suspicious, own, fitted) + _next(estimate, suggestions)
@@ -152,21 +153,33 @@ def _in_short(
     sentences.append(
         f"Suspicious records: {first_few(suspicious)}." if suspicious else "No training record is suspicious."
     )
-    if seen.structure is not None and seen.structure.worthwhile:
-        listed = "; ".join(
-            f"{s.words}{', or on another cause' if s.alternatives else ''} ({s.falls_mm:.2f} {seen.unit})"
-            for s in seen.structure.worthwhile
-        )
-        sentences.append(f"Residuals still depend on {listed}.")
-    elif seen.structure is not None and seen.structure.unlisted > CLEAR:
-        sentences.append("Residuals follow the pose in a way that no cause that was looked for explains.")
-    elif seen.structure is not None and seen.structure.lag_after_p <= seen.structure.level:
-        after = f"{seen.structure.lag_after:.2f}"
-        sentences.append(f"No cause that was looked for is left in the residuals, yet neighbours correlate by {after}.")
-    elif seen.structure is not None:
-        sentences.append("Nothing that was looked for is left in the residuals.")
+    sentences += _left(seen)
     if suggestions:
         sentences.append(f"Measure these poses next: {'; '.join(suggestion.text for suggestion in suggestions)}.")
+    return sentences
+
+
+def _left(seen: Evidence) -> list[str]:
+    """What is left in the residuals; that nothing was found only where all that was looked at says so."""
+    left = seen.structure
+    if left is None:
+        return ["Whether the model lacks anything is not known: the training records are too few."]
+    sentences = []
+    if left.predictable is not None and left.is_predictable:
+        sentences.append(predicted_in_short(left.predictable))
+    if left.worthwhile:
+        listed = "; ".join(
+            f"{s.words}{', or on another cause' if s.alternatives else ''} ({s.falls_mm:.2f} {seen.unit})"
+            for s in left.worthwhile
+        )
+        sentences.append(f"Residuals still depend on {listed}.")
+    elif not sentences and left.lag_after_p <= left.level:
+        text = f"No cause that was looked for explains the residuals, yet neighbours correlate by {left.lag_after:.2f}."
+        sentences.append(text)
+    elif left.predictable is None:
+        sentences.append("No cause that was looked for explains the residuals; for others the poses are too few.")
+    elif not sentences:
+        sentences.append("The residuals look like noise: nothing that was recorded predicts them.")
     return sentences
 
 
@@ -219,7 +232,8 @@ def _size(estimate: Estimate, seen: Evidence) -> Finding:
         why = "the model's error or the instrument's, which this test cannot separate"
         if seen.structure is not None:
             known = "some of it is the model's: what residuals depend on is named below"
-            why += f"; {known if seen.structure.structures else 'no cause that was looked for is in it'}"
+            found = seen.structure.structures or seen.structure.is_predictable
+            why += f"; {known if found else 'no cause that was looked for is in it'}"
         text = f"Residuals are {ratio:.1f} times the declared noise: {why}. Intervals are widened to the residuals."
         action = (
             "Repeat some poses, each from elsewhere: the spread of the repeats is noise, the rest the model's error."
@@ -228,7 +242,9 @@ def _size(estimate: Estimate, seen: Evidence) -> Finding:
     if ratio < 0.5:
         text = f"Residuals are only {ratio:.2f} times the declared noise: was it stated too large?"
         return Finding("note", text, "ratio below 0.5", "State the noise as the instrument's data sheet does.")
-    return Finding("good", "Residuals are as large as the declared noise: the model explains the data.", test)
+    explained = seen.structure is None or not seen.structure.is_predictable
+    text = f"Residuals are as large as the declared noise{': the model explains the data' if explained else ''}."
+    return Finding("good", text, test)
 
 
 def _neighbours(whitened: Array, train: NDArray[np.intp], estimate: Estimate) -> list[Finding]:

@@ -1,0 +1,299 @@
+"""How much of the residuals the pose, time, load, approach or temperature still predicts, whatever the cause.
+
+Residuals of a fit are regressed on functions of what was recorded: of each joint's angle, along the joint's own motion
+and along the residual's entries; of pairs of joints; of time, payload, direction of approach, temperature. Functions
+are harmonics whose coefficients shrink as those of a smooth random function would [Rasmussen2006]. Records are
+predicted by the poses of other folds. The same regression of the same residuals with random signs, one a pose, taken
+through the same fit, is what chance predicts: signs keep how large each record's error is, and what neighbours share
+in a pose, so that neither outliers nor uneven noise pass for a dependence [Liu1988].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.diagnose.fit_rows import FitRows
+from armcal.problem.motion import Motion, recorded_order
+from armcal.problem.problem import Problem
+
+LEVEL = 0.02
+FEWEST_POSES = 40
+"""Distinct poses below which nothing is said."""
+MOST_CARRIERS = 3
+_DRAWS = 99
+_FOLDS = 5
+_FINE, _COARSE, _SLOW = 30, 3, 6
+"""Highest harmonics: of a joint along its own motion, of anything else, of time."""
+_RECORDS_PER_HARMONIC = 6
+_SIZES = (0.03, 0.1, 0.3, 1.0)
+"""Standard deviations of one function, in those of the residuals."""
+MOST_OF_MEDIAN = 3.0
+"""A record farther off than so many medians counts as one that is as far off."""
+_NEXT_CARRIER = 0.1
+"""Of the whole share: what predicts less beside the ones before it is not named."""
+
+
+@dataclass(frozen=True)
+class Carrier:
+    """What predicts residuals.
+
+    Attributes:
+        kind: ``joint``, ``time``, ``payload``, ``approach`` or ``temperature``.
+        name: of the joint, with its arm where there are several; empty where it is none.
+        share: of the residual variance, beside the carriers before it.
+    """
+
+    kind: str
+    name: str
+    share: float
+
+    @property
+    def words(self) -> str:
+        """As a part of a sentence."""
+        of = {"joint": f"the angle of {self.name}", "approach": f"the side {self.name} was approached from"}
+        return of.get(self.kind, f"the {self.kind}" if self.kind != "time" else "time")
+
+
+@dataclass(frozen=True)
+class Predictable:
+    """What other records predict of a record's residual.
+
+    Attributes:
+        share: of the squared residuals of records held out; below 0 where predictions are worse than none.
+        chance: below what 98 % of the shares of residuals without any dependence lie.
+        p_value: of the share, by chance.
+        carriers: what it is predicted by, the most important first; empty where the share is not above chance.
+        records: how many were looked at.
+        poses: how many distinct ones.
+        by_time: share that time alone predicts.
+        learnable: whether a pose residual could learn it: tools are measured, and none was asked for yet.
+    """
+
+    share: float
+    chance: float
+    p_value: float
+    carriers: tuple[Carrier, ...]
+    records: int
+    poses: int
+    by_time: float
+    learnable: bool
+
+    @property
+    def above_chance(self) -> bool:
+        """At 2 %."""
+        return self.share > 0 and self.p_value <= LEVEL
+
+    @property
+    def is_in_order(self) -> bool:
+        """Whether time, which adds nothing to the rest, alone predicts half of it: poses were visited in an order."""
+        return self.by_time > self.share / 2 and all(carrier.kind != "time" for carrier in self.carriers)
+
+    @property
+    def falls(self) -> float:
+        """By which share the root mean square error would fall without what is predicted."""
+        return 1 - float(np.sqrt(max(0.0, 1 - max(self.share, 0.0))))
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Columns of some functions: which inputs they are of, and their spectrum."""
+
+    inputs: frozenset[int]
+    columns: Array
+    order: Array
+
+    @property
+    def deviations(self) -> Array:
+        """Of the coefficients: the variance of a harmonic falls as 1/order, as if any length scale were as likely."""
+        return np.asarray(np.sqrt(1 / (self.order * np.sum(1 / np.unique(self.order)))))
+
+
+@dataclass(frozen=True)
+class _Input:
+    kind: str
+    name: str
+    channel: str
+    angle: Array
+    """On a circle, or on half of one where it does not close (N; rad)."""
+
+
+def predictable(problem: Problem, rows: FitRows, basis: Array, motion: Motion, dataset: Dataset) -> Predictable | None:
+    """Of the residuals of a fit, free of what it takes up (``basis``); None where the poses are too few to judge."""
+    pose = _poses(motion, dataset)
+    count = int(pose.max(initial=-1)) + 1
+    if count < FEWEST_POSES:
+        return None
+    inputs = list(_inputs(problem, motion, dataset))
+    blocks = list(_blocks(rows, motion, inputs))
+    random = np.random.default_rng(0)
+    fold = np.argsort(random.permutation(count))[pose] * _FOLDS // count
+    signs = random.choice((-1.0, 1.0), (count, _DRAWS))[pose]
+    whole = _Regression.of(blocks, fold[rows.record_of], _drawn(rows, basis, signs))
+    models = [(parts, size) for parts in (None, *({i} for i in range(len(inputs)))) for size in _SIZES]
+    shares = np.array([whole.shares(size, parts) for parts, size in models])
+    size, highest = models[int(np.argmax(shares[:, 0]))][1], shares.max(axis=0)
+    p = (1 + np.count_nonzero(highest[1:] >= highest[0])) / (1 + _DRAWS)
+    chance = float(np.quantile(highest[1:], 1 - LEVEL))
+    tools = all(kernel.factor.output_channels for kernel in problem.kernels)
+    learnable = tools and not any(arm.residual for arm in problem.blueprint.arms.values())
+    found = Predictable(float(highest[0]), chance, float(p), (), len(dataset), count, 0.0, learnable)
+    return _carried(found, whole.of_first(), inputs, size) if found.above_chance else found
+
+
+def _poses(motion: Motion, dataset: Dataset) -> NDArray[np.intp]:
+    """Which distinct pose each record is of (N)."""
+    commands = np.nan_to_num(np.round(dataset.stacked(motion.channels), 9)).T
+    return np.asarray(np.unique(commands, axis=0, return_inverse=True)[1], dtype=np.intp).ravel()
+
+
+def _inputs(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[_Input]:
+    """Everything recorded that varies."""
+
+    def on_circle(values: Array, closed: bool = False) -> Array:
+        low, high = np.nanmin(values), np.nanmax(values)
+        return np.nan_to_num(values if closed else np.pi * (values - low) / (high - low))
+
+    arms = problem.blueprint.arms
+    for channel in motion.channels:
+        arm, _, joint = channel.partition(".")
+        shown, command = joint if len(arms) == 1 else channel, dataset.column(channel)
+        if np.nanmax(command) > np.nanmin(command):
+            yield _Input("joint", shown, channel, on_circle(command, arms[arm].commanded[joint] == "angle"))
+        side = f"{arm}.approach.{joint}"
+        if dataset.has(side) and np.nanmax(dataset.column(side)) > np.nanmin(dataset.column(side)):
+            yield _Input("approach", shown, channel, on_circle(dataset.column(side)))
+    yield _Input("time", "", "", on_circle(recorded_order(dataset)))
+    for kind in ("payload", "temperature"):
+        if dataset.has(kind) and np.ptp(dataset.column(kind)) > 0:
+            yield _Input(kind, "", "", on_circle(dataset.column(kind)))
+
+
+def _blocks(rows: FitRows, motion: Motion, inputs: Sequence[_Input]) -> Iterator[_Block]:
+    """Functions of each input and of each pair of joints of an arm."""
+    typical = np.sqrt(np.mean([np.mean(_along(rows, motion, c) ** 2) for c in motion.channels])) or 1.0
+    finest = min(_FINE, max(_COARSE, len(inputs[0].angle) // _RECORDS_PER_HARMONIC))
+    acting = np.abs(rows.columns([np.ones((len(w), w.shape[2], 1)) for w in rows.whitening])[:, 0]) > 0
+    for i, own in enumerate(inputs):
+        highest = min({"joint": finest, "time": _SLOW}.get(own.kind, _COARSE), len(np.unique(np.round(own.angle, 9))))
+        features, order = _harmonics(own.angle, highest)
+        if own.channel:
+            along = _along(rows, motion, own.channel) / typical
+            yield _Block(frozenset({i}), along[:, None] * features[rows.record_of], order)
+        coarse = order <= (_SLOW if own.kind == "time" else _COARSE)
+        yield _entries(rows, frozenset({i}), features[:, coarse], order[coarse], acting)
+    joints = [i for i, own in enumerate(inputs) if own.kind == "joint"]
+    for i, j in combinations(joints, 2):
+        if inputs[i].channel.partition(".")[0] == inputs[j].channel.partition(".")[0]:
+            first, second = (_harmonics(inputs[k].angle, 1)[0] for k in (i, j))
+            features = np.einsum("nk,nl->nkl", first, second).reshape(len(first), -1)
+            yield _entries(rows, frozenset({i, j}), features, np.full(4, np.sqrt(2)), acting)
+
+
+def _along(rows: FitRows, motion: Motion, channel: str) -> Array:
+    """The data's rows by a joint's command."""
+    return rows.columns([slope[:, :, None] for slope in motion.along(channel)])[: len(rows.record_of), 0]
+
+
+def _harmonics(angle: Array, highest: int) -> tuple[Array, Array]:
+    """Cosines and sines of multiples of an angle (N x 2 highest), and which multiples."""
+    order = np.arange(1, highest + 1)
+    turned = angle[:, None] * order
+    return np.hstack([np.cos(turned), np.sin(turned)]), np.tile(order, 2).astype(float)
+
+
+def _entries(rows: FitRows, inputs: frozenset[int], features: Array, order: Array, acting: NDArray[np.bool_]) -> _Block:
+    """Functions of each entry of a record's residual for itself; none of an entry that did not take part."""
+    entries, size = rows.by_record.shape[1], features.shape[1]
+    columns = np.zeros((len(rows.record_of), entries * size))
+    for entry, own in enumerate(rows.by_record.T):
+        columns[own, entry * size : (entry + 1) * size] = features * acting[own, None]
+    return _Block(inputs, columns, np.tile(order, entries))
+
+
+def _drawn(rows: FitRows, basis: Array, signs: Array) -> Array:
+    """The data's residuals, and the same with random signs of their records (rows x (1 + draws)); outliers bounded."""
+    count = len(rows.record_of)
+    lengths = np.linalg.norm(rows.residual[rows.by_record], axis=1)
+    limit = MOST_OF_MEDIAN * float(np.median(lengths[lengths > 0])) if np.any(lengths) else 1.0
+    bounded = np.minimum(1.0, limit / np.maximum(lengths, 1e-300))
+    both = np.repeat(rows.residual[:, None], 1 + signs.shape[1], axis=1)
+    both[:count] *= bounded[rows.record_of][:, None]
+    both[:count, 1:] *= signs[rows.record_of]
+    return np.asarray((both - basis @ (basis.T @ both))[:count])
+
+
+@dataclass(frozen=True)
+class _Regression:
+    """On columns of blocks (p), of which each of F folds is predicted by the others; all of it by products.
+
+    Columns are not freed of what the fit takes up: the residuals of a fold would then follow from those of the others.
+
+    Attributes:
+        blocks: whose columns.
+        grams: products of columns in each fold (F x p x p).
+        alongs: of columns and values (F x p x m).
+        squares: of values (m).
+    """
+
+    blocks: Sequence[_Block]
+    grams: Array
+    alongs: Array
+    squares: Array
+
+    @classmethod
+    def of(cls, blocks: Sequence[_Block], fold: NDArray[np.intp], values: Array) -> _Regression:
+        """Of values (rows x m) that are of folds (rows)."""
+        columns, members = np.hstack([b.columns for b in blocks]), [np.flatnonzero(fold == f) for f in range(_FOLDS)]
+        parts = [columns[own] for own in members]
+        grams = np.array([part.T @ part for part in parts])
+        alongs = np.array([part.T @ values[own] for part, own in zip(parts, members, strict=True)])
+        return cls(blocks, grams, alongs, np.maximum(np.sum(values**2, axis=0), 1e-300))
+
+    def of_first(self) -> _Regression:
+        """Of the first values alone."""
+        return replace(self, alongs=self.alongs[:, :, :1], squares=self.squares[:1])
+
+    def shares(self, size: float, inputs: AbstractSet[int] | None = None) -> Array:
+        """Of the squares of values, which functions of a size of some inputs, or of all, predict (m)."""
+        used = [inputs is None or block.inputs <= inputs for block in self.blocks]
+        chosen = np.flatnonzero(np.repeat(used, [len(block.order) for block in self.blocks]))
+        shrunk = np.concatenate([(size * block.deviations) ** -2.0 for block in self.blocks])[chosen]
+        grams = self.grams[:, chosen[:, None], chosen] if inputs is not None else self.grams
+        alongs = self.alongs[:, chosen]
+        gram, along, explained = grams.sum(axis=0) + np.diag(shrunk), alongs.sum(axis=0), np.zeros(len(self.squares))
+        for own, products in zip(grams, alongs, strict=True):
+            solved = cho_solve(cho_factor(gram - own), along - products)
+            explained += np.sum(solved * (2 * products - own @ solved), axis=0)
+        return explained / self.squares
+
+
+def _carried(found: Predictable, whole: _Regression, inputs: Sequence[_Input], size: float) -> Predictable:
+    """With the inputs that carry it, one after another, each that which predicts most beside the ones before it.
+
+    Time is one of them only where it predicts what all others do not: of poses visited in an order it predicts much.
+    """
+
+    def share(used: set[int]) -> float:
+        return float(whole.shares(size, used)[0])
+
+    least = _NEXT_CARRIER * found.share
+    time = next(i for i, own in enumerate(inputs) if own.kind == "time")
+    possible, carriers, taken, so_far = set(range(len(inputs))), list[Carrier](), set[int](), 0.0
+    if share(possible) - share(possible - {time}) < least and share(possible - {time}) > share({time}):
+        possible.discard(time)
+    while len(carriers) < min(MOST_CARRIERS, len(possible)):
+        best, reached = max(((i, share(taken | {i})) for i in sorted(possible - taken)), key=lambda pair: pair[1])
+        if carriers and reached - so_far < least:
+            break
+        carriers.append(Carrier(inputs[best].kind, inputs[best].name, reached - so_far))
+        taken, so_far = taken | {best}, reached
+    return replace(found, by_time=share({time}), carriers=tuple(carriers))
