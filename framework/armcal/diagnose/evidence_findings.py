@@ -128,41 +128,42 @@ def structure_findings(structure: ResidualStructure | None, unit: str = _MM) -> 
 
 def _predictable_finding(structure: ResidualStructure) -> Finding:
     """What other records predict of the residuals, whatever its cause is."""
-    found = structure.predictable
-    if found is None:
+    predicted = structure.predictable
+    if predicted is None:
         text = "Whether the pose still predicts the residuals is not known: the distinct poses are too few."
         return Finding("note", text, f"at least {FEWEST_POSES} distinct poses", "Measure more poses.")
     test = (
-        f"{found.records} records of {found.poses} poses, each predicted by the poses of other folds; residuals with "
-        f"random signs, {100 * PREDICTED_LEVEL:g} %; an error beyond {MOST_OF_MEDIAN:g} times the median counts as that"
+        f"{predicted.records} records of {predicted.poses} poses, each predicted by the poses of other folds; "
+        f"residuals with random signs, {100 * PREDICTED_LEVEL:g} %; errors beyond {MOST_OF_MEDIAN:g} times the median "
+        "are cut"
     )
-    if not found.above_chance:
+    if not predicted.above_chance:
         return Finding("good", "Other poses predict no more of the residuals than chance does.", test)
-    grade: Grade = "warning" if found.falls >= WORTHWHILE else "note"
-    listed = ", ".join(f"{carrier.words} ({percent(carrier.share)})" for carrier in found.carriers)
-    text = f"{predicted_in_short(found)} Of it: {listed}."
-    if found.is_in_order:
-        text += f" The poses were visited in an order: time alone predicts {percent(found.by_time)} as well."
+    grade: Grade = "warning" if predicted.falls >= WORTHWHILE else "note"
+    listed = ", ".join(f"{carrier.words} ({percent(carrier.share)})" for carrier in predicted.carriers)
+    text = f"{predicted_in_short(predicted)} Of it: {listed}."
+    if predicted.is_in_order:
+        text += f" The poses were visited in an order: time alone predicts {percent(predicted.by_time)} as well."
     first = "Model what is named beside this, then look again. " if structure.worthwhile else ""
-    return Finding(grade, text, test, first + " ".join(_remedies(found)))
+    return Finding(grade, text, test, first + " ".join(_remedies(predicted)))
 
 
-def predicted_in_short(found: Predictable) -> str:
+def predicted_in_short(predicted: Predictable) -> str:
     """How much of the residuals is no noise."""
-    share = f"{percent(found.share)} of the variance of the residuals is no noise"
-    names = [carrier.words for carrier in found.carriers]
+    share = f"{percent(predicted.share)} of the variance of the residuals is no noise"
+    names = [carrier.words for carrier in predicted.carriers]
     listed = " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
-    return f"{share}: other records predict it, mostly from {listed} (chance: below {percent(max(found.chance, 0))})."
+    return f"{share}: other records predict it, mostly from {listed} (chance: below {percent(predicted.chance)})."
 
 
-def _remedies(found: Predictable) -> Iterator[str]:
+def _remedies(predicted: Predictable) -> Iterator[str]:
     """What takes up what each kind of carrier predicts."""
-    kinds = {carrier.kind for carrier in found.carriers}
-    if "joint" in kinds and found.learnable:
+    kinds = {carrier.kind for carrier in predicted.carriers}
+    if "joint" in kinds and predicted.learnable:
         yield "Learn it: arms.NAME.residual: {type: gaussian_process}; or free more parameters of these joints."
     elif "joint" in kinds:
         yield "Free more parameters of these joints, or add effects to them; more poses show more of it."
-    if "time" in kinds or found.is_in_order:
+    if "time" in kinds or predicted.is_in_order:
         yield "Let the base drift (parameters.drift); record the temperature, and repeat one pose from time to time."
     if "temperature" in kinds:
         yield "Add thermal_length, or measure at one temperature."

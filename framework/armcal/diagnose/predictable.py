@@ -145,8 +145,8 @@ def predictable(problem: Problem, rows: FitRows, basis: Array, motion: Motion, d
     chance = float(np.quantile(highest[1:], 1 - LEVEL))
     tools = all(kernel.factor.output_channels for kernel in problem.kernels)
     learnable = tools and not any(arm.residual for arm in problem.blueprint.arms.values())
-    found = Predictable(float(highest[0]), chance, float(p), (), len(dataset), count, 0.0, learnable)
-    return _carried(found, whole.of_first(), inputs, size) if found.above_chance else found
+    predicted = Predictable(float(highest[0]), chance, float(p), (), len(dataset), count, 0.0, learnable)
+    return _carried(predicted, whole.of_first(), inputs, size) if predicted.above_chance else predicted
 
 
 def _poses(motion: Motion, dataset: Dataset) -> NDArray[np.intp]:
@@ -276,7 +276,7 @@ class _Regression:
         return explained / self.squares
 
 
-def _carried(found: Predictable, whole: _Regression, inputs: Sequence[_Input], size: float) -> Predictable:
+def _carried(predicted: Predictable, whole: _Regression, inputs: Sequence[_Input], size: float) -> Predictable:
     """With the inputs that carry it, one after another, each that which predicts most beside the ones before it.
 
     Time is one of them only where it predicts what all others do not: of poses visited in an order it predicts much.
@@ -285,7 +285,7 @@ def _carried(found: Predictable, whole: _Regression, inputs: Sequence[_Input], s
     def share(used: set[int]) -> float:
         return float(whole.shares(size, used)[0])
 
-    least = _NEXT_CARRIER * found.share
+    least = _NEXT_CARRIER * predicted.share
     time = next(i for i, own in enumerate(inputs) if own.kind == "time")
     possible, carriers, taken, so_far = set(range(len(inputs))), list[Carrier](), set[int](), 0.0
     if share(possible) - share(possible - {time}) < least and share(possible - {time}) > share({time}):
@@ -296,4 +296,4 @@ def _carried(found: Predictable, whole: _Regression, inputs: Sequence[_Input], s
             break
         carriers.append(Carrier(inputs[best].kind, inputs[best].name, reached - so_far))
         taken, so_far = taken | {best}, reached
-    return replace(found, by_time=share({time}), carriers=tuple(carriers))
+    return replace(predicted, by_time=share({time}), carriers=tuple(carriers))

@@ -232,8 +232,8 @@ def _size(estimate: Estimate, seen: Evidence) -> Finding:
         why = "the model's error or the instrument's, which this test cannot separate"
         if seen.structure is not None:
             known = "some of it is the model's: what residuals depend on is named below"
-            found = seen.structure.structures or seen.structure.is_predictable
-            why += f"; {known if found else 'no cause that was looked for is in it'}"
+            is_seen = seen.structure.structures or seen.structure.is_predictable
+            why += f"; {known if is_seen else 'no cause that was looked for is in it'}"
         text = f"Residuals are {ratio:.1f} times the declared noise: {why}. Intervals are widened to the residuals."
         action = (
             "Repeat some poses, each from elsewhere: the spread of the repeats is noise, the rest the model's error."
