@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ import numpy as np
 from armcal.base.units import display_unit, to_unit
 from armcal.cli.common import FILE, Console, overrides, speaking
 from armcal.cli.console import columned
+from armcal.cli.plan_iso import show_iso_plan
 from armcal.config.selection import DIMENSION_OF_UNIT
-from armcal.errors import ConfigError
+from armcal.errors import ConfigError, InputError, Location
 from armcal.measure.csv_writer import write_csv
 from armcal.planning.criterion import GOALS
 from armcal.run.experiment import Experiment
@@ -23,11 +25,25 @@ from armcal.run.plan_poses import counts_text
 from armcal.run.settings import PlanSettings
 
 _SHOWN = 8
+_LARGEST_CUBE_MM = 10_000.0
 
 
 @click.command()
 @click.argument("config", type=FILE)
-@click.option("--poses", "count", type=click.IntRange(min=1), required=True, help="How many poses to plan.")
+@click.option("--poses", "count", type=click.IntRange(min=1), help="How many poses to plan.")
+@click.option(
+    "--iso-cube",
+    metavar="SIZE_MM|auto",
+    help="Plan the test of ISO 9283 instead, in a cube with edges of this length, or in the largest that fits.",
+)
+@click.option("--cycles", type=click.IntRange(min=2), default=30, show_default=True, help="Of --iso-cube.")
+@click.option(
+    "--directions",
+    type=click.IntRange(0, 3),
+    default=3,
+    show_default=True,
+    help="Of --iso-cube: directions of approach for vAP, along x, y and z.",
+)
 @click.option("--out", required=True, type=FILE, help="The CSV to write, in the order of visit.")
 @click.option("--data", type=FILE, help="A dataset to choose from instead of the configured one.")
 @click.option("--candidates", type=FILE, help="A CSV of poses to choose from.")
@@ -37,15 +53,23 @@ _SHOWN = 8
 @click.option("--order", type=click.Choice(["travel", "torque", "none"]), help="Order of visit [default: travel].")
 @overrides
 @speaking
-def plan(console: Console, config: Path, count: int, out: Path, overrides: tuple[str, ...], **given: Any) -> None:
+def plan(
+    console: Console, config: Path, count: int | None, out: Path, overrides: tuple[str, ...], **given: Any
+) -> None:
     """Choose the poses that determine the free parameters of CONFIG best, and say how good any could be."""
     began = time.perf_counter()
     if out.is_dir() or not out.absolute().parent.is_dir():
         text = "it is a directory" if out.is_dir() else "its directory is not there"
         raise ConfigError(f"--out {out}: {text}.", hint="Give the path of a CSV in a directory that is there.")
     registry = console.registry()
+    edge = _edge(given, count)
+    if given["iso_cube"]:
+        experiment = Experiment.load(config, overrides, registry=registry)
+        show_iso_plan(console, experiment, edge, out, given)
+        return
     chosen = [f"plan.{key}={given[key]}" for key in ("goal", "order") if given[key]]
     experiment = Experiment.load(config, (*overrides, *chosen), given["data"], registry)
+    assert count is not None
     with console.progress() as progress:
         result = make_plan(experiment, count, given["candidates"], given["given"], given["calibration"], progress)
     write_csv(out, result.dataset, experiment.request(measured=False).channels)
@@ -54,6 +78,32 @@ def plan(console: Console, config: Path, count: int, out: Path, overrides: tuple
     for text in experiment.warnings:
         console.warn(text)
     _show(console, content)
+
+
+def _edge(given: Mapping[str, Any], count: int | None) -> float | None:
+    """The edge of the cube (m); None for the largest, or where none is planned.
+
+    Raises:
+        InputError: neither poses nor a cube are asked for, both are, or the size is none.
+    """
+    text = given["iso_cube"]
+    if (text is None) == (count is None):
+        raise InputError("give --poses N to calibrate, or --iso-cube SIZE_MM to test; one of them.")
+    if text is None:
+        return None
+    if idle := [name for name in ("data", "candidates", "given", "goal", "order") if given[name]]:
+        raise InputError(f"--{idle[0]} has no meaning with --iso-cube.", hint="Leave it out.")
+    if text == "auto":
+        return None
+    try:
+        size = float(text)
+    except ValueError:
+        size = math.nan
+    if not 1 <= size <= _LARGEST_CUBE_MM:
+        raise InputError(
+            f"found {text!r}, expected an edge of 1 to {_LARGEST_CUBE_MM:g} mm, or auto.", where=Location("--iso-cube")
+        )
+    return size / 1000
 
 
 def _content(experiment: Experiment, result: PlanResult) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from armcal.errors import DataError, Location
 from armcal.measure.layout import Layout, joints_by_arm, layout_of, set_aside, warned
 from armcal.measure.missing import set_aside_not_finite
 from armcal.measure.poses import first_of_pose
-from armcal.measure.reader import RequestedChannel
+from armcal.measure.reader import CYCLE, RequestedChannel
 
 __all__ = [
     "Layout",
@@ -261,7 +261,7 @@ def set_aside_frozen(dataset: Dataset, layout: Layout) -> Dataset:
 
 def set_aside_duplicates(dataset: Dataset, layout: Layout) -> Dataset:
     """Set aside copies: records that agree with an earlier one in everything but id, time and temperature."""
-    if not layout.measured:  # poses to predict may repeat
+    if not layout.measured or dataset.has(CYCLE):  # poses to predict may repeat, and visits that are numbered
         return dataset
     alike = _first_alike(dataset, [name for name in dataset.channels if name not in _VARIES_AT_REST])
     reads = ~np.isnan(dataset.stacked(layout.measured)).all(axis=0)  # an arm at rest in a contact is no copy

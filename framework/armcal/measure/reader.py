@@ -63,6 +63,8 @@ class Reader(Protocol):
         """
 
 
+CYCLE = "cycle"
+"""A channel that numbers repeated visits to poses: where it is read, records that agree are no copies."""
 ID_NAMES = ("pose_id", "id")
 """Columns that name a record."""
 

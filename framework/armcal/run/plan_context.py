@@ -77,6 +77,16 @@ def parameters_of(experiment: Experiment, calibration: Path | None) -> Parameter
         )
     if not parameters.free:
         raise ProblemError("no parameter is free: there is nothing to plan for.", hint="Set parameters.free.")
+    return values_about(experiment, calibration)
+
+
+def values_about(experiment: Experiment, calibration: Path | None) -> Parameters:
+    """An experiment's parameters, at the values of a calibration if one is given.
+
+    Raises:
+        ConfigError: the calibration is of another arm.
+    """
+    parameters = experiment.parameters
     if calibration is None:
         return parameters
     calibrated = Calibration.load(calibration, experiment.registry).parameters

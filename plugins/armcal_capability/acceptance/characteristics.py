@@ -50,6 +50,12 @@ def repeatability(positions: Array) -> Figure:
     return Figure(estimate, estimate / float(high), estimate / float(low) if low > 0 else np.inf)
 
 
+def repeatability_of(deviations: Array) -> float:
+    """RP of normal noise with these standard deviations along x, y and z (3; m)."""
+    far = np.linalg.norm(np.random.default_rng(_SEED).standard_normal((_MOST_NUMBERS, 3)) * deviations, axis=1)
+    return float(far.mean() + _TIMES * far.std())
+
+
 def turn_accuracy(turns: Array) -> tuple[Figure, ...]:
     """APa, APb, APc of one pose (n x 3; rad): the mean turn about each axis."""
     return tuple(mean_figure(column) for column in turns.T)

@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 from armcal.base.config_text import as_json
 from armcal.cli.common import FILE, Console, accept, command_line, overrides, speaking
 from armcal.io.folder import reserved
 
 from armcal_capability.acceptance.assessment import assess
+from armcal_capability.acceptance.characteristics import repeatability_of
 from armcal_capability.acceptance.comparison import FRAMES, FrameChoice, compare
 from armcal_capability.acceptance.content import content_of, csv_rows, sentences, tables
 from armcal_capability.acceptance.pictures import pictures
@@ -51,11 +53,11 @@ def acceptance(console: Console, source: Path, records: Path, out: Path, frame: 
     subject = ArmToJudge.load(source, given["settings"], given["overrides"], records, registry, given["accept"])
     visits = read_visits(subject, registry, records)
     comparisons = compare(subject, visits, frame)
-    assessment = assess(visits, comparisons)
+    assessment, noise = assess(visits, comparisons), subject.measurement[1].noise()
     warnings = list(dict.fromkeys((*visits.warnings, *(w for c in comparisons.values() for w in c.warnings))))
     if subject.trained_on and visits.dataset.sha256 == subject.trained_on:
         warnings.append("the calibration was fitted to these very records: measure others to judge it by.")
-    content = content_of(assessment, visits, comparisons, warnings)
+    content = content_of(assessment, visits, comparisons, repeatability_of(np.array(noise[:3])), warnings)
     texts, shown = sentences(content, subject.name), list(tables(assessment))
     drawn = pictures(assessment, visits, comparisons)
     facts = {"command": command_line(), "files": ", ".join(map(str, (*subject.files, records)))}

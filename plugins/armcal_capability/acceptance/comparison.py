@@ -144,7 +144,8 @@ def _as_stated(tools: Tools, sighting: Sighting) -> Comparison:
             warnings.append(
                 f"typically {off * _MM:.3g} mm are between commanded and attained positions, and "
                 f"{ranked[0].left * _MM:.3g} mm where the records themselves place the base, at "
-                f"{pose_words(ranked[0])}. If the instrument's frame is not the stated one, give --frame found."
+                f"{pose_words(ranked[0])}. Either the arm is as far off, or the instrument's frame is not the stated "
+                "one: then give --frame found."
             )
     words = "as stated: nothing was fitted to these records"
     turns = None if sighting.turned is None else _turns(tools.rotations, sighting.turned)

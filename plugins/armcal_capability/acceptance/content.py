@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from armcal.report.numbers import decimals_for
 
-from armcal_capability.acceptance.assessment import SERIES, Assessment, Row
+from armcal_capability.acceptance.assessment import MM, SERIES, Assessment, Row
 from armcal_capability.acceptance.comparison import Comparison
 from armcal_capability.acceptance.figure import Figure
 from armcal_capability.acceptance.records import COMMANDED, Visits
@@ -23,15 +23,22 @@ _NAMES: Mapping[str, tuple[str, ...]] = {
     "directions": ("pose", "directions"),
     "drifts": ("pose", "direction"),
 }
-_LARGEST = 1e4
+_LARGEST, _MUCH = 1e4, 0.3
 _MOST_ROWS = 40
 """Of a table on the screen and the page; the CSV has all."""
 
 
 def content_of(
-    assessment: Assessment, visits: Visits, comparisons: Mapping[str, Comparison], warnings: Sequence[str]
+    assessment: Assessment,
+    visits: Visits,
+    comparisons: Mapping[str, Comparison],
+    noise: float,
+    warnings: Sequence[str],
 ) -> dict[str, Any]:
-    """Everything, for JSON: lengths in mm, angles in degrees, intervals of 95 %."""
+    """Everything, for JSON: lengths in mm, angles in degrees, intervals of 95 %.
+
+    ``noise`` is the repeatability that the declared noise of the instrument makes alone (m).
+    """
     sections = _sections(assessment)
     stated = visits.dataset.has(COMMANDED[0])
     how = "columns of the records" if stated else "the nominal arm at the commanded joint positions"
@@ -48,6 +55,7 @@ def content_of(
         },
         "summary": {model: _summary(assessment, model) for model in comparisons},
         "repeatability_mm": _ends([row.measured["RP_mm"].value for row in assessment.poses]),
+        "of_instrument_mm": noise * MM,
         **{name: [_row(row, _NAMES[name]) for row in rows] for name, rows in sections.items()},
         "warnings": list(warnings),
     }
@@ -88,6 +96,10 @@ def sentences(content: Mapping[str, Any], name: str) -> list[str]:
     texts = [f"{name}: mean pose accuracy AP {accuracy}; mean repeatability RP {ends.format(**rp)}."]
     for model, frame in content["frames"].items():
         texts.append(f"AP, {model}: commanded is {content['commanded'][model]}; the frame is {frame['words']}.")
+    if content["of_instrument_mm"] > _MUCH * rp["mean"]:
+        texts.append(
+            f"RP holds the instrument's noise, which as declared makes {content['of_instrument_mm']:.2g} mm alone."
+        )
     cycles = content["cycles"]
     if cycles["least"] < ISO_CYCLES:
         texts.append(

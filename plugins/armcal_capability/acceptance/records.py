@@ -15,14 +15,14 @@ from armcal.errors import DataError, Location
 from armcal.io.plain_files import input_file
 from armcal.measure.environment import noticed
 from armcal.measure.poses import pose_numbers
-from armcal.measure.reader import Reader, ReadRequest, RequestedChannel, requested_channels
+from armcal.measure.reader import CYCLE, Reader, ReadRequest, RequestedChannel, requested_channels
 from armcal.plugins import PluginRegistry
 from numpy.typing import NDArray
 
 from armcal_capability.acceptance.subject import ArmToJudge
 
 Indices = NDArray[np.intp]
-CYCLE, POSE, DIRECTION = "cycle", "pose", "direction"
+POSE, DIRECTION = "pose", "direction"
 COMMANDED = tuple(f"commanded_{axis}" for axis in "xyz")
 COMMANDED_TURN = tuple(f"commanded_{part}" for part in ("qw", "qx", "qy", "qz"))
 FEWEST = 2
@@ -33,7 +33,7 @@ _OWN = (
     *(RequestedChannel(name, (name,), DIMENSIONLESS, required=False) for name in COMMANDED_TURN),
 )
 _REPEATS = "Records of one pose are held out together"
-"""In what readers warn of: repeats, which are rows here."""
+"""In what readers warn of: repeats, which are what is measured here."""
 
 
 @dataclass(frozen=True)
@@ -190,11 +190,13 @@ def _lost_labels(dataset: Dataset, path: Path, delimiter: str) -> dict[str, list
     if not rows:
         return lost
     with input_file(path, _MOST_BYTES, "a table of records") as stream:
+        place: int | None = None
         for number, raw in enumerate(stream, start=1):
-            if number == 1:
-                place = _split(raw, delimiter).index(POSE)
-            elif number in rows:
-                lost.setdefault(_split(raw, delimiter)[place].strip(), []).append(number)
+            cells = _split(raw, delimiter) if place is None or number in rows else []
+            if place is None:
+                place = cells.index(POSE) if POSE in cells else None
+            elif len(cells) > place:
+                lost.setdefault(cells[place], []).append(number)
     return lost
 
 
