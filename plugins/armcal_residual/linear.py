@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import itertools
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -27,6 +27,7 @@ _LEAST_TAKEN = 1e-3
 _LEAST_KNOWN = 0.5
 """Weights that records determine: a function of fewer is none."""
 _UNSEEN = 1e-6
+_AT_A_TIME = 4096
 
 
 class PartSettings(Settings):
@@ -90,15 +91,30 @@ class LinearResidual(PoseResidual):
         return ca.vertcat(*rows)
 
     @override
+    def corrections(self, postures: Postures) -> Array:
+        def moved(part: PartSettings, features: Array) -> Array:
+            return np.asarray(unpacked(part.weights, len(features), len(part.scales)).T @ features)
+
+        return self._summed(postures, moved)
+
+    @override
     def deviations(self, postures: Postures) -> Array:
-        variance = np.zeros((len(OF_TOOL) + len(self.joint_names), postures.commands.shape[1]))
-        for part in self.parts:
-            features = self.features(part, postures.commands, postures.approaches)
+        def variance(part: PartSettings, features: Array) -> Array:
             taken = np.sum((unpacked(part.root, len(features), None).T @ features) ** 2, axis=0)
-            left = np.maximum(self.prior_variance(part, features) - taken, 0.0)
-            for i, scale in enumerate(part.scales):
-                variance[part.first + i] += scale**2 * left
-        return np.asarray(np.sqrt(variance))
+            return np.outer(np.square(part.scales), np.maximum(self.prior_variance(part, features) - taken, 0.0))
+
+        return np.asarray(np.sqrt(self._summed(postures, variance)))
+
+    def _summed(self, postures: Postures, of_part: Callable[[PartSettings, Array], Array]) -> Array:
+        """What parts give by their features, by correction (6 + joints x N); of some thousand postures at a time."""
+        total = np.zeros((len(OF_TOOL) + len(self.joint_names), postures.commands.shape[1]))
+        for start in range(0, total.shape[1], _AT_A_TIME):
+            here = slice(start, start + _AT_A_TIME)
+            own = postures.subset(here)
+            for part in self.parts:
+                rows = slice(part.first, part.first + len(part.scales))
+                total[rows, here] += of_part(part, self.features(part, own.commands, own.approaches))
+        return total
 
 
 @dataclass(frozen=True)

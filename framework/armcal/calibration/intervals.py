@@ -24,7 +24,6 @@ from armcal.errors import DataError, Location
 from armcal.estimate.prediction import LEVELS, STATED, KnownDrift, Predictor, Spread, is_position
 from armcal.estimate.validation import Indices
 from armcal.estimate.variance import Axes, Component, VarianceComponents, apply_components
-from armcal.problem.corrections import correctable
 from armcal.problem.drift import Chain, chain, with_drift
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.readings import reading_slopes
@@ -227,7 +226,6 @@ class Uncertainty:
 
     def _problem(self, dataset: Dataset) -> Problem:
         system = self.system
-        dataset = correctable(dataset, system.arms)
         parts = (system.arms, system.measurements, self._drifting, system.environment, dataset)
         return Problem.build(*parts, "interpreted", groups={})
 

@@ -20,7 +20,7 @@ from scipy.special import fdtri, stdtrit
 
 from armcal.base.domains import Array
 from armcal.estimate.validation import error_dimension
-from armcal.problem.corrections import unexplained
+from armcal.problem.corrected import unexplained
 from armcal.problem.factor_records import noise_roots
 from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem

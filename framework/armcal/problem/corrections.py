@@ -1,18 +1,20 @@
-"""Corrections of joints and tools in records: what an arm's pose residual adds, and how residuals change with them."""
+"""Corrections of joints and tools that records carry: what an arm's pose residual has learned of their commands.
+
+They depend on what was commanded alone, so they are made once, in batches, and no expression holds what was learned.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from armcal.arm.assembly import Arm
-from armcal.arm.pose_residual import PoseResidual, Postures, correction_names
+from armcal.arm.pose_residual import Postures, correction_names
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.problem.factor import CORRECTION
-from armcal.problem.problem import FactorRecords, Problem
 
 
 def correction_channels(arm: Arm) -> tuple[str, ...]:
@@ -20,25 +22,16 @@ def correction_channels(arm: Arm) -> tuple[str, ...]:
     return tuple(f"{arm.name}.{CORRECTION}{name}" for name in correction_names(arm.joint_names))
 
 
-def correctable(dataset: Dataset, arms: Mapping[str, Arm]) -> Dataset:
-    """The records with corrections of arms that have a pose residual, all zero: a problem of these has their slopes."""
-    channels = [channel for arm in arms.values() if arm.residual is not None for channel in correction_channels(arm)]
-    zeros = {channel: np.zeros(len(dataset)) for channel in channels}
-    return replace(dataset, channels={**dataset.channels, **zeros}) if channels else dataset
-
-
-def corrected_records(
-    problem: Problem, records: Sequence[FactorRecords], arm: Arm, corrections: Array
-) -> tuple[FactorRecords, ...]:
-    """Records with corrections of an arm (6 + joints x N) in place of theirs."""
-    result = []
-    for kernel, own in zip(problem.kernels, records, strict=True):
-        content = own.record.copy()
-        for channel, row in zip(correction_channels(arm), corrections, strict=True):
-            if channel in kernel.factor.channels:
-                content[kernel.factor.channels.index(channel), : own.count] = row
-        result.append(replace(own, record=content, state=own.state.copy()))
-    return tuple(result)
+def with_corrections(dataset: Dataset, arms: Mapping[str, Arm]) -> Dataset:
+    """The records with corrections of the arms that have a pose residual: zero where it has not learned."""
+    channels = dict(dataset.channels)
+    for arm in arms.values():
+        names = correction_channels(arm)
+        if arm.residual is not None and arm.residual.is_learned:
+            channels |= zip(names, arm.residual.corrections(postures_of(arm, dataset)), strict=True)
+        elif arm.residual is not None:
+            channels |= dict.fromkeys(names, np.zeros(len(dataset)))
+    return replace(dataset, channels=channels) if len(channels) > len(dataset.channels) else dataset
 
 
 def postures_of(arm: Arm, dataset: Dataset) -> Postures:
@@ -51,28 +44,3 @@ def postures_of(arm: Arm, dataset: Dataset) -> Postures:
     commands = [column(f"{arm.name}.{joint}") for joint in arm.commanded]
     approaches = [column(f"{arm.name}.approach.{joint}") for joint in arm.commanded]
     return Postures(np.array(arm.joint_commands(commands)), np.array(arm.joint_approaches(approaches)))
-
-
-def unexplained(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], learned: Mapping[str, PoseResidual] | None = None
-) -> list[Array]:
-    """Covariance of residuals by what learned pose residuals do not know (N x n_r x n_r a factor; SI).
-
-    Those of ``learned``, by arm, take the place of the arms' own. Records must carry corrections; arms that have none,
-    or whose pose residual has not learned, add nothing.
-    """
-    count = records[0].count
-    total = [
-        np.zeros((count, kernel.factor.residual.numel(), kernel.factor.residual.numel())) for kernel in problem.kernels
-    ]
-    for arm in problem.blueprint.arms.values():
-        residual = (learned or {}).get(arm.name, arm.residual)
-        if residual is None or not residual.is_learned:
-            continue
-        slopes = problem.channel_slopes(values, records, correction_channels(arm))
-        for i, (kernel, own, slope) in enumerate(zip(problem.kernels, records, slopes, strict=True)):
-            known = dict(zip(kernel.factor.channels, own.record[:, : own.count], strict=True))
-            here = postures_of(arm, Dataset(("",) * own.count, known))
-            spread = slope * residual.deviations(here)
-            total[i] += np.einsum("rcn,scn->nrs", spread, spread)
-    return total

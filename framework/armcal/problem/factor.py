@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -32,7 +32,7 @@ from armcal.measure.measurement import GroupedMeasurement, Measurement, noise_ch
 from armcal.measure.partners import OTHER
 
 CORRECTION = "correction."
-"""Channels ``ARM.correction.shift_x`` and so on, where records carry them: see ``arm/pose_residual.py``."""
+"""Channels ``ARM.correction.shift_x`` and so on, of arms with a pose residual: see ``corrections.py``."""
 
 
 @dataclass(frozen=True)
@@ -275,7 +275,7 @@ def _arm_states(
         angles, approach = ca.vertcat(*arm.joint_commands(commands)), ca.vertcat(*arm.joint_approaches(approaches))
         conditions = {channel: records.number(channel) for channel in arm.conditions if channel in available}
         corrections = [f"{arm.name}.{CORRECTION}{own}{which}" for own in correction_names(arm.joint_names)]
-        correction = ca.vertcat(*map(records.number, corrections)) if corrections[0] in available else None
+        correction = None if arm.residual is None else ca.vertcat(*map(records.number, corrections))
         inputs = ArmInputs(angles, approach, load, deflections[-1], conditions, correction)
-        states[name] = arm.state(values, inputs)
+        states[name] = replace(arm, residual=None).state(values, inputs)  # records carry what it has learned
     return records, states, deflections

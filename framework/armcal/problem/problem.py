@@ -22,7 +22,7 @@ from armcal.measure.measurement import Measurement
 from armcal.measure.partners import with_partners
 from armcal.problem import factor_records
 from armcal.problem.blueprint import Blueprint
-from armcal.problem.factor import CORRECTION
+from armcal.problem.corrections import with_corrections
 from armcal.problem.factor_records import FactorRecords, correlation_of, mean_shares, transformed
 from armcal.problem.grouped_kernel import GroupedKernel
 from armcal.problem.kernel import Kernel
@@ -115,7 +115,7 @@ class Problem:
     def records(self, dataset: Dataset, weights: Array | None = None) -> tuple[FactorRecords, ...]:
         """A dataset as the kernels read it; ``weights`` (N) multiply each record's squared residual."""
         plan = self.blueprint
-        dataset = _with_corrections(with_partners(dataset, plan.measurements), plan.channels)
+        dataset = with_partners(with_corrections(dataset, plan.arms), plan.measurements)
         factors = [kernel.factor for kernel in self.kernels]
         numbers = [group_numbers(dataset, name, m, plan.groups) for name, m in plan.measurements.items()]
         masks = [factor_records.applicable(f, dataset, n) for f, n in zip(factors, numbers, strict=True)]
@@ -297,13 +297,6 @@ class Problem:
         plan = self.blueprint.parameters
         held = [block.name for block in plan.blocks if not block.free and not block.nuisance]
         return np.array([i for name in held for i in range(*plan.entries_of(name).indices(1 << 30))], dtype=np.intp)
-
-
-def _with_corrections(dataset: Dataset, channels: frozenset[str]) -> Dataset:
-    """The records with what they do not say of corrections that they could carry: nothing."""
-    silent = [c for c in channels if f".{CORRECTION}" in c and not dataset.has(c)]
-    zeros = {channel: np.zeros(len(dataset)) for channel in silent}
-    return replace(dataset, channels={**dataset.channels, **zeros}) if silent else dataset
 
 
 @lru_cache(maxsize=64)

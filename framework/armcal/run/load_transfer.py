@@ -25,8 +25,9 @@ from armcal.estimate.validation import (
 )
 from armcal.io.parallel import Executor
 from armcal.problem.drift import with_drift
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Prepared, Stopwatch, built
+from armcal.run.pipeline import Prepared, Stopwatch
 from armcal.run.study import LoadTransferSettings, Study, interpreted_first, judged_fits, naming
 from armcal.run.study_result import TransferCell, TransferResult
 
@@ -143,7 +144,7 @@ def _groups(dataset: Dataset, settings: LoadTransferSettings) -> tuple[list[Indi
 def _prepared(experiment: Experiment, dataset: Dataset, groups: Sequence[Indices]) -> Prepared:
     system, parameters = experiment.system, experiment.parameters
     choice = interpreted_first(experiment).evaluator
-    problem = built(system, dataset, parameters, choice)
+    problem = Problem.build(system.arms, system.measurements, parameters, system.environment, dataset, choice)
     start = aligned_start(problem, problem.records(dataset), dataset)
     problem, nominal = start.problem, start.problem.parameters.nominal()
     records = with_drift(problem, problem.records(dataset), dataset, nominal)

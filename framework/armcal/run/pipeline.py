@@ -10,9 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from armcal.base.dataset import Dataset, SetAside
-from armcal.base.parameters import Parameters
 from armcal.calibration.intervals import PredictionRecord, covariance_rows, recording_record, stretch_records
-from armcal.config.system import System
 from armcal.diagnose.clustered import widened
 from armcal.diagnose.coverage import fit_and_predict
 from armcal.diagnose.noise_findings import Finding
@@ -35,11 +33,9 @@ from armcal.estimate.validation import (
     split_by_label,
 )
 from armcal.estimate.weighing import WeighedFit, fit, plain_fit
-from armcal.functions.batch_function import EvaluatorChoice
 from armcal.io.parallel import Executor
 from armcal.measure.id_list import read_ids
 from armcal.plugins import PluginRegistry
-from armcal.problem.corrections import correctable
 from armcal.problem.drift import with_drift
 from armcal.problem.motion import recorded_position
 from armcal.problem.problem import FactorRecords, Problem
@@ -117,7 +113,8 @@ def assemble(experiment: Experiment, watch: Stopwatch, accept: bool = False) -> 
         experiment = experiment.of_records(dataset)
     system = experiment.system
     with watch.stage("build"):
-        problem = built(system, dataset, experiment.parameters, experiment.settings.evaluator)
+        settings = (experiment.parameters, system.environment)
+        problem = Problem.build(system.arms, system.measurements, *settings, dataset, experiment.settings.evaluator)
         records = problem.records(dataset)
         start = aligned_start(problem, records, dataset)
         problem = started(start.problem, records)
@@ -139,12 +136,6 @@ def assemble(experiment: Experiment, watch: Stopwatch, accept: bool = False) -> 
         profiled(problem, experiment.settings.uncertainty.profile)
     texts = (*experiment.warnings, *dataset.warnings, *start.warnings)
     return Prepared(dataset, problem, records, split, texts, start, tuple(mixed_up))
-
-
-def built(system: System, dataset: Dataset, parameters: Parameters, evaluator: EvaluatorChoice) -> Problem:
-    """The problem of these records, which can carry corrections where a pose residual is to be learned."""
-    records, settings = correctable(dataset, system.arms), (parameters, system.environment)
-    return Problem.build(system.arms, system.measurements, *settings, records, evaluator)
 
 
 def _acting(problem: Problem, records: tuple[FactorRecords, ...], dataset: Dataset) -> tuple[FactorRecords, ...]:
@@ -310,11 +301,8 @@ def _with_pose_residual(
         ready = replace(ready, findings=(*ready.findings, *outcome.findings()))
         if outcome.residual is None:
             return ready, fitted, outcome
-        # What was learned has thousands of terms: to compile them takes longer than the fits that are left.
-        choice = experiment.settings.evaluator
-        evaluator: EvaluatorChoice = "interpreted" if choice == "auto" else choice
-        system, parameters = outcome.system(experiment.system), ready.problem.parameters
-        problem = built(system, ready.dataset, parameters, evaluator)
+        arms = outcome.system(experiment.system).arms
+        problem = replace(ready.problem, blueprint=replace(ready.problem.blueprint, arms=arms))
         records = _acting(problem, problem.records(ready.dataset), ready.dataset)
         ready = replace(ready, problem=problem, records=records)
         estimator = spread(experiment.estimator, executor)

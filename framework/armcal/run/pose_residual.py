@@ -34,8 +34,8 @@ from armcal.estimate.weighing import WeighedFit, fit
 from armcal.io.parallel import Executor
 from armcal.measure.contact import Contact
 from armcal.measure.partners import PairedMeasurement
-from armcal.problem.corrections import corrected_records, correction_channels, postures_of, unexplained
-from armcal.problem.drift import residuals
+from armcal.problem.corrected import corrected_records, unexplained
+from armcal.problem.corrections import correction_channels, postures_of
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.run.experiment import Experiment
 
@@ -290,9 +290,9 @@ def judged_with(task: FitTask, layer: Layer) -> JudgedFit:
 def model_errors(
     problem: Problem, fitted: WeighedFit, records: tuple[FactorRecords, ...], arm: Arm, postures: Postures
 ) -> ModelErrors | None:
-    """What a fit leaves of its records, the drift taken off; None where no record shows the tool."""
+    """What a fit leaves of its records, at rest where something drifts; None where no record shows the tool."""
     values = fitted.estimate.values
-    raw = problem.whitened(residuals(problem, values, records, records), records)
+    raw = problem.whitened(problem.residuals(values, records), records)
     by_correction = problem.channel_slopes(values, records, correction_channels(arm))
     count = len(correction_channels(arm))
     columns = [problem.whitened([slope[:, i] for slope in by_correction], records) for i in range(count)]

@@ -83,10 +83,10 @@ class NominalArm:
 
     @classmethod
     def of(cls, arm: Arm, parameters: Parameters, environment: Environment) -> NominalArm:
-        """An arm without those of its effects that have no springs: its joints stand where they are commanded."""
+        """An arm whose joints stand where they are commanded: of its effects, it has the springs alone."""
         nominal = {block.name: ca.SX(list(block.nominal)) for block in arm.parameters()}
         springy = {n: e for n, e in arm.effects.items() if e.springs(scoped(nominal, f"{arm.name}.{n}."))}
-        arm = replace(arm, effects=springy)
+        arm = replace(arm, effects=springy, residual=None)
         parameters = parameters.with_free(block.name for block in arm.parameters())
         conditions = frozenset(arm.conditions)
         factor = build_factor("tool", _ToolFrame(arm.name), {arm.name: arm}, parameters, environment, conditions)
