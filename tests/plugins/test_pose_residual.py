@@ -164,6 +164,18 @@ def test_a_study_compares_with_and_without(tmp_path):
     assert errors["learned"] < 0.3 * errors["plain"]
 
 
+def test_what_a_drift_could_explain_is_learned_all_the_same(tmp_path):
+    data = recorded(tmp_path)
+    head, *rows = data.read_text().splitlines()
+    first = head.split(",").index("q1_deg")
+    rows.sort(key=lambda row: float(row.split(",")[first]))  # neighbours in time stand alike
+    data.write_text("\n".join([head + ",sequence", *(f"{row},{i}" for i, row in enumerate(rows))]) + "\n")
+    ran(tmp_path, "{type: fourier}", data, "--set", "parameters.drift={arm.mdh.theta*: {sd: 0.1 deg, over: 6}}")
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    folds = metrics["pose_residual"]["folds"]
+    assert metrics["pose_residual"]["kept"] and folds["with_mm"] < 0.5 * folds["without_mm"]
+
+
 def test_a_recalibration_holds_what_was_learned(tmp_path):
     run = learned_run("fourier")
     (tmp_path / "calibration.yaml").write_text((run.folder / "run/calibration.yaml").read_text())
