@@ -73,13 +73,28 @@ def untold_payload(random: np.random.Generator) -> dict[str, Any]:
     return {"events": [{"kind": "payload", "day": DAY, "mass_g": mass, "lever_mm": lever}]}
 
 
+def bent_link(random: np.random.Generator) -> dict[str, Any]:
+    """A link's length jumps by 1 to 8 mm and its twist by 1 to 4 deg."""
+    i, length, twist = random.integers(3, 6), _size(random, 1, 8), _size(random, 1, 4)
+    changes = {f"arm.mdh.a{i}": f"{length:.2f} mm", f"arm.mdh.alpha{i}": f"{twist:.2f} deg"}
+    return {"events": [{"kind": "bend", "day": DAY, "joint": f"arm.q{i}", "changes": changes}]}
+
+
+def unread_tilt(random: np.random.Generator) -> dict[str, Any]:
+    """The rover reads its tilt wrong by 10 to 25 deg."""
+    azimuth, size = random.uniform(0, 2 * np.pi), abs(_size(random, 10, 25))
+    turn = [float(size * np.cos(azimuth)), float(size * np.sin(azimuth))]
+    return {"events": [{"kind": "tilt", "day": DAY, "turn_deg": turn}]}
+
+
 def nothing(random: np.random.Generator) -> dict[str, Any]:
     """What the configuration has: creep, temperature, tilts, 5 % outliers of 30 to 60 mm."""
     return {"events": []}
 
 
 CASES: dict[str, Callable[[np.random.Generator], dict[str, Any]]] = {
-    case.__name__: case for case in (two_slips, outliers, tracker_bias, creeping_joint, untold_payload, nothing)
+    case.__name__: case
+    for case in (two_slips, outliers, tracker_bias, creeping_joint, untold_payload, nothing, bent_link, unread_tilt)
 }
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from armcal.arm.environment import gravity_tilt
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.config.selection import quantity
@@ -26,6 +27,7 @@ from armcal_simulation.mission_events import (
     PlaySettings,
     SlipSettings,
     SwapSettings,
+    TiltedSettings,
     parsed_creep,
 )
 from armcal_simulation.mission_settings import MissionSettings, TemperatureSettings
@@ -219,6 +221,9 @@ def _steps(parameters: Parameters, settings: MissionSettings) -> Iterator[Step]:
                     f"simulation.events: {block.name} is no angle.", hint="Give the joint's offset, such as theta3."
                 )
             yield Step(_entry(parameters, event.parameter), event.day * DAY_S, event.turned)
+        elif isinstance(event, TiltedSettings):
+            for block, turn in zip(gravity_tilt(), event.turn, strict=True):
+                yield Step(_entry(parameters, block.name), event.day * DAY_S, turn)
         elif isinstance(event, SwapSettings | BendSettings):
             for name, change in event.changes.items():
                 yield Step(_entry(parameters, name), event.day * DAY_S, _amount(parameters, name, change))

@@ -13,6 +13,7 @@ from pydantic import Field, field_validator, model_validator
 _CREEP = re.compile(r"\s*(?P<walk>walk\s+)?(?P<amount>\S.*?)\s+in\s+(?P<over>[0-9.]+)\s*(?P<unit>d|h|min|s)\s*")
 _SECONDS = {"d": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0}
 
+Angle2 = tuple[Angle, Angle]
 Day = Annotated[float, Field(ge=0)]
 
 
@@ -160,6 +161,18 @@ class PayloadSettings(LastingSettings):
         return f"unreported payload of {1000 * self.mass:.0f} g at {1000 * float(np.linalg.norm(self.lever)):.0f} mm"
 
 
+class TiltedSettings(EventSettings):
+    """The rover reads its tilt wrong from now on: gravity is turned against it about the base's x and y axes."""
+
+    kind: Literal["tilt"]
+    turn: Angle2
+
+    @property
+    def label(self) -> str:
+        """How far."""
+        return f"unreported tilt of {math.degrees(math.hypot(*self.turn)):.1f} deg"
+
+
 class BumpSettings(EventSettings):
     """The camera moves: what is measured is turned about the base's origin (a rotation vector), then shifted."""
 
@@ -213,6 +226,7 @@ Event = Annotated[
     | CreepSettings
     | PlaySettings
     | PayloadSettings
+    | TiltedSettings
     | BumpSettings
     | BiasSettings
     | ClimateSettings,

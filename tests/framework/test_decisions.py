@@ -39,7 +39,7 @@ SLIP = math.radians(6.0)
 def section(kind: str) -> str:
     """What docs/decisions.md says of a kind."""
     of = KINDS[kind]
-    subject = "the joint" if kind.startswith("joint") else "the instrument"
+    subject = {"joint": "the joint", "link": "the link"}.get(kind.partition("_")[0], "the instrument")
     texts = advice(kind, {"subject": subject, "candidates": "these joints", "calm": 16, "good": "the last good record"})
     level = f" The level becomes {of.level}." if of.level else ""
     return f"## `{kind}`\n\n{of.means}{level}\n\n- **Do:** {texts['do']}\n- **Confirm:** {texts['confirm']}\n"

@@ -33,7 +33,7 @@ def text_of(level: str) -> str:
     """What a recalibration at a level publishes."""
     session = begun(settings(evaluator="interpreted"))
     told = {"records": {}, "sequence": 17, "time_s": 0.0, "level": level, "why": WHY}
-    return calibration_text(calibration(), session.setup.space, session.state.belief, told)
+    return calibration_text(calibration(), session.setup, session.state.belief, told)
 
 
 @pytest.fixture(scope="module")

@@ -76,6 +76,15 @@ CREEP = event("creep", 5, "arm.q3", until=20)
         # A bent link lies between two joints.
         ([event("bend", 5, "arm.q3", beside="arm.q4")], [decided("joint_slipped", 5.1, "arm.q4")], ["right"], 0),
         ([event("bend", 5, "arm.q3", beside="arm.q4")], [decided("joint_slipped", 5.1, "arm.q5")], ["wrong"], 0),
+        ([event("bend", 5, "arm.q3", beside="arm.q4")], [decided("link_bent", 5.1, "link arm.q3")], ["right"], 0),
+        ([event("bend", 5, "arm.q3", beside="arm.q4")], [decided("link_bent", 5.1, "link arm.q4")], ["wrong"], 0),
+        ([SLIP], [decided("link_bent", 5.1, "link arm.q3")], ["wrong"], 0),
+        ([event("tilt", 5)], [decided("gravity_tilted", 5.1)], ["right"], 0),
+        ([event("tilt", 5)], [decided("payload_changed", 5.1)], ["wrong"], 0),
+        # One of several kinds of causes: vague if the right one is among them.
+        ([event("payload", 5)], [decided("one_of_several", 5.1, "", "arm.q2", "payload")], ["vague"], 0),
+        ([event("bump", 5)], [decided("one_of_several", 5.1, "", "gravity", "tracker")], ["vague"], 0),
+        ([event("bump", 5)], [decided("one_of_several", 5.1, "", "gravity", "payload")], ["wrong"], 0),
         ([event("bias", 5, until=9)], [decided("sensor_moved", 8)], ["right"], 0),
         ([event("bias", 5, until=9)], [decided("joint_slipped", 8, "arm.q3")], ["wrong"], 0),
         ([event("payload", 5)], [decided("joint_slipped", 5.1, "arm.q3")], ["wrong"], 0),

@@ -42,9 +42,22 @@ def gravity_tilt() -> tuple[ParameterBlock, ...]:
     return tuple(scalar(f"{STATICS}.gravity_{axis}", "rad", 0.0, 0.02) for axis in ("rx", "ry"))
 
 
-def tilted(load: Load, tilt: Mapping[str, Expression]) -> Load:
-    """A load under the real gravity; ``tilt`` has the values of ``gravity_tilt`` by local name, or nothing."""
-    if not tilt:
+def unstated_payload() -> tuple[ParameterBlock, ...]:
+    """What hangs on the tool beyond what is stated: its mass (kg), its first moments in the tool frame (kg m)."""
+    moments = (scalar(f"{STATICS}.payload_moment_{axis}", "kg_m", 0.0, 0.005) for axis in "xyz")
+    return scalar(f"{STATICS}.payload", "kg", 0.0, 0.1), *moments
+
+
+def tilted(load: Load, values: Mapping[str, Expression]) -> Load:
+    """A load under the real gravity.
+
+    ``values`` are those of ``gravity_tilt``, and those of ``unstated_payload`` where it is followed, by local
+    name; or nothing.
+    """
+    if not values:
         return load
-    about_x, about_y = (se3.rotation_about(axis, tilt[f"gravity_r{axis}"]).rotation for axis in "xy")
-    return replace(load, gravity=ca.mtimes(about_y, ca.mtimes(about_x, load.gravity)))
+    about_x, about_y = (se3.rotation_about(axis, values[f"gravity_r{axis}"]).rotation for axis in "xy")
+    real = replace(load, gravity=ca.mtimes(about_y, ca.mtimes(about_x, load.gravity)))
+    if "payload" not in values:
+        return real
+    return replace(real, beyond=(values["payload"], ca.vertcat(*(values[f"payload_moment_{axis}"] for axis in "xyz"))))

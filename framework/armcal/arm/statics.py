@@ -48,6 +48,7 @@ class Load:
         payload_com: its centre in the tool frame (3x1, m).
         force: external force at the tool frame's origin, in the base frame's axes (3x1, N).
         torque: external torque, in the base frame's axes (3x1, N m).
+        beyond: mass (kg) and first moment in the tool frame (3x1, kg m) of what hangs there beside the payload.
     """
 
     gravity: Expression
@@ -55,6 +56,7 @@ class Load:
     payload_com: Expression
     force: Expression
     torque: Expression
+    beyond: tuple[Expression, Expression] | None = None
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,10 @@ def wrenches(chain: Chain, frames: Frames, masses: Sequence[Mass], load: Load) -
         moment_at[up_to] += mass.mass * pose.apply(mass.com)
     weight_at[last] += load.payload_mass
     moment_at[last] += load.payload_mass * frames.base_T_tool.apply(load.payload_com)
+    if load.beyond is not None:
+        mass, moment = load.beyond
+        weight_at[last] += mass
+        moment_at[last] += mass * frames.base_T_tool.translation + ca.mtimes(frames.base_T_tool.rotation, moment)
     result: list[SiteWrench] = []
     weight, first_moment = ca.SX(0), ca.SX(3, 1)
     for index in reversed(range(last + 1)):

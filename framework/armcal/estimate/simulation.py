@@ -19,7 +19,7 @@ from armcal.problem.problem import Problem
 from armcal.problem.readings import disturbed_records
 
 DAY_S = 86400.0
-EventKind = Literal["slip", "swap", "bend", "creep", "play", "payload", "bump", "bias", "climate"]
+EventKind = Literal["slip", "swap", "bend", "creep", "play", "payload", "tilt", "bump", "bias", "climate"]
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,8 @@ class MissionEvent:
     Attributes:
         kind: ``slip`` (a horn slipped on its shaft), ``swap`` (a servo was replaced), ``bend`` (a link is bent),
             ``creep`` (a joint creeps), ``play`` (a joint's backlash grows), ``payload`` (picked up or set down, which
-            no record reports), ``bump`` (the camera moved), ``bias`` (the camera's readings move away), ``climate``
+            no record reports), ``tilt`` (gravity pulls from another direction than the records report), ``bump`` (the
+            camera moved), ``bias`` (the camera's readings move away), ``climate``
             (days and nights change).
         time: s since the mission began.
         joint: whose, ``arm.q3``; empty where it is no joint's.

@@ -10,11 +10,18 @@ from typing import Literal
 from armcal.estimate.simulation import DAY_S, MissionEvent
 
 from armcal_online.mission.log import Decision
+from armcal_online.tracking.causes import GRAVITY, LINK, PAYLOAD
 
 Verdict = Literal["right", "vague", "wrong", "missed"]
-INSTRUMENT, PAYLOAD, TEMPERATURE = "instrument", "payload", "temperature"
-_OF_KIND = {"bump": INSTRUMENT, "bias": INSTRUMENT, "payload": PAYLOAD, "climate": TEMPERATURE}
-_NAMING = {"sensor_": INSTRUMENT, "payload": PAYLOAD, "temperature": TEMPERATURE, "thermal": TEMPERATURE}
+INSTRUMENT, TEMPERATURE = "instrument", "temperature"
+_OF_KIND = {"bump": INSTRUMENT, "bias": INSTRUMENT, "payload": PAYLOAD, "tilt": GRAVITY, "climate": TEMPERATURE}
+_NAMING = {
+    "sensor_": INSTRUMENT,
+    "payload": PAYLOAD,
+    "gravity_": GRAVITY,
+    "temperature": TEMPERATURE,
+    "thermal": TEMPERATURE,
+}
 """How the kinds of decisions begin that name something else than a joint."""
 _GENERAL = ("general_change", "model_no_longer_fits", "unexplained")
 """Decisions that something changed, or is wrong, without a name."""
@@ -118,13 +125,17 @@ def subjects_of(decision: Decision) -> tuple[frozenset[str], bool]:
     for begin, subject in _NAMING.items():
         if decision.kind.startswith(begin):
             return frozenset({subject}), True
-    joints = frozenset(decision.candidates or ((decision.joint,) if decision.joint else ()))
-    return joints, len(joints) == 1
+    named = decision.candidates or ((decision.joint,) if decision.joint else ())
+    # A name without a dot that is no cause's is an instrument's.
+    subjects = frozenset(name if "." in name or name in (PAYLOAD, GRAVITY) else INSTRUMENT for name in named)
+    return subjects, len(subjects) == 1
 
 
 def _subjects(event: MissionEvent) -> frozenset[str]:
     if event.kind in _OF_KIND:
         return frozenset({_OF_KIND[event.kind]})
+    if event.kind == "bend":
+        return frozenset({f"{LINK}{event.joint}", event.joint, event.beside} - {""})
     return frozenset({event.joint, event.beside} - {""})
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 from armcal.arm.assembly import ArmState
+from armcal.arm.environment import unstated_payload
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
@@ -56,8 +57,11 @@ def error_curve(
     times = np.unique(np.concatenate([mission.times, hours]))
     frozen, true = parameters.nominal(), mission.truth.values_at(times)
     entries = dict(zip(parameters.entry_names, frozen.tolist(), strict=True))
-    estimates = tuple((time, np.array(list((entries | {**values}).values()))) for time, values in log.estimates)
+    estimates = tuple(
+        (time, np.array([values.get(name, value) for name, value in entries.items()])) for time, values in log.estimates
+    )
     series = {"frozen": ((0.0, frozen),), **(references or {}), "recalibrated": estimates}
+    loads = {time: load for time, values in log.estimates if (load := _payload_found(values)).any()}
     estimated = [values for of_one in series.values() for _, values in of_one]
     differing = np.any(np.vstack([true, *estimated]) != frozen, axis=0)
     changing = [block.name for block in parameters.blocks if differing[parameters.entries_of(block.name)].any()]
@@ -65,7 +69,10 @@ def error_curve(
     poses = random_poses(mission.records, tuple(arm.commanded), arm.name, settings.poses, settings.seed)
     tips = Tips.of(system, instrument, parameters, changing, poses, evaluator)
     seen = _true_tips(tips, poses, mission, times, true)
-    errors = {name: _errors(tips.again(poses), of_one, times, seen) for name, of_one in series.items()}
+    errors = {
+        name: _errors(tips, poses, of_one, loads if name == "recalibrated" else {}, times, seen)
+        for name, of_one in series.items()
+    }
     is_record, is_hour = np.isin(times, mission.times), np.isin(times, hours)
     return ErrorCurve(times, is_hour, is_record, errors, log.levels_at(times))
 
@@ -81,15 +88,25 @@ def _true_tips(tips: Tips, poses: Dataset, mission: Mission, times: Array, value
     return seen
 
 
-def _errors(tips: Tips, series: Series, times: Array, seen: Array) -> Array:
-    """Mean distance of a calibration's tips from those seen, at each time (m).
+def _payload_found(values: Mapping[str, float]) -> Array:
+    """The payload that a recalibration found: its mass (kg) and its centre in the tool frame (m)."""
+    mass, *moments = (values.get(block.name, 0.0) for block in unstated_payload())
+    return np.array([mass, *(moment / (mass or 1.0) for moment in moments)])
+
+
+def _errors(
+    unloaded: Tips, poses: Dataset, series: Series, loads: Mapping[float, Array], times: Array, seen: Array
+) -> Array:
+    """Mean distance of a calibration's tips from those seen, at each time (m); ``loads`` are payloads that it knows.
 
     One whose springs do not hold the arm predicts nothing: it is off by as much as the tips lie apart.
     """
     numbers = newest([time for time, _ in series], times)
-    errors, now = np.zeros(len(times)), seen[0]
+    errors, now, tips = np.zeros(len(times)), seen[0], unloaded.again(poses)
     for i in range(len(times)):
         if i == 0 or numbers[i] != numbers[i - 1]:
+            if loads:
+                tips = unloaded.again(with_payload(poses, loads.get(series[numbers[i]][0], np.zeros(4))))
             try:
                 now = tips.at(series[numbers[i]][1])
             except NotConvergedError:

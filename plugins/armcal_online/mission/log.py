@@ -10,12 +10,15 @@ import numpy as np
 from armcal.base.domains import Array
 from armcal.estimate.simulation import Mission
 
+from armcal_online.tracking.causes import LINK
+
 
 @dataclass(frozen=True)
 class Decision:
     """One decision: when (s since the mission began), what, of which joint, in words.
 
-    ``candidates`` are joints of which it is one, where the records cannot decide between them.
+    ``joint`` may be a link, by the joint that carries it (``link arm.q3``). ``candidates`` are those of which it is
+    one, where the records cannot decide between them.
     """
 
     time: float
@@ -80,6 +83,7 @@ def read_mission_log(events: Iterable[Mapping[str, Any]], mission: Mission) -> M
             levels.append((now, str(event["to"])))
         elif what == "decision":
             kind, joint, sentence = (str(event.get(key) or "") for key in ("kind", "joint", "sentence"))
+            joint = joint or (f"{LINK}{event['link']}" if "link" in event else "")
             decisions.append(Decision(now, kind, joint, sentence, tuple(event.get("candidates") or ())))
     return MissionLog(
         verdicts, tuple(estimates.items()), tuple(levels or [(0.0, "nominal")]), tuple(decisions), resumed

@@ -19,7 +19,7 @@ class DecisionKind:
     """One kind of decision.
 
     ``do`` and ``confirm`` are whole sentences for somebody who cannot reach the arm. They may hold ``{subject}`` (the
-    joint or instrument), ``{candidates}`` (all joints that it may be), ``{calm}`` (how many records in a row without
+    joint, instrument or link), ``{candidates}`` (all that it may be), ``{calm}`` (how many records in a row without
     trouble improve the level) and ``{good}`` (where to roll back to).
 
     Attributes:
@@ -81,6 +81,45 @@ KINDS: Mapping[str, DecisionKind] = {
         confirm="Look at something fixed to the arm's base with {subject}: it appears moved if {subject} moved. If it "
         "did not, the arm changed: roll back to {good}.",
         level="watch",
+        explains=True,
+    ),
+    "payload_changed": DecisionKind(
+        means="What hangs on the tool became heavier or lighter, and the records do not state it: the springs of all "
+        "joints give way as under a load. Its mass and, as far as records determine it, its centre are estimated; the "
+        "arm itself did not change.",
+        do="Go on. State the payload in the records, or let the tool set it down. Take {calm} records at different "
+        "poses before precise work.",
+        confirm="Is something in the gripper, or was it lost? Set it down and take 3 records: another decision of this "
+        "kind takes the load away again. If nothing was picked up or set down, roll back to {good}.",
+        level="watch",
+        explains=True,
+    ),
+    "gravity_tilted": DecisionKind(
+        means="Gravity pulls the arm from another direction than the records or the configuration state, as when the "
+        "base tilts together with its instrument, or an inclinometer errs. The direction is estimated anew.",
+        do="Go on with coarse work. Check the inclinometer, or state gravity as it is now. Take {calm} records at "
+        "different poses before precise work.",
+        confirm="Compare the stated direction of gravity with another sensor on the base: they differ by the size of "
+        "the decision. If they agree, roll back to {good}.",
+        level="watch",
+        explains=True,
+    ),
+    "link_bent": DecisionKind(
+        means="The geometry of one link jumped, more than the zero of the joint at either end explains: it is bent, or "
+        "its screws gave. All free lengths and angles of the link are estimated anew.",
+        do="Stop work that loads {subject}. Take 20 records at poses that move every joint.",
+        confirm="The new records fit if it is bent. If the same decision comes again, it goes on giving way: keep its "
+        "load low. If they do not fit, roll back to {good}.",
+        level="watch",
+        explains=True,
+    ),
+    "one_of_several": DecisionKind(
+        means="Something changed at once, and the records since fit several causes of different kinds about equally. "
+        "None is named; all of them are open.",
+        do="Stop precise work. Take 10 records at poses that move every joint, near and far, so that loads and lengths "
+        "act differently. It is one of {candidates}.",
+        confirm="A decision that names the one follows as soon as the records distinguish them.",
+        level="suspect",
         explains=True,
     ),
     "drift": DecisionKind(
@@ -165,9 +204,9 @@ class Decision:
         why: the evidence, a clause without a full stop.
         log_odds: of this against everything else that was considered.
         since: the number of the first record that it affects.
-        subject: a joint's channel, or a measurement.
-        candidates: joints that these records cannot distinguish, the likeliest first.
-        size: of a step (rad or m).
+        subject: a joint's channel, a measurement, or that of a cause.
+        candidates: what these records cannot distinguish, the likeliest first.
+        size: of a step (rad, m or kg).
         dimension: of that.
     """
 

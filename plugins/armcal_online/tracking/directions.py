@@ -7,7 +7,7 @@ prediction in some poses as the step does. Where one parameter alone does (a joi
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from armcal.arm.assembly import Arm
@@ -18,6 +18,7 @@ from armcal.calibration.calibration import Calibration
 from armcal.errors import ArmcalError
 from armcal.problem.problem import FactorRecords, Problem
 
+from armcal_online.tracking.causes import Cause, find_causes
 from armcal_online.tracking.observer import Observer
 
 _POSES = 60
@@ -57,11 +58,13 @@ class Steps:
         unfollowed: joints whose steps no combination of parameters makes.
         sensors: by measurement, scaled coordinates of shifts (m) and turns (rad) of its frame (n x up to 6), and
             which of ``x y z rx ry rz`` they are.
+        causes: what else may change at once.
     """
 
     joints: tuple[JointStep, ...]
     unfollowed: tuple[str, ...]
     sensors: Mapping[str, tuple[Array, tuple[str, ...]]]
+    causes: tuple[Cause, ...] = ()
 
 
 def find_steps(calibration: Calibration, observer: Observer, values: Array) -> Steps:
@@ -104,7 +107,15 @@ def find_steps(calibration: Calibration, observer: Observer, values: Array) -> S
         tuple(step for step in steps.values() if step is not None),
         tuple(channel for channel, step in steps.items() if step is None),
         {name: motion for name, motion in motions_of.items() if motion is not None},
+        _seen_causes(find_causes(calibration, space, {step.parameter for step in steps.values() if step}), slopes),
     )
+
+
+def _seen_causes(causes: Sequence[Cause], slopes: Array) -> tuple[Cause, ...]:
+    """Causes with the coordinates that move a prediction in some pose; none where no pose shows any."""
+    seen = np.sum(slopes**2, axis=0) > _CUT * len(slopes)
+    narrowed = [replace(cause, coordinates=tuple(i for i in cause.coordinates if seen[i])) for cause in causes]
+    return tuple(cause for cause in narrowed if cause.coordinates)
 
 
 def _probing_poses(arms: Iterable[Arm]) -> Dataset:

@@ -11,6 +11,7 @@ import numpy as np
 from armcal.estimate.online import Linearised
 
 from armcal_online.sources.source import Incoming
+from armcal_online.tracking.causes import CAUSES, LINK, spoken
 from armcal_online.tracking.decisions import LEVEL_ADVICE, Decision, advice, per_cent, sure
 from armcal_online.tracking.directions import Steps
 from armcal_online.tracking.health import Health
@@ -21,6 +22,7 @@ from armcal_online.tracking.state import Arrival, State
 from armcal_online.tracking.tip_error import TipError
 
 _MOST_LOG_ODDS = 700.0
+_SIZES = {"angle": ("size_deg", math.degrees(1.0)), "length": ("size_mm", 1000.0), "mass": ("size_g", 1000.0)}
 _FIRST_DATE, _LAST_DATE = 1e8, 1e11
 """Unix seconds (1973 to 5138); other times are of a clock that began elsewhere."""
 
@@ -45,6 +47,7 @@ def started(
         "left_out": list(setup.left_out),
         "joint_steps": {joint.joint: joint.parameter or "several parameters" for joint in steps.joints},
         "joint_steps_not_followed": list(steps.unfollowed),
+        "other_changes": [spoken(cause.subject) for cause in steps.causes],
         "sensor_motions": {name: list(which) for name, (_, which) in steps.sensors.items()},
     }
 
@@ -99,23 +102,26 @@ def decided(state: State, decision: Decision, tip: TipError | None, calm: int) -
     event |= {"sure_percent": per_cent(log_odds), "log_odds": log_odds, "why": f"{decision.why}."}
     if tip is not None:
         event |= {f"tip_error_{tip.unit}": tip.size, "tip_error_is": tip.source}
-    subject = decision.subject or "it"
+    subject, kind = spoken(decision.subject or "it"), decision.kind
     names = {
-        "subject": f"joint {subject}" if decision.kind.startswith("joint") else subject,
-        "candidates": " and ".join(decision.candidates) or subject,
+        "subject": f"joint {subject}" if kind.startswith("joint") else subject,
+        "candidates": (" and " if kind == "joint_stepped" else " or ").join(map(spoken, decision.candidates))
+        or subject,
         **_names(good, calm),
     }
     event |= {**advice(decision.kind, names), "last_good": _named(good)}
     off = "" if tip is None else f" The tip was {tip.size:.3g} {tip.unit} off."
     text = f"{decision.what}. First record affected: {record_name(decision.since, first)}. {sure(log_odds)}.{off}"
     event["sentence"] = text
-    if decision.subject:
+    if decision.kind == "link_bent":
+        event["link"] = decision.subject.removeprefix(LINK)
+    elif decision.subject and decision.kind not in CAUSES:
         event["joint" if decision.kind.startswith("joint") else "measurement"] = decision.subject
     if len(decision.candidates) > 1:
         event["candidates"] = list(decision.candidates)
-    if decision.size is not None:
-        turned = decision.dimension == "angle"
-        event["size_deg" if turned else "size_mm"] = math.degrees(decision.size) if turned else 1000 * decision.size
+    if decision.size is not None and decision.dimension:
+        name, factor = _SIZES[decision.dimension]
+        event[name] = factor * decision.size
     return event
 
 

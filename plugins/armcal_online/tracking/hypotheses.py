@@ -17,6 +17,7 @@ from armcal.errors import ArmcalError
 from armcal.estimate.online import Gaussian, OnlineEstimator, log_likelihood
 
 from armcal_online.tracking.belief import Belief
+from armcal_online.tracking.causes import CAUSES, Cause, CauseKind
 from armcal_online.tracking.directions import Steps
 from armcal_online.tracking.observer import JointNoise, Observer, Reading
 from armcal_online.tracking.outliers import log_density_of_outlier
@@ -29,7 +30,7 @@ _SCALES = (1.0, 0.1)
 """A change is of the stated size, or small: to a prior wide enough for a slipped tooth a small step is unlikely."""
 _MOST_ONSETS = 5
 """So many of the last records with a large NIS are tried as the first after a change."""
-Kind = Literal["none", "joint_slipped", "joint_replaced", "sensor_moved", "general_change", "two_changes"]
+Kind = Literal["none", "joint_slipped", "joint_replaced", "sensor_moved", "general_change", "two_changes", CauseKind]
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,11 @@ class Hypothesis:
     def singles(self) -> tuple[Hypothesis, ...]:
         """The single changes in it."""
         return self.parts or (self,)
+
+    @property
+    def is_simple(self) -> bool:
+        """Whether it is one change, of a joint, an instrument or everything."""
+        return not self.parts and self.kind not in CAUSES
 
 
 @dataclass(frozen=True)
@@ -128,12 +134,26 @@ def hypotheses(space: StateSpace, steps: Steps, settings: ChangeSettings, size: 
         deviations = [settings.sensor_turn if axis.startswith("r") else settings.sensor_shift for axis in which]
         moved = _columns([c * d for c, d in zip(columns.T, deviations, strict=True)], size)
         changes += [("sensor_moved", name, moved * scale, columns[:, 0], scale) for scale in _SCALES]
+    for cause in steps.causes:
+        moved = _columns([np.eye(n)[i] * d for i, d in _deviations(cause, space, settings).items()], size)
+        step = np.eye(n)[cause.coordinates[0]] / space.scales[cause.coordinates[0]]
+        changes += [(cause.kind, cause.subject, moved * scale, step, scale) for scale in _SCALES]
     prior = float(np.log(settings.probability / max(len(changes), 1)))
     listed = [Hypothesis(kind, subject, d, 1.0, prior, step, scale) for kind, subject, d, step, scale in changes]
     rare, none = float(np.log(settings.probability / 10)), np.zeros((size, 0))
     general = Hypothesis("general_change", "", none, settings.factor, rare, np.zeros(n))
     large = replace(general, factor=settings.factor**2)
     return *listed, general, large
+
+
+def _deviations(cause: Cause, space: StateSpace, settings: ChangeSettings) -> dict[int, float]:
+    """Standard deviations of what a cause changes, by coordinate (scaled)."""
+    payload, units = settings.payload, [b.unit for b in space.parameters.free for _ in range(b.domain.dof)]
+    by_unit = {"kg": payload, "kg_m": payload * settings.payload_lever}
+    by_unit |= {"m": settings.link_length, "rad": settings.link_angle}
+    if cause.kind == "gravity_tilted":
+        by_unit["rad"] = settings.gravity_turn
+    return {i: by_unit[units[i]] / float(space.scales[i]) for i in cause.coordinates}
 
 
 def _columns(columns: Sequence[Array], size: int) -> Array:

@@ -15,9 +15,10 @@ from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.decisions import EXPLAINED, Decision, log_odds_of
 from armcal_online.tracking.directions import Steps
 from armcal_online.tracking.health import Health, improbability, many_outliers, nis_limit
-from armcal_online.tracking.hypotheses import Candidate, Explanation, Hypothesis, HypothesisFilter
+from armcal_online.tracking.hypotheses import Explanation, Hypothesis, HypothesisFilter
 from armcal_online.tracking.pairs import LEAST_RECORDS, is_enough, pairs
 from armcal_online.tracking.settings import RecalibrateSettings
+from armcal_online.tracking.sizes import Size, size_of
 from armcal_online.tracking.state import State
 from armcal_online.tracking.state_space import StateSpace
 
@@ -25,7 +26,7 @@ _LARGE = 0.01
 """A record with an NIS as large as this is one in a hundred: two of them near each other are looked into."""
 _AGREEING = 2
 """A change explains at least so many of the records that do not fit, and at least this share of the misfit: one wrong
-record alone is no evidence of it."""
+record alone is no evidence of it. Two changes, a load or a bent link fit two records too easily."""
 _SHARE = 0.5
 _LEFT = 0.01
 """What explains the records leaves no more outliers among them than chance makes with this probability."""
@@ -104,10 +105,14 @@ class Judge:
         best, gate, settings = explanations[0], self._settings.gate, self._settings.changes
         alike = self._indistinguishable(explanations)
         others = _others(explanations, alike)
-        total = float(logsumexp([explanation.log_odds for explanation in alike]))
         margin = best.log_odds - others[0].log_odds if others else math.inf
-        is_named = len(large) >= gate.window - 1 or margin >= math.log(settings.naming_odds)
-        if total > math.log(settings.odds) and is_named and self._is_explaining(state, best):
+        is_clear, is_due = margin >= math.log(settings.naming_odds), len(large) >= gate.window - 1
+        if is_due and not is_clear:
+            # It has to be decided now: nothing is named that is hardly likelier than something else.
+            alike = self._candidates(explanations)
+            best, others = alike[0], _others(explanations, alike)
+        total = float(logsumexp([explanation.log_odds for explanation in alike]))
+        if total > math.log(settings.odds) and (is_clear or is_due) and self._is_explaining(state, best):
             return self._follow_change(state, alike, others)
         state = replace(state, wary=bool(best.log_odds > 0))
         rejected = sum(record.rejected for record in state.recent)
@@ -138,7 +143,7 @@ class Judge:
             return False  # what is left of a change that nothing explained is no joint's
         if many_outliers(*best.outliers, self._settings.outliers.fraction) < _LEFT:
             return False
-        return agreeing >= (LEAST_RECORDS if best.hypothesis.parts else _AGREEING) and best.share >= _SHARE
+        return agreeing >= (_AGREEING if best.hypothesis.is_simple else LEAST_RECORDS) and best.share >= _SHARE
 
     def _indistinguishable(self, explanations: Sequence[Explanation]) -> list[Explanation]:
         """The likeliest, and if it is a joint's the other joints that these records cannot distinguish from it."""
@@ -157,6 +162,15 @@ class Judge:
                     near[explanation.hypothesis.subject] = explanation
         return list(near.values())
 
+    def _candidates(self, explanations: Sequence[Explanation]) -> list[Explanation]:
+        """All that these records cannot distinguish from the likeliest; a change of everything, if that is one."""
+        best, odds = explanations[0], math.log(self._settings.changes.naming_odds)
+        near = [e for e in explanations if best.log_odds - e.log_odds < odds]
+        everything = [e for e in near if e.hypothesis.kind == "general_change"]
+        if everything or best.hypothesis.parts:
+            return everything[:1] or self._indistinguishable(explanations)
+        return list({e.hypothesis.subject: e for e in reversed(near) if not e.hypothesis.parts}.values())[::-1]
+
     def _follow_change(
         self, state: State, alike: Sequence[Explanation], others: Sequence[Explanation]
     ) -> tuple[State, tuple[Decision, ...]]:
@@ -165,15 +179,14 @@ class Judge:
         reopened = {id(change): change for explanation in alike for change in explanation.hypothesis.singles}
         directions = np.hstack([change.directions for change in reopened.values()])
         belief = self._filter.follow(-1, since, directions, best.hypothesis.factor).belief
-        suspects: tuple[Candidate, ...] = ()
-        if best.hypothesis.kind.startswith("joint"):
-            # Of each joint, that it slipped, and that its servo was replaced.
-            joints = [explanation.hypothesis.subject for explanation in alike]
-            suspects = tuple(
-                self._filter.follow(place, since, change.directions)
-                for place, change in enumerate(self._changes)
-                if change.subject in joints and change.kind.startswith("joint") and change.scale == 1.0
-            )
+        # Of each joint, that it slipped, and that its servo was replaced.
+        subjects = [] if best.hypothesis.parts else [explanation.hypothesis.subject for explanation in alike]
+        suspects = tuple(
+            self._filter.follow(place, since, change.directions)
+            for place, change in enumerate(self._changes)
+            if change.subject in subjects and change.subject and change.scale == 1.0
+        )
+        suspects = suspects if len(suspects) > 1 else ()
         after = replace(
             state,
             belief=belief,
@@ -216,7 +229,7 @@ class Judge:
         changes = self._settings.changes
         if margin < math.log(changes.naming_odds if others else changes.odds):
             return replace(state, suspects=tuple(followed)), ()
-        if not others and change.kind == "joint_slipped":
+        if not others and change.kind != "joint_replaced":
             return settled, ()
         left = tuple(candidate for candidate in followed if candidate not in others) if others else ()
         after = replace(settled, belief=best.belief, anchor=best.belief, held=(), recent=(), wary=False)
@@ -225,8 +238,8 @@ class Judge:
         size = self._size(state.before_change or best.belief, best.belief, change)
         if others:
             names = tuple(dict.fromkeys(self._changes[other.place].subject for other in others))
-            return after, (sentences.named(state, self._steps, change, names, margin, size),)
-        return after, (sentences.replaced(state, self._steps, change, margin, size),)
+            return after, (sentences.named(state, change, names, margin, size),)
+        return after, (sentences.replaced(state, change, margin, size),)
 
     def _detect_drift(self, state: State) -> tuple[State, tuple[Decision, ...]]:
         """Whether the NIS as a whole is too large, though no record's is."""
@@ -249,15 +262,8 @@ class Judge:
         decision = sentences.drift(state, count, ratio, by_chance, factor)
         return replace(state, belief=belief, anchor=belief, held=()), (decision,)
 
-    def _size(self, before: Belief, after: Belief, hypothesis: Hypothesis) -> tuple[float, float]:
-        """How far a joint stepped (rad or m), and its standard deviation."""
-        step, n = hypothesis.step, len(self._space.scales)
-        if not step.any():
-            return 0.0, 0.0
-        moved = self._space.between(before.values(self._space), after.values(self._space))
-        along = step / float(step @ step)
-        covariance = after.gaussian.covariance[:n, :n]
-        return float(along @ moved), math.sqrt(max(float(along @ covariance @ along), 0.0))
+    def _size(self, before: Belief, after: Belief, change: Hypothesis) -> Size:
+        return size_of(self._space, self._steps, before, after, change)
 
 
 def _others(explanations: Sequence[Explanation], alike: Sequence[Explanation]) -> list[Explanation]:

@@ -76,7 +76,8 @@ class Net:
         self._setup, self._refitter = setup, Refitter(setup.observer)
         n = len(setup.space.scales)
         self._beside = setup.observer.size - n
-        directions = [change.directions[:n] for change in changes if change.scale == 1.0]
+        # Of a link any number may have changed: the prior is widened where records ask for it.
+        directions = [c.directions[:n] for c in changes if c.scale == 1.0 and c.kind != "link_bent"]
         reopened = np.hstack([np.zeros((n, 0)), *directions])
         gaussian = setup.belief.gaussian
         self._mean, self._covariance = gaussian.mean[:n], gaussian.covariance[:n, :n] + reopened @ reopened.T

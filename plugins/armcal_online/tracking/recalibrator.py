@@ -85,7 +85,7 @@ class Recalibrator:
             first = fault.errors()[0]
             where = Location(".".join(["estimator", *map(str, first["loc"])]))
             raise ConfigError(f"{first['msg']}.", where=where, hint=f"See the settings of {name}.") from fault
-        setup = filter_setup(calibration, settings, shares=estimator.window == 1)
+        setup = filter_setup(calibration, settings, shares=estimator.window == 1, loads=settings.gating == "on")
         if estimator.window > 1 and setup.space.cones:
             raise ConfigError(
                 "found an estimator that holds records back, and 3x3 compliances: together they may not converge.",
@@ -113,11 +113,12 @@ class Recalibrator:
 
     @property
     def estimate(self) -> dict[str, list[float]]:
-        """Value and standard deviation of the free entries, by name (SI)."""
-        space = self.setup.space
+        """Value and standard deviation of the free entries, by name (SI); none that no decision has opened."""
+        space, held = self.setup.space, self.setup.held
+        values = self.values[space.entries].tolist()
         names = [space.parameters.entry_names[i] for i in space.entries]
-        numbers = zip(self.values[space.entries].tolist(), deviations(space, self.state.belief).tolist(), strict=True)
-        return {name: [value, sd] for name, (value, sd) in zip(names, numbers, strict=True)}
+        rows = zip(names, values, deviations(space, self.state.belief).tolist(), strict=True)
+        return {name: [value, sd] for name, value, sd in rows if sd > 0 or name not in held}
 
     def take(self, incoming: Incoming, sequence: int) -> tuple[dict[str, Any], ...]:
         """Take one record; what came of it, as events.
@@ -328,7 +329,7 @@ class Recalibrator:
             "level": state.health.level,
             "why": state.health.sentence,
         }
-        return calibration_text(self._calibration, self.setup.space, state.belief, source)
+        return calibration_text(self._calibration, self.setup, state.belief, source)
 
 
 def _counted(state: State, what: str) -> State:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 from scipy.special import logsumexp
 
+from armcal_online.tracking.causes import CAUSES, spoken
 from armcal_online.tracking.decisions import Decision, log_odds_of, per_cent
 from armcal_online.tracking.directions import Steps
 from armcal_online.tracking.hypotheses import Explanation, Hypothesis
+from armcal_online.tracking.sizes import Size
 from armcal_online.tracking.state import State
 
 
@@ -18,7 +19,7 @@ def change(
     steps: Steps,
     alike: Sequence[Explanation],
     others: Sequence[Explanation],
-    size: tuple[float, float],
+    size: Size,
 ) -> Decision:
     """A change that is followed from now on."""
     best = alike[0]
@@ -35,17 +36,17 @@ def change(
         what = "Something changed that no single joint or instrument explains"
         why += f"; all standard deviations are made {hypothesis.factor:g} times larger"
         return Decision(kind, what, why, log_odds, onset)
-    if kind == "sensor_moved":
-        return Decision(kind, f"The frame of {subject} has moved", why, log_odds, onset, subject)
     names = tuple(explanation.hypothesis.subject for explanation in alike)
-    dimension = next(joint.dimension for joint in steps.joints if joint.joint == subject)
-    if len(names) > 1:
+    if len(names) > 1 and all(explanation.hypothesis.kind.startswith("joint") for explanation in alike):
         what = f"Joint {' or '.join(names)} has stepped"
         why += "; poses since do not distinguish them, and the variance of their offsets is open until one does"
-        return Decision("joint_stepped", what, why, log_odds, onset, names[0], names, None, dimension)
-    shown = _shown(size, dimension)
-    what = f"slipped by {shown}" if kind == "joint_slipped" else f"acts like a new servo, {shown} off"
-    return Decision(kind, f"Joint {subject} {what}", why, log_odds, onset, subject, names, size[0], dimension)
+        return Decision("joint_stepped", what, why, log_odds, onset, names[0], names)
+    if len(names) > 1:
+        what = f"One of these changed: {', '.join(_named(explanation.hypothesis) for explanation in alike)}"
+        why += "; records since do not distinguish them, and all of them are open until one does"
+        return Decision("one_of_several", what, why, log_odds, onset, "", names)
+    what = _happened(hypothesis, size)
+    return Decision(kind, what, why, log_odds, onset, subject, names, size.value, size.dimension)
 
 
 def together(
@@ -53,7 +54,7 @@ def together(
     steps: Steps,
     alike: Sequence[Explanation],
     others: Sequence[Explanation],
-    sizes: Sequence[tuple[float, float]],
+    sizes: Sequence[Size],
 ) -> tuple[Decision, ...]:
     """Two changes at once that are followed from now on: a decision each, or one where several pairs are as likely."""
     best, since = alike[0], state.recent[alike[0].onset :]
@@ -71,41 +72,28 @@ def together(
         return (Decision("joint_stepped", what, why, log_odds, onset, joints[0], joints),)
     decisions = []
     for part, other, size in zip(parts, reversed(parts), sizes, strict=True):
-        dimension = next((joint.dimension for joint in steps.joints if joint.joint == part.subject), "")
-        beside = f"; {_named(other)} changed at the same time"
-        if part.kind == "sensor_moved":
-            what = f"The frame of {part.subject} has moved{beside}"
-            decisions.append(Decision(part.kind, what, why, log_odds, onset, part.subject))
-        else:
-            what = f"Joint {part.subject} slipped by {_shown(size, dimension)}{beside}"
-            names = (part.subject,)
-            decisions.append(Decision(part.kind, what, why, log_odds, onset, part.subject, names, size[0], dimension))
+        what, names = f"{_happened(part, size)}; {_named(other)} changed at the same time", (part.subject,)
+        kind, value = part.kind, size.value
+        decisions.append(Decision(kind, what, why, log_odds, onset, part.subject, names, value, size.dimension))
     return tuple(decisions)
 
 
-def named(
-    state: State,
-    steps: Steps,
-    hypothesis: Hypothesis,
-    others: Sequence[str],
-    margin: float,
-    size: tuple[float, float],
-) -> Decision:
-    """Which joint it was."""
-    joint = hypothesis.subject
-    dimension = next(joint_step.dimension for joint_step in steps.joints if joint_step.joint == joint)
-    what = f"It was joint {joint} that stepped, by {_shown(size, dimension)}"
-    why = f"the records since do not fit a step of {' or '.join(others)} as well, whose offsets are as before"
-    return Decision("joint_named", what, why, margin, state.suspected, joint, (joint,), size[0], dimension)
+def named(state: State, change: Hypothesis, others: Sequence[str], margin: float, size: Size) -> Decision:
+    """Which of several it was."""
+    subject, numbers = change.subject, (size.value, size.dimension)
+    if change.kind.startswith("joint"):
+        what = f"It was joint {subject} that stepped, by {size.shown}"
+        why = f"the records since do not fit a change of {_or(others)} as well, which is as before"
+        return Decision("joint_named", what, why, margin, state.suspected, subject, (subject,), *numbers)
+    why = f"the records since fit this better than a change of {_or(others)}, which is as before"
+    return Decision(change.kind, _happened(change, size), why, margin, state.suspected, subject, (subject,), *numbers)
 
 
-def replaced(state: State, steps: Steps, hypothesis: Hypothesis, margin: float, size: tuple[float, float]) -> Decision:
+def replaced(state: State, change: Hypothesis, margin: float, size: Size) -> Decision:
     """A joint that stepped acts like a new servo."""
-    joint = hypothesis.subject
-    dimension = next(joint_step.dimension for joint_step in steps.joints if joint_step.joint == joint)
-    what = f"Joint {joint} acts like a new servo, {_shown(size, dimension)} off"
-    why = "the records since fit this better than a slip alone"
-    return Decision("joint_replaced", what, why, margin, state.suspected, joint, (joint,), size[0], dimension)
+    why, joint = "the records since fit this better than a slip alone", change.subject
+    what, numbers = _happened(change, size), (size.value, size.dimension)
+    return Decision(change.kind, what, why, margin, state.suspected, joint, (joint,), *numbers)
 
 
 def drift(state: State, count: int, ratio: float, by_chance: float, factor: float) -> Decision:
@@ -155,10 +143,24 @@ def _named(hypothesis: Hypothesis) -> str:
         return " with ".join(_named(part) for part in hypothesis.parts)
     if hypothesis.kind == "general_change":
         return "a change of everything"
+    if hypothesis.kind in CAUSES:
+        return spoken(hypothesis.subject)
     return f"joint {hypothesis.subject}" if hypothesis.kind.startswith("joint") else f"a moved {hypothesis.subject}"
 
 
-def _shown(size: tuple[float, float], dimension: str) -> str:
-    if dimension == "length":
-        return f"{1000 * size[0]:+.2f} mm (sd {1000 * size[1]:.2f} mm)"
-    return f"{math.degrees(size[0]):+.2f} deg (sd {math.degrees(size[1]):.2f} deg)"
+def _happened(change: Hypothesis, size: Size) -> str:
+    """What happened, as a clause."""
+    subject = spoken(change.subject)
+    clauses = {
+        "joint_slipped": f"Joint {subject} slipped by {size.shown}",
+        "joint_replaced": f"Joint {subject} acts like a new servo, {size.shown} off",
+        "sensor_moved": f"The frame of {subject} has moved",
+        "payload_changed": f"What hangs on the tool changed by {size.shown}, which no record states",
+        "gravity_tilted": f"Gravity pulls from another direction than the records state, by {size.shown}",
+        "link_bent": f"{subject[:1].upper()}{subject[1:]} is bent: {size.shown}",
+    }
+    return clauses[change.kind]
+
+
+def _or(subjects: Sequence[str]) -> str:
+    return " or ".join(map(spoken, subjects))

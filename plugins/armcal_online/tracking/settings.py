@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from armcal.base.settings import Angle, Duration, Length, Settings
+from armcal.base.settings import Angle, Duration, Length, Mass, Settings
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
@@ -47,7 +47,9 @@ class ChangeSettings(Settings):
     """Sudden changes that are looked for: standard deviations of how large they are, and how likely in one record.
 
     ``joint`` of a joint's offset (``slide`` of one that slides), as a slipped horn or a replaced servo makes;
-    ``sensor_shift`` and ``sensor_turn`` of the frame that an instrument measures in, as a bump makes. ``factor``
+    ``sensor_shift`` and ``sensor_turn`` of the frame that an instrument measures in, as a bump makes; ``payload`` of
+    what hangs on the tool, its centre ``payload_lever`` from the tool frame; ``gravity_turn`` of gravity's direction
+    about the base's x and y axes; ``link_length`` and ``link_angle`` of the numbers of a bent link. ``factor``
     multiplies all standard deviations when something else has changed. A change is followed once it is ``odds`` times
     likelier than outliers, and ``naming_odds`` times likelier than any other.
     """
@@ -56,6 +58,11 @@ class ChangeSettings(Settings):
     slide: Length = 0.02
     sensor_shift: Length = 0.03
     sensor_turn: Angle = 0.05
+    payload: Annotated[Mass, Field(gt=0)] = 0.3
+    payload_lever: Annotated[Length, Field(gt=0)] = 0.05
+    gravity_turn: Annotated[Angle, Field(gt=0)] = 0.1
+    link_length: Annotated[Length, Field(gt=0)] = 0.005
+    link_angle: Annotated[Angle, Field(gt=0)] = 0.05
     factor: Annotated[float, Field(gt=1)] = 10.0
     probability: Probability = 1e-4
     odds: Annotated[float, Field(gt=1)] = 100.0

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from armcal.arm.environment import gravity_tilt, unstated_payload
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array, Interval
 from armcal.base.parameters import Parameters
@@ -47,6 +48,7 @@ class FilterSetup:
         process_noise: how beliefs widen between records.
         request: what a source should look for.
         left_out: measurements that cannot be taken one record at a time.
+        held: parameters that are as they were calibrated until a decision opens them.
     """
 
     problem: Problem
@@ -56,42 +58,42 @@ class FilterSetup:
     process_noise: ProcessNoise
     request: ReadRequest
     left_out: tuple[str, ...]
+    held: frozenset[str] = frozenset()
 
 
-def filter_setup(calibration: Calibration, settings: RecalibrateSettings, shares: bool) -> FilterSetup:
+def filter_setup(
+    calibration: Calibration, settings: RecalibrateSettings, shares: bool, loads: bool = False
+) -> FilterSetup:
     """What a recalibration starts with.
 
     Args:
         calibration: with its covariance.
         settings: of the recalibration.
         shares: whether what neighbouring records share is followed beside the parameters; else it is noise.
+        loads: whether a payload that no record states, and another direction of gravity, may be found.
 
     Raises:
         ConfigError: the calibration keeps no covariance, or a glob or a quantity in the settings is refused.
     """
-    system, kept = calibration.system, calibration.record
+    system = calibration.system
     measurements = {n: m for n, m in system.measurements.items() if not isinstance(m, PairedMeasurement)}
-    parameters, opened = _parameters(calibration, settings)
+    parameters, opened = _parameters(calibration, settings, loads)
     space = StateSpace(parameters)
-    record = _full_record(calibration, measurements)
-    problem = Problem.build(
-        system.arms, measurements, parameters, system.environment, record, settings.evaluator, groups=kept.groups
-    )
+    parts = (parameters, system.environment, _full_record(calibration, measurements), settings.evaluator)
+    problem = Problem.build(system.arms, measurements, *parts, groups=calibration.record.groups)
     follows = shares and settings.model_error == "calibrated"
     white, shared = _white_and_shared_noise(calibration, measurements, follows)
     drifts = _drifts(calibration, space)
     followed = GaussMarkovStates((*drifts, *shared) if follows else ())
-    own, degrees_of_fit = kept.noise.get("scatter") or {}, max(kept.noise["degrees_of_freedom"], 1)
-    known = {entry.name.partition("[")[0] for entry in kept.parameters if entry.free}
     observer = Observer(
         problem,
         space,
         followed,
         GaussMarkovStates(() if follows else drifts),
         white,
-        {name: float((own.get(name) or {}).get("freedom") or degrees_of_fit) for name in white},
+        _freedoms(calibration, white),
         _defaults(calibration),
-        {block.name for block in calibration.parameters.nuisances if block.free} - known,
+        {block.name for block in calibration.parameters.nuisances if block.free} - _calibrated(calibration),
         _noise_scale(calibration),
     )
     return FilterSetup(
@@ -102,13 +104,23 @@ def filter_setup(calibration: Calibration, settings: RecalibrateSettings, shares
         ProcessNoise(variance_rates(parameters, settings.process_noise), followed),
         ReadRequest(system.arms, measurements, requested_channels(system.arms, measurements, measured=True)),
         tuple(sorted(set(system.measurements) - set(measurements))),
+        frozenset(block.name for block in parameters.free) - _calibrated(calibration) - set(opened),
     )
 
 
-def _parameters(calibration: Calibration, settings: RecalibrateSettings) -> tuple[Parameters, dict[str, float]]:
-    """Blocks about the calibrated values, those that were free then free, and the deviations of those opened now."""
-    parameters = calibration.parameters
-    free = {entry.name.partition("[")[0] for entry in calibration.record.parameters if entry.free}
+def _calibrated(calibration: Calibration) -> set[str]:
+    """The parameters that were free in the calibration."""
+    return {entry.name.partition("[")[0] for entry in calibration.record.parameters if entry.free}
+
+
+def _parameters(
+    calibration: Calibration, settings: RecalibrateSettings, loads: bool
+) -> tuple[Parameters, dict[str, float]]:
+    """Blocks about the calibrated values, those that were free then free, and the deviations of those opened now.
+
+    With ``loads``, those of an elastic arm's load are free too; they are known exactly until a decision opens them.
+    """
+    parameters, free = calibration.parameters, _calibrated(calibration)
     opened: dict[str, float] = {}
     for glob, text in settings.free.items():
         names = fnmatch.filter(parameters.names, glob)
@@ -120,6 +132,9 @@ def _parameters(calibration: Calibration, settings: RecalibrateSettings) -> tupl
         for block in parameters.blocks
         if isinstance(block.domain, Interval) and block.domain.check(np.array(block.nominal))
     }
+    if loads and any(arm.deflection_size for arm in calibration.system.arms.values()):
+        parameters = Parameters((*parameters.blocks, *unstated_payload()))
+        free |= {block.name for block in (*gravity_tilt(), *unstated_payload())}
     return parameters.replaced(beyond).with_free([n for n in parameters.names if n in free or n in opened]), opened
 
 
@@ -170,6 +185,13 @@ def _white_and_shared_noise(
                 covariance = (1 - share) * covariance
         white[name] = covariance
     return white, shared
+
+
+def _freedoms(calibration: Calibration, names: Iterable[str]) -> dict[str, float]:
+    """Degrees of freedom with which the noise of measurements is known: their own, or those of the fit."""
+    noise = calibration.record.noise
+    own, of_fit = noise.get("scatter") or {}, max(noise["degrees_of_freedom"], 1)
+    return {name: float((own.get(name) or {}).get("freedom") or of_fit) for name in names}
 
 
 def _drifts(calibration: Calibration, space: StateSpace) -> tuple[GaussMarkovState, ...]:
