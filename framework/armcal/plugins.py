@@ -159,10 +159,11 @@ def discover(points: Iterable[EntryPoint] | None = None) -> PluginRegistry:
         PluginError: a plugin's file is not there, does not load or registers nothing, or has another plugin's name; or
             a plugin that is to be left out is not there.
     """
-    trace, manager = HookTrace.from_environment(), new_manager()
+    trace, manager, alone = HookTrace.from_environment(), new_manager(), new_manager()
+    trace.watch(alone)
     plugins, components = [], []
     for point in _chosen(entry_points(group=plugin_files.GROUP) if points is None else points):
-        outcome = registered(manager, point, trace)
+        outcome = registered(manager, alone, point)
         if isinstance(point, plugin_files.FilePoint) and (outcome.fault or not outcome.works):
             text = outcome.fault or "it registers nothing: write a function armcal_register_... after @hookimpl."
             raise PluginError(text, where=None if str(point.file) in text else Location(str(point.file)))

@@ -10,7 +10,6 @@ import pluggy
 
 from armcal import hooks
 from armcal.errors import ArmcalError
-from armcal.hook_trace import HookTrace
 
 
 @dataclass(frozen=True)
@@ -45,21 +44,28 @@ def new_manager() -> pluggy.PluginManager:
     return manager
 
 
-def registered(manager: pluggy.PluginManager, point: EntryPoint, trace: HookTrace) -> Registration:
-    """Register one plugin; one that fails in any way is left out, and says why."""
+def registered(manager: pluggy.PluginManager, alone: pluggy.PluginManager, point: EntryPoint) -> Registration:
+    """Register one plugin; one that fails in any way is left out, and says why.
+
+    Args:
+        manager: of all plugins.
+        alone: a manager without plugins, in which this one is asked alone. It is empty again afterwards.
+        point: names the plugin.
+    """
     name = f"{point.name} ({point.value})"
     try:
         module = point.load()
-        alone = new_manager()
-        trace.watch(alone)
         alone.register(module, name)
         alone.check_pending()
         _require_marks(module)
-        announced = _announced(alone)
+        announced, works = _announced(alone), bool(alone.get_hookcallers(module))
         manager.register(module, name)
     except (Exception, SystemExit) as fault:  # whatever a third party's module does, the others must work
         return Registration(said(fault))
-    return Registration("", announced, bool(alone.get_hookcallers(module)))
+    finally:
+        if alone.has_plugin(name):
+            alone.unregister(name=name)
+    return Registration("", announced, works)
 
 
 def said(fault: BaseException) -> str:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from functools import cache
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, NotRequired
 
 from armcal.base.config_text import as_line
-from armcal.base.quantities import Kind
 from armcal.base.settings import Acceleration3, Angle, Angle3, Force3, Length3, Mass, Settings, Temperature, Torque3
 from armcal.errors import ArmcalError
 from pydantic import Field, field_validator
@@ -43,16 +41,7 @@ def _rows(value: Any) -> Any:
     return value
 
 
-class _Quick(Settings):
-    """Settings that are read very often: the kinds of its fields are worked out once."""
-
-    @classmethod
-    @cache
-    def _kinds(cls) -> dict[str, Kind]:
-        return super()._kinds()
-
-
-class Acting(_Quick):
+class Acting(Settings):
     """What acts on the arm; the calibration states what is left out.
 
     Attributes:
@@ -73,7 +62,7 @@ class Acting(_Quick):
     approach: tuple[Approach, ...] | dict[str, Approach] | None = None
 
 
-class Request(_Quick):
+class Request(Settings):
     """The fields of every request.
 
     Attributes:

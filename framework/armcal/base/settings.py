@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping
 from enum import Enum
+from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -147,7 +148,9 @@ class Settings(BaseModel):
         return config
 
     @classmethod
-    def _kinds(cls) -> dict[str, Kind]:
+    @cache
+    def _kinds(cls) -> Mapping[str, Kind]:
+        """What each field takes; worked out once a class, as settings are read and written often."""
         return {name: kind_of((info.annotation, *info.metadata)) for name, info in cls.model_fields.items()}
 
     @classmethod
