@@ -113,13 +113,17 @@ class _Positions:
 
         Where more than ``enough`` is left however far they adapt, that is given.
         """
-        off = (measured - self.predicted).T.ravel()
-        along, unit = self.ways.T @ off, 3 / max(1, len(off) - len(self.sizes))
-        left = float(off @ off - along @ along)
-        if unit * left <= enough**2:
-            fitted = self.sizes * _within(along, self.sizes, _FAR * np.sqrt(len(self.sizes)))
-            left += float((along - fitted) @ (along - fitted))
-        return float(np.sqrt(unit * max(left, 0.0)))
+        return float(self.left_of_each(measured[None], enough)[0])
+
+    def left_of_each(self, measured: Array, enough: float) -> Array:
+        """The same of several readings (k x 3 x N) of what was measured (k)."""
+        off = (measured - self.predicted).transpose(0, 2, 1).reshape(len(measured), -1)
+        along, unit = off @ self.ways, 3 / max(1, off.shape[1] - len(self.sizes))
+        left = np.sum(off**2, axis=1) - np.sum(along**2, axis=1)
+        for i in np.flatnonzero(unit * left <= enough**2):
+            fitted = self.sizes * _within(along[i], self.sizes, _FAR * np.sqrt(len(self.sizes)))
+            left[i] += np.sum((along[i] - fitted) ** 2)
+        return np.asarray(np.sqrt(unit * np.maximum(left, 0.0)))
 
     def can_move(self, turn: Array, shift: Array) -> bool:
         """Whether the free parameters move all positions as the beginning of a motion of the base would."""
@@ -296,10 +300,11 @@ def _single(
     smaller = _Smaller.than(straight.predicted)
     for words, measured in _of_axes(seen, straight):
         left = straight.left(measured) if seen.placing is None else _left(problem, seen, {}, measured, enough)
-        yield _Reading(smaller.left(left, measured), words, False)
+        yield _Reading(smaller.left(left, spread_of(measured)), words, False)
+    spread = spread_of(seen.measured)
     for words, read_as in single_joints(arm):
         left = _left(problem, seen, read_as, seen.measured, enough)
-        yield _Reading(smaller.left(left, seen.measured), words, True)
+        yield _Reading(smaller.left(left, spread), words, True)
 
 
 def _several(problem: Problem, seen: _Seen, arm: Arm, enough: float) -> Iterator[_Reading]:
@@ -308,18 +313,18 @@ def _several(problem: Problem, seen: _Seen, arm: Arm, enough: float) -> Iterator
     straight = _positions(problem, seen, {}, problem.parameters.nominal())
     if straight is None:
         return
-    smaller, axes = _Smaller.than(straight.predicted), list(_of_axes(seen, straight))
+    axes = [("", seen.measured), *((f" and {own}", moved) for own, moved in _of_axes(seen, straight))]
+    axes = axes if seen.placing is None else axes[:2]
+    smaller, measured = _Smaller.than(straight.predicted), np.array([moved for _, moved in axes])
+    spreads = [spread_of(moved) for moved in measured]
     for words, read_as in [*single_joints(arm), *several_joints(arm)]:
         if seen.placing is not None:
-            for own, moved in (("", seen.measured), *((f" and {LEFT_HANDED}", moved) for _, moved in axes[:1])):
-                left = _left(problem, seen, read_as, moved, enough)
-                yield _Reading(smaller.left(left, moved), f"{words}{own}", True)
-            continue
-        positions = _positions(problem, seen, read_as, problem.parameters.nominal())
-        if positions is not None:
-            for own, moved in (("", seen.measured), *((f" and {own}", moved) for own, moved in axes)):
-                left = positions.left(moved, enough)
-                yield _Reading(smaller.left(left, moved), f"{words}{own}", True)
+            lefts = [_left(problem, seen, read_as, moved, enough) for moved in measured]
+        else:
+            positions = _positions(problem, seen, read_as, problem.parameters.nominal())
+            lefts = [] if positions is None else positions.left_of_each(measured, enough).tolist()
+        for left, spread, (own, _) in zip(lefts, spreads, axes, strict=False):
+            yield _Reading(smaller.left(left, spread), f"{words}{own}", True)
 
 
 @dataclass(frozen=True)
@@ -332,7 +337,7 @@ class _Smaller:
     def than(cls, positions: Array) -> _Smaller:
         return cls(spread_of(positions))
 
-    def left(self, left: float, measured: Array) -> float:
+    def left(self, left: float, spread: float) -> float:
         """What a reading leaves, as many times more as its positions are spread less; infinite where it is no fit."""
-        spread = max(spread_of(measured), _SMALLEST)
+        spread = max(spread, _SMALLEST)
         return np.inf if left > FITS * spread else left * max(1.0, self.size / spread)
