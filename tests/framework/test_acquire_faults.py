@@ -13,7 +13,7 @@ from armcal.devices.serial_port import SerialPort, SerialPortSettings
 
 from tests.bench_runs import BenchRun, positions
 
-QUICK, MANY = 3, 200
+MANY = 200
 SECONDS = 28.0
 """What the run takes when nothing goes wrong."""
 SERIAL = ("drop", "duplicate", "reorder", "flip", "split")
@@ -143,17 +143,9 @@ def judge(run: BenchRun, seed: int, undisturbed: dict[str, np.ndarray], kinds: t
     return troubled
 
 
-@pytest.mark.parametrize("seed", range(QUICK))
-@pytest.mark.quick("0")
-def test_random_troubles_never_make_the_arm_unsafe(
-    run: BenchRun, undisturbed: dict[str, np.ndarray], seed: int
-) -> None:
-    judge(run, seed, undisturbed)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(QUICK, MANY))
-def test_many_random_troubles_never_make_the_arm_unsafe(
+@pytest.mark.parametrize("seed", range(MANY))
+def test_random_troubles_never_make_the_arm_unsafe(
     run: BenchRun, undisturbed: dict[str, np.ndarray], seed: int
 ) -> None:
     judge(run, seed, undisturbed)

@@ -458,6 +458,7 @@ class TestNobodyFeelsWhereTheArmIs:
 
 
 class TestTracker:
+    @pytest.mark.slow
     @pytest.mark.parametrize("kind", ["frozen", pytest.param("silent", marks=SLOW), pytest.param("lost", marks=SLOW)])
     def test_lost_exactly_as_the_arm_settles(
         self, run: BenchRun, undisturbed: dict, kind: str, monkeypatch: Any
@@ -518,6 +519,7 @@ class TestTracker:
         assert outcome.ending.how == "parked" and "base body" in outcome.ending.sentence
         assert run.progress().left_out == {}
 
+    @pytest.mark.slow
     def test_nor_does_one_that_does_so_for_hours(self) -> None:
         run = Run()
         run.monitor.restless.update(tuple(round(a, 6) for a in pose) for pose in run.poses)

@@ -58,6 +58,7 @@ def some_rows(tmp_path: Path, count: int, columns: dict[str, str] | None = None,
     return path
 
 
+@pytest.mark.slow
 def test_fewer_equations_than_parameters_needs_priors_and_says_both_numbers(tmp_path: Path) -> None:
     data = some_rows(tmp_path, 8)
     alone = ("validation.holdout=0", "validation.folds=0")

@@ -34,6 +34,7 @@ class TestAFrameThatIsNotTheArms:
             assert code == 2 and "nothing was moved" in said and "another --out" in said
             assert clock.ask({"state": True})["events"] == moves
 
+    @pytest.mark.slow
     def test_poses_that_noise_never_lets_settle_show_the_unit_too(self, tmp_path: Path) -> None:
         arm = OwnArm(tmp_path, POST, **{"bench.simulator.tracker.length_gain": 1000})
         with arm.run.simulated():
@@ -68,6 +69,7 @@ class TestAJointThatGivesWay:
         assert code == 1 and re.search(r"failed: lift .*sinks by [23]\d deg/min while it should stand", said)
         assert "Look at the screw of lift's horn" in said and "done" not in said
 
+    @pytest.mark.slow
     def test_one_that_is_too_slow_to_keep_poses_from_settling_is_named_at_the_end(self, tmp_path: Path) -> None:
         arm = OwnArm(tmp_path, TOWER, **{"bench.simulator.joints.lift.creep_deg_per_min": 10})
         with arm.run.simulated():

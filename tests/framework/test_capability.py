@@ -268,6 +268,7 @@ def test_where_the_base_stands_does_not_matter(tmp_path: Path) -> None:
         assert np.allclose(values, there.postures.values[name], rtol=1e-6, atol=1e-9), name
 
 
+@pytest.mark.slow
 def test_cells_of_another_size_cover_the_same_and_keep_the_mean(lrm: Task) -> None:
     postures = postures_at(mechanics(lrm.subject), spread(lrm.subject.limits, 2000, 0), weights(lrm.subject))
     fine, coarse = voxels_of(postures, 0.02), voxels_of(postures, 0.04)
@@ -377,6 +378,7 @@ def test_the_nominal_error_is_between_two_forward_models(calibration: Calibratio
     assert np.allclose(found["nominal_mm"], 1000 * np.linalg.norm(apart, axis=1), atol=1e-7)
 
 
+@pytest.mark.slow
 def test_steps_of_servos_spread_the_tool_as_rounding_does(calibration: Calibration) -> None:
     table = PulseTable((-1.75, 0.0, 1.75), (0.0006, 0.0015, 0.0025))
     clock = PulseClock(25e6, 121)

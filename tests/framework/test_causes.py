@@ -175,6 +175,7 @@ def test_noise_that_grows_is_noise_that_depends_on_the_order(lrm):
     assert graded(found, "growing noise") == "nothing"
 
 
+@pytest.mark.slow
 def test_larger_noise_is_not_said_to_be_the_models_error(tmp_path):
     """Nothing but noise, of twice the declared size, through the command line."""
     flags = ["--set", "measurements.tracker.noise_mm=0.25", *QUICKLY, "--json"]
@@ -202,6 +203,7 @@ def test_a_stretched_instrument_is_named_by_the_command(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "in_order", "cause"), [("drift", False, "time"), ("slow joints", True, "open")])
+@pytest.mark.quick("slow joints-True-open")
 def test_time_is_blamed_only_where_poses_do_not_follow_it(lrm, name, in_order, cause):
     found = found_in(lrm, name, 0, in_order)
     assert found.lag_p <= LEVEL

@@ -80,6 +80,7 @@ def test_gauge_poses_and_values_are_told_apart_in_words() -> None:
     assert "Undetermined without a prior: armcal run refuses these (2)" in text
 
 
+@pytest.mark.slow
 def test_poses_that_do_not_tell_are_told_from_poses_that_cannot(tmp_path: Path) -> None:
     lines = [line.split(",") for line in Path(DATA).read_text().splitlines()]
     column = lines[0].index("q6_deg")
@@ -177,6 +178,7 @@ def test_holding_every_record_out_is_refused(tmp_path: Path) -> None:
     assert result.exit_code == 2 and "no record is left to train on" in result.output
 
 
+@pytest.mark.slow
 def test_the_real_arm(shared_data: Path) -> None:
     """313 real poses: the same counts as for the simulated arm."""
     told = asked(ALL, "--data", str(shared_data / "lrm_arm" / "poses.csv"), "--minimal", *PREFER)

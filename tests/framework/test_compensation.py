@@ -63,6 +63,7 @@ def test_what_the_arm_reaches_is_found_again(name: str, turns: bool) -> None:
     arrives(found, targets, found.solve(targets), name)
 
 
+@pytest.mark.slow
 def test_it_is_found_again_with_every_effect_and_whatever_hangs_on_the_tool() -> None:
     found = compensator("best")
     targets = of(found, drawn(found, 12), payload=0.1)
@@ -102,6 +103,7 @@ def test_the_same_question_has_the_same_answer_in_any_order() -> None:
     assert (fresh.joint_angles == one.joint_angles).all()
 
 
+@pytest.mark.slow
 def test_other_random_starts_find_all_targets_too() -> None:
     for seed in (1, 2):
         found = with_options("lrm", Options(limits=LRM_LIMITS, seed=seed))
@@ -117,6 +119,7 @@ def test_where_the_arm_stands_is_its_own_nearest_command() -> None:
             assert np.abs(found.solve(of(found, commands, turns), commands).joint_angles - commands).max() < 2e-5
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler is here")
 def test_c_and_the_interpreter_find_the_same() -> None:
     interpreted = compensator("rigid")
@@ -384,6 +387,7 @@ def test_the_nearest_commands_cannot_be_bettered(count: int) -> None:
 
 
 @pytest.mark.parametrize("redundancy", ["stiffest", "least_sag", "coolest"])
+@pytest.mark.quick("least_sag")
 def test_what_redundancy_makes_small_cannot_be_made_much_smaller(redundancy: str) -> None:
     found = with_options("five", Options(limits=NARROW, redundancy=redundancy))
     targets = of(found, drawn(found, 2, seed=3))

@@ -176,6 +176,7 @@ def test_what_counts_as_there_is_what_is_given(kind: str) -> None:
     assert np.abs(left).max() <= near.rest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("held", [(), (1,), (0, 1, 2)])
 def test_without_limits_and_with_nothing_that_may_move(held: tuple[int, ...]) -> None:
     pair = Pair("lift", False, np.array([[-np.inf, np.inf], [-np.inf, 0.3], [-0.2, np.inf]]))

@@ -120,6 +120,7 @@ def test_the_slow_end_of_a_motion_is_waited_for() -> None:
     assert isinstance(found, Settled) and abs(found.base_T_target[0, 3] - 0.3) < SPREAD_M
 
 
+@pytest.mark.slow
 @given(st.integers(0, 1000), st.sampled_from(["moving", "still"]))
 @settings(max_examples=25, deadline=None)
 def test_where_the_world_is_does_not_matter(seed: int, motion: str) -> None:
@@ -238,6 +239,7 @@ def test_positions_alone_settle_too() -> None:
     assert (found.deviations[:3] > 0).all()
 
 
+@pytest.mark.slow
 def test_memory_is_bounded() -> None:
     settling = Settling(RULES, ONLY_TOOL)
     for frame in frames(lambda t: at(0.3), 60.0):

@@ -223,6 +223,7 @@ def difference(name, q, step=1e-5):
 
 
 @pytest.mark.parametrize("evaluator", ["interpreted", "compiled"])
+@pytest.mark.quick("interpreted")
 def test_the_exact_hessian_is_the_difference_of_the_gradient(lrm, evaluator):
     q = oracle.random_poses(11, 9)
     measured = oracle.tip(oracle.published(), q) + np.random.default_rng(9).normal(0, 0.01, (11, 3))

@@ -147,6 +147,7 @@ def test_surroundings_must_be_told_as_they_were_asked_for() -> None:
 
 
 @pytest.mark.parametrize("name", ["three", "play", "lift", "lrm", "best"])
+@pytest.mark.quick("best")
 def test_slopes_are_those_of_finite_differences(name: str) -> None:
     """In elastic equilibrium, away from zero where some effects branch."""
     found = compensator(name)

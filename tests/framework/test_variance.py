@@ -176,7 +176,8 @@ def test_planted_components_come_back_within_their_intervals(lrm):
     assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1, abs=0.12)
 
 
-@pytest.mark.parametrize("experiments", [3, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("experiments", [3, 8])
 def test_weighing_by_what_was_estimated_is_more_accurate(lrm, experiments):
     """Against equal weights, in experiments in which joint 2 scatters most."""
     joint_sd = np.array([0, 0.01, 0, 0, 0, 0])
@@ -210,6 +211,7 @@ def test_axes_apart_find_the_noisy_axis(lrm):
     assert sd["tracker.x"] == pytest.approx(1, rel=0.2) and sd["tracker.y"] == pytest.approx(1, rel=0.2)
 
 
+@pytest.mark.slow
 def test_neither_order_nor_the_declared_noise_matters(lrm):
     q, points, _ = measured(80, 5, joint_sd=JOINT_RAD)
     problem, records, start = posed(lrm, q, points)

@@ -25,10 +25,15 @@ DEMO = str(CONFIGS / "demo.yaml")
 COMPLIANCES = [f"arm.spring.k{i}" for i in range(7)]
 
 
+def judged(*settings: str, data: Path = CONFIGS / "demo.csv") -> dict:
+    """The numbers of a run without its files, judged by the records that were held out."""
+    experiment = Experiment.load(DEMO, [*settings, "validation.folds=0", "evaluator=interpreted"], data)
+    return outputs.metrics(calibrate(experiment))
+
+
 def sentences(*settings: str, data: Path = CONFIGS / "demo.csv") -> str:
     """All findings of a run, in one text with their grades."""
-    experiment = Experiment.load(DEMO, [*settings, "validation.folds=0", "evaluator=interpreted"], data)
-    findings = outputs.metrics(calibrate(experiment))["verdict"]["findings"]
+    findings = judged(*settings, data=data)["verdict"]["findings"]
     assert all(f["test"] for f in findings if f["grade"] == "good"), "a finding without a test"
     assert all(f["action"] for f in findings if f["grade"] in ("bad", "warning")), "a warning that tells nothing to do"
     return "\n".join(f"{f['grade']}: {f['text']}" for f in findings)
@@ -60,6 +65,7 @@ def test_a_noise_stated_too_small_or_too_large_is_noticed() -> None:
     assert "was it stated too large" in sentences("measurements.tracker.noise_mm=5")
 
 
+@pytest.mark.slow
 def test_a_drift_of_the_tracker_shows_as_correlated_neighbours(tmp_path: Path) -> None:
     data = disturbed(tmp_path, lambda points: points + 3 * np.sin(np.linspace(0, 9, len(points)))[:, None])
     told = sentences(data=data)
@@ -109,9 +115,7 @@ def test_missed_records_are_listed_where_the_limit_says(tmp_path: Path) -> None:
     assert finding["grade"] == "warning" and "validation.limit_mm" in finding["test"]
     assert "Error above 6.00 mm" in run["verdict"]["paragraph"]
     assert "an error above 6.00 mm by fits that did not see them" in (tmp_path / "run" / "report.html").read_text()
-    relaxed = verdict(
-        tmp_path / "relaxed", "validation.holdout=0", "validation.folds=2", "validation.limit_mm=60", data=data
-    )
+    relaxed = judged("validation.limit_mm=60", data=data)
     assert relaxed["structure"]["large_errors"]["beyond"] == 0
 
 
@@ -134,6 +138,7 @@ def test_the_tolerance_is_good_for_its_share_with_its_confidence() -> None:
     assert "not known" in _good_for(np.zeros(0), "x")
 
 
+@pytest.mark.slow
 def test_what_priors_alone_hold_is_a_note_where_the_tip_does_not_depend_on_it(tmp_path: Path) -> None:
     """A twist behind the last joint trades with a turn of the tool: a gauge."""
     freed = "parameters.free=[arm.mdh.alpha6, arm.mdh.tool_rx, arm.mdh.tool_z, arm.mdh.theta2, arm.mdh.base_z]"

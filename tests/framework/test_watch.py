@@ -141,6 +141,7 @@ def test_thinning_keeps_the_newest_whole_and_the_rest_even() -> None:
     assert len(set(steps.tolist())) == 1 and known[0] == 0 and len(steps) >= 24
 
 
+@pytest.mark.slow
 def test_memory_is_flat_however_long_it_goes_on() -> None:
     history = History()
     events = made_up(400)

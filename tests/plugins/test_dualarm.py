@@ -168,6 +168,7 @@ def test_records_that_only_one_arm_takes_part_in_run_from_a_file(in_sockets, tmp
         assert held == pytest.approx(trained, rel=0.5)
 
 
+@pytest.mark.slow
 def test_sockets_of_their_own_tell_nothing_of_the_placement(in_sockets):
     """What ties the arms is that the sockets are the same."""
     path = in_sockets.path.parent / "apart.yaml"
@@ -323,6 +324,7 @@ def test_the_rank_with_a_placement_is_that_of_plain_numpy(chained):
     assert int(np.sum(values > 1e-6 * values[0])) == 18 and len(values) == 20
 
 
+@pytest.mark.slow
 def test_a_placement_in_the_problem_costs_the_other_joints_little_and_one_left_out_costs_all(chained):
     """What does not trade comes back; with the placement held where it is believed nothing does."""
     held = Case(chained.path, ('parameters.free=["left.poe.offset*", "right.poe.offset*"]', "parameters.priors={}"))

@@ -110,6 +110,7 @@ def test_without_free_parameters_nothing_moves(lrm, name):
 
 
 @pytest.mark.parametrize("case", ["free of bounds", "at bounds", "priors", "priors at bounds", "outliers"])
+@pytest.mark.quick("outliers", "priors at bounds")
 def test_ipopt_and_cvxpy_agree_to_a_ten_thousandth_of_a_standard_deviation(lrm, case):
     truth = oracle.published()
     if case.endswith("at bounds"):
@@ -157,6 +158,7 @@ def test_scipys_trust_region_finds_the_same_on_the_oracles_residual(lrm, bounded
 
 
 @both
+@pytest.mark.quick("ipopt")
 def test_the_answer_satisfies_the_conditions_of_an_optimum_within_bounds(lrm, name):
     """Karush, Kuhn and Tucker: no gradient inside, none that pushes back in at a bound; by the oracle's differences."""
     truth = {**oracle.published(), "k0": 0.0, "k4": 0.0, "k6": 0.0}
@@ -249,6 +251,7 @@ def test_a_prior_is_about_the_nominal_value_not_about_the_start(lrm, name):
     np.testing.assert_allclose(one, two, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_exact_hessian_gives_the_same_answer(lrm):
     truth = {**oracle.published(), "k0": 0.0}
     q, measured = simulated(truth, 60, 10, noise=0.002)
@@ -273,6 +276,7 @@ def test_the_number_of_starts_and_of_those_that_agree_is_told(lrm):
     np.testing.assert_allclose(again.values, several.values, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_start_beside_the_optimum_takes_no_search_among_rounding_errors(lrm, monkeypatch):
     """What the fits of a robust loss start from: there the cost's rounding errors exceed what is left to gain."""
     q, measured = simulated(oracle.published(), 60, 10)

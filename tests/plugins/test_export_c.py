@@ -86,6 +86,7 @@ def predicted(calibration, compiled, records):
 
 
 @pytest.mark.parametrize("name", [*CASES, "mimic and slide"])
+@pytest.mark.quick("elastic", "rigid, limits")
 def test_the_code_says_where_the_calibrated_arm_is(arms, name):
     calibration, compiled = arms(name)
     records = records_of(compiled, 60)

@@ -360,6 +360,7 @@ def test_two_events_of_one_day_come_at_once() -> None:
     assert set(moved_by(made, 0.5)) == {"arm.mdh.theta2", "arm.mdh.theta4"}
 
 
+@pytest.mark.slow
 def test_outliers_are_of_any_size_few_of_them_large() -> None:
     """Log-uniform from 30 to 500 mm: the median is their geometric mean, 122 mm."""
     plain = mission(days=40)

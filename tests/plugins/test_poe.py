@@ -82,7 +82,7 @@ def moved(parameters, seed, size):
 
 @pytest.mark.parametrize("parametrisation", ["minimal", "full"])
 @pytest.mark.parametrize("config", [frida.model(), MIXED], ids=["frida", "mixed"])
-@pytest.mark.quick("frida-minimal", "mixed-full")
+@pytest.mark.quick("mixed-full")
 def test_poses_are_products_of_pinocchios_exponentials(config, parametrisation):
     """Of nominal and of moved parameters: axes off the nominal ones, and twists with pitch and scale."""
     pin = pytest.importorskip("pinocchio")
