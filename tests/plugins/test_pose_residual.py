@@ -1,6 +1,7 @@
 """Pose residuals: errors of joints that no effect models, learned, kept where they help, and used wherever arms are."""
 
 import json
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 
@@ -93,6 +94,20 @@ def test_unseen_errors_fall_to_near_the_noise_and_the_run_says_so(kind):
     assert "The pose residual of arm takes unseen errors from" in log
 
 
+def test_the_report_says_where_it_acts_and_how_much():
+    run = learned_run("fourier")
+    calibration, commands = run.calibration, Experiment.load(run.folder / "run.yaml").read()
+    arm = calibration.system.arms["arm"]
+    bare = replace(calibration, system=replace(calibration.system, arms={"arm": replace(arm, residual=None)}))
+    apart = calibration.predict(commands)[1][0] - bare.predict(commands)[1][0]
+    moved = 1000 * np.linalg.norm(apart[:, :3, 3], axis=1)
+    said = run.metrics["pose_residual"]["moves_tool_mm"]
+    assert said["altogether"] == pytest.approx({"mean": moved.mean(), "max": moved.max()}, rel=1e-6)
+    assert {"tool", "q1", "q2", "q3"} <= set(said) and said["tool"]["max"] == 0
+    page = (run.folder / "run/report.html").read_text()
+    assert "What was learned beside the model" in page and "shift by the pose residual" in page
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_calibration_predicts_what_the_run_found_and_compensates_to_the_same_arm(kind):
     run = learned_run(kind)
@@ -123,6 +138,7 @@ def test_an_arm_without_such_errors_keeps_none(kind, tmp_path):
     ran(tmp_path, f"{{type: {kind}}}", recorded(tmp_path, ""))
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
     assert not metrics["pose_residual"]["kept"]
+    assert "What was learned beside" not in (tmp_path / "run/report.html").read_text()
     kept = Calibration.load(tmp_path / "run/calibration.yaml").system.arms["arm"].residual
     assert kept is not None and not kept.is_learned
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from armcal.arm.assembly import Arm
-from armcal.arm.pose_residual import PoseResidual
+from armcal.arm.pose_residual import OF_TOOL, PoseResidual
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.problem.corrections import correction_channels, postures_of
@@ -27,6 +27,46 @@ def corrected_records(
                 content[kernel.factor.channels.index(channel), : own.count] = row
         result.append(replace(own, record=content, state=own.state.copy()))
     return tuple(result)
+
+
+@dataclass(frozen=True)
+class Moved:
+    """How far corrections move the tool of an arm in each record (N; m): all of them, and parts of them alone.
+
+    Parts are ``tool`` and those joints that are corrected, by name.
+    """
+
+    altogether: Array
+    parts: Mapping[str, Array]
+
+
+def moved_by(problem: Problem, values: Array, records: Sequence[FactorRecords], arm: Arm) -> Moved:
+    """What the pose residual of an arm does in records that carry its corrections.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium.
+    """
+    place = next(i for i, k in enumerate(problem.kernels) if arm.name in _arms_of(problem, k.factor.name))
+    own, channels = records[place], problem.kernels[place].factor.channels
+    size, known = len(correction_channels(arm)), dict(zip(channels, own.record[:, : own.count], strict=True))
+    corrections = np.array([known.get(channel, np.zeros(own.count)) for channel in correction_channels(arm)])
+
+    def tools(rows: Sequence[int]) -> Array:
+        some = np.zeros((size, own.count))
+        some[list(rows)] = corrections[list(rows)]
+        shown = problem.predict(values, corrected_records(problem, records, arm, some))[place]
+        first = len(problem.kernels[place].factor.output_channels)
+        at = first + 12 * _arms_of(problem, problem.kernels[place].factor.name).index(arm.name) + 9
+        return shown[at : at + 3]
+
+    none, joints = tools(()), [i for i in range(len(OF_TOOL), size) if np.any(corrections[i])]
+    parts = {"tool": range(len(OF_TOOL)), **{arm.joint_names[i - len(OF_TOOL)]: (i,) for i in joints}}
+    apart = {name: np.linalg.norm(tools(tuple(rows)) - none, axis=0) for name, rows in parts.items()}
+    return Moved(np.linalg.norm(tools(range(size)) - none, axis=0), apart)
+
+
+def _arms_of(problem: Problem, measurement: str) -> Sequence[str]:
+    return tuple(problem.blueprint.measurements[measurement].arms)
 
 
 def unexplained(

@@ -183,6 +183,18 @@ def worst_records(result: RunResult, number: int = 10) -> NDArray[np.intp]:
     return np.argsort(-ranked, kind="stable")[:number].astype(np.intp)
 
 
+def moved_rows(result: RunResult) -> list[tuple[str, str, str]]:
+    """How far the pose residual moves the tool, by part: its name, the mean and the largest (mm)."""
+    outcome = result.pose_residual
+    if outcome is None or outcome.moved is None:
+        return []
+    parts = {"altogether": outcome.moved.altogether, **outcome.moved.parts}
+    numbers = [1000 * float(number) for own in parts.values() for number in (own.mean(), own.max())]
+    decimals = common_decimals(numbers, most=3)
+    shown = [fixed(number, decimals) for number in numbers]
+    return list(zip(parts, shown[::2], shown[1::2], strict=True))
+
+
 def worst_rows(result: RunResult, worst: NDArray[np.intp]) -> list[tuple[str, ...]]:
     """Id, source row, role, and errors of these records: nominal, calibrated, cross-validated."""
     errors, data = result.errors, result.dataset

@@ -1,6 +1,8 @@
-"""Errors over the workspace: two views of the tip positions, coloured by what is left of the error."""
+"""The workspace: two views of the tip positions, coloured by an error or another length."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,61 +22,85 @@ _STEPS = (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10, 20)
 _NAMES = "xyz"
 
 
+@dataclass(frozen=True)
+class Coloured:
+    """What colours the tip positions.
+
+    Attributes:
+        key: of the figures on the page.
+        numbers: one a record (N).
+        unit: theirs.
+        name: of one of them.
+        vectors: lines from the positions (3 x N; mm), if they are to be drawn.
+    """
+
+    key: str
+    numbers: Array
+    unit: str
+    name: str
+    vectors: Array | None = None
+
+
 def views(result: RunResult) -> list[Figure]:
-    """The views from above (x, y) and from the side (x, z); empty when no position is known."""
-    position, errors = result.errors.position_mm, result.errors.calibrated_mm
+    """What is left of the error, from above (x, y) and from the side (x, z); empty when no position is known."""
+    errors = result.errors
+    return _views(
+        result, Coloured("workspace", errors.calibrated_mm, errors.unit, "calibrated error", _vectors(result))
+    )
+
+
+def moved_views(result: RunResult) -> list[Figure]:
+    """The same of how far a pose residual moves the tip; empty where none was learned."""
+    moved = result.pose_residual and result.pose_residual.moved
+    if not moved:
+        return []
+    return _views(result, Coloured("pose-residual", 1000 * moved.altogether, "mm", "shift by the pose residual"))
+
+
+def _views(result: RunResult, what: Coloured) -> list[Figure]:
+    position = result.errors.position_mm
     if position.shape[0] < 3:
         return []
-    known = np.flatnonzero(np.isfinite(errors) & np.isfinite(position[:3]).all(axis=0))
+    known = np.flatnonzero(np.isfinite(what.numbers) & np.isfinite(position[:3]).all(axis=0))
     if not len(known):
         return []
     chosen = known
     if len(known) > MOST_POINTS:  # evenly through the recorded order, and the worst in any case
-        worst = known[np.argsort(-errors[known], kind="stable")[:50]]
+        worst = known[np.argsort(-what.numbers[known], kind="stable")[:50]]
         even = known[np.linspace(0, len(known) - 1, MOST_POINTS - 50).astype(np.intp)]
         chosen = np.unique(np.concatenate([even, worst]))
-    chosen = chosen[np.argsort(errors[chosen], kind="stable")]
-    vectors = _vectors(result, chosen)
-    parts = (position, errors, chosen, len(known), vectors)
-    return [_view(*parts, axes, result.errors.unit) for axes in ((0, 1), (0, 2))]
+    chosen = chosen[np.argsort(what.numbers[chosen], kind="stable")]
+    return [_view(position, what, chosen, len(known), axes) for axes in ((0, 1), (0, 2))]
 
 
-def _vectors(result: RunResult, chosen: NDArray[np.intp]) -> Array | None:
-    """Residual vectors of the chosen records, where the residual is one measured position."""
+def _vectors(result: RunResult) -> Array | None:
+    """Residual vectors, where the residual is one measured position."""
     residual = result.errors.calibrated_residual_mm
     if result.errors.unit != "mm":
         return None
     ends = [name.removesuffix(".x") for name in result.dataset.channels if name.endswith(".x")]
     positions = [p for p in ends if result.dataset.has(f"{p}.y") and result.dataset.has(f"{p}.z")]
-    if residual.shape[0] != 3 or len(positions) != 1 or len(chosen) > _MOST_VECTORS:
-        return None
-    vectors = residual[:, chosen]
-    return vectors if np.isfinite(vectors).all() else None
+    return residual if residual.shape[0] == 3 and len(positions) == 1 else None
 
 
-def _view(
-    position: Array,
-    errors: Array,
-    chosen: NDArray[np.intp],
-    total: int,
-    vectors: Array | None,
-    axes: tuple[int, int],
-    unit: str,
-) -> Figure:
+def _view(position: Array, what: Coloured, chosen: NDArray[np.intp], total: int, axes: tuple[int, int]) -> Figure:
     shown = position[list(axes)][:, chosen]
     across, up = (_NAMES[i] for i in axes)
-    step = svg.nice_step(float(np.percentile(errors[chosen], 98)) / len(_COLOURS), _STEPS)
+    numbers, unit = what.numbers[chosen], what.unit
+    vectors = what.vectors[:, chosen] if what.vectors is not None and len(chosen) <= _MOST_VECTORS else None
+    if vectors is not None and not np.isfinite(vectors).all():
+        vectors = None
+    step = svg.nice_step(float(np.percentile(numbers, 98)) / len(_COLOURS), _STEPS)
     enlarged = _enlargement(shown, vectors)
-    caption = "Predicted tip positions; the darker, the larger the calibrated error."
+    caption = f"Predicted tip positions; the darker, the larger the {what.name}."
     if enlarged:
         caption += f" Lines: residuals, {significant(enlarged, 1)} times enlarged."
     if len(chosen) < total:
         caption += f" {count(len(chosen))} of {count(total)} drawn, evenly chosen, the 50 worst among them."
-    worst = chosen[-1]
     said = (
-        f"{plural(len(chosen), 'tip position')} seen along {({'xy': 'z', 'xz': 'y'})[across + up]}; the largest error, "
-        f"{significant(float(errors[worst]))} {unit}, at {across} {position[axes[0], worst]:.0f}, "
-        f"{up} {position[axes[1], worst]:.0f} mm."
+        f"{plural(len(chosen), 'tip position')} seen along {({'xy': 'z', 'xz': 'y'})[across + up]}; the largest "
+        f"{what.name}, {significant(float(numbers[-1]))} {unit}, "
+        f"at {across} {shown[0, -1]:.0f}, {up} {shown[1, -1]:.0f} mm."
     )
 
     def draw(width: float) -> tuple[float, list[str]]:
@@ -83,16 +109,16 @@ def _view(
         if vectors is not None and enlarged:
             tips = shown + enlarged * vectors[list(axes)]
             parts.append(svg.segments(x.at(shown[0]), y.at(shown[1]), x.at(tips[0]), y.at(tips[1]), "vector"))
-        level = np.minimum((errors[chosen] / step).astype(int), len(_COLOURS) - 1)
+        level = np.minimum((numbers / step).astype(int), len(_COLOURS) - 1)
         css = "dot" if len(chosen) <= 1000 else "dot small"
         for number, colour in enumerate(_COLOURS):
             here = level == number
             parts.append(svg.dots(x.at(shown[0, here]), y.at(shown[1, here]), css, colour))
-        parts += _colour_key(box, step, unit)
+        parts += _colour_key(box, step, f"{what.name}, {unit}")
         return box.bottom + 104, parts
 
     title = "Workspace from above (x, y)" if up == "y" else "Workspace from the side (x, z)"
-    return svg.both(f"workspace-{across}{up}", (title, said, caption), draw, svg.HALF)
+    return svg.both(f"{what.key}-{across}{up}", (title, said, caption), draw, svg.HALF)
 
 
 def _enlargement(shown: Array, vectors: Array | None) -> float:
@@ -117,7 +143,7 @@ def _equal_axes(shown: Array, width: float) -> tuple[Box, Axis, Axis]:
     return box, x, Axis(float(middle[1] - half[1]), float(middle[1] + half[1]), box.bottom, box.top)
 
 
-def _colour_key(box: Box, step: float, unit: str) -> list[str]:
+def _colour_key(box: Box, step: float, words: str) -> list[str]:
     width = min((box.right - box.left) / len(_COLOURS), 44.0)
     left = (box.left + box.right - width * len(_COLOURS)) / 2
     y = box.bottom + 50
@@ -125,5 +151,4 @@ def _colour_key(box: Box, step: float, unit: str) -> list[str]:
     decimals = decimals_for(step, 2 if round(step / 10 ** np.floor(np.log10(step)), 6) % 1 else 1)
     for i in range(len(_COLOURS)):
         parts.append(svg.text(left + i * width, y + 24, fixed(i * step, decimals), "tick", "middle"))
-    words = f"calibrated error, {unit}; the darkest: and more"
-    return [*parts, svg.text((box.left + box.right) / 2, y + 44, words, "tick", "middle")]
+    return [*parts, svg.text((box.left + box.right) / 2, y + 44, f"{words}; the darkest: and more", "tick", "middle")]

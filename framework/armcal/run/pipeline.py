@@ -36,6 +36,7 @@ from armcal.estimate.weighing import WeighedFit, fit, plain_fit
 from armcal.io.parallel import Executor
 from armcal.measure.id_list import read_ids
 from armcal.plugins import PluginRegistry
+from armcal.problem.corrected import moved_by
 from armcal.problem.drift import with_drift
 from armcal.problem.motion import recorded_position
 from armcal.problem.problem import FactorRecords, Problem
@@ -307,7 +308,8 @@ def _with_pose_residual(
         ready = replace(ready, problem=problem, records=records)
         estimator = spread(experiment.estimator, executor)
         again = fit(problem, ready.training, estimator, fitted.estimate.values, progress)
-        return ready, _widened(ready, again), outcome
+        moved = moved_by(problem, again.estimate.values, records, arms[outcome.arm])
+        return ready, _widened(ready, again), replace(outcome, moved=moved)
 
 
 def _notify_rejected(registry: PluginRegistry, records: Sequence[SetAside | SuspiciousRecord]) -> list[str]:

@@ -34,7 +34,7 @@ from armcal.estimate.weighing import WeighedFit, fit
 from armcal.io.parallel import Executor
 from armcal.measure.contact import Contact
 from armcal.measure.partners import PairedMeasurement
-from armcal.problem.corrected import corrected_records, unexplained
+from armcal.problem.corrected import Moved, corrected_records, unexplained
 from armcal.problem.corrections import correction_channels, postures_of
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.run.experiment import Experiment
@@ -92,6 +92,7 @@ class ResidualOutcome:
         residual: as learned; None if it is not kept.
         crossed: of the random folds, with it.
         splits: these folds.
+        moved: what it does in the run's records, once it is kept.
     """
 
     arm: str
@@ -103,6 +104,7 @@ class ResidualOutcome:
     residual: PoseResidual | None = None
     crossed: CrossValidation | None = None
     splits: tuple[Split, ...] = ()
+    moved: Moved | None = None
 
     def system(self, system: System) -> System:
         """With what was learned."""
@@ -142,12 +144,17 @@ class ResidualOutcome:
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json."""
-        parts = {"folds": self.folds, "stretches": self.stretches}
-        named = {
+        compared = {"folds": self.folds, "stretches": self.stretches}
+        named: dict[str, Any] = {
             name: {f"without_{self.unit}": p.without, f"with_{self.unit}": p.with_it, "standard_errors": p.sure}
-            for name, p in parts.items()
+            for name, p in compared.items()
             if p is not None
         }
+        if self.moved is not None:
+            parts = {"altogether": self.moved.altogether, **self.moved.parts}
+            named["moves_tool_mm"] = {
+                name: {"mean": _MM * float(own.mean()), "max": _MM * float(own.max())} for name, own in parts.items()
+            }
         return {"arm": self.arm, "type": self.kind, "kept": self.residual is not None, **named}
 
 
