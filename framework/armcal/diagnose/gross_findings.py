@@ -16,8 +16,12 @@ from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
 OF_REACH = 0.03
 """An error beyond this share of the arm's reach is gross, whatever the arm."""
 UNEXPLAINED_OF_REACH, EXPLAINED_OF_REACH, TIMES_NOISE, EXPLAINED = 0.005, 0.02, 5.0, 1 / 3
-"""An error beyond the second share of the reach and so many times the declared noise is gross; beyond the first one
-where no structure in the residuals makes up a third of it, as gravity does of a printed arm whose base is rigid."""
+"""An error so many times the declared noise is gross where nothing explains a third of it; beyond the first share of
+the reach where other poses predict a third of it, but no cause is known; beyond the second one even where a structure
+in the residuals makes up a third of it, as gravity does of a printed arm whose base is rigid."""
+OVERFITTED = 3.0
+"""Times the noise that training records show, from which on errors of records that did not train are the fit's."""
+FEWEST_JUDGED = 10
 _NO_EXCUSE = frozenset({"order", "step", "slip", "scale"})
 """Kinds of structure that explain no gross error: something may have moved, or a frame be wrong."""
 SIZE, GROSS_SIZE = 0.02, 0.05
@@ -44,16 +48,51 @@ def gross_error(
     if share > OF_REACH:
         test = f"mean, limit {100 * OF_REACH:g} % of {whole:.0f} {unit}"
         return [Finding("bad", f"{error}: the values do not describe this arm.", test, CHECK_THE_DATA)]
-    explained = 0.0
-    if left is not None:
-        causes = [s.falls_mm for s in left.worthwhile if s.kind not in _NO_EXCUSE]
-        explained = max(causes, default=0.0) / max(left.mean_mm, 1e-12)
-    limit = UNEXPLAINED_OF_REACH if explained < EXPLAINED else EXPLAINED_OF_REACH
+    explained, predicted = _explained(left)
+    limit = EXPLAINED_OF_REACH if explained >= EXPLAINED else UNEXPLAINED_OF_REACH if predicted >= EXPLAINED else 0.0
     if share <= limit or scale <= TIMES_NOISE:
         return []
     text = f"{error} and {scale:.0f} times the declared noise; what was found in the residuals does not explain it."
-    test = f"limits {100 * limit:g} % and {TIMES_NOISE:g} times; one cause explains at most {100 * explained:.0f} %"
-    return [Finding("bad", text, test, f"The cause is not known. {CHECK_THE_DATA}")]
+    test = (
+        f"limits {100 * limit:g} % and {TIMES_NOISE:g} times; one cause explains at most {100 * explained:.0f} % of "
+        f"it, other poses predict {100 * predicted:.0f} %"
+    )
+    return [
+        Finding("bad", text, test, f"The cause is not known: is the stated noise the instrument's? {CHECK_THE_DATA}")
+    ]
+
+
+def _explained(left: ResidualStructure | None) -> tuple[float, float]:
+    """Which shares of the error one cause makes up at most, and other records predict, whatever the cause."""
+    if left is None:
+        return 0.0, 0.0
+    causes = [s.falls_mm for s in left.worthwhile if s.kind not in _NO_EXCUSE]
+    predicted = left.predictable.falls if left.predictable is not None and left.is_predictable else 0.0
+    return max(causes, default=0.0) / max(left.mean_mm, 1e-12), predicted
+
+
+def overfitted(trained_mm: Array, judged_mm: Array, equations: int, freedom: float, unit: str = "mm") -> list[Finding]:
+    """Errors of records that did not train (nan where not judged) beside those that did, parameters counted.
+
+    A fit that spends p of m equations leaves sqrt(1 - p/m) of the noise in the records that train it, so that their
+    errors by sqrt(m / (m - p)) are the noise. Records that did not train have sqrt(1 + p / (m - p - 1)) times that
+    where poses are alike [Breiman1983]: three times only if p is eight ninths of m, or if poses are not alike.
+    """
+    judged = judged_mm[np.isfinite(judged_mm)]
+    if min(len(judged), len(trained_mm)) < FEWEST_JUDGED or freedom <= 0:
+        return []
+    noise = float(np.median(trained_mm)) * float(np.sqrt(max(equations, freedom) / freedom))
+    after = float(np.median(judged))
+    if after <= OVERFITTED * noise:
+        return []
+    text = (
+        f"Overfitted: records that did not train have an error of {after:.3g} {unit}, {after / noise:.1f} times what "
+        f"those that trained let expect ({noise:.3g} {unit})."
+    )
+    test = f"medians; {equations - freedom:.0f} of {equations} equations are spent on parameters; limit {OVERFITTED:g}"
+    return [
+        Finding("bad", text, test, "Measure more poses, more different ones; free fewer parameters; or give priors.")
+    ]
 
 
 def contradicting(minority: Minority | None, ids: Sequence[str]) -> list[Finding]:
@@ -89,13 +128,13 @@ def size_findings(figure: Figure) -> list[Finding]:
 def displacement_findings(figure: Figure) -> list[Finding]:
     """Parameters that contradict their priors, or are implausibly far from their nominal values."""
     geometry = [displaced for displaced in figure.displaced if displaced.by_prior or not displaced.placement]
-    gross = [displaced for displaced in geometry if displaced.times > FAR_BEYOND]
-    beyond = [displaced for displaced in geometry if displaced.times <= FAR_BEYOND]
+    gross = [displaced for displaced in geometry if displaced.by_prior or displaced.times > FAR_BEYOND]
+    beyond = [displaced for displaced in geometry if displaced not in gross]
     elsewhere = [
         displaced for displaced in figure.displaced if displaced not in geometry and displaced.times > FAR_BEYOND
     ]
-    test = f"limits {BEYOND:g} and {FAR_BEYOND:g} standard deviations of the prior, or typical corrections"
-    action = "If the arm is so, correct the nominal values; else look for a joint's zero, sign, or unit."
+    test = f"limit {BEYOND:g} sd of the prior; without a prior {BEYOND:g} and {FAR_BEYOND:g} typical corrections"
+    action = "If the arm is so, correct the nominal values or the prior; else look for a joint's zero, sign, or unit."
     findings = []
     if gross:
         findings.append(Finding("bad", f"Far from the nominal values: {_listed(gross)}.", test, action))

@@ -67,6 +67,10 @@ def component_findings(components: VarianceComponents) -> list[Finding]:
         sd = f"{factor * c.sd:.2g}{unit}, 95 % {factor * c.lower:.2g} to {factor * c.upper:.2g}"
         texts.append(f"{c.name} {100 * c.share:.0f} % ({sd})")
     listed = "; ".join(texts)
+    if not components.unseen and all(c.kind == "instrument" for c in parts):
+        text = f"The noise is not stated but estimated from the residuals, and priors are weighed against it: {listed}."
+        action = "State it once you know it: only then do residuals show that the model lacks something."
+        return [Finding("note", text, "restricted maximum likelihood", action)]
     whose = "the joints" if joints > 0.5 else "the instruments"
     share = joints if joints > 0.5 else 1 - joints
     meaning = (

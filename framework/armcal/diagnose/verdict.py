@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ from armcal.estimate.identifiability import POOR_CONDITION, bound_together, corr
 from armcal.estimate.prediction import NewRecording
 from armcal.estimate.validation import summarise
 from armcal.estimate.weighing import WeighedFit
-from armcal.planning.suggestion import CANDIDATES, Suggestion
+from armcal.planning.suggestion import CANDIDATES, Suggestion, is_worth_measuring
 
 LEVEL = 0.05
 SHARE = 0.95
@@ -44,6 +45,12 @@ class Verdict:
     headline: str
     findings: tuple[Finding, ...]
     paragraph: str = ""
+
+    @property
+    def grade(self) -> Literal["good", "usable with care", "bad"]:
+        """Of the calibration as a whole, by its worst finding: a note does not count."""
+        grades = {finding.grade for finding in self.findings}
+        return "bad" if "bad" in grades else "usable with care" if "warning" in grades else "good"
 
     @property
     def bad(self) -> tuple[Finding, ...]:
@@ -154,7 +161,7 @@ def _in_short(
         f"Suspicious records: {first_few(suspicious)}." if suspicious else "No training record is suspicious."
     )
     sentences += _left(seen)
-    if suggestions:
+    if is_worth_measuring(suggestions):
         sentences.append(f"Measure these poses next: {'; '.join(suggestion.text for suggestion in suggestions)}.")
     return sentences
 
@@ -198,7 +205,9 @@ def _condition(estimate: Estimate) -> list[Finding]:
     known = estimate.identifiability
     if known.condition <= POOR_CONDITION:
         return []
-    held = bool(np.all(estimate.parameters.prior_information() > 0))
+    direction = known.directions[known.rank - 1] * estimate.parameters.scales()
+    by_priors = float(direction**2 @ estimate.parameters.prior_information())
+    held = by_priors >= float(known.singular_values[known.rank - 1]) ** 2
     test = f"scaled condition {known.condition:.1e}, limit {POOR_CONDITION:.0e}"
     action = "Their priors hold them." if held else "Measure what armcal plan asks for, or give them priors."
     return [Finding("note" if held else "warning", f"Hardly determined: {known.weakest}.", test, action)]
@@ -303,7 +312,7 @@ def _next(estimate: Estimate, suggestions: Sequence[Suggestion]) -> list[Finding
     if not suggestions:
         return [Finding("note", text)]
     shrink = 100 * (1 - suggestions[-1].shrink)
-    text += f" Three poses more would shrink standard deviations by {shrink:.1f} % on average."
+    text += f" {len(suggestions)} poses more would shrink standard deviations by {shrink:.1f} % on average."
     test = f"determinant of the information, {CANDIDATES} poses like the recorded ones; clearance was not checked"
     poses = "; ".join(suggestion.text for suggestion in suggestions)
-    return [Finding("note", text, test, f"Measure next: {poses}.")]
+    return [Finding("note", text, test, f"Measure next: {poses}." if is_worth_measuring(suggestions) else "")]

@@ -88,14 +88,20 @@ class VarianceComponents:
 
 
 def estimate_components(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], axes: Axes = "together"
+    problem: Problem,
+    values: Array,
+    records: Sequence[FactorRecords],
+    axes: Axes = "together",
+    of_joints: bool = True,
 ) -> VarianceComponents:
-    """Components at a fit; ``records`` carry the declared noise, and weight 0 where they are left out.
+    """Components at a fit, those of instruments alone unless ``of_joints``.
+
+    ``records`` carry the declared noise, and weight 0 where they are left out.
 
     Raises:
         ProblemError: there are not more equations than parameters and components, or parameters drift.
     """
-    sources = _sources(problem, values, records, axes)
+    sources = [s for s in _sources(problem, values, records, axes) if of_joints or s.kind == "instrument"]
     sizes = np.array([_mean_variance(source.bases, records) for source in sources])
     joints = np.array([source.kind == "joint" for source in sources])
     seen = ~joints | (sizes > SMALLEST_SHARE * float(sizes[joints].max(initial=0.0)))

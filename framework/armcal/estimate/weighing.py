@@ -37,11 +37,12 @@ class NoiseSettings(Settings):
 
     ``loss``: ``none`` is least squares; ``huber`` and ``cauchy`` weigh large residuals less; ``reject`` sets records
     aside and fits the rest, at most the fraction ``most_rejected``. ``estimate`` finds variance components, of each
-    instrument as a whole or of its axes apart, and of each joint, and fits with them.
+    instrument as a whole or of its axes apart, and of each joint, and fits with them; ``instruments`` those of
+    instruments alone, where their noise is not known: what the model lacks then counts as noise.
     """
 
     loss: Literal["none", "huber", "cauchy", "reject"] = "none"
-    estimate: bool = False
+    estimate: bool | Literal["instruments"] = False
     axes: Axes = "together"
     most_rejected: Annotated[float, Field(gt=0, lt=0.5)] = 0.1
 
@@ -166,7 +167,8 @@ class Weighing:
                 break
             progress("variance components", number / MOST_ESTIMATES)
             counted = problem.weighted(records, self._trusted(problem, whitened, robust))
-            components = estimate_components(problem, robust.solution.values, counted, axes)
+            of_joints = self.settings.estimate is True
+            components = estimate_components(problem, robust.solution.values, counted, axes, of_joints)
             components = replace(components, rounds=number + 1)
             if before is not None and components.close_to(before):
                 return robust, whitened, components

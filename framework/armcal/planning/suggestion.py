@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from armcal.planning.relaxation import Task
 from armcal.problem.problem import Problem
 
 CANDIDATES = 400
+LEAST_GAIN = 0.05
 MOST_LEVELS = 12
 
 
@@ -27,6 +28,11 @@ class Suggestion:
     commands: dict[str, float]
     text: str
     shrink: float
+
+
+def is_worth_measuring(suggestions: Sequence[Suggestion]) -> bool:
+    """Whether standard deviations would shrink by a twentieth or more."""
+    return bool(suggestions) and 1 - suggestions[-1].shrink >= LEAST_GAIN
 
 
 def suggest(

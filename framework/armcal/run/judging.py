@@ -19,6 +19,7 @@ from armcal.diagnose.gross_findings import (
     displacement_findings,
     gross_error,
     limit_findings,
+    overfitted,
     size_findings,
 )
 from armcal.diagnose.large_errors import Judged, large_errors
@@ -71,6 +72,10 @@ def verdict_of(
             joints = {f"{name}.{j}": kind for name, arm in system.arms.items() for j, kind in arm.commanded.items()}
             suggestions = suggest(problem, run.dataset.subset(train), estimate, joints)
     worse = worse_than_nominal(judged, errors.nominal_mm, errors.unit)
+    if not any(arm.residual is not None and arm.residual.is_learned for arm in problem.blueprint.arms.values()):
+        trained = (errors.calibrated_mm if errors.at_rest_mm is None else errors.at_rest_mm)[train]
+        spent = problem.equations(fitted.records), estimate.degrees_of_freedom
+        worse += overfitted(trained, judged, *spent, errors.unit)
     verdict = judge(
         estimate,
         _whitened(run),

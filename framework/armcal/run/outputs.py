@@ -151,7 +151,11 @@ def metrics(result: RunResult) -> dict[str, Any]:
         },
         "noise": _noise(result),
         "solver": asdict(estimate.verdict),
-        "verdict": {"usable": not result.verdict.bad, **asdict(result.verdict)},
+        "verdict": {
+            "usable": not result.verdict.bad,
+            "grade": result.verdict.grade,
+            **asdict(result.verdict),
+        },
         "structure": result.evidence.as_dict(),
         "prediction_intervals": result.intervals.as_dict(),
         "bootstrap": _bootstrap_metrics(result),
