@@ -22,6 +22,8 @@ in the residuals makes up a third of it, as gravity does of a printed arm whose 
 OVERFITTED = 3.0
 """Times the noise that training records show, from which on errors of records that did not train are the fit's."""
 FEWEST_JUDGED = 10
+_MEDIAN_OF_NOISE = 0.6745
+"""The median size of a normal number of deviation 1."""
 _NO_EXCUSE = frozenset({"order", "step", "slip", "scale"})
 """Kinds of structure that explain no gross error: something may have moved, or a frame be wrong."""
 SIZE, GROSS_SIZE = 0.02, 0.05
@@ -31,9 +33,17 @@ MOST_NAMED = 3
 
 
 def gross_error(
-    judged_mm: Array, figure: Figure, estimate: Estimate, left: ResidualStructure | None, unit: str = "mm"
+    judged_mm: Array,
+    figure: Figure,
+    estimate: Estimate,
+    left: ResidualStructure | None,
+    whitened: Array,
+    unit: str = "mm",
 ) -> list[Finding]:
     """Errors of records that did not train (N; nan where not judged) beside the reach and the noise.
+
+    ``whitened`` are residuals in units of the noise, nan outside of training: where some records alone are far off, and
+    named for it, the others are as the noise has it.
 
     Where nothing measured is a length, errors are in ``mrad`` and stand beside a radian: what the reach is at the
     distance of the reach.
@@ -50,7 +60,8 @@ def gross_error(
         return [Finding("bad", f"{error}: the values do not describe this arm.", test, CHECK_THE_DATA)]
     explained, predicted = _explained(left)
     limit = EXPLAINED_OF_REACH if explained >= EXPLAINED else UNEXPLAINED_OF_REACH if predicted >= EXPLAINED else 0.0
-    if share <= limit or scale <= TIMES_NOISE:
+    typical = float(np.nanmedian(np.abs(whitened))) / _MEDIAN_OF_NOISE
+    if share <= limit or min(scale, typical if limit == 0 else np.inf) <= TIMES_NOISE:
         return []
     text = f"{error} and {scale:.0f} times the declared noise; what was found in the residuals does not explain it."
     test = (
@@ -72,16 +83,16 @@ def _explained(left: ResidualStructure | None) -> tuple[float, float]:
 
 
 def overfitted(trained_mm: Array, judged_mm: Array, equations: int, freedom: float, unit: str = "mm") -> list[Finding]:
-    """Errors of records that did not train (nan where not judged) beside those that did, parameters counted.
+    """Errors of records that did not train beside those that did (nan where unknown), parameters counted.
 
     A fit that spends p of m equations leaves sqrt(1 - p/m) of the noise in the records that train it, so that their
     errors by sqrt(m / (m - p)) are the noise. Records that did not train have sqrt(1 + p / (m - p - 1)) times that
     where poses are alike [Breiman1983]: three times only if p is eight ninths of m, or if poses are not alike.
     """
-    judged = judged_mm[np.isfinite(judged_mm)]
-    if min(len(judged), len(trained_mm)) < FEWEST_JUDGED or freedom <= 0:
+    judged, trained = judged_mm[np.isfinite(judged_mm)], trained_mm[np.isfinite(trained_mm)]
+    if min(len(judged), len(trained)) < FEWEST_JUDGED or freedom <= 0:
         return []
-    noise = float(np.median(trained_mm)) * float(np.sqrt(max(equations, freedom) / freedom))
+    noise = float(np.median(trained)) * float(np.sqrt(max(equations, freedom) / freedom))
     after = float(np.median(judged))
     if after <= OVERFITTED * noise:
         return []

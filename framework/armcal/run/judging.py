@@ -128,7 +128,7 @@ def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array
     position = recorded_position(run.dataset)[looked_at]
     read = predicted_positions(problem, estimate.values, acting, dataset)
     return [
-        *gross_error(judged_mm, figure, estimate, evidence.structure, evidence.unit),
+        *gross_error(judged_mm, figure, estimate, evidence.structure, _whitened(run), evidence.unit),
         *contradicting(minority(rows, estimate.noise_scale, position), dataset.ids),
         *size_findings(figure),
         *displacement_findings(figure),
