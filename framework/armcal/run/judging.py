@@ -71,11 +71,7 @@ def verdict_of(
         if estimate.names and all(kernel.factor.output_channels for kernel in problem.kernels):
             joints = {f"{name}.{j}": kind for name, arm in system.arms.items() for j, kind in arm.commanded.items()}
             suggestions = suggest(problem, run.dataset.subset(train), estimate, joints)
-    worse = worse_than_nominal(judged, errors.nominal_mm, errors.unit)
-    if not any(arm.residual is not None and arm.residual.is_learned for arm in problem.blueprint.arms.values()):
-        trained = (errors.calibrated_mm if errors.at_rest_mm is None else errors.at_rest_mm)[train]
-        spent = problem.equations(fitted.records), estimate.degrees_of_freedom
-        worse += overfitted(trained, judged, *spent, errors.unit)
+    worse = worse_than_nominal(judged, errors.nominal_mm, errors.unit) + _overfitted(run, errors, judged)
     verdict = judge(
         estimate,
         _whitened(run),
@@ -134,6 +130,16 @@ def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array
         *displacement_findings(figure),
         *limit_findings(figure, scale_deviation(problem, rows, read, estimate.noise_scale)),
     ]
+
+
+def _overfitted(run: FittedRecords, errors: RecordErrors, judged_mm: Array) -> list[Finding]:
+    """Of a physical model: how much freedom what was learned takes up is not known, and its own folds judged it."""
+    problem, fitted = run.problem, run.fitted
+    if any(arm.residual is not None and arm.residual.is_learned for arm in problem.blueprint.arms.values()):
+        return []
+    trained = (errors.calibrated_mm if errors.at_rest_mm is None else errors.at_rest_mm)[run.split.train]
+    spent = problem.equations(fitted.records), fitted.estimate.degrees_of_freedom
+    return overfitted(trained, judged_mm, *spent, errors.unit)
 
 
 def effect_types(system: System) -> frozenset[str]:
