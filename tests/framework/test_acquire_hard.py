@@ -142,6 +142,7 @@ class TestHostThatStalls:
 
 
 class TestJournalThatFails:
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("fault", "call", "after"),
         [
@@ -152,7 +153,6 @@ class TestJournalThatFails:
             (JournalFailedError("the disk fails"), "record", 14),
         ],
     )
-    @pytest.mark.quick("fault4-record-14")
     def test_the_arm_is_parked_and_the_run_can_go_on(
         self, holding: BenchRun, undisturbed: dict, fault: ArmcalError, call: str, after: int, monkeypatch: Any
     ) -> None:

@@ -121,6 +121,7 @@ def test_no_damage_of_one_byte_is_taken_or_ends_in_a_traceback(calibration: Path
     assert predicted(path).exit_code == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [4, pytest.param(300, marks=pytest.mark.slow)])
 def test_what_is_accepted_by_hand_is_used_or_refused_without_a_traceback(
     calibration: Path, tmp_path: Path, count: int

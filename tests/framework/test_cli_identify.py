@@ -58,6 +58,7 @@ def test_45_parameters_reduce_to_34_of_which_the_published_28_are_part() -> None
     assert set(asked_for["kept"]) == set(published) and len(asked_for["left_out"]) == 6
 
 
+@pytest.mark.slow
 def test_the_printed_block_is_a_configuration_that_can_be_solved(tmp_path: Path) -> None:
     result = armcal("identify", ALL, "--data", DATA, "--minimal")
     block = result.stdout[result.stdout.index("parameters:\n") :]

@@ -144,6 +144,7 @@ def nearest_by_scipy(found: Compensator, position: np.ndarray, known: np.ndarray
 
 
 @pytest.mark.parametrize("name", ["three", "five", "lrm"])
+@pytest.mark.quick("five")
 def test_beyond_its_reach_the_arm_comes_as_near_as_it_can(name: str) -> None:
     found = compensator(name)
     positions = np.array([[1.5, 0.2, 0.1], [0.1, -0.2, 0.9], [-0.4, 0.5, -0.6]])

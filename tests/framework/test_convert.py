@@ -155,7 +155,7 @@ def test_every_form_of_an_arm_stands_where_the_arm_stands_by_pinocchio_too(arm, 
 
 
 @pytest.mark.parametrize("arm", ARMS)
-@pytest.mark.quick("lrm", "degenerate")
+@pytest.mark.quick("lrm")
 def test_round_and_round_again_comes_back(arm):
     first = chain = ARMS[arm]()
     for form in ("poe", "urdf", "mdh", "craig", "urdf", "poe", "mdh"):

@@ -132,6 +132,7 @@ def test_the_gradient_is_that_of_the_cost_and_the_exact_hessian_that_of_the_grad
 
 @pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler on this machine")
 @pytest.mark.parametrize("counts", [(1, 0), (3, 2)], ids=["one record a group", "several"])
+@pytest.mark.quick("several")
 def test_compiled_and_interpreted_evaluators_agree(counts):
     data, made = touches(3, counts), bench(mean_weight=30.0)
     if not counts[1]:
@@ -175,6 +176,7 @@ def test_the_order_of_records_means_nothing(data, mean_weight):
     assert_same(summary(problem, records, values), summary(again, others, values))
 
 
+@pytest.mark.slow
 def test_names_of_groups_mean_nothing_but_their_order():
     one, names = touches(5), {"back": "zebra", "front": "ant", "shelf": "mouse"}
     renamed = replace(one, extra={**one.extra, "position": tuple(names[p] for p in one.extra["position"])})

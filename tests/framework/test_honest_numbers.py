@@ -82,6 +82,7 @@ def test_parameters_that_priors_hold_are_not_counted_as_spent() -> None:
     assert 5 < spent < 20  # of 35 free parameters
 
 
+@pytest.mark.slow
 def test_robust_scales_do_not_count_them_either() -> None:
     fits = fits_under_priors(13, 2, "huber")
     assert all(0.6 < each.estimate.noise_scale < 1.6 for each, _ in fits)

@@ -380,6 +380,7 @@ def test_a_record_of_weight_two_counts_as_two_and_of_weight_zero_not_at_all(lrm,
     assert not chosen[0].weight[3:].any()
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_many_records_in_threads_give_the_sum_of_small_blocks(lrm):
     count = 3 * BLOCK_RECORDS + 77
@@ -508,6 +509,7 @@ def test_costs_with_springs_too_soft_for_repetition_are_one_number_or_refused(lr
 
 
 @pytest.mark.parametrize("evaluator", ["interpreted", pytest.param("compiled", marks=needs_compiler)])
+@pytest.mark.quick("interpreted")
 def test_one_record_that_needs_newton_leaves_the_others_right(lrm, evaluator):
     """A heavy payload in one record makes its repetition diverge; the seven beside it do not notice."""
     payload = np.zeros(8)

@@ -142,6 +142,7 @@ def test_records_that_were_measured_give_what_their_simulation_gave(place: Path,
         assert one.errors.mean == pytest.approx(other.errors.mean, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_no_figure_rests_on_a_record_that_it_judges(plain: Path) -> None:
     """Measured values far off at one payload change nothing that was trained and judged at the other."""
     data = _measured(plain, {0: 20, 66.3: 20})

@@ -37,7 +37,7 @@ def lrm_data(shared_data: Path) -> Path:
 
 
 @pytest.mark.parametrize("option", [1, 2, 3, 4, 5])
-@pytest.mark.quick("1", "2")
+@pytest.mark.quick("1")
 def test_mean_errors_over_all_poses_are_the_published_ones(
     repository: Path, lrm_data: Path, tmp_path: Path, option: int
 ) -> None:
@@ -80,6 +80,7 @@ def loaded(repository: Path, lrm_data: Path):
     return experiment, problem, problem.records(dataset)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sets", [15, pytest.param(200, marks=pytest.mark.slow)])
 def test_no_training_set_gives_a_negative_compliance(loaded, sets: int) -> None:
     """Random sets of 50 poses; many of them want one."""
@@ -96,6 +97,7 @@ def test_no_training_set_gives_a_negative_compliance(loaded, sets: int) -> None:
     assert held > sets / 10, "the bounds were hardly ever needed: this test shows nothing"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sets", [3, pytest.param(15, marks=pytest.mark.slow)])
 def test_ipopt_and_cvxpy_agree_on_the_real_arm(repository: Path, loaded, sets: int) -> None:
     experiment, problem, records = loaded

@@ -122,6 +122,7 @@ def test_a_program_and_a_server_can_ask_for_the_measured_target(tmp_path: Path) 
     assert off.forward(plain.joint_angles)[0, :3, 3] * 1000 == pytest.approx(goals[0], abs=1e-4)
 
 
+@pytest.mark.slow
 def test_a_table_can_be_of_the_measured_target(tmp_path: Path) -> None:
     """At a node the nominal arm's target is told the corrected place; the tracker then reads the node."""
     lrm = calibration("lrm", OFF_MM)

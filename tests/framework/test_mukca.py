@@ -236,10 +236,10 @@ class PublishedCost:
         return self(x + 1j * h * np.eye(len(x))).imag / h
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "trained"), [pytest.param(*k, marks=[] if k in POLISHED else SLOW) for k in PUBLISHED]
 )
-@pytest.mark.quick("kinova-left")
 def test_nothing_near_the_solution_has_a_lower_published_cost(run, name, trained):
     told, values = published(run, name, trained)
     urdf = Urdf.read(CONFIGS / ROBOTS[name].urdf, ROBOTS[name].root)

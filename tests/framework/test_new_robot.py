@@ -74,6 +74,7 @@ def test_the_page_takes_five_joints_from_a_table_to_a_calibrated_urdf(here: Path
     assert (here / "arm7" / "arm7-calibrated.urdf").exists()
 
 
+@pytest.mark.slow
 def test_the_calibration_is_nearer_to_the_truth_everywhere_than_the_drawing(here: Path) -> None:
     """The made-up arm without noise, at poses of its own, against what was found: below the noise of one reading."""
     rows = table(here, files_of(PAGE)["arm5.csv"])
@@ -89,6 +90,7 @@ def test_the_calibration_is_nearer_to_the_truth_everywhere_than_the_drawing(here
     assert float(np.linalg.norm(off, axis=0).mean()) < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [3, pytest.param(20, marks=pytest.mark.slow)])
 def test_first_runs_warn_by_chance_only_as_often_as_one_test_at_5_percent(here: Path, seeds: int) -> None:
     """Over seeds of the noise: each finding has a level of its own, and of a few records one run in five warns."""
@@ -231,6 +233,7 @@ def test_a_urdf_gives_limits_and_masses(here: Path) -> None:
     assert experiment.simulator() is not None
 
 
+@pytest.mark.slow
 def test_the_trackers_frame_stays_out_of_a_urdfs_joints(here: Path) -> None:
     """Measured by a tracker 0.8 m away and turned by 80 deg: the first joint is exported as it was."""
     source = ROOT / "configs" / "ball" / "arm7.urdf"
@@ -306,6 +309,7 @@ def test_answers_that_end_early_are_refused(lines: int, here: Path) -> None:
 # Which way is up
 
 
+@pytest.mark.slow
 def test_a_frame_that_is_tilted_is_stated_or_the_assumption_is_a_finding(here: Path) -> None:
     """The tracker's y axis points up: stated, the spring is found; not stated, the run says what it assumed."""
     rows = table(here, f"{HEADER},mass_g,com_x_mm\n90,0,0,120,400,0\n0,200,0,0,900,-100\n0,160,0,0,500,-80\n")

@@ -142,6 +142,7 @@ def rejected(repository, spoilt):
         return calibrate(experiment), heard
 
 
+@pytest.mark.slow
 def test_plugins_hear_of_records_that_were_set_aside(spoilt, rejected):
     wrong, heard = spoilt[1], rejected[1]
     assert {told["record_id"] for event, told in heard if event == "armcal_record_rejected"} == wrong

@@ -146,6 +146,7 @@ missed = pytest.mark.xfail(
 LONG = pytest.mark.slow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("degrees", "joints", "seeds"),
     [
@@ -155,7 +156,6 @@ LONG = pytest.mark.slow
         pytest.param(2.0, (1, 2, 3, 4, 5, 6), 25, marks=LONG),
     ],
 )
-@pytest.mark.quick("2.0-joints1-1")
 def test_a_small_step_is_decided_soon(degrees: float, joints: tuple[int, ...], seeds: int) -> None:
     """Half a degree of the wrist moves the tip by hardly more than the noise: see the test after this one."""
     soon = {joint: [] for joint in joints}

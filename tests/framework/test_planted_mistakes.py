@@ -31,6 +31,13 @@ def planted(name: str, folder: Path, arm: PlantedArm = PRINTED, seed: int = 1) -
     return outcome(arm, data, folder, [*QUICK, *mistake.overrides(arm)])
 
 
+@pytest.mark.quick(
+    "x and y exchanged, one sign-refused-the sign of q4 reversed and x and y exchanged",
+    "half the rows in metres-refused-100 of 200 positions are about 0.001 times as far",
+    "base 200 mm off and held-refused-the arm's base elsewhere by 198 mm",
+    "base turned by 3 deg and held-bad-does not explain it",
+    "a slip of 3 deg after a third-bad-contradict the others",
+)
 @pytest.mark.parametrize(
     ("name", "grade", "words"),
     [
@@ -109,6 +116,7 @@ def repeated(data: Dataset, noise: float) -> Dataset:
     return replace(data, ids=tuple(map(str, range(2 * count))), channels=twice, rows=())
 
 
+@pytest.mark.slow
 def test_records_of_one_pose_are_held_out_together_and_counted(tmp_path: Path) -> None:
     """Else what was fitted to judges, and the error claimed is half of the true one."""
     few = PRINTED.recording(4).subset(np.arange(0, 200, 5))

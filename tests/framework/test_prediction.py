@@ -86,6 +86,7 @@ def test_covariances_are_those_of_dense_gaussian_conditioning(drifting) -> None:
         assert np.allclose(spread.covariance[i], block, rtol=2e-4, atol=1e-4 * np.trace(block))
 
 
+@pytest.mark.slow
 def test_without_priors_it_is_the_joint_posterior(drifting) -> None:
     """The textbook form: invert the information on values and innovations together."""
     loaded, dataset, problem, records, train, held, _ = drifting
@@ -263,6 +264,7 @@ def test_the_stretch_that_judges_a_record_does_not_know_its_score() -> None:
     assert stretch(scores) != stretch(spoilt)
 
 
+@pytest.mark.slow
 def test_folds_err_as_they_did_before_they_were_asked_for_intervals() -> None:
     from armcal.estimate.validation import cross_validate
 
@@ -367,7 +369,7 @@ def test_python_gives_what_the_command_gives(recording: Path) -> None:
     "extra",
     [
         pytest.param((), marks=pytest.mark.slow),
-        ("noise.estimate=true",),
+        pytest.param(("noise.estimate=true",), marks=pytest.mark.slow),
         DRIFTING,
         pytest.param((*DRIFTING, "noise.loss=huber"), marks=pytest.mark.slow),
     ],

@@ -110,8 +110,8 @@ def test_where_two_of_three_agree_in_a_socket_the_third_is_wrong() -> None:
     assert judged({15: 0.4}, 19, order)[1] == {15}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("off_deg", [0.1, -1.0, 5.0])
-@pytest.mark.quick("0.1")
 def test_wrong_postures_are_found_whatever_their_size(off_deg: float) -> None:
     assert judged({22: off_deg, 26: -off_deg}, 28)[1] == {22, 26}
 

@@ -124,6 +124,7 @@ def test_its_size_and_the_error_it_costs_are_told(lrm):
     assert found.mean_mm - first.falls_mm == pytest.approx(sound.mean_mm, rel=0.05)
 
 
+@pytest.mark.slow
 def test_two_structures_are_told_apart(lrm):
     stood = lambda q, came: on_joint(4, -0.6 * DEG * came[:, 3]) + on_joint(3, 0.8 * DEG * (q[:, 2] > 1))  # noqa: E731
     found = looked_at(*recording(lrm, 200, 4, stood))
@@ -196,6 +197,7 @@ def test_what_the_model_has_is_told_to_be_loosened_not_added(lrm):
     assert found.structures[0].effect.endswith("(it is in the model: free it, or loosen its prior)")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("most", [200, pytest.param(MOST_RECORDS, marks=pytest.mark.slow)])
 def test_very_many_records_are_looked_at_in_part_and_few_not_at_all(lrm, monkeypatch, most):
     monkeypatch.setattr("armcal.diagnose.residual_structure.MOST_RECORDS", most)

@@ -169,8 +169,8 @@ def scale_of(problem, records, start, loss):
     return last.scales[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
-@pytest.mark.quick("huber")
 def test_once_the_scale_is_held_the_robust_cost_never_rises(lrm, loss, monkeypatch):
     monkeypatch.setattr(robust, "SCALE_SETTLED", 0.1)
     q, points, _ = measured(60, 8, outliers=0.1)
@@ -182,6 +182,7 @@ def test_once_the_scale_is_held_the_robust_cost_never_rises(lrm, loss, monkeypat
     assert held[-1].moved <= robust.WEIGHTS_SETTLED
 
 
+@pytest.mark.slow
 def test_the_cost_also_falls_from_a_bad_start_at_a_fixed_scale(lrm, monkeypatch):
     """With the scale held from the first round on, from an answer that outliers led astray."""
     q, points, _ = measured(60, 9, outliers=0.3, size=0.1)
@@ -219,8 +220,8 @@ def test_neither_order_nor_unit_nor_axes_of_the_noise_matter(lrm, loss):
     np.testing.assert_allclose(three.estimate.deviations, one.estimate.deviations, rtol=1e-3)
 
 
+@pytest.mark.slow
 @every_loss
-@pytest.mark.quick("reject")
 def test_both_solvers_give_the_same_robust_answer(lrm, loss):
     q, points, _ = measured(60, 12, outliers=0.05)
     problem, records, start = posed(lrm, q, points)
@@ -252,6 +253,7 @@ def test_studentised_distances_against_fits_without_the_record(lrm):
         assert told.studentised[0][i] == pytest.approx(expected, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_distances_of_good_records_are_chi_distributed(lrm):
     q, points, _ = measured(400, 14)
     problem, records, start = posed(lrm, q, points)

@@ -112,6 +112,7 @@ def test_a_turn_about_the_target_is_motion_too() -> None:
     assert "moving" in why(state(seen, 2.0))
 
 
+@pytest.mark.slow
 def test_the_slow_end_of_a_motion_is_waited_for() -> None:
     """An arm that creeps to rest: what is called settled is where it comes to, within the spread."""
     seen = frames(lambda t: at(0.3 - 0.05 * np.exp(-t / 0.4)), 8.0)

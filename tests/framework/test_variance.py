@@ -255,8 +255,8 @@ def test_joints_through_the_tip_are_unseen(lrm):
     assert "arm.q6" in component_findings(found)[-1].text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", ["huber", "reject"])
-@pytest.mark.quick("huber")
 def test_outliers_do_not_pass_for_noise(lrm, loss):
     q, points, wrong = measured(120, 8, outliers=0.05)
     problem, records, truth = posed(lrm, q, points)

@@ -130,6 +130,7 @@ def test_shared_sockets_tell_where_the_arms_stand_to_each_other(in_sockets):
         assert place == pytest.approx(spot, abs=2e-5)
 
 
+@pytest.mark.slow
 def test_with_noise_the_placement_comes_back_within_its_intervals(in_sockets):
     true, _ = true_placement()
     inside, off, by_means = [], [], []

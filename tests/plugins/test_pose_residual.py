@@ -80,6 +80,7 @@ def test_the_contract(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.quick("fourier")
 def test_unseen_errors_fall_to_near_the_noise_and_the_run_says_so(kind):
     run = learned_run(kind)
     errors, outcome = run.metrics["error_mm"]["calibrated"], run.metrics["pose_residual"]
@@ -134,6 +135,7 @@ def test_intervals_widen_where_nothing_was_measured(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.quick("fourier")
 def test_an_arm_without_such_errors_keeps_none(kind, tmp_path):
     ran(tmp_path, f"{{type: {kind}}}", recorded(tmp_path, ""))
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())

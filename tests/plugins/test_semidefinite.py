@@ -119,6 +119,7 @@ def test_the_gradient_by_increments_is_the_difference_of_the_cost(posed):
         np.testing.assert_allclose(gradient, numeric, rtol=0, atol=1e-6 * np.abs(gradient).max())
 
 
+@pytest.mark.slow
 def test_the_gradient_by_coordinates_is_the_difference_of_the_cost(posed):
     random = np.random.default_rng(2)
     for _ in range(3):
@@ -195,6 +196,7 @@ def agree(lrm, seed, count, *overrides):
     return smallest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "count"), [(1, 60), pytest.param(21, 100, marks=pytest.mark.slow)])
 def test_cone_and_root_agree_where_matrices_end_on_the_boundary(lrm, seed, count):
     smallest = agree(lrm, seed, count)
@@ -301,6 +303,7 @@ def test_no_fit_of_many_has_a_negative_eigenvalue(lrm, solver, count):
 # ---------------------------------------------------------------- what must not matter
 
 
+@pytest.mark.slow
 def test_the_order_of_the_records_does_not_matter(lrm):
     problem, records = springs_measured(lrm, 11, 50, f"parameters.free={json.dumps(FEW)}")
     turned = problem.subset(records, np.random.default_rng(1).permutation(50))
@@ -322,6 +325,7 @@ def test_what_a_parameter_calls_an_ordinary_size_does_not_matter(lrm):
     same_answer(problem, records, one, found(ROOT.solve(other, records, parameters.nominal())))
 
 
+@pytest.mark.slow
 def test_an_arm_ten_times_as_large_is_the_same_arm_in_another_unit(lrm, tmp_path):
     """All lengths in cm instead of mm: moments grow tenfold, so a tenth of the compliance turns as far."""
     q = oracle.random_poses(60, 13)
@@ -387,6 +391,7 @@ def coverage(lrm, seeds, count=150, noise=2e-4):
     return np.mean(held), np.array(scores)
 
 
+@pytest.mark.slow
 def test_truths_lie_within_a_few_deviations(lrm):
     held, scores = coverage(lrm, range(2))
     assert held > 0.85 and np.abs(scores).max() < 4.5

@@ -270,6 +270,7 @@ class TestArm:
 
 
 class TestSafety:
+    @pytest.mark.slow
     def test_slow_ramps_of_all_joints_over_their_range_are_safe(self, make: Make, experiment: Experiment) -> None:
         host = make(safety={"clearance_slack_mm": 1000})
         host.energise()
