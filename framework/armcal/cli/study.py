@@ -60,7 +60,9 @@ def _show_study(console: Console, result: StudyResult) -> None:
     records = f"{len(result.dataset)} records, {result.folds} folds"
     records += f" drawn {result.repeats} times" if result.repeats > 1 else ""
     title = f"{result.name}: mean error, {result.unit}; cross-validated (cv): {records}"
-    table = columned(title, ("variant", "free", "train", "cv", "cv 95 %", "change", "± se", "helps"))
+    turned = any(v.turns for v in result.variants)
+    columns = ("variant", "free", "train", "cv", "cv 95 %", "change", "± se", "helps", *(["cv, deg"] if turned else []))
+    table = columned(title, columns)
     for v in result.variants:
         moved = ["", "", ""]
         if v.change:
@@ -68,7 +70,8 @@ def _show_study(console: Console, result: StudyResult) -> None:
         figures = ["-" if x is None else f"{x:.3f}" for x in (v.train.mean, v.crossed.mean, v.crossed.p95)]
         if v.failed_folds:  # over fewer records than the others
             figures[1:] = [f"({x})" for x in figures[1:]]
-        table.add_row(v.name, str(v.free), *figures, *moved)
+        turns = [f"{v.turns.crossed.mean:.3f}" if v.turns.crossed.mean is not None else "-"] if v.turns else []
+        table.add_row(v.name, str(v.free), *figures, *moved, *turns)
         console.detail(f"{v.name}: {v.fit_seconds:.2f} s for the fit on all records, {v.seconds:.2f} s for all fits")
     console.out.print(table)
     for text in conclusions(result):

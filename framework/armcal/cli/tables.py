@@ -16,6 +16,7 @@ from armcal.estimate.bootstrap import Bootstrap
 from armcal.estimate.validation import ErrorSummary
 from armcal.report.numbers import MINUS, NONE, decimals_for, shown_unit, significant
 from armcal.report.tables import parameter_rows, part_of
+from armcal.run.errors import ErrorTable
 from armcal.run.result import RunResult
 
 _SETS = {"train": "training", "holdout": "held out", "cross_validated": "cross-validated"}
@@ -25,7 +26,10 @@ _STYLES = {"bad": "bold red", "warning": "yellow", "note": "", "good": "green"}
 def show_run(console: Console, result: RunResult, folder: Path, seconds: float) -> None:
     """The end of a run: errors, compliances, verdict, where the report is."""
     out = console.out
-    out.print(_errors(result))
+    unit = result.errors.unit
+    out.print(_errors(f"{'Tip' if unit == 'mm' else 'Angle'} error, {unit}: {result.name}", result.table))
+    if result.table.turns is not None:
+        out.print(_errors(f"Orientation error, deg: {result.name}", result.table.turns))
     if result.groups.errors:
         out.print(_groups(result))
     for compliances in (_compliances(result), _matrices(result)):
@@ -54,16 +58,14 @@ def _findings(result: RunResult) -> Table:
     return table
 
 
-def _errors(result: RunResult) -> Table:
-    unit = result.errors.unit
-    title = f"{'Tip' if unit == 'mm' else 'Angle'} error, {unit}: {result.name}"
+def _errors(title: str, errors: ErrorTable) -> Table:
     table = columned(title, ("records", "count", "", "mean", "rms", "95 %", "max"), left=("",))
     for key, words in _SETS.items():
-        before, after = result.table.nominal[key], result.table.calibrated[key]
+        before, after = errors.nominal[key], errors.calibrated[key]
         if not after.count:
             continue
         table.add_row(words, str(after.count), "nominal", *_numbers(before))
-        at_rest = result.table.at_rest.get(key)
+        at_rest = errors.at_rest.get(key)
         table.add_row("", "", "calibrated", *_numbers(after), end_section=at_rest is None)
         if at_rest is not None:
             table.add_row("", "", "drift unknown", *_numbers(at_rest), end_section=True)

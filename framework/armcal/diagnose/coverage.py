@@ -214,7 +214,8 @@ def fit_and_predict(task: FitTask) -> JudgedFit:
         )
     except NotConvergedError:
         return failed_fit(task, began)
-    return PredictedFit(judged.errors, judged.at_rest, True, time.perf_counter() - began, held_residuals)
+    seconds = time.perf_counter() - began
+    return PredictedFit(judged.errors, judged.at_rest, judged.turns, True, seconds, held_residuals)
 
 
 def besides(scores: Scores, places: Indices) -> Scores:

@@ -70,10 +70,31 @@ def record_errors(
     of a group disagree. ``training`` are the records that determine how far drifting parameters had drifted; without
     them they are at rest.
     """
+    return errors_and_turns(problem, values, records, training)[0]
+
+
+def errors_and_turns(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], training: Sequence[FactorRecords] | None = None
+) -> tuple[Array, Array | None]:
+    """As ``record_errors``, and errors of orientations (rad, N): the angle of the turn that is left.
+
+    None where no orientation is measured beside lengths.
+    """
     values = settled(problem, values, records)
     raw = problem.residuals(values, records) if training is None else residuals(problem, values, records, training)
+    errors = _sizes(problem, records, raw, error_dimension(problem))
+    return errors, _sizes(problem, records, raw, "angle") if measures_turns(problem) else None
+
+
+def measures_turns(problem: Problem) -> bool:
+    """Whether orientations are measured beside lengths."""
+    turned = any("angle" in kernel.factor.dimensions for kernel in problem.kernels)
+    return turned and error_dimension(problem) == "length"
+
+
+def _sizes(problem: Problem, records: Sequence[FactorRecords], raw: Sequence[Array], counted: str) -> Array:
+    """Of each record's residual, the entries of one dimension; root mean square over its measurements (N)."""
     squares, count = np.zeros((2, records[0].count))
-    counted = error_dimension(problem)
     for kernel, record, residual in zip(problem.kernels, records, raw, strict=True):
         rows = np.array([dimension == counted for dimension in kernel.factor.dimensions], dtype=bool)
         if rows.any():
@@ -188,11 +209,12 @@ class FitTask:
 class JudgedFit:
     """Errors (m) of the records that judge, by a fit on those that train; nan if it did not converge.
 
-    ``at_rest`` are the errors if nothing is known of a drift.
+    ``at_rest`` are the errors if nothing is known of a drift, ``turns`` those of orientations (rad), where measured.
     """
 
     errors: Array
     at_rest: Array
+    turns: Array | None
     converged: bool
     seconds: float
 
@@ -201,11 +223,13 @@ class JudgedFit:
 class CrossValidation:
     """Errors of each record, judged by the fold that did not train on it (nan if that fold did not converge).
 
-    ``at_rest`` are the errors if nothing is known of a drift; ``fits`` those of the folds, in order.
+    ``at_rest`` are the errors if nothing is known of a drift, ``turns`` those of orientations (rad), where measured;
+    ``fits`` those of the folds, in order.
     """
 
     errors: Array
     at_rest: Array
+    turns: Array | None
     failed_folds: int
     fits: tuple[JudgedFit, ...] = ()
 
@@ -233,17 +257,18 @@ def judged_fit(
     Raises:
         NotConvergedError: a record has no elastic equilibrium there.
     """
-    judged = record_errors(task.problem, solution.values, held, train)
+    judged, turns = errors_and_turns(task.problem, solution.values, held, train)
     at_rest = record_errors(task.problem, solution.values, held)
     if not solution.verdict.converged:
         return failed_fit(task, began)
-    return JudgedFit(judged, at_rest, True, time.perf_counter() - began)
+    return JudgedFit(judged, at_rest, turns, True, time.perf_counter() - began)
 
 
 def failed_fit(task: FitTask, began: float) -> JudgedFit:
     """Errors that are not known: nan."""
     nothing = np.full(len(task.split.holdout), np.nan)
-    return JudgedFit(nothing, nothing, False, time.perf_counter() - began)
+    turns = nothing if measures_turns(task.problem) else None
+    return JudgedFit(nothing, nothing, turns, False, time.perf_counter() - began)
 
 
 def cross_validate(
@@ -259,7 +284,9 @@ def cross_validate(
     """Fit on each fold's training records, judge on its others; the same compiled functions throughout."""
     tasks = [FitTask(problem, estimator, start, tuple(records), split) for split in splits]
     fits = (executor or Sequential()).map(judge, tasks, lambda done: progress("cross-validation", done))
-    errors, at_rest = np.full((2, records[0].count), np.nan)
+    errors, at_rest, turns = np.full((3, records[0].count), np.nan)
     for split, fit in zip(splits, fits, strict=True):
         errors[split.holdout], at_rest[split.holdout] = fit.errors, fit.at_rest
-    return CrossValidation(errors, at_rest, sum(not fit.converged for fit in fits), tuple(fits))
+        turns[split.holdout] = np.nan if fit.turns is None else fit.turns
+    failed = sum(not fit.converged for fit in fits)
+    return CrossValidation(errors, at_rest, turns if measures_turns(problem) else None, failed, tuple(fits))

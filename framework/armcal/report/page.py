@@ -94,7 +94,7 @@ def rendered(template: str, content: Mapping[str, Any], *folders: Path) -> str:
 
 
 def _accuracy(result: RunResult) -> dict[str, Any]:
-    from_set = judged(result)
+    from_set, turns = judged(result.table), result.table.turns
     tiles = []
     if from_set:
         before, after = from_set.nominal, from_set.calibrated
@@ -105,7 +105,11 @@ def _accuracy(result: RunResult) -> dict[str, Any]:
     rows = group_rows(result.groups.errors)
     distances = bool(rows) and len(rows[0][-1]) > 2
     shown = {"group_rows": rows, "group_distances": distances}
-    return {"judged": from_set, "tiles": tiles, "error_rows": error_rows(result), **shown}
+    errors = f"Distance between measured and predicted, {result.errors.unit}"
+    parts = [(errors, result.table), *([("Turn between measured and predicted, deg", turns)] if turns else [])]
+    listed = [(caption, of_sets) for caption, table in parts if (of_sets := error_rows(table))]
+    turned = {"turned": turns is not None, "judged_turns": judged(turns) if turns else None}
+    return {"judged": from_set, "tiles": tiles, "error_tables": listed, **turned, **shown}
 
 
 def _correlations(estimate: Estimate) -> dict[str, Any]:

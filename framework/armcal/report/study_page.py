@@ -140,11 +140,13 @@ def _variants(result: StudyResult) -> StudyTable:
         errors = (*train, *(fixed(x, decimals) for x in (v.crossed.mean, v.crossed.rms, v.crossed.p95, v.crossed.max)))
         failed = v.failed_folds + (not v.converged)
         remark = f"{plural(failed, 'fit')} failed, {plural(v.crossed.count, 'record')} judged" if failed else ""
-        rows.append((v.name, count(v.free), *errors, *moved, duration(v.fit_seconds), remark))
+        turned = [] if v.turns is None else [fixed(x, 3) for x in (v.turns.crossed.mean, v.turns.crossed.p95)]
+        rows.append((v.name, count(v.free), *errors, *moved, *turned, duration(v.fit_seconds), remark))
     words = f"Distance between measured and predicted, {result.unit}; "
     words += f"{plural(len(result.dataset), 'record')}, {result.folds} folds"
     words += f" drawn {result.repeats} times" if result.repeats > 1 else ""
-    names = ("Free", "Train mean", "Train 95 %", "Mean", "RMS", "95 %", "Max", "Change", "Helps", "Fit")
+    turns = ("Turn mean, deg", "Turn 95 %, deg") if any(v.turns for v in result.variants) else ()
+    names = ("Free", "Train mean", "Train 95 %", "Mean", "RMS", "95 %", "Max", "Change", "Helps", *turns, "Fit")
     return StudyTable(words, (("Variant", False), *((n, True) for n in names), ("", False)), tuple(rows))
 
 
@@ -159,13 +161,18 @@ def transfer_table(result: TransferResult) -> StudyTable:
         words = " and ".join(f"{g:g} g" for g in trained) or "nominal"
         words += f" ({plural(cells[0].failed_fits, 'fit')} failed)" if cells[0].failed_fits else ""
         figures = [
-            fixed(x, decimals) + ("*" if trained and not cell.seen else "")
+            fixed(x, digits) + ("*" if trained and not cell.seen else "")
             for cell in cells
-            for x in (cell.errors.mean, cell.errors.p95)
+            for x, digits in (
+                (cell.errors.mean, decimals),
+                (cell.errors.p95, decimals),
+                *([(cell.turns.mean, 3)] if cell.turns else []),
+            )
         ]
         rows.append((variant, words, *figures))
+    names = ("mean", "95 %", *(["turn mean, deg"] if any(c.turns for c in result.cells) else []))
     headings = [("Variant", False), ("Trained at", False)]
-    headings += [(f"{g:g} g, {name}", True) for g in result.payloads_g for name in ("mean", "95 %")]
+    headings += [(f"{g:g} g, {name}", True) for g in result.payloads_g for name in names]
     counts = ", ".join(f"{n} at {g:g} g" for g, n in zip(result.payloads_g, result.counts, strict=True))
     caption = f"error, {result.unit}; {'simulated' if result.simulated else 'measured'} records: {counts}. "
     caption += "Cross-validated; with *, judged at another load than it trained at"

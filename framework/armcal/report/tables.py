@@ -23,6 +23,7 @@ from armcal.report.numbers import (
     ratio,
     shown_unit,
 )
+from armcal.run.errors import ErrorTable
 from armcal.run.groups import GroupError
 from armcal.run.result import RunResult
 
@@ -34,12 +35,12 @@ _FIGURE_SPACE, _POINT_SPACE = "\u2007", "\u2008"
 _MM = 1000.0
 
 
-def error_rows(result: RunResult) -> list[dict[str, Any]]:
+def error_rows(table: ErrorTable) -> list[dict[str, Any]]:
     """Of each set that has records, errors before and after calibration, and their ratios.
 
     And after if nothing is known of a drift (``at_rest``), where something drifts.
     """
-    nominal, calibrated = result.table.nominal, result.table.calibrated
+    nominal, calibrated = table.nominal, table.calibrated
     sets = [(k, w, nominal.get(k, _EMPTY), calibrated.get(k, _EMPTY)) for k, w in _SETS]
     extra = [k for k in {**nominal, **calibrated} if k not in {key for key, _ in _SETS}]
     sets += [(k, k.replace("_", " "), nominal.get(k, _EMPTY), calibrated.get(k, _EMPTY)) for k in extra]
@@ -47,7 +48,7 @@ def error_rows(result: RunResult) -> list[dict[str, Any]]:
     decimals = common_decimals(v for _, _, *pair in sets for s in pair for v in _statistics(s))
     rows = []
     for key, words, before, after in sets:
-        at_rest = result.table.at_rest.get(key)
+        at_rest = table.at_rest.get(key)
         pairs = list(zip(_statistics(before), _statistics(after), strict=True))
         rows.append(
             {
@@ -75,13 +76,13 @@ class Judged:
     calibrated: ErrorSummary
 
 
-def judged(result: RunResult) -> Judged | None:
+def judged(table: ErrorTable) -> Judged | None:
     """Held-out records if there are any, else cross-validation, else training records."""
     choices = (("holdout", "held-out records"), ("cross_validated", "cross-validation"), ("train", "training records"))
     for key, words in choices:
-        after = result.table.calibrated.get(key, _EMPTY)
+        after = table.calibrated.get(key, _EMPTY)
         if after.count and after.mean is not None and math.isfinite(after.mean):
-            before = result.table.nominal.get(key, _EMPTY)
+            before = table.nominal.get(key, _EMPTY)
             return Judged(words, before if before.count else _EMPTY, after)
     return None
 
@@ -195,17 +196,25 @@ def moved_rows(result: RunResult) -> list[tuple[str, str, str]]:
     return list(zip(parts, shown[::2], shown[1::2], strict=True))
 
 
-def worst_rows(result: RunResult, worst: NDArray[np.intp]) -> list[tuple[str, ...]]:
-    """Id, source row, role, and errors of these records: nominal, calibrated, cross-validated."""
+def worst_rows(result: RunResult, worst: NDArray[np.intp]) -> list[tuple[Any, ...]]:
+    """Id, source row, role, and errors of these records: nominal, calibrated, cross-validated.
+
+    Then a list of the same of orientations (deg), empty where none are measured.
+    """
     errors, data = result.errors, result.dataset
     train, holdout = set(result.split.train.tolist()), set(result.split.holdout.tolist())
     columns = np.array([errors.nominal_mm[worst], errors.calibrated_mm[worst], errors.cross_validated_mm[worst]])
     decimals = common_decimals(columns.ravel().tolist())
+    turned, own = np.zeros((0, len(worst))), errors.turns
+    if own is not None:
+        turned = np.array([own.nominal_deg[worst], own.calibrated_deg[worst], own.cross_validated_deg[worst]])
+    digits = common_decimals(turned.ravel().tolist())
     rows = []
-    for i, numbers in zip(worst.tolist(), columns.T.tolist(), strict=True):
+    for i, numbers, turns in zip(worst.tolist(), columns.T.tolist(), turned.T.tolist(), strict=True):
         role = "train" if i in train else "holdout" if i in holdout else "not used"
         row = str(data.rows[i]) if data.rows else NONE
-        rows.append((data.ids[i], row, role, *(fixed(number, decimals) for number in numbers)))
+        shown = (fixed(number, decimals) for number in numbers)
+        rows.append((data.ids[i], row, role, *shown, [fixed(turn, digits) for turn in turns]))
     return rows
 
 

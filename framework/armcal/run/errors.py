@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
@@ -15,8 +17,10 @@ from armcal.estimate.nuisance import settled, untrained
 from armcal.estimate.validation import (
     CrossValidation,
     ErrorSummary,
+    Indices,
     Split,
     error_unit,
+    errors_and_turns,
     record_errors,
     summarise,
 )
@@ -41,6 +45,15 @@ class FittedRecords:
 
 
 @dataclass(frozen=True)
+class TurnErrors:
+    """Error of each record's orientation (deg, N each), as ``RecordErrors`` has those of lengths."""
+
+    nominal_deg: Array
+    calibrated_deg: Array
+    cross_validated_deg: Array
+
+
+@dataclass(frozen=True)
 class RecordErrors:
     """Error of each record of the dataset, in dataset order: in mm, or in ``unit`` where nothing measured is a length.
 
@@ -56,6 +69,7 @@ class RecordErrors:
         cross_validated_at_rest_mm: the same by the fold that did not train on it.
         residual_columns: names of the rows of the residuals, with their units (mm; mrad for angles).
         unit: of all errors, ``mm`` or ``mrad``.
+        turns: of orientations, where they are measured beside lengths.
     """
 
     nominal_mm: Array
@@ -69,10 +83,15 @@ class RecordErrors:
     cross_validated_at_rest_mm: Array | None = None
     residual_columns: tuple[str, ...] = ()
     unit: str = "mm"
+    turns: TurnErrors | None = None
 
     def with_nominal(self, other: RecordErrors) -> RecordErrors:
         """With the nominal errors of others, which were made without what was learned since."""
-        return replace(self, nominal_mm=other.nominal_mm, nominal_residual_mm=other.nominal_residual_mm)
+        turns = self.turns
+        if turns is not None and other.turns is not None:
+            turns = replace(turns, nominal_deg=other.turns.nominal_deg)
+        nominal, residual = other.nominal_mm, other.nominal_residual_mm
+        return replace(self, nominal_mm=nominal, nominal_residual_mm=residual, turns=turns)
 
     def fold_warnings(self, folds: int) -> tuple[str, ...]:
         """That some of the folds did not converge."""
@@ -98,9 +117,13 @@ def errors_of(run: FittedRecords, crossed: CrossValidation | None) -> RecordErro
     first = len(problem.kernels[0].factor.output_channels)
     try:
         before, after = settled(unfitted, nominal, records), settled(problem, values, records)
+        (nominal_errors, *nominal_turns), (errors, *turns) = (
+            errors_and_turns(unfitted, nominal, records),
+            errors_and_turns(problem, values, records, fitted.records),
+        )
         return RecordErrors(
-            nominal_mm=record_errors(unfitted, nominal, records) * _MM,
-            calibrated_mm=record_errors(problem, values, records, fitted.records) * _MM,
+            nominal_mm=nominal_errors * _MM,
+            calibrated_mm=errors * _MM,
             cross_validated_mm=judged,
             nominal_residual_mm=np.vstack(problem.residuals(before, records)) * _MM,
             calibrated_residual_mm=np.vstack(residuals(problem, after, records, fitted.records)) * _MM,
@@ -110,10 +133,22 @@ def errors_of(run: FittedRecords, crossed: CrossValidation | None) -> RecordErro
             cross_validated_at_rest_mm=judged_at_rest if drifts else None,
             residual_columns=("dx_mm", "dy_mm", "dz_mm") if dimensions == ["length"] * 3 else columns,
             unit=error_unit(problem),
+            turns=_turns(nominal_turns[0], turns[0], crossed, train),
         )
     except NotConvergedError as fault:
         verdict = fitted.estimate.verdict
         raise fault if verdict.converged else gave_up(verdict) from fault
+
+
+def _turns(
+    nominal: Array | None, calibrated: Array | None, crossed: CrossValidation | None, train: Indices
+) -> TurnErrors | None:
+    if nominal is None or calibrated is None:
+        return None
+    judged = np.full(len(nominal), np.nan)
+    if crossed is not None and crossed.turns is not None:
+        judged[train] = np.degrees(crossed.turns)
+    return TurnErrors(np.degrees(nominal), np.degrees(calibrated), judged)
 
 
 @dataclass(frozen=True)
@@ -121,12 +156,13 @@ class ErrorTable:
     """Error summaries (mm) by model and by records (train, holdout, cross_validated).
 
     ``calibrated`` counts the drift that neighbouring records show; ``at_rest`` is without it, and empty if nothing
-    drifts.
+    drifts. ``turns`` are those of orientations (deg): another table, without a drift; None where none are measured.
     """
 
     nominal: dict[str, ErrorSummary]
     calibrated: dict[str, ErrorSummary]
     at_rest: dict[str, ErrorSummary] = field(default_factory=dict)
+    turns: ErrorTable | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -140,16 +176,23 @@ class ErrorTable:
     def of(cls, errors: RecordErrors, split: Split) -> ErrorTable:
         """The summaries of every record's errors."""
         judged = np.isfinite(errors.cross_validated_mm)
-
-        def summaries(of: Array, crossed: Array) -> dict[str, ErrorSummary]:
-            return {
-                "train": summarise(of[split.train]),
-                "holdout": summarise(of[split.holdout]),
-                "cross_validated": summarise(crossed[judged]),
-            }
-
+        summaries = partial(_summaries, split=split, judged=judged)
         at_rest = {}
         if errors.at_rest_mm is not None and errors.cross_validated_at_rest_mm is not None:
             at_rest = summaries(errors.at_rest_mm, errors.cross_validated_at_rest_mm)
         nominal = summaries(errors.nominal_mm, errors.nominal_mm)
-        return cls(nominal, summaries(errors.calibrated_mm, errors.cross_validated_mm), at_rest)
+        turns = None
+        if errors.turns is not None:
+            own = errors.turns
+            before = summaries(own.nominal_deg, own.nominal_deg)
+            turns = cls(before, summaries(own.calibrated_deg, own.cross_validated_deg))
+        return cls(nominal, summaries(errors.calibrated_mm, errors.cross_validated_mm), at_rest, turns)
+
+
+def _summaries(of: Array, crossed: Array, split: Split, judged: NDArray[np.bool_]) -> dict[str, ErrorSummary]:
+    """Of each set of records."""
+    return {
+        "train": summarise(of[split.train]),
+        "holdout": summarise(of[split.holdout]),
+        "cross_validated": summarise(crossed[judged]),
+    }

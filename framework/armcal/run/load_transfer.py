@@ -19,8 +19,8 @@ from armcal.estimate.validation import (
     Indices,
     Split,
     error_unit,
+    errors_and_turns,
     folds,
-    record_errors,
     summarise,
 )
 from armcal.io.parallel import Executor
@@ -74,8 +74,11 @@ def transfer(
     plan = [fit for name in ready for fit in _plan(name, groups, settings)]
     fits = judged_fits(study, ready, [(fit.variant, fit.split) for fit in plan], executor, progress, watch)
     errors = {fit.key: np.full(len(dataset), np.nan) for fit in plan}
+    turns = {fit.key: np.full(len(dataset), np.nan) for fit in plan}
     for fit, judged in zip(plan, fits, strict=True):
         errors[fit.key][fit.split.holdout] = judged.errors * _MM
+        if judged.turns is not None:
+            turns[fit.key][fit.split.holdout] = np.degrees(judged.turns)
     unsolved = [fit.key for fit, judged in zip(plan, fits, strict=True) if not judged.converged]
     return TransferResult(
         name=study.name,
@@ -84,7 +87,7 @@ def transfer(
         simulated=simulated,
         payloads_g=payloads,
         counts=tuple(len(group) for group in groups),
-        cells=_cells(ready, errors, groups, payloads, unsolved),
+        cells=_cells(ready, errors, turns, groups, payloads, unsolved),
         errors_mm={(name, tuple(payloads[i] for i in trained)): error for (name, trained), error in errors.items()},
         warnings=dataset.warnings,
         seconds=watch.seconds,
@@ -171,6 +174,7 @@ def _plan(name: str, groups: Sequence[Indices], settings: LoadTransferSettings) 
 def _cells(
     ready: Mapping[str, Prepared],
     errors: Mapping[tuple[str, tuple[int, ...]], Array],
+    turns: Mapping[tuple[str, tuple[int, ...]], Array],
     groups: Sequence[Indices],
     payloads: Sequence[float],
     unsolved: Sequence[tuple[str, tuple[int, ...]]],
@@ -178,11 +182,13 @@ def _cells(
     """Variant by variant: without calibration, then by what it was trained at."""
     cells: list[TransferCell] = []
     for name, own in ready.items():
-        nominal = record_errors(own.problem, own.problem.parameters.nominal(), own.records) * _MM
-        for trained, row in (((), nominal), *((key[1], row) for key, row in errors.items() if key[0] == name)):
+        nominal, turned = errors_and_turns(own.problem, own.problem.parameters.nominal(), own.records)
+        before = nominal if turned is None else np.degrees(turned)
+        rows = [((), nominal * _MM, before), *((k[1], row, turns[k]) for k, row in errors.items() if k[0] == name)]
+        for trained, row, turn in rows:
             at, failed = tuple(payloads[i] for i in trained), unsolved.count((name, trained))
-            cells += [
-                TransferCell(name, at, payloads[i], summarise(row[group]), i in trained, failed)
-                for i, group in enumerate(groups)
-            ]
+            for i, group in enumerate(groups):
+                of_turns = None if turned is None else summarise(turn[group])
+                cell = TransferCell(name, at, payloads[i], summarise(row[group]), i in trained, failed, of_turns)
+                cells.append(cell)
     return tuple(cells)

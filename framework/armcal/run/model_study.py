@@ -9,6 +9,7 @@ from itertools import chain
 
 import numpy as np
 
+from armcal.base.domains import Array
 from armcal.diagnose.comparison import change, simplest_good
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.estimator import Progress, no_progress
@@ -18,14 +19,14 @@ from armcal.estimate.validation import (
     JudgedFit,
     Split,
     error_unit,
+    errors_and_turns,
     folds,
-    record_errors,
     summarise,
 )
 from armcal.io.parallel import Executor
 from armcal.run.pipeline import Prepared, Stopwatch, prepare
 from armcal.run.study import PREVIOUS, ModelStudySettings, Study, interpreted_first, judged_fits, naming
-from armcal.run.study_result import NestedResult, StudyResult, VariantResult
+from armcal.run.study_result import NestedResult, StudyResult, VariantResult, VariantTurns
 
 _MM = 1000.0
 
@@ -82,7 +83,7 @@ def _inside(outer: Split, settings: ModelStudySettings, poses: Indices) -> tuple
 
 
 def _judged(name: str, ready: Prepared, fits: Sequence[JudgedFit], drawn: Sequence[Sequence[Split]]) -> VariantResult:
-    whole, rest = fits[0], iter(fits[1:])
+    whole, turned, rest = fits[0], fits[1:], iter(fits[1:])
     repeats, at_rest = np.full((2, len(drawn), len(ready.dataset)), np.nan)
     failed = 0
     for number, splits in enumerate(drawn):
@@ -91,7 +92,7 @@ def _judged(name: str, ready: Prepared, fits: Sequence[JudgedFit], drawn: Sequen
             repeats[number, split.holdout] = fit.errors * _MM
             at_rest[number, split.holdout] = fit.at_rest * _MM
             failed += not fit.converged
-    nominal = record_errors(ready.problem, ready.problem.parameters.nominal(), ready.records)
+    nominal, nominal_turns = errors_and_turns(ready.problem, ready.problem.parameters.nominal(), ready.records)
     return VariantResult(
         name=name,
         free=ready.problem.increments,
@@ -105,7 +106,22 @@ def _judged(name: str, ready: Prepared, fits: Sequence[JudgedFit], drawn: Sequen
         failed_folds=failed,
         fit_seconds=whole.seconds,
         seconds=sum(fit.seconds for fit in fits),
+        turns=_turns(whole, turned, nominal_turns, drawn),
     )
+
+
+def _turns(
+    whole: JudgedFit, rest: Sequence[JudgedFit], nominal: Array | None, drawn: Sequence[Sequence[Split]]
+) -> VariantTurns | None:
+    """Errors of orientations, where they are measured."""
+    if nominal is None or whole.turns is None:
+        return None
+    repeats, fits = np.full((len(drawn), len(nominal)), np.nan), iter(rest)
+    for number, splits in enumerate(drawn):
+        for split in splits:
+            repeats[number, split.holdout] = next(fits).turns
+    crossed = _averaged([summarise(np.degrees(row)) for row in repeats])
+    return VariantTurns(summarise(np.degrees(nominal)), summarise(np.degrees(whole.turns)), crossed)
 
 
 def _averaged(summaries: Sequence[ErrorSummary]) -> ErrorSummary:

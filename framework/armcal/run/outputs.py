@@ -130,6 +130,7 @@ def metrics(result: RunResult) -> dict[str, Any]:
     content = {
         "experiment": result.name,
         "error_mm": _errors(result),
+        **({"orientation_error_deg": result.table.turns.as_dict()} if result.table.turns else {}),
         "groups": result.groups.as_dict(),
         **({"pose_residual": result.pose_residual.as_dict()} if result.pose_residual else {}),
         "records": {
@@ -254,14 +255,17 @@ def residuals_text(result: RunResult) -> str:
     numbered = [f"residual{i}_{errors.unit}" for i in range(1, len(errors.calibrated_residual_mm) + 1)]
     axes = list(errors.residual_columns) or numbered
     columns = ["pose_id", "source_row", "set", "weight"]
-    columns += [*(f"{model}_{errors.unit}" for model in ("nominal", "calibrated", "cross_validated")), *axes]
+    models, turns = ("nominal", "calibrated", "cross_validated"), errors.turns
+    columns += [*(f"{model}_{errors.unit}" for model in models), *axes]
+    columns += [f"{model}_deg" for model in models if turns]
     rows: list[list[object]] = [[*columns]]
     for i, record in enumerate(dataset.ids):
         row = dataset.rows[i] if dataset.rows else ""
         weight = "" if held[i] or result.noise.weights is None else f"{result.noise.weights[i]:.6g}"
         numbers = [errors.nominal_mm[i], errors.calibrated_mm[i], errors.cross_validated_mm[i]]
+        turned = [turns.nominal_deg[i], turns.calibrated_deg[i], turns.cross_validated_deg[i]] if turns else []
         residual = errors.calibrated_residual_mm[:, i]
-        rows.append([record, row, "holdout" if held[i] else "train", weight, *numbers, *residual])
+        rows.append([record, row, "holdout" if held[i] else "train", weight, *numbers, *residual, *turned])
     return csv_text(rows)
 
 

@@ -289,9 +289,8 @@ def judged_with(task: FitTask, layer: Layer) -> JudgedFit:
         unknown = tuple(unexplained(task.problem, fitted.solution.values, held, own))
     except NotConvergedError:
         return failed_fit(task, began)
-    return LayeredFit(
-        judged.errors, judged.at_rest, True, time.perf_counter() - began, held_residuals, unknown, plain.at_rest
-    )
+    seconds, errors = time.perf_counter() - began, (judged.errors, judged.at_rest, judged.turns)
+    return LayeredFit(*errors, True, seconds, held_residuals, unknown, plain.at_rest)
 
 
 def model_errors(

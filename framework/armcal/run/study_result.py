@@ -19,6 +19,15 @@ FILES = ("experiment.yaml", "study.csv", "study.json", "study.html")
 
 
 @dataclass(frozen=True)
+class VariantTurns:
+    """Errors of orientations (deg) of one variant, as its errors of lengths."""
+
+    nominal: ErrorSummary
+    train: ErrorSummary
+    crossed: ErrorSummary
+
+
+@dataclass(frozen=True)
 class VariantResult:
     """One variant, judged.
 
@@ -35,6 +44,7 @@ class VariantResult:
         failed_folds: how many fits of the cross-validation did not converge.
         fit_seconds: of the fit on all records.
         seconds: of all fits of this variant.
+        turns: errors of orientations, where they are measured beside lengths.
     """
 
     name: str
@@ -49,9 +59,16 @@ class VariantResult:
     failed_folds: int
     fit_seconds: float
     seconds: float
+    turns: VariantTurns | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
+        turns = self.turns
+        turned = turns and {
+            "nominal": turns.nominal.as_dict(),
+            "train": turns.train.as_dict(),
+            "cross_validated": turns.crossed.as_dict(),
+        }
         return {
             "name": self.name,
             "free": self.free,
@@ -61,6 +78,7 @@ class VariantResult:
                 "cross_validated": self.crossed.as_dict(),
                 "cross_validated_at_rest": self.at_rest.as_dict(),
             },
+            **({"orientation_error_deg": turned} if turned else {}),
             "change_mm": self.change and asdict(self.change),
             "converged": self.converged,
             "failed_folds": self.failed_folds,
@@ -143,7 +161,7 @@ class TransferCell:
     """One variant trained at some payloads and judged at one (mm).
 
     ``trained_g`` is empty for the nominal model; with ``seen`` the records that judge were at a payload that also
-    trained, and were kept out of the training by folds.
+    trained, and were kept out of the training by folds. ``turns`` are errors of orientations (deg), where measured.
     """
 
     variant: str
@@ -152,6 +170,7 @@ class TransferCell:
     errors: ErrorSummary
     seen: bool
     failed_fits: int
+    turns: ErrorSummary | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -160,6 +179,7 @@ class TransferCell:
             "trained_at_g": list(self.trained_g),
             "judged_at_g": self.judged_g,
             "error_mm": self.errors.as_dict(),
+            **({"orientation_error_deg": self.turns.as_dict()} if self.turns else {}),
             "cross_validated": self.seen,
             "failed_fits": self.failed_fits,
         }
