@@ -144,7 +144,8 @@ def _predictable_finding(structure: ResidualStructure) -> Finding:
     text = f"{predicted_in_short(predicted)} Of it: {listed}."
     if predicted.is_in_order:
         text += f" The poses were visited in an order: time alone predicts {percent(predicted.by_time)} as well."
-    first = "Model what is named beside this, then look again. " if structure.worthwhile else ""
+    named = sum(s.falls_mm for s in structure.worthwhile) / max(structure.mean_mm, 1e-12)
+    first = "Model what is named beside this, then look again. " if named > predicted.falls / 2 else ""
     return Finding(grade, text, test, first + " ".join(_remedies(predicted)))
 
 
