@@ -297,7 +297,8 @@ def test_an_instrument_that_was_bumped_is_found_anew(bump: str, seeds: int) -> N
     assert kinds.count("sensor_moved") >= 0.9 * seeds
 
 
-@pytest.mark.parametrize("count", [400, pytest.param(100_000, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [400, 100_000])
 def test_outliers_alone_never_reset_anything(count: int) -> None:
     recalibrator, fresh = _shared()
     recalibrator.restore(fresh)

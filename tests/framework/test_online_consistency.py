@@ -93,10 +93,8 @@ LIES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lie", LIES)
-@pytest.mark.quick(
-    "a quarter of the noise", "no process noise under drift", "half the prior's deviations", "1 mm bias, base free"
-)
 def test_a_planted_inconsistency_is_seen(lie: str) -> None:
     setup, world, by_nis, by_nees = LIES[lie]
     found = study(2, setup(), world)
@@ -108,6 +106,7 @@ def test_a_planted_inconsistency_is_seen(lie: str) -> None:
         assert abs(found.nis.mean() - 3) < 0.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("held", [False, True])
 def test_what_is_sound_is_not_seen_as_inconsistent(held: bool) -> None:
     setup = begun_setup(held_base=held)

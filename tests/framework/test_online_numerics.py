@@ -184,7 +184,8 @@ def _steadily(recalibrator: Recalibrator, fresh: dict, count: int) -> tuple[str,
     return recalibrator.digest(), used
 
 
-@pytest.mark.parametrize("count", [200, pytest.param(7 * 24 * 240, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [200, 7 * 24 * 240])
 def test_seven_days_need_no_more_memory_and_come_out_the_same_twice(count: int) -> None:
     recalibrator = begun()
     fresh = recalibrator.snapshot()
@@ -203,6 +204,7 @@ RUNS = {"extended": {"type": "extended"}, "window": {"type": "window", "records"
 
 
 @pytest.mark.parametrize("estimator", RUNS)
+@pytest.mark.quick("window")
 def test_a_restored_state_goes_on_as_if_nothing_had_been(estimator: str) -> None:
     """At every record of a run in which a joint slips: a snapshot as a journal keeps it, taken up by another."""
     given = settings(estimator=RUNS[estimator])

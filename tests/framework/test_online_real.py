@@ -114,9 +114,9 @@ def test_a_clean_run_raises_no_alarm_and_foretells_as_a_refit_would(halves: Halv
     assert course.innovations[-HALF:].mean() < white.innovations[-HALF:].mean()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("halves", MODELS, indirect=True)
 @pytest.mark.parametrize("step_deg", [5.0, 14.4])
-@pytest.mark.quick("5.0-option1")
 def test_a_step_of_joint_3_is_named_and_followed(halves: Halves, step_deg: float) -> None:
     """In the eight poses after the step joint 2 stands at zero and the axes of joints 1 and 3 coincide: no pose tells
     one from the other before the ninth record, so two joints are named at first, and one by the tenth."""
