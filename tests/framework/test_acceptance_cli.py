@@ -154,6 +154,17 @@ def test_an_arm_that_no_instrument_sees_is_refused(tmp_path: Path) -> None:
     assert done.exit_code == 2 and "Traceback" not in done.output
 
 
+def test_one_name_for_two_commanded_poses_is_named(config: Path, tmp_path: Path) -> None:
+    rows, random = rows_of(), np.random.default_rng(1)
+    for row in rows[::3]:
+        row["q2_deg"] = 20.0 + random.normal(scale=0.1)
+        both, first = np.deg2rad(30.0 + float(str(row["q2_deg"])) - 20.0), np.deg2rad(10)
+        row["x_mm"], row["y_mm"] = (301 * f(first) + 199.5 * f(both) for f in (np.cos, np.sin))
+    done = armcal("acceptance", config, written(tmp_path / "records.csv", rows), "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    assert "visits to P1 were commanded up to" in " ".join(done.output.split())
+
+
 def test_a_visit_that_lies_out_is_named_and_counts(config: Path, tmp_path: Path) -> None:
     rows = rows_of(10)
     far = _with(9, y_mm=float(str(rows[9]["y_mm"])) + 3)(rows)

@@ -15,12 +15,13 @@ from armcal.estimate.start import BETTER, FAR, pose_words
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.rigid_alignment import FEWEST, Alignment, Tools, alignments, nearest_turn, undetermined
 from armcal.problem.sighting import Sighting, sighting_of, tools_of
+from armcal.report.numbers import plural
 from armcal.run.data_checks import check_reach
 from scipy.spatial.transform import Rotation
 
 from armcal_capability.acceptance.records import COMMANDED, COMMANDED_TURN, Visits
 from armcal_capability.acceptance.subject import ArmToJudge
-from armcal_capability.acceptance.suspects import refuse_strangers
+from armcal_capability.acceptance.suspects import moved_commands, refuse_strangers
 
 FrameChoice = Literal["auto", "stated", "found"]
 FRAMES = get_args(FrameChoice)
@@ -100,6 +101,7 @@ def _compared(subject: ArmToJudge, model: str, visits: Visits, choice: FrameChoi
             tools = _stated_commands(tools, visits)
             reach = float(np.median(np.linalg.norm(tools.places, axis=0)))
             strangers = refuse_strangers(visits, sighting.measured.T, reach)
+            strangers += moved_commands(visits, tools.places.T, sighting.measured.T)
         basis, axes = _basis(problem, records, sighting, choice)
         if basis is None:
             check_reach(problem, records, dataset)
@@ -158,18 +160,22 @@ def _aligned(tools: Tools, sighting: Sighting, basis: Array, axes: bool, where: 
     ranked = alignments(tools, sighting.measured, basis, sighting.turned)
     if not ranked or poses < 3:
         raise DataError(
-            f"found {len(sighting.chosen)} records of {poses} poses, expected {FEWEST} of three or more: the "
+            f"found {len(sighting.chosen)} records of {plural(poses, 'pose')}, expected {FEWEST} of three or more: the "
             "instrument's frame cannot be found from fewer.",
             where=where,
             hint="Measure more poses, or state where the instrument is and give --frame stated.",
         )
     best = ranked[0]
-    fitted = 6 + basis.shape[1] - len(undetermined(tools, best, basis))
+    gauges = undetermined(tools, best, basis)
+    fitted = 6 + basis.shape[1] - len(gauges)
     commanded = (tools.places + np.einsum("nij,j->in", tools.rotations, best.offset)).T
-    words = f"found from these records: the base at {pose_words(best)} in the instrument's frame"
+    words = f"found from these records: the described base frame at {pose_words(best)} in the instrument's frame"
     if basis.shape[1]:
         x, y, z = best.offset * _MM
         words += f", the target ({x:.2f}, {y:.2f}, {z:.2f}) mm from where it is stated on the tool"
+    if gauges:
+        ways = plural(len(gauges), "direction")
+        words += f" (these poses leave open in {ways} which of base and target it is; that changes no figure)"
     turns, axes = None, axes and sighting.turned is not None
     if sighting.turned is not None:
         turns, mounted = _turns_of(tools, sighting.turned, best, axes)

@@ -14,6 +14,8 @@ _OUTLYING = 8.0
 """Times the typical distance from the middle of the pose."""
 _FACTORS = {1000.0: "m", 10.0: "cm", 25.4: "inches", 0.001: "thousandths of the column's unit"}
 _NEAR = 0.02
+_COMMANDED = 0.3
+"""Of the spread of the visits: what may be commanded apart before it is named."""
 _MM = 1000.0
 
 
@@ -46,6 +48,29 @@ def refuse_strangers(visits: Visits, measured: Array, reach: float) -> tuple[str
                 f"typically {typical * _MM:.3g} mm. They count: find out why, or take them out."
             )
     return tuple(warnings)
+
+
+def moved_commands(visits: Visits, commanded: Array, measured: Array) -> tuple[str, ...]:
+    """Warn of a pose whose visits were commanded apart: RP takes that for the arm's.
+
+    Args:
+        visits: to poses.
+        commanded: positions (N x 3; m).
+        measured: positions (N x 3; m).
+    """
+    for group in visits.groups:
+        apart, spread = (
+            np.linalg.norm(places[group.members] - np.median(places[group.members], axis=0), axis=1)
+            for places in (commanded, measured)
+        )
+        if apart.max() > _COMMANDED * spread.max():
+            index = group.members[int(np.argmax(apart))]
+            return (
+                f"{visits.dataset.source}: visits to {group.pose} were commanded up to {apart.max() * _MM:.3g} mm "
+                f"apart (line {visits.dataset.rows[index]}), and RP takes that for the arm's. Give each commanded pose its "
+                "own name.",
+            )
+    return ()
 
 
 def _refuse(visits: Visits, group: Group, worst: int, off: float, measured: Array, middles: dict[str, Array]) -> None:
