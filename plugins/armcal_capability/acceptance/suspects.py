@@ -67,8 +67,8 @@ def moved_commands(visits: Visits, commanded: Array, measured: Array) -> tuple[s
             index = group.members[int(np.argmax(apart))]
             return (
                 f"{visits.dataset.source}: visits to {group.pose} were commanded up to {apart.max() * _MM:.3g} mm "
-                f"apart (line {visits.dataset.rows[index]}), and RP takes that for the arm's. Give each commanded pose its "
-                "own name.",
+                f"apart (line {visits.dataset.rows[index]}), and RP takes that for the arm's. Give each commanded "
+                "pose its own name.",
             )
     return ()
 
