@@ -113,6 +113,26 @@ KINDS: Mapping[str, DecisionKind] = {
         level="watch",
         explains=True,
     ),
+    "joint_creeping": DecisionKind(
+        means="The zero of one joint moves on and on, faster than process_noise states, as a screw works loose or a "
+        "gear wears. The motion is taken into the estimate, which follows it from now on.",
+        do="Go on with coarse work; keep the load of {subject} low. State a process_noise for its zero. Take {calm} "
+        "records at different poses before precise work.",
+        confirm="The decision states how far the zero moves in a day. If it does not, another decision of this kind "
+        "ends the trend; if the records do not fit, roll back to {good}.",
+        level="watch",
+        explains=True,
+    ),
+    "sensor_drifting": DecisionKind(
+        means="What an instrument reads is off by more every day, alike at all poses: its mount creeps, or it warms "
+        "up. The bias is taken into the estimate, which follows it from now on; the arm itself did not change.",
+        do="Go on, in the frame of {subject}. Measure targets again before the arm goes to them. Check the mount and "
+        "the warm-up of {subject}.",
+        confirm="Look at something fixed to the arm's base with {subject}, today and tomorrow: it appears to move. If "
+        "it does not, the arm changed: roll back to {good}.",
+        level="watch",
+        explains=True,
+    ),
     "one_of_several": DecisionKind(
         means="Something changed at once, and the records since fit several causes of different kinds about equally. "
         "None is named; all of them are open.",

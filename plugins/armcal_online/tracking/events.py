@@ -22,7 +22,13 @@ from armcal_online.tracking.state import Arrival, State
 from armcal_online.tracking.tip_error import TipError
 
 _MOST_LOG_ODDS = 700.0
-_SIZES = {"angle": ("size_deg", math.degrees(1.0)), "length": ("size_mm", 1000.0), "mass": ("size_g", 1000.0)}
+_SIZES = {
+    "angle": ("size_deg", math.degrees(1.0)),
+    "length": ("size_mm", 1000.0),
+    "mass": ("size_g", 1000.0),
+    "angle a day": ("rate_deg_per_day", math.degrees(1.0)),
+    "length a day": ("rate_mm_per_day", 1000.0),
+}
 _FIRST_DATE, _LAST_DATE = 1e8, 1e11
 """Unix seconds (1973 to 5138); other times are of a clock that began elsewhere."""
 

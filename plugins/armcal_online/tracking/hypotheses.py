@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from armcal.base.domains import Array
@@ -30,15 +30,20 @@ _SCALES = (1.0, 0.1)
 """A change is of the stated size, or small: to a prior wide enough for a slipped tooth a small step is unlikely."""
 _MOST_ONSETS = 5
 """So many of the last records with a large NIS are tried as the first after a change."""
-Kind = Literal["none", "joint_slipped", "joint_replaced", "sensor_moved", "general_change", "two_changes", CauseKind]
+GradualKind = Literal["joint_creeping", "sensor_drifting"]
+GRADUAL: tuple[GradualKind, ...] = get_args(GradualKind)
+Kind = Literal[
+    "none", "joint_slipped", "joint_replaced", "sensor_moved", "general_change", "two_changes", CauseKind, GradualKind
+]
 
 
 @dataclass(frozen=True)
 class Hypothesis:
     """A change: its kind, joint or measurement, what it reopens (N x k; a column a standard deviation), its prior.
 
-    ``scale`` is 1 for one of the stated size, less for a small one; ``step`` (n) is a step of 1 rad or m; ``parts`` are
-    those of which it is made, if they are two.
+    ``scale`` is 1 for one of the stated size, less for a small one; ``step`` (n) is a step of 1 rad, m or kg; ``parts``
+    are those of which it is made, if they are two. What a gradual one reopens it gains in a day; ``rates`` (k) are the
+    standard deviations of that (rad or m).
     """
 
     kind: Kind
@@ -49,6 +54,7 @@ class Hypothesis:
     step: Array
     scale: float = 1.0
     parts: tuple[Hypothesis, ...] = ()
+    rates: tuple[float, ...] = ()
 
     @property
     def singles(self) -> tuple[Hypothesis, ...]:
@@ -137,13 +143,32 @@ def hypotheses(space: StateSpace, steps: Steps, settings: ChangeSettings, size: 
     for cause in steps.causes:
         moved = _columns([np.eye(n)[i] * d for i, d in _deviations(cause, space, settings).items()], size)
         step = np.eye(n)[cause.coordinates[0]] / space.scales[cause.coordinates[0]]
-        changes += [(cause.kind, cause.subject, moved * scale, step, scale) for scale in _SCALES]
+        changes.append((cause.kind, cause.subject, moved, step, 1.0))
     prior = float(np.log(settings.probability / max(len(changes), 1)))
     listed = [Hypothesis(kind, subject, d, 1.0, prior, step, scale) for kind, subject, d, step, scale in changes]
     rare, none = float(np.log(settings.probability / 10)), np.zeros((size, 0))
     general = Hypothesis("general_change", "", none, settings.factor, rare, np.zeros(n))
     large = replace(general, factor=settings.factor**2)
     return *listed, general, large
+
+
+def slow_changes(
+    changes: Sequence[Hypothesis], steps: Steps, settings: ChangeSettings, size: int
+) -> tuple[Hypothesis, ...]:
+    """Changes that no single record may show: loads among those at once (``changes``), and what grows day by day."""
+    slow = [c for c in changes if c.kind in ("payload_changed", "gravity_tilted") and c.scale == 1.0]
+    prior = float(np.log(settings.probability))
+    for joint in steps.joints:
+        rate = settings.joint_creep if joint.dimension == "angle" else settings.slide_creep
+        columns = _columns([joint.direction * rate], size)
+        slow.append(Hypothesis("joint_creeping", joint.joint, columns, 1.0, prior, joint.direction, rates=(rate,)))
+    for name, (motions, which) in steps.sensors.items():
+        shifts = [c for c, axis in zip(motions.T, which, strict=True) if not axis.startswith("r")]
+        if shifts:
+            rates = (settings.sensor_creep,) * len(shifts)
+            columns = _columns([c * rate for c, rate in zip(shifts, rates, strict=True)], size)
+            slow.append(Hypothesis("sensor_drifting", name, columns, 1.0, prior, shifts[0], rates=rates))
+    return tuple(slow)
 
 
 def _deviations(cause: Cause, space: StateSpace, settings: ChangeSettings) -> dict[int, float]:

@@ -15,10 +15,11 @@ from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.decisions import EXPLAINED, Decision, log_odds_of
 from armcal_online.tracking.directions import Steps
 from armcal_online.tracking.health import Health, improbability, many_outliers, nis_limit
-from armcal_online.tracking.hypotheses import Explanation, Hypothesis, HypothesisFilter
+from armcal_online.tracking.hypotheses import GRADUAL, Explanation, Hypothesis, HypothesisFilter
 from armcal_online.tracking.pairs import LEAST_RECORDS, is_enough, pairs
 from armcal_online.tracking.settings import RecalibrateSettings
-from armcal_online.tracking.sizes import Size, size_of
+from armcal_online.tracking.sizes import Size, rate_of, size_of
+from armcal_online.tracking.slow_changes import SlowChanges
 from armcal_online.tracking.state import State
 from armcal_online.tracking.state_space import StateSpace
 
@@ -31,6 +32,8 @@ _SHARE = 0.5
 _LEFT = 0.01
 """What explains the records leaves no more outliers among them than chance makes with this probability."""
 _MOST_WIDENING = 3.0
+_UNNAMED = 2.0
+"""Standard deviations are made so many times larger where something slow moves that has no name."""
 _UNEXPLAINED = 3
 """So many changes that nothing explains, or windows of too large NIS: the model no longer fits."""
 _LONGEST_NAMING = 100
@@ -48,9 +51,10 @@ class Judge:
         steps: Steps,
         hypothesis_filter: HypothesisFilter,
         changes: Sequence[Hypothesis],
+        slow: SlowChanges,
         settings: RecalibrateSettings,
     ) -> None:
-        self._space, self._steps, self._filter = space, steps, hypothesis_filter
+        self._space, self._steps, self._filter, self._slow = space, steps, hypothesis_filter, slow
         self._changes, self._settings = changes, settings
 
     def after(self, state: State) -> tuple[State, tuple[Decision, ...]]:
@@ -59,7 +63,10 @@ class Judge:
         state, change = self._detect_change(state)
         if not change and state.recent and not state.recent[-1].rejected:
             state, change = self._detect_drift(state)
-        return state, (*naming, *change)
+            if not change:
+                state, change = self._detect_slow(state)
+        decisions = (*naming, *change)
+        return (replace(state, slow=replace(state.slow, tracks=())) if decisions else state), decisions
 
     def health(self, state: State, decisions: Sequence[Decision], first: Linearised) -> Health:
         """Health after a record, the last of ``state.recent`` before the decisions; ``first`` is at its prior mean."""
@@ -261,6 +268,32 @@ class Judge:
         belief = state.belief.widened(len(self._space.scales), factor)
         decision = sentences.drift(state, count, ratio, by_chance, factor)
         return replace(state, belief=belief, anchor=belief, held=()), (decision,)
+
+    def _detect_slow(self, state: State) -> tuple[State, tuple[Decision, ...]]:
+        """Whether many records together speak for a change that none of them shows."""
+        weighings, settings = self._slow.weighed(state.slow), self._settings.changes
+        if not weighings or state.suspects or weighings[0].log_odds <= math.log(settings.odds):
+            return state, ()
+        best, odds = weighings[0], math.log(settings.naming_odds)
+        near = [one for one in weighings if best.log_odds - one.log_odds < odds]
+        others = [one.log_odds for one in weighings if one not in near]
+        log_odds = float(logsumexp([one.log_odds for one in near]) - logsumexp([0.0, *others]))
+        about = (best.track.since, best.track.records, log_odds)
+        if len(near) > 1 and not self._slow.is_due(best):
+            return state, ()
+        if len(near) > 1:
+            belief = state.belief.widened(len(self._space.scales), _UNNAMED)
+            decision = sentences.slow_unnamed([one.change.subject for one in near], *about, _UNNAMED)
+            return replace(state, belief=belief, anchor=belief), (decision,)
+        slow, belief = self._slow.followed(state.slow, best, state.belief)
+        is_gradual = best.change.kind in GRADUAL
+        size = (
+            rate_of(self._steps, best.change, best.size, best.covariance)
+            if is_gradual
+            else self._size(state.belief, belief, best.change)
+        )
+        decision = sentences.slow(best.change, size, *about, weighings[1].change.subject if len(weighings) > 1 else "")
+        return replace(state, belief=belief, anchor=belief, recent=(), nis_window=(), slow=slow), (decision,)
 
     def _size(self, before: Belief, after: Belief, change: Hypothesis) -> Size:
         return size_of(self._space, self._steps, before, after, change)

@@ -115,6 +115,7 @@ class Net:
             before_change=None,
             drifted=0,
             net=net,
+            slow=replace(state.slow, tracks=()),
         )
         return after, (self._decision(state.belief, over),)
 

@@ -29,12 +29,13 @@ from armcal_online.tracking.decisions import EXPLAINED
 from armcal_online.tracking.directions import Steps, find_steps
 from armcal_online.tracking.evaluator import identity
 from armcal_online.tracking.health import nis_limit
-from armcal_online.tracking.hypotheses import HypothesisFilter, Recent, hypotheses
+from armcal_online.tracking.hypotheses import GRADUAL, HypothesisFilter, Recent, hypotheses, slow_changes
 from armcal_online.tracking.judge import Judge
 from armcal_online.tracking.net import Net
 from armcal_online.tracking.observer import Reading
 from armcal_online.tracking.refit import NetRecord
 from armcal_online.tracking.settings import RecalibrateSettings
+from armcal_online.tracking.slow_changes import SlowChanges
 from armcal_online.tracking.start import FilterSetup, filter_setup
 from armcal_online.tracking.state import Arrival, State, Tick, advanced, remembering, ticked
 from armcal_online.tracking.tip_error import tip_error
@@ -60,7 +61,12 @@ class Recalibrator:
         self.setup, self.steps = setup, steps
         hypothesis_filter = HypothesisFilter(setup.observer, estimator, setup.process_noise, settings.outliers)
         changes = hypotheses(setup.space, steps, settings.changes, setup.observer.size)
-        self._judge = Judge(setup.space, steps, hypothesis_filter, changes, settings)
+        slow = slow_changes(changes, steps, settings.changes, setup.observer.size) if estimator.window == 1 else ()
+        if hypothesis_filter.is_model_wrong:
+            # Neighbours err alike: a load that no record shows cannot be told from the error of the model.
+            slow = tuple(change for change in slow if change.kind in GRADUAL)
+        self._slow = SlowChanges(slow, setup.process_noise, settings.changes.probability)
+        self._judge = Judge(setup.space, steps, hypothesis_filter, changes, self._slow, settings)
         self._net = Net(setup, changes) if settings.net and settings.gating == "on" else None
         self.state = State(setup.belief, setup.belief)
 
@@ -176,9 +182,9 @@ class Recalibrator:
     ) -> tuple[dict[str, Any], ...]:
         """Gate a record, take it in if it is accepted, and judge what the last records mean now."""
         process_noise, observer = self.setup.process_noise, self.setup.observer
-        before = process_noise.faded(state.belief, passed)
+        before = self._slow.carried(state.slow, process_noise.faded(state.belief, passed), passed["time"])
         anchor = process_noise.faded(state.anchor, passed) if state.held else before
-        state = replace(state, belief=before, anchor=anchor)
+        state = replace(state, belief=before, anchor=anchor, slow=self._slow.passed(state.slow, passed))
         try:
             gated, first, limit = self._gated(state, readings, passed)
             state, decisions = self._judge.after(gated) if self._settings.gating == "on" else (gated, ())
@@ -229,6 +235,9 @@ class Recalibrator:
         recent = Recent(state.sequence, readings, noise, passed, before, rejected, nis, dof)
         nis_window = self._settings.levels.window
         after = state if rejected else advanced(state, recent, self.setup, self._estimator, nis_window)
+        if not rejected:
+            slow = self._slow.after(state.slow, state.sequence, before.gaussian, first, covariance)
+            after = replace(after, slow=slow)
         counted = _counted(after, "rejected" if rejected else "accepted")
         return replace(counted, recent=(*counted.recent, recent)[-self._settings.gate.window :]), first, limit
 

@@ -78,6 +78,24 @@ def together(
     return tuple(decisions)
 
 
+def slow(change: Hypothesis, size: Size, since: int, records: int, log_odds: float, next_likeliest: str) -> Decision:
+    """A small or slow change that many records speak for."""
+    why = f"no single one of the {records} records since shows it, but all of them together do"
+    why += f"; the next likeliest is {spoken(next_likeliest)}" if next_likeliest else ""
+    numbers = (change.subject, (change.subject,), size.value, size.dimension)
+    return Decision(change.kind, _happened(change, size), why, log_odds, since, *numbers)
+
+
+def slow_unnamed(candidates: Sequence[str], since: int, records: int, log_odds: float, factor: float) -> Decision:
+    """Something moves slowly, and the records do not distinguish what."""
+    what = f"Something moves more than stated: {_or(candidates)}"
+    why = (
+        f"no single one of the {records} records since shows it, but all of them together do, and they fit these about "
+        f"equally; all standard deviations are made {factor:g} times larger"
+    )
+    return Decision("drift", what, why, log_odds, since, "", tuple(candidates))
+
+
 def named(state: State, change: Hypothesis, others: Sequence[str], margin: float, size: Size) -> Decision:
     """Which of several it was."""
     subject, numbers = change.subject, (size.value, size.dimension)
@@ -157,6 +175,8 @@ def _happened(change: Hypothesis, size: Size) -> str:
         "sensor_moved": f"The frame of {subject} has moved",
         "payload_changed": f"What hangs on the tool changed by {size.shown}, which no record states",
         "gravity_tilted": f"Gravity pulls from another direction than the records state, by {size.shown}",
+        "joint_creeping": f"The zero of joint {subject} creeps by {size.shown}",
+        "sensor_drifting": f"The readings of {subject} drift by {size.shown}",
         "link_bent": f"{subject[:1].upper()}{subject[1:]} is bent: {size.shown}",
     }
     return clauses[change.kind]

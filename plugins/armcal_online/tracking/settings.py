@@ -49,9 +49,10 @@ class ChangeSettings(Settings):
     ``joint`` of a joint's offset (``slide`` of one that slides), as a slipped horn or a replaced servo makes;
     ``sensor_shift`` and ``sensor_turn`` of the frame that an instrument measures in, as a bump makes; ``payload`` of
     what hangs on the tool, its centre ``payload_lever`` from the tool frame; ``gravity_turn`` of gravity's direction
-    about the base's x and y axes; ``link_length`` and ``link_angle`` of the numbers of a bent link. ``factor``
-    multiplies all standard deviations when something else has changed. A change is followed once it is ``odds`` times
-    likelier than outliers, and ``naming_odds`` times likelier than any other.
+    about the base's x and y axes; ``link_length`` and ``link_angle`` of the numbers of a bent link. What grows is
+    stated in a day: ``joint_creep`` and ``slide_creep`` of a joint's zero, ``sensor_creep`` of an instrument's bias.
+    ``factor`` multiplies all standard deviations when something else has changed. A change is followed once it is
+    ``odds`` times likelier than outliers, and ``naming_odds`` times likelier than any other.
     """
 
     joint: Angle = 0.26
@@ -63,6 +64,9 @@ class ChangeSettings(Settings):
     gravity_turn: Annotated[Angle, Field(gt=0)] = 0.1
     link_length: Annotated[Length, Field(gt=0)] = 0.005
     link_angle: Annotated[Angle, Field(gt=0)] = 0.05
+    joint_creep: Annotated[Angle, Field(gt=0)] = 0.005
+    slide_creep: Annotated[Length, Field(gt=0)] = 0.0005
+    sensor_creep: Annotated[Length, Field(gt=0)] = 0.001
     factor: Annotated[float, Field(gt=1)] = 10.0
     probability: Probability = 1e-4
     odds: Annotated[float, Field(gt=1)] = 100.0

@@ -13,7 +13,13 @@ from armcal_online.tracking.directions import Steps
 from armcal_online.tracking.hypotheses import Hypothesis
 from armcal_online.tracking.state_space import StateSpace
 
-_UNITS = {"angle": ("deg", math.degrees(1.0)), "length": ("mm", 1000.0), "mass": ("g", 1000.0)}
+_UNITS = {
+    "angle": ("deg", math.degrees(1.0)),
+    "length": ("mm", 1000.0),
+    "mass": ("g", 1000.0),
+    "angle a day": ("deg a day", math.degrees(1.0)),
+    "length a day": ("mm a day", 1000.0),
+}
 _DIMENSIONS = {"rad": "angle", "m": "length"}
 _CLEAR = 3.0
 """So many standard deviations from zero a number is worth saying."""
@@ -49,6 +55,17 @@ def size_of(space: StateSpace, steps: Steps, before: Belief, after: Belief, chan
     if change.kind == "payload_changed":
         return _with_centre(space, moved, covariance, _sized(*_along(along, moved, covariance), "mass"))
     return _sized(*_along(along, moved, covariance), dimension) if dimension else Size(0.0, 0.0, "", "")
+
+
+def rate_of(steps: Steps, change: Hypothesis, size: Array, covariance: Array) -> Size:
+    """How fast a gradual change goes on, by its size and covariance in standard deviations (k, k x k)."""
+    rates = np.array(change.rates)
+    moved, own = size * rates, covariance * np.outer(rates, rates)
+    sliding = {joint.joint for joint in steps.joints if joint.dimension == "length"}
+    is_length = change.kind == "sensor_drifting" or change.subject in sliding
+    fast = float(moved[0]) if len(moved) == 1 else float(np.linalg.norm(moved))
+    along = moved / (fast or 1.0)
+    return _sized(fast, math.sqrt(float(along @ own @ along)), "length a day" if is_length else "angle a day")
 
 
 def _with_centre(space: StateSpace, moved: Array, covariance: Array, mass: Size) -> Size:

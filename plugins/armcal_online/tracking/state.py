@@ -20,6 +20,7 @@ from armcal_online.tracking.health import Health
 from armcal_online.tracking.hypotheses import Candidate, Recent
 from armcal_online.tracking.net_state import NetState
 from armcal_online.tracking.settings import ClockSettings
+from armcal_online.tracking.slow_state import SlowState
 from armcal_online.tracking.start import FilterSetup
 
 REMEMBERED = 128
@@ -123,6 +124,7 @@ class State:
         sequence: of the last entry.
         at: time of the last record (unix seconds, or as records count it).
         net: the windows of records that are refitted beside the filter.
+        slow: evidence of slow changes, and trends that were found.
     """
 
     belief: Belief
@@ -145,6 +147,7 @@ class State:
     sequence: int = 0
     at: float = 0.0
     net: NetState = field(default_factory=NetState)
+    slow: SlowState = field(default_factory=SlowState)
 
     def known(self, sequence: int) -> Arrival | None:
         """The record of a number, if it is remembered."""
@@ -170,7 +173,7 @@ class State:
             KeyError, TypeError, ValueError, AttributeError, IndexError: it is no state.
         """
         anchor = content["belief"] if content["anchor"] is None else content["anchor"]
-        before_nets = {"net": _encoded(NetState())}  # a state of an earlier version has none
+        before_nets = {"net": _encoded(NetState()), "slow": _encoded(SlowState())}  # none in an earlier version
         state: State = _decoded(cls, {**before_nets, **content, "anchor": anchor, "nis_window": content["nis"]})
         if set(state.counts) != {"accepted", "rejected", "ignored"}:
             raise ValueError(f"counts of {', '.join(state.counts)}")
@@ -186,6 +189,8 @@ class State:
         hashed.update(json.dumps(rest, sort_keys=True).encode())
         if self.net.taken:
             hashed.update(json.dumps(_encoded(self.net), sort_keys=True).encode())
+        if self.slow.tracks or self.slow.trend is not None:
+            hashed.update(json.dumps(_encoded(self.slow), sort_keys=True).encode())
         return hashed.hexdigest()[:16]
 
 

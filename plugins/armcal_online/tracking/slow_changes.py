@@ -1,0 +1,145 @@
+"""Slow and small changes, of which no single record is odd: a creeping joint, a drifting instrument, a light load.
+
+If such a change began before some record, the mean of the filter has been off since by a known multiple of its size,
+and so is each innovation: the two-stage filter of [Friedland1969] carries both along beside the filter. The size's
+likelihood under all records since is Gaussian, and its evidence against no change is known in closed form, at the cost
+of a few small products a record. Changes are taken to begin where a track begins; a new track begins again and again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.estimate.online import Gaussian, Linearised
+
+from armcal_online.tracking.belief import Belief
+from armcal_online.tracking.hypotheses import GRADUAL, Hypothesis
+from armcal_online.tracking.process_noise import ProcessNoise
+from armcal_online.tracking.slow_state import SlowEvidence, SlowState
+
+_LONGEST = 200
+"""Records of a track; at half of them the next begins."""
+_FEWEST = 24
+_DAY_S = 86400.0
+_WANDERS = 0.25
+"""A trend may become as much faster or slower in the time that it took to be weighing."""
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """A slow change: weighed by a track, its size (k; standard deviations) and the covariance of that (k x k)."""
+
+    change: Hypothesis
+    track: SlowEvidence
+    columns: slice
+    log_odds: float
+    size: Array
+    covariance: Array
+
+
+class SlowChanges:
+    """Evidence for some changes; it keeps no state.
+
+    Args:
+        changes: whose directions are reopened at once, or, of the kinds that are gradual, gained in a day.
+        process_noise: of the beliefs.
+        probability: of any change before one record.
+    """
+
+    def __init__(self, changes: Sequence[Hypothesis], process_noise: ProcessNoise, probability: float) -> None:
+        self._changes, self._process_noise, self._probability = changes, process_noise, probability
+        self._ends = np.cumsum([0, *(change.directions.shape[1] for change in changes)]).tolist()
+        whole = np.hstack([c.directions for c in changes]) if changes else np.zeros((0, 0))
+        is_gradual = np.repeat([c.kind in GRADUAL for c in changes], np.diff(self._ends))
+        self._at_once = whole * ~is_gradual
+        self._in_a_second = whole * is_gradual / _DAY_S
+
+    def passed(self, state: SlowState, passed: Mapping[str, float]) -> SlowState:
+        """After some distance in each channel: gradual changes have gone on."""
+        n, seconds = len(self._process_noise.rates), max(passed.get("time", 0.0), 0.0)
+        kept = np.ones(len(self._at_once))
+        kept[n:] = self._process_noise.gauss_markov.kept(passed)
+        tracks = tuple(
+            replace(t, seconds=t.seconds + seconds, effect=t.effect * kept[:, None] + seconds * self._in_a_second)
+            for t in state.tracks
+        )
+        return replace(state, tracks=tracks)
+
+    def carried(self, state: SlowState, belief: Belief, seconds: float) -> Belief:
+        """A belief that trends have carried on for some time."""
+        if state.trend is None or state.wander is None or seconds <= 0:
+            return belief
+        n, mean, covariance = len(state.trend), belief.gaussian.mean.copy(), belief.gaussian.covariance.copy()
+        mean[:n] += seconds * state.trend
+        covariance[np.arange(n), np.arange(n)] += seconds * state.wander
+        return Belief(belief.origin, Gaussian(mean, covariance))
+
+    def after(
+        self, state: SlowState, sequence: int, prior: Gaussian, record: Linearised, covariance: Array
+    ) -> SlowState:
+        """With a record that the filter takes: linearised at its prior mean, its innovation's covariance (m x m)."""
+        if not self._changes:
+            return state
+        tracks = tuple(track for track in state.tracks if track.records < _LONGEST)
+        if not tracks or (len(tracks) == 1 and tracks[0].records >= _LONGEST // 2):
+            m = self._ends[-1]
+            tracks = (*tracks, SlowEvidence(sequence, 0, 0.0, self._at_once, np.zeros((m, m)), np.zeros(m)))
+        both = np.column_stack([record.slope @ prior.covariance, record.innovation])
+        weighted = np.asarray(np.linalg.solve(covariance, both), dtype=np.float64)
+        gain, innovation = weighted[:, :-1].T, weighted[:, -1]
+        return replace(state, tracks=tuple(self._used(t, record, gain, innovation, covariance) for t in tracks))
+
+    def _used(
+        self, track: SlowEvidence, record: Linearised, gain: Array, innovation: Array, expected: Array
+    ) -> SlowEvidence:
+        seen = record.slope @ track.effect
+        return replace(
+            track,
+            records=track.records + 1,
+            effect=track.effect - gain @ seen,
+            information=track.information + seen.T @ np.linalg.solve(expected, seen),
+            score=track.score + seen.T @ innovation,
+        )
+
+    def weighed(self, state: SlowState) -> list[Weighing]:
+        """All changes by the track that speaks for them most, the likeliest first."""
+        best: dict[str, Weighing] = {}
+        for track in state.tracks:
+            if track.records < _FEWEST:
+                continue
+            prior = math.log(self._probability * track.records / len(self._changes))
+            for change, start, stop in zip(self._changes, self._ends[:-1], self._ends[1:], strict=True):
+                own = slice(start, stop)
+                precision = np.eye(stop - start) + track.information[own, own]
+                covariance = np.asarray(np.linalg.inv(precision), dtype=np.float64)
+                size = covariance @ track.score[own]
+                evidence = 0.5 * float(track.score[own] @ size) - 0.5 * float(np.linalg.slogdet(precision)[1])
+                known = best.get(change.subject)
+                if known is None or evidence + prior > known.log_odds:
+                    best[change.subject] = Weighing(change, track, own, evidence + prior, size, covariance)
+        return sorted(best.values(), key=lambda one: -one.log_odds)
+
+    def is_due(self, weighing: Weighing) -> bool:
+        """Whether the track of a change ends, so that it is to be decided now."""
+        return weighing.track.records >= _LONGEST - 1
+
+    def followed(self, state: SlowState, weighing: Weighing, belief: Belief) -> tuple[SlowState, Belief]:
+        """The belief with a change in it; where that is gradual, it goes on from now on."""
+        effect = weighing.track.effect[:, weighing.columns]
+        gaussian, n = belief.gaussian, len(self._process_noise.rates)
+        covariance = gaussian.covariance + effect @ weighing.covariance @ effect.T
+        after = Belief(belief.origin, Gaussian(gaussian.mean + effect @ weighing.size, covariance))
+        if weighing.change.kind not in GRADUAL:
+            return replace(state, tracks=()), after
+        directions = self._in_a_second[:n, weighing.columns]
+        rate = directions @ weighing.size
+        # What moves unforeseen may turn, and others of its kind move too: none of them stays known exactly.
+        alike = np.repeat([c.kind == weighing.change.kind for c in self._changes], np.diff(self._ends))
+        moved = np.linalg.norm(self._in_a_second[:n, alike], axis=1) * np.linalg.norm(weighing.size)
+        wander = _WANDERS**2 * moved**2 * weighing.track.seconds
+        before = (state.trend, state.wander) if state.trend is not None and state.wander is not None else (0.0, 0.0)
+        return SlowState((), before[0] + rate, before[1] + wander), after
