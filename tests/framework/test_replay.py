@@ -142,8 +142,8 @@ def test_the_calibration_as_it_was_at_any_entry(whole: Path, tmp_path: Path) -> 
     out = tmp_path / "then.yaml"
     told(whole, "--until", checkpoint.sequence, "--calibration", out)
     written = yaml.safe_load(out.read_text())
-    values = np.array([entry["value"] for entry in written["parameters"]])
-    assert np.array_equal(values, session.values)
+    values = dict(zip(session.setup.space.parameters.entry_names, session.values.tolist(), strict=True))
+    assert {entry["name"]: entry["value"] for entry in written["parameters"]}.items() <= values.items()
     assert written["recalibrated"]["sequence"] == checkpoint.content["state"]["sequence"]
     assert armcal("predict", out, "--poses", DEMO.with_suffix(".csv"), "--out", tmp_path / "p.csv").exit_code == 0
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from armcal import plugin_files
 from armcal.arm import assembly
+from armcal.arm.environment import Environment
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
@@ -38,6 +39,7 @@ SHARE = 0.05
 UNSTATED_M = 1e-5
 """The same where no accuracy of the tool is stated: below what any tracker can resolve."""
 CHECK_POSES = 8
+_PAYLOAD = ("payload", "payload_x", "payload_y", "payload_z")
 
 
 class ComponentRecord(Settings):
@@ -203,6 +205,14 @@ def check_record(system: System, parameters: Parameters, commands: Dataset, stat
         half_widths={name: width for name, width in widths.items() if np.isfinite(width) and width > 0},
         radius=min((radius for radius in radii if np.isfinite(radius) and radius > 0), default=None),
     )
+
+
+def under_load(kept: CheckRecord, environment: Environment) -> CheckRecord:
+    """The same, its commands with the payload that they were predicted with: it may be stated otherwise from now on."""
+    stated = dict(zip(_PAYLOAD, (environment.payload_mass, *environment.payload_com), strict=True))
+    silent = {channel: value for channel, value in stated.items() if channel not in kept.channels}
+    records = tuple((*record, *silent.values()) for record in kept.records)
+    return kept.model_copy(update={"channels": (*kept.channels, *silent), "records": records})
 
 
 def movement(system: System, parameters: Parameters, kept: CheckRecord) -> Movement:

@@ -54,7 +54,7 @@ class SlowChanges:
         self._changes, self._process_noise, self._probability = changes, process_noise, probability
         self._ends = np.cumsum([0, *(change.directions.shape[1] for change in changes)]).tolist()
         whole = np.hstack([c.directions for c in changes]) if changes else np.zeros((0, 0))
-        is_gradual = np.repeat([c.kind in GRADUAL for c in changes], np.diff(self._ends))
+        is_gradual = np.repeat(np.array([c.kind in GRADUAL for c in changes], dtype=bool), np.diff(self._ends))
         self._at_once = whole * ~is_gradual
         self._in_a_second = whole * is_gradual / _DAY_S
 

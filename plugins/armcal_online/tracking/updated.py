@@ -12,6 +12,7 @@ from armcal.base.domains import Array, Interval
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import UNMOVED_SD, InformationRecord, ParameterRecord, identity_of, sealed
 from armcal.calibration.intervals import covariance_rows
+from armcal.calibration.physics import under_load
 from scipy.special import ndtri
 
 from armcal_online.tracking.belief import Belief, most_likely
@@ -114,7 +115,8 @@ def _statics(calibration: Calibration, setup: FilterSetup, values: Array) -> dic
     kept = {key: value for key, value in record.statics.items() if not key.startswith("payload")}
     statics = {**kept, "payload_kg": max(float(mass), 0.0), "payload_com_m": centre.tolist()}
     described = {"arms": record.arms, "measurements": record.measurements, "statics": statics}
-    return {"statics": statics, "identity": {**record.identity, "arm": identity_of(described)}}
+    checks = record.checks and under_load(record.checks, environment)
+    return {"statics": statics, "identity": {**record.identity, "arm": identity_of(described)}, "checks": checks}
 
 
 def _square_root(scales: Array, covariance: Array) -> tuple[tuple[float, ...], ...]:
