@@ -27,11 +27,17 @@ class Input(Settings):
     scale: Positive
 
 
-class ProcessSettings(PartSettings):
-    """A process: what it depends on, and its poses (M x inputs)."""
+class TermSettings(Settings):
+    """Features of a process: what they depend on, and its poses (M x inputs)."""
 
     inputs: tuple[Input, ...]
     poses: Numbers
+
+
+class ProcessSettings(PartSettings):
+    """A process of one term, or the sum of several."""
+
+    terms: Annotated[tuple[TermSettings, ...], Field(min_length=1)]
 
 
 @dataclass(frozen=True)

@@ -73,13 +73,11 @@ class Fourier(LinearResidual):
                 first=len(OF_TOOL) + joint - 1,
                 scales=(float(np.sqrt(variance)),),
                 weights=packed(weights),
-                root=packed(taken_root(np.eye(2 * orders), left)),
+                root=packed(taken_root(np.eye(2 * orders), fitted.left_of([i]))),
                 joint=joint,
                 orders=orders,
             )
-            for i, (joint, weights, variance, left) in enumerate(
-                zip(moved, fitted.weights, fitted.variances, fitted.left, strict=True)
-            )
+            for i, (joint, weights, variance) in enumerate(zip(moved, fitted.weights, fitted.variances, strict=True))
             if fitted.is_known(i)
         )
         if not parts:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
+import casadi as ca
 import numpy as np
 from armcal.arm.pose_residual import ModelErrors
 from armcal.base.domains import Array
@@ -16,7 +17,7 @@ from armcal.base.settings import Settings
 from pydantic import Field
 from typing_extensions import override
 
-from armcal_residual.correlations import Correlations, ProcessSettings
+from armcal_residual.correlations import Correlations, ProcessSettings, TermSettings
 from armcal_residual.joint_processes import of_joints
 from armcal_residual.linear import LinearResidual, unpacked
 from armcal_residual.tool_processes import of_tool
@@ -40,12 +41,16 @@ class GaussianProcess(LinearResidual):
 
     def __init__(self, settings: GaussianProcessSettings, joint_names: Sequence[str]) -> None:
         super().__init__(settings, joint_names)
-        self._correlations = {id(part): Correlations.of(part.inputs, _poses_of(part)) for part in settings.learned}
+        self._correlations = {
+            id(part): [Correlations.of(term.inputs, _poses_of(term)) for term in part.terms]
+            for part in settings.learned
+        }
         self.check()
 
     @override
     def features(self, part: Any, commands: Any, approaches: Any) -> Any:
-        return self._correlations[id(part)](commands, approaches)
+        features = [correlations(commands, approaches) for correlations in self._correlations[id(part)]]
+        return ca.vertcat(*features) if isinstance(commands, ca.SX) else np.vstack(features)
 
     @override
     def prior_variance(self, part: Any, features: Array) -> Array:
@@ -62,5 +67,5 @@ class GaussianProcess(LinearResidual):
         return GaussianProcess(self.settings.model_copy(update={"learned": tuple(parts)}), self.joint_names)
 
 
-def _poses_of(part: ProcessSettings) -> Array:
-    return unpacked(part.poses, None, len(part.inputs)).T
+def _poses_of(term: TermSettings) -> Array:
+    return unpacked(term.poses, None, len(term.inputs)).T

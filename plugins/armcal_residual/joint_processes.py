@@ -1,4 +1,7 @@
-"""A process of each turning joint's error over its own angle, of the likeliest of a few length scales."""
+"""Processes of each turning joint's error over its own angle: a long one, and one of the likeliest finer length scale.
+
+The long one holds on a little where no record stood, and leaves less of the error to the model's parameters.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from armcal.arm.pose_residual import OF_TOOL, ModelErrors
 from armcal.base.domains import Array
+from scipy.linalg import block_diag
 
-from armcal_residual.correlations import Correlations, Input, ProcessSettings, roots_of
+from armcal_residual.correlations import Correlations, Input, ProcessSettings, TermSettings, roots_of
 from armcal_residual.linear import Products, Regression, packed, regressed, seen, taken_root
 
 _JOINT_LENGTHS = (1.0, 0.5, 0.25, 0.12, 0.06)
-"""Chords, about rad."""
+"""Chords, about rad. The first stands beside each of the others."""
 _ROWS_PER_FEATURE = 2
 
 
@@ -44,16 +48,10 @@ class _JointProcess:
         rows = -(slopes[:, :, None] * features[:, None, :]).reshape(-1, count)
         return cls(joint, inputs, poses, roots, rows)
 
-    def part(self, weights: Array, variance: float, left: Array) -> ProcessSettings:
-        """As learned."""
-        return ProcessSettings(
-            first=len(OF_TOOL) + self.joint,
-            scales=(float(np.sqrt(variance)),),
-            weights=packed(self.roots @ weights),
-            root=packed(taken_root(self.roots, left)),
-            inputs=self.inputs,
-            poses=packed(self.poses),
-        )
+    @property
+    def term(self) -> TermSettings:
+        """As settings hold it."""
+        return TermSettings(inputs=self.inputs, poses=packed(self.poses))
 
 
 def of_joints(errors: ModelErrors) -> tuple[list[ProcessSettings], Array]:
@@ -66,11 +64,29 @@ def of_joints(errors: ModelErrors) -> tuple[list[ProcessSettings], Array]:
     if chosen is None:
         return [], left.reshape(errors.residuals.shape)
     regression, processes, parts = search.regression(chosen), search.processes(chosen), list[ProcessSettings]()
-    for i, own in enumerate(processes):
-        if regression.is_known(i):
-            parts.append(own.part(regression.weights[i], float(regression.variances[i]), regression.left[i]))
-            left = left - errors.apart(own.rows @ regression.weights[i])
+    for joint in moved:
+        blocks = [i for i, own in enumerate(processes) if own.joint == joint and regression.is_known(i)]
+        if blocks:
+            parts.append(_part([processes[i] for i in blocks], regression, blocks))
+        for i in blocks:
+            left = left - errors.apart(processes[i].rows @ regression.weights[i])
     return parts, left.reshape(errors.residuals.shape)
+
+
+def _part(terms: Sequence[_JointProcess], regression: Regression, blocks: Sequence[int]) -> ProcessSettings:
+    """The sum of a joint's processes as learned: what is known of it is more than what is known of each."""
+    variances = regression.variances[list(blocks)]
+    scale = float(np.sqrt(variances.sum()))
+    roots = block_diag(*(term.roots * np.sqrt(own) / scale for term, own in zip(terms, variances, strict=True)))
+    return ProcessSettings(
+        first=len(OF_TOOL) + terms[0].joint,
+        scales=(scale,),
+        weights=packed(
+            np.concatenate([own.roots @ regression.weights[i] for own, i in zip(terms, blocks, strict=True)])
+        ),
+        root=packed(taken_root(roots, regression.left_of(blocks))),
+        terms=tuple(own.term for own in terms),
+    )
 
 
 class _LengthSearch:
@@ -82,7 +98,7 @@ class _LengthSearch:
         self._regressions: dict[tuple[int, ...], Regression] = {}
 
     def likeliest(self) -> tuple[int, ...] | None:
-        """Places in ``_JOINT_LENGTHS``, one a joint; None where the records are too few for any."""
+        """Places in ``_JOINT_LENGTHS`` of the finer ones, one a joint; None where the records are too few for any."""
         same = [(place,) * len(self._joints) for place in range(len(_JOINT_LENGTHS))]
         possible = [places for places in same if self._is_possible(places)]
         if not possible:
@@ -95,11 +111,12 @@ class _LengthSearch:
         return best
 
     def processes(self, places: tuple[int, ...]) -> list[_JointProcess]:
-        """Those of the joints with these length scales."""
-        for key in zip(self._joints, places, strict=True):
+        """Those of the joints with the first of the length scales, and with these."""
+        keys = dict.fromkeys([(joint, 0) for joint in self._joints] + list(zip(self._joints, places, strict=True)))
+        for key in keys:
             if key not in self._processes:
                 self._processes[key] = _JointProcess.over(self._errors, key[0], _JOINT_LENGTHS[key[1]])
-        return [self._processes[key] for key in zip(self._joints, places, strict=True)]
+        return [self._processes[key] for key in keys]
 
     def regression(self, places: tuple[int, ...]) -> Regression:
         """On their features."""

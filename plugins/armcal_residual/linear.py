@@ -27,6 +27,8 @@ _LEAST_TAKEN = 1e-3
 _LEAST_KNOWN = 0.5
 """Weights that records determine: a function of fewer is none."""
 _UNSEEN = 1e-6
+_MOST = 10.0
+"""Times the rms of what is to be explained: as large as a block may be."""
 _AT_A_TIME = 4096
 
 
@@ -124,7 +126,7 @@ class Regression:
     Attributes:
         weights: of each block.
         variances: prior ones, by block.
-        left: of each block's covariance where what else explains the rows is known, in units of its prior variance.
+        left: covariance of all weights where what else explains the rows is known, in units of prior deviations.
         known: how many weights of each block the rows determine.
         evidence: logarithm of the marginal likelihood.
         noise: variance.
@@ -132,10 +134,16 @@ class Regression:
 
     weights: tuple[Array, ...]
     variances: Array
-    left: tuple[Array, ...]
+    left: Array
     known: Array
     evidence: float
     noise: float
+
+    def left_of(self, blocks: Sequence[int]) -> Array:
+        """The same of some blocks' weights."""
+        edges = np.cumsum([0, *map(len, self.weights)])
+        chosen = np.concatenate([np.arange(edges[i], edges[i + 1]) for i in blocks])
+        return np.asarray(self.left[np.ix_(chosen, chosen)])
 
     def is_known(self, block: int) -> bool:
         """Whether the rows say anything of a block's weights."""
@@ -168,13 +176,16 @@ def regressed(products: Products, sizes: Sequence[int], whole: Array | None = No
     spread = products.square / max(products.rows, 1)
     total = max(spread * products.rows, 1e-300) / len(blocks)
     precisions = np.array([max(float(diagonal[b].sum()), 1e-300) / total for b in blocks])
+    # A block that acts like what was taken off shows no size of its own: it explains no more than what is there.
+    acting = diagonal if whole is None else np.diag(whole)
+    least = np.array([max(float(acting[b].sum()), 1e-300) for b in blocks]) / (_MOST**2 * max(products.square, 1e-300))
     noise = spread / 2
     for _ in range(_ROUNDS):
         inverse, weights = _posterior(products, precisions, noise, sizes)
         known = np.array([b.stop - b.start - precisions[i] * np.trace(inverse[b, b]) for i, b in enumerate(blocks)])
         squares = np.array([max(float(weights[b] @ weights[b]), 1e-300) for b in blocks])
         error = products.square - 2 * weights @ products.vector + weights @ products.matrix @ weights
-        following = np.clip(np.maximum(known, 1e-12) / squares, 1e-12, 1e30)
+        following = np.clip(np.maximum(known, 1e-12) / squares, least, 1e30)
         noise = max(error, 1e-9 * products.square) / max(products.rows - known.sum(), 1.0)
         moved = np.max(np.abs(np.log(following / precisions)))
         precisions = following
@@ -188,7 +199,8 @@ def regressed(products: Products, sizes: Sequence[int], whole: Array | None = No
     known = np.array([b.stop - b.start - precisions[i] * np.trace(inverse[b, b]) for i, b in enumerate(blocks)])
     if whole is not None:
         inverse, _ = _posterior(replace(products, matrix=whole), precisions, noise, sizes)
-    left = tuple(precisions[i] * inverse[b, b] for i, b in enumerate(blocks))
+    scale = np.sqrt(np.repeat(precisions, sizes))
+    left = scale[:, None] * inverse * scale
     return Regression(tuple(weights[b] for b in blocks), 1 / precisions, left, known, float(evidence), float(noise))
 
 

@@ -14,7 +14,7 @@ from armcal.base.domains import Array
 from scipy.linalg import cho_solve
 from scipy.optimize import minimize
 
-from armcal_residual.correlations import Correlations, Input, Kind, ProcessSettings, roots_of
+from armcal_residual.correlations import Correlations, Input, Kind, ProcessSettings, TermSettings, roots_of
 from armcal_residual.linear import packed, taken_root
 
 _FEWEST = 12
@@ -93,8 +93,7 @@ def _process(
         scales=tuple(likelihood.scales(best).tolist()),
         weights=packed(roots @ (left @ (independent.T @ own / noise**2))),
         root=packed(taken_root(roots, left)),
-        inputs=tuple(listed),
-        poses=packed(raw[:, kept].T),
+        terms=(TermSettings(inputs=tuple(listed), poses=packed(raw[:, kept].T)),),
     )
 
 

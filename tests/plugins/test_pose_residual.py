@@ -264,6 +264,22 @@ def test_the_evidence_finds_the_noise_and_leaves_out_what_is_not_there():
     np.testing.assert_allclose(found.weights[0], weights, atol=0.05)
 
 
+def test_a_slow_error_under_a_fine_one_holds_on_where_no_record_stood():
+    def error(angle):
+        return 0.002 * np.sin(2 * angle) + 0.0005 * np.sin(40 * angle)
+
+    random, count = np.random.default_rng(1), 500
+    commands = np.vstack([random.uniform(-1.2, 0.6, count), np.zeros((2, count))])
+    slopes = np.zeros((count, 1, 9))
+    slopes[:, 0, 6] = -1 / 1e-4  # the error is measured to 0.1 mrad
+    measured = (error(commands[0]) / 1e-4 + random.normal(size=count))[:, None]
+    errors = ModelErrors(Postures(commands, 0 * commands), ("angle",) * 3, measured, slopes, 0, np.zeros((count, 0)))
+    learned = GaussianProcess(GaussianProcessSettings(), ("a", "b", "c")).learned(errors)
+    beside = np.vstack([np.linspace(0.65, 0.9, 50), np.zeros((2, 50))])
+    left = error(beside[0]) - learned.corrections(Postures(beside, 0 * beside))[6]
+    assert np.mean(np.abs(left)) < 0.5 * np.mean(np.abs(error(beside[0])))
+
+
 def test_few_records_teach_nothing():
     postures = Postures(np.random.default_rng(0).uniform(-1, 1, (3, 8)), np.zeros((3, 8)))
     errors = ModelErrors(postures, ("angle",) * 3, np.ones((8, 3)), np.ones((8, 3, 9)), 3, np.zeros((24, 0)))
