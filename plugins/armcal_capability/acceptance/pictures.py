@@ -17,7 +17,7 @@ from armcal_capability.drawing import GRID, INK, empty_figure, png_of, style
 _COLOURS = {"nominal": "#d95f02", "calibrated": "#1b6ca8", "RP": "#777777"}
 _CLOUDS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999", "#000000")
 _MOST_POSES = 40
-"""Of which bars can be told apart."""
+"""Of which bars can be distinguished."""
 _MOST_CLOUDS = 8
 
 

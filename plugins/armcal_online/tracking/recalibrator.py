@@ -63,7 +63,7 @@ class Recalibrator:
         changes = hypotheses(setup.space, steps, settings.changes, setup.observer.size)
         slow = slow_changes(changes, steps, settings.changes, setup.observer.size) if estimator.window == 1 else ()
         if hypothesis_filter.is_model_wrong:
-            # Neighbours err alike: a load that no record shows cannot be told from the error of the model.
+            # Neighbours err alike: a load that no record shows cannot be distinguished from the error of the model.
             slow = tuple(change for change in slow if change.kind in GRADUAL)
         self._slow = SlowChanges(slow, setup.process_noise, settings.changes.probability)
         self._judge = Judge(setup.space, steps, hypothesis_filter, changes, self._slow, settings)
