@@ -280,6 +280,16 @@ def test_a_slow_error_under_a_fine_one_holds_on_where_no_record_stood():
     assert np.mean(np.abs(left)) < 0.5 * np.mean(np.abs(error(beside[0])))
 
 
+def test_what_acts_like_parameters_does_not_grow_beyond_what_is_to_be_explained():
+    random = np.random.default_rng(4)
+    features, left = random.normal(size=(300, 3)), 1e-5 * random.normal(size=(300, 3))  # all but taken up
+    errors = 1e5 * left @ np.ones(3) + 0.1 * random.normal(size=300)
+    products, whole = Products.of(left, errors), features.T @ features
+    free, bounded = regressed(products, [3]), regressed(products, [3], whole)
+    explained = np.array([one.variances[0] * np.trace(whole) / products.square for one in (free, bounded)])
+    assert explained[0] > 1e6 and explained[1] <= 100 * (1 + 1e-9)
+
+
 def test_few_records_teach_nothing():
     postures = Postures(np.random.default_rng(0).uniform(-1, 1, (3, 8)), np.zeros((3, 8)))
     errors = ModelErrors(postures, ("angle",) * 3, np.ones((8, 3)), np.ones((8, 3, 9)), 3, np.zeros((24, 0)))
