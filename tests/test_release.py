@@ -242,6 +242,7 @@ def test_an_empty_environment_is_all_it_takes(empty: Path, tmp_path: Path) -> No
 WITH = {
     "i2c": "import smbus2; smbus2.i2c_msg.write(64, [0]); from armcal_pca9685.linux_i2c import _library; _library()",
     "mujoco": "import mujoco; mujoco.MjModel.from_xml_string('<mujoco><worldbody/></mujoco>')",
+    "camera": "import cv2; cv2.CharucoBoard((5, 4), 0.04, 0.03, cv2.aruco.getPredefinedDictionary(0))",
     "docs": "import mkdocs, material, pymdownx, latex2mathml",
     "dev": "import ruff, mypy.api, yaml",
     "test": "import pytest, hatchling, xdist, hypothesis, pinocchio, distributed",

@@ -56,6 +56,7 @@ LIBRARIES: Mapping[str, Purpose] = MappingProxyType(
 
 EXTRAS: Mapping[str, str] = MappingProxyType(
     {
+        "camera": "boards found in images, boards to print (armcal board)",
         "i2c": "servo boards on this computer's own I2C bus (link linux_i2c)",
         "mujoco": "checking an export for MuJoCo by MuJoCo itself",
         "bench": "make bench: comparing armcal with other programs",

@@ -1,0 +1,1 @@
+"""Cameras: boards seen by a camera that an arm carries, or that watches an arm."""
