@@ -1,0 +1,291 @@
+"""Boards that a camera sees: which kind, its sizes, and where its points are.
+
+A board's frame lies in its printed face, x along its columns and y along its rows. Points are counted from 0, the
+columns first. Nothing here needs OpenCV.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from types import MappingProxyType
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+
+import numpy as np
+from armcal.base.config_text import resolve_path
+from armcal.base.domains import Array
+from armcal.base.settings import Length, Settings
+from armcal.config.validate import validate
+from armcal.config.yaml_source import load_config
+from armcal.errors import ConfigError
+from pydantic import BeforeValidator, Field, model_validator
+from typing_extensions import override
+
+FAMILIES = MappingProxyType({"16h5": 30, "25h9": 35, "36h10": 2320, "36h11": 587})
+"""AprilTag families and how many tags each has. [Olson2011]"""
+_DICTIONARY = re.compile(r"DICT_([4-7])X\1_(50|100|250|1000)")
+_MOST = 200
+_Count = Annotated[int, Field(ge=1, le=_MOST)]
+_Size = Annotated[Length, Field(gt=0.0, le=100.0)]
+_Id = Annotated[int, Field(ge=0)]
+
+
+def tags_in(family: str) -> int:
+    """How many tags an AprilTag family (``36h11``) or a dictionary of OpenCV (``DICT_5X5_100``) has.
+
+    Raises:
+        ValueError: no such family.
+    """
+    if family in FAMILIES:
+        return FAMILIES[family]
+    match = _DICTIONARY.fullmatch(family)
+    if match is None:
+        known = f"{', '.join(FAMILIES)}, or a dictionary such as DICT_5X5_100 (4X4 to 7X7; 50, 100, 250 or 1000)"
+        raise ValueError(f"found the family {family!r}, expected one of {known}")
+    return int(match[2])
+
+
+class Board(Settings):
+    """What all boards have; the kinds derive from it."""
+
+    kind: ClassVar[str]
+    """What one of them is called."""
+
+    @property
+    def points(self) -> Array:
+        """Where its points are (P x 3, m, in the board's frame; z = 0)."""
+        raise NotImplementedError
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Width and height of what is printed, without a margin (m)."""
+        raise NotImplementedError
+
+    @property
+    def tag_family(self) -> str:
+        """The family of its tags; empty if it has none."""
+        return ""
+
+    @property
+    def tag_ids(self) -> range:
+        """The ids of its tags, in their order on the board."""
+        return range(0)
+
+
+class Chessboard(Board):
+    """A chessboard of ``columns`` x ``rows`` inner corners.
+
+    The origin is the inner corner at the upper left as it is printed, x points right and y down: z points into the
+    paper, away from the camera. With a column count and a row count that are both odd or both even the pattern is the
+    same upside down, and which of two corners is the origin is undetermined; see ``armcal_camera.detection``.
+    """
+
+    kind: ClassVar[str] = "chessboard"
+    type: Literal["chessboard"]
+    columns: Annotated[int, Field(ge=3, le=_MOST)]
+    rows: Annotated[int, Field(ge=3, le=_MOST)]
+    square: _Size
+
+    @property
+    def points(self) -> Array:
+        """The inner corners, row by row from the origin."""
+        return _grid(self.columns, self.rows, self.square)
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """As of ``Board``: one square more than inner corners."""
+        return (self.columns + 1) * self.square, (self.rows + 1) * self.square
+
+
+class Charuco(Board):
+    """A chessboard of ``columns`` x ``rows`` squares with a tag in each white one.
+
+    The origin is the first inner corner, at the upper left as it is printed; x points right, y down, z into the paper.
+    ``legacy`` is the pattern of OpenCV before 4.6, whose first square is white where the rows are even in number.
+    """
+
+    kind: ClassVar[str] = "ChArUco board"
+    type: Literal["charuco"]
+    columns: Annotated[int, Field(ge=3, le=_MOST)]
+    rows: Annotated[int, Field(ge=3, le=_MOST)]
+    square: _Size
+    marker: _Size
+    dictionary: str = "DICT_5X5_100"
+    first_id: _Id = 0
+    legacy: bool = False
+
+    @model_validator(mode="after")
+    def _fits(self) -> Charuco:
+        if self.marker >= self.square:
+            sizes = f"marker {1000 * self.marker:g} mm and square {1000 * self.square:g} mm"
+            raise ValueError(f"found {sizes}, expected the marker to be smaller")
+        return _with_enough_tags(self)
+
+    @property
+    def points(self) -> Array:
+        """The inner corners, row by row from the origin."""
+        return _grid(self.columns - 1, self.rows - 1, self.square)
+
+    @property
+    @override
+    def extent(self) -> tuple[float, float]:
+        return self.columns * self.square, self.rows * self.square
+
+    @property
+    @override
+    def tag_family(self) -> str:
+        return self.dictionary
+
+    @property
+    @override
+    def tag_ids(self) -> range:
+        return range(self.first_id, self.first_id + self.columns * self.rows // 2)
+
+
+class Aprilgrid(Board):
+    """A grid of ``columns`` x ``rows`` tags, ``spacing`` apart, as Kalibr prints and numbers it.
+
+    The origin is the lower left corner of the first tag, which is at the lower left; x points right, y up, and z out
+    of the paper, towards the camera. ``border_bits`` is the width of a tag's black border: 2 as Kalibr prints it.
+    """
+
+    kind: ClassVar[str] = "AprilTag grid"
+    type: Literal["aprilgrid"]
+    columns: _Count
+    rows: _Count
+    tag: _Size
+    spacing: _Size
+    family: str = "36h11"
+    first_id: _Id = 0
+    border_bits: Literal[1, 2] = 1
+
+    @model_validator(mode="after")
+    def _fits(self) -> Aprilgrid:
+        return _with_enough_tags(self)
+
+    @property
+    def points(self) -> Array:
+        """Each tag's corners, the tags row by row: upper left, upper right, lower right, lower left."""
+        origins = _grid(self.columns, self.rows, self.tag + self.spacing)
+        return np.asarray((origins[:, None] + self.tag * np.array(_UPWARDS)).reshape(-1, 3))
+
+    @property
+    @override
+    def extent(self) -> tuple[float, float]:
+        width, height = (n * (self.tag + self.spacing) - self.spacing for n in (self.columns, self.rows))
+        return width, height
+
+    @property
+    @override
+    def tag_family(self) -> str:
+        return self.family
+
+    @property
+    @override
+    def tag_ids(self) -> range:
+        return range(self.first_id, self.first_id + self.columns * self.rows)
+
+
+class Tag(Board):
+    """A single tag.
+
+    The origin is its centre; x points right, y down, z into the paper.
+    """
+
+    kind: ClassVar[str] = "tag"
+    type: Literal["tag"]
+    id: _Id
+    tag: _Size
+    family: str = "36h11"
+    border_bits: Literal[1, 2] = 1
+
+    @model_validator(mode="after")
+    def _fits(self) -> Tag:
+        return _with_enough_tags(self)
+
+    @property
+    def points(self) -> Array:
+        """The corners: upper left, upper right, lower right, lower left."""
+        return self.tag * np.array([(-0.5, -0.5, 0.0), (0.5, -0.5, 0.0), (0.5, 0.5, 0.0), (-0.5, 0.5, 0.0)])
+
+    @property
+    @override
+    def extent(self) -> tuple[float, float]:
+        return self.tag, self.tag
+
+    @property
+    @override
+    def tag_family(self) -> str:
+        return self.family
+
+    @property
+    @override
+    def tag_ids(self) -> range:
+        return range(self.id, self.id + 1)
+
+
+_UPWARDS = ((0.0, 1.0, 0.0), (1.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+def _grid(columns: int, rows: int, step: float) -> Array:
+    """Points of a grid, row by row (N x 3)."""
+    x, y = np.meshgrid(np.arange(columns), np.arange(rows))
+    return step * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+
+
+def _with_enough_tags(board: Any) -> Any:
+    """The board, whose family has all its ids."""
+    known = tags_in(board.tag_family)
+    if board.tag_ids.stop > known:
+        ids = f"ids up to {board.tag_ids.stop - 1}"
+        raise ValueError(f"found {ids}, expected at most {known - 1} in {board.tag_family}: take a larger family")
+    return board
+
+
+def _from_file(value: Any) -> Any:
+    """A text names a file that ``armcal board`` wrote; its board stands in its place."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return read_board(resolve_path(value))
+    except ConfigError as fault:  # pydantic places it; it would not catch an error of ours
+        raise ValueError(str(fault)) from fault
+
+
+AnyBoard: TypeAlias = Annotated[Chessboard | Charuco | Aprilgrid | Tag, Field(discriminator="type")]
+"""A field of settings that is a board."""
+BoardOrFile: TypeAlias = Annotated[AnyBoard, BeforeValidator(_from_file)]
+"""A field of settings that is a board, or the path of a file of one; relative to the configuration it stands in."""
+
+
+class BoardFile(Settings):
+    """What ``board.yaml`` has: ``board: {type: chessboard, ...}``."""
+
+    board: AnyBoard
+
+
+def read_board(path: Any) -> Board:
+    """The board of a file that ``armcal board`` wrote.
+
+    Raises:
+        ConfigError: the file is not there, or is not one; with its line.
+    """
+    return validate(BoardFile, load_config(path)).board
+
+
+def require_distinct(boards: Sequence[Board]) -> None:
+    """That boards of one measurement can be told apart in an image.
+
+    Raises:
+        ValueError: two of them share tags, or look alike.
+    """
+    for index, board in enumerate(boards):
+        for other in boards[:index]:
+            shared = set(board.tag_ids) & set(other.tag_ids) if board.tag_family == other.tag_family else set()
+            if shared:
+                tags = f"the tag {min(shared)} of {board.tag_family}"
+                raise ValueError(f"two boards have {tags}: give each its own ids, by first_id or id")
+            if isinstance(board, Chessboard) and isinstance(other, Chessboard):
+                same = {board.columns, board.rows} == {other.columns, other.rows}
+                if same:
+                    raise ValueError("two chessboards of the same size look alike: use ChArUco boards")
