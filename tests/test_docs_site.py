@@ -18,8 +18,10 @@ import yaml
 from browser import CHROMIUM, Browser
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from tests import docs_commands
 from tests.docs_commands import (
     DONE_BY_TESTS,
+    KEPT,
     Block,
     blocks,
     commands,
@@ -29,6 +31,7 @@ from tests.docs_commands import (
     plain_words,
     run_armcal,
     run_bash,
+    run_once,
 )
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -99,6 +102,34 @@ def test_what_needs_no_shell_runs_in_a_fork_and_says_the_same() -> None:
         code, out, err = run_armcal(["armcal", *words])
         done = run_bash(" ".join([sys.executable, "-m", "armcal.cli", *words]))
         assert (code, out, err) == done and out + err
+
+
+def test_a_run_is_made_once_and_copied_where_nothing_but_its_folder_differs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[str] = []
+
+    def run(words: list[str]) -> tuple[int, str, str]:
+        folder = Path(words[words.index("--out") + 1])
+        folder.mkdir()
+        (folder / "metrics.json").write_text(folder.name)
+        made.append(folder.name)
+        return int("bad.yaml" in words), "", "said"
+
+    def output(folder: str, config: str = "configs/a.yaml", *more: str) -> str:
+        run_once(["armcal", "run", config, "--out", folder, *more])
+        return (Path(folder) / "metrics.json").read_text()
+
+    monkeypatch.setattr(docs_commands, "run_armcal", run)
+    monkeypatch.setenv(KEPT, str(tmp_path))
+    (tmp_path / "page" / "configs").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "page")
+    assert [output("one"), output("two"), output("three", "configs/a.yaml", "-q")] == ["one", "one", "three"]
+    (tmp_path / "page" / "configs" / "a.yaml").write_text("x: 1")
+    assert output("four") == "four"
+    assert run_once(["armcal", "run", "bad.yaml", "--out", "five"]) == (1, "", "said")
+    assert run_once(["armcal", "run", "bad.yaml", "--out", "six"]) == (1, "", "said")
+    assert made == ["one", "three", "four", "five", "six"]
 
 
 def test_a_fence_that_is_never_closed_is_refused() -> None:

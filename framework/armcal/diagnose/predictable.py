@@ -13,11 +13,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import LinAlgError
+from scipy.linalg.lapack import dposv
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
@@ -111,7 +113,7 @@ class _Block:
     columns: Array
     order: Array
 
-    @property
+    @cached_property
     def deviations(self) -> Array:
         """Of the coefficients: the variance of a harmonic falls as 1/order, as if any length scale were as likely."""
         return np.asarray(np.sqrt(1 / (self.order * np.sum(1 / np.unique(self.order)))))
@@ -271,7 +273,9 @@ class _Regression:
         alongs = self.alongs[:, chosen]
         gram, along, explained = grams.sum(axis=0) + np.diag(shrunk), alongs.sum(axis=0), np.zeros(len(self.squares))
         for own, products in zip(grams, alongs, strict=True):
-            solved = cho_solve(cho_factor(gram - own), along - products)
+            _, solved, failed = dposv(gram - own, along - products)
+            if failed:
+                raise LinAlgError("the equations of the coefficients are not positive definite")
             explained += np.sum(solved * (2 * products - own @ solved), axis=0)
         return explained / self.squares
 

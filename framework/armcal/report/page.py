@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,12 @@ def render(result: RunResult, sections: Sequence[PluginSection] = ()) -> str:
 
 def rendered(template: str, content: Mapping[str, Any], *folders: Path) -> str:
     """A page of this folder's templates, or of others' that stand before them."""
+    return str(_templates(folders).get_template(template).render(content))
+
+
+@lru_cache(maxsize=4)
+def _templates(folders: tuple[Path, ...]) -> Any:
+    """What compiles each template once."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     loader = FileSystemLoader([*folders, Path(__file__).parent])
@@ -90,7 +97,7 @@ def rendered(template: str, content: Mapping[str, Any], *folders: Path) -> str:
     environment.lstrip_blocks = True
     environment.filters.update(count=count, fixed=fixed, plural=plural, unbroken=unbroken)
     environment.filters["signed"] = lambda x: fixed(x, 3, signed=True)
-    return environment.get_template(template).render(content)
+    return environment
 
 
 def _accuracy(result: RunResult) -> dict[str, Any]:
