@@ -164,8 +164,8 @@ class Uncertainty:
             DataError: in the same recording, and the records do not say their place in it.
             NotConvergedError: a record has no equilibrium.
         """
-        recording_record, commands = self.record.recording, self._with_predictions(commands)
-        problem = self._problem(commands)
+        recording_record = self.record.recording
+        problem, commands = self._with_predictions(commands)
         near = np.zeros(len(commands), dtype=bool)
         if recording == "same" and recording_record is not None:
             near = self._near(recording_record, commands)
@@ -213,16 +213,19 @@ class Uncertainty:
     def _drifted(self, problem: Problem, dataset: Dataset, along: Chain | None) -> tuple[FactorRecords, ...]:
         return with_drift(problem, problem.records(dataset), dataset, self.parameters.nominal(), along)
 
-    def _with_predictions(self, commands: Dataset) -> Dataset:
+    def _with_predictions(self, commands: Dataset) -> tuple[Problem, Dataset]:
         """The commands with what instruments read there: residuals may depend on readings in any way."""
-        problem = self._problem(commands)
-        shown = problem.predict(self.values, problem.records(commands))
+        names = [f"{name}.{c.name}" for name, m in self.system.measurements.items() for c in m.channels()]
+        unread = dict.fromkeys(names, np.zeros(len(commands)))
+        blank = replace(commands, channels={**commands.channels, **unread})
+        problem = self._problem(blank)
+        shown = problem.predict(self.values, problem.records(blank))
         read = {
             channel: values[row]
             for kernel, values in zip(problem.kernels, shown, strict=True)
             for row, channel in enumerate(kernel.factor.output_channels)
         }
-        return replace(commands, channels={**commands.channels, **read})
+        return problem, replace(commands, channels={**unread, **commands.channels, **read})
 
     def _problem(self, dataset: Dataset) -> Problem:
         system = self.system

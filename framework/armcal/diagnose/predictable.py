@@ -139,10 +139,10 @@ def predictable(problem: Problem, rows: FitRows, basis: Array, motion: Motion, d
     random = np.random.default_rng(0)
     fold = np.argsort(random.permutation(count))[pose] * _FOLDS // count
     signs = random.choice((-1.0, 1.0), (count, _DRAWS))[pose]
-    whole = _Regression.of(blocks, fold[rows.record_of], _drawn(rows, basis, signs))
-    models = [(parts, size) for parts in (None, *({i} for i in range(len(inputs)))) for size in _SIZES]
-    shares = np.array([whole.shares(size, parts) for parts, size in models])
-    size, highest = models[int(np.argmax(shares[:, 0]))][1], shares.max(axis=0)
+    members = [np.flatnonzero(fold[rows.record_of] == f) for f in range(_FOLDS)]
+    whole = _Regression(blocks, members, _drawn(rows, basis, signs))
+    shares = np.concatenate([whole.shares(_SIZES, parts) for parts in (None, *({i} for i in range(len(inputs))))])
+    size, highest = _SIZES[int(np.argmax(shares[:, 0])) % len(_SIZES)], shares.max(axis=0)
     p = (1 + np.count_nonzero(highest[1:] >= highest[0])) / (1 + _DRAWS)
     chance = float(np.quantile(highest[1:], 1 - LEVEL))
     tools = all(kernel.factor.output_channels for kernel in problem.kernels)
@@ -235,49 +235,51 @@ def _drawn(rows: FitRows, basis: Array, signs: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Regression:
-    """On columns of blocks (p), of which each of F folds is predicted by the others; all of it by products.
+    """On columns of blocks, of which each fold is predicted by the others.
 
     Columns are not freed of what the fit takes up: the residuals of a fold would then follow from those of the others.
 
     Attributes:
         blocks: whose columns.
-        grams: products of columns in each fold (F x p x p).
-        alongs: of columns and values (F x p x m).
-        squares: of values (m).
+        members: which rows each fold has.
+        values: rows x m.
     """
 
     blocks: Sequence[_Block]
-    grams: Array
-    alongs: Array
-    squares: Array
-
-    @classmethod
-    def of(cls, blocks: Sequence[_Block], fold: NDArray[np.intp], values: Array) -> _Regression:
-        """Of values (rows x m) that are of folds (rows)."""
-        columns, members = np.hstack([b.columns for b in blocks]), [np.flatnonzero(fold == f) for f in range(_FOLDS)]
-        parts = [columns[own] for own in members]
-        grams = np.array([part.T @ part for part in parts])
-        alongs = np.array([part.T @ values[own] for part, own in zip(parts, members, strict=True)])
-        return cls(blocks, grams, alongs, np.maximum(np.sum(values**2, axis=0), 1e-300))
+    members: Sequence[NDArray[np.intp]]
+    values: Array
 
     def of_first(self) -> _Regression:
         """Of the first values alone."""
-        return replace(self, alongs=self.alongs[:, :, :1], squares=self.squares[:1])
+        return replace(self, values=self.values[:, :1])
 
-    def shares(self, size: float, inputs: AbstractSet[int] | None = None) -> Array:
-        """Of the squares of values, which functions of a size of some inputs, or of all, predict (m)."""
-        used = [inputs is None or block.inputs <= inputs for block in self.blocks]
-        chosen = np.flatnonzero(np.repeat(used, [len(block.order) for block in self.blocks]))
-        shrunk = np.concatenate([(size * block.deviations) ** -2.0 for block in self.blocks])[chosen]
-        grams = self.grams[:, chosen[:, None], chosen] if inputs is not None else self.grams
-        alongs = self.alongs[:, chosen]
-        gram, along, explained = grams.sum(axis=0) + np.diag(shrunk), alongs.sum(axis=0), np.zeros(len(self.squares))
-        for own, products in zip(grams, alongs, strict=True):
-            _, solved, failed = dposv(gram - own, along - products)
-            if failed:
-                raise LinAlgError("the equations of the coefficients are not positive definite")
-            explained += np.sum(solved * (2 * products - own @ solved), axis=0)
-        return explained / self.squares
+    def shares(self, sizes: Sequence[float], inputs: AbstractSet[int] | None = None) -> Array:
+        """Of the squares of values, which functions of each size of some inputs, or of all, predict (sizes x m)."""
+        used = [block for block in self.blocks if inputs is None or block.inputs <= inputs]
+        columns = np.hstack([block.columns * block.deviations for block in used])
+        explained = np.zeros((len(sizes), self.values.shape[1]))
+        for own, (matrix, known, onto) in zip(self.members, self._systems(columns), strict=True):
+            for i, size in enumerate(sizes):
+                _, solved, failed = dposv(matrix + np.eye(len(matrix)) / size**2, known)
+                if failed:
+                    raise LinAlgError("the equations of the coefficients are not positive definite")
+                predicted = onto @ solved
+                explained[i] += np.sum(predicted * (2 * self.values[own] - predicted), axis=0)
+        return np.asarray(explained / np.maximum(np.sum(self.values**2, axis=0), 1e-300))
+
+    def _systems(self, columns: Array) -> Iterator[tuple[Array, Array, Array]]:
+        """Of each fold: the equations of the others, by coefficients or by rows, the fewer; and what predicts it."""
+        if columns.shape[1] <= len(columns):
+            parts = [columns[own] for own in self.members]
+            grams = [part.T @ part for part in parts]
+            alongs = [part.T @ self.values[own] for part, own in zip(parts, self.members, strict=True)]
+            gram, along = sum(grams), sum(alongs)
+            yield from ((gram - g, along - a, part) for g, a, part in zip(grams, alongs, parts, strict=True))
+            return
+        kernel = columns @ columns.T
+        for own in self.members:
+            others = np.delete(np.arange(len(columns)), own)
+            yield kernel[np.ix_(others, others)], self.values[others], kernel[np.ix_(own, others)]
 
 
 def _carried(predicted: Predictable, whole: _Regression, inputs: Sequence[_Input], size: float) -> Predictable:
@@ -287,7 +289,7 @@ def _carried(predicted: Predictable, whole: _Regression, inputs: Sequence[_Input
     """
 
     def share(used: set[int]) -> float:
-        return float(whole.shares(size, used)[0])
+        return float(whole.shares([size], used)[0, 0])
 
     least = _NEXT_CARRIER * predicted.share
     time = next(i for i, own in enumerate(inputs) if own.kind == "time")
