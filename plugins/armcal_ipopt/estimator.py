@@ -1,7 +1,8 @@
 """IPOPT over the increments of a problem. [Waechter2006]
 
 IPOPT sees sums over all records (cost, gradient, Hessian) through callbacks, so its own work does not grow
-with the data. Bounds are kept exactly: its bound relaxation is off. It also ends, converged, where the best step left
+with the data. Where semidefinite matrices are free, it begins with steps of quadratic models in their entries. Bounds
+are kept exactly: its bound relaxation is off. It also ends, converged, where the best step left
 would lower the cost by no more than its rounding errors.
 """
 
@@ -9,14 +10,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import casadi as ca
 import numpy as np
-from armcal.base.domains import Array, Semidefinite, symmetric
-from armcal.base.parameters import Parameters
+from armcal.base.domains import Array
 from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Progress, Solution, SolverVerdict, no_progress
@@ -28,13 +28,13 @@ from armcal.problem.problem import FactorRecords, NormalEquations, Problem
 from pydantic import Field
 from typing_extensions import override
 
+from armcal_ipopt.convex_steps import Posed, approached, has_matrices
+
 T = TypeVar("T")
 
 _SAME_COST = 1e-6
 _BARRIER_START = 1e-8
 _SMALLEST_UNIT = 1e-9
-_LEAST_START = 2e-2
-"""Of a semidefinite matrix's typical scale: its smallest eigenvalue at the start."""
 _MOST_REFUSED = 110
 """Trial points in a row without an equilibrium, which is two whole line searches down to a step of rounding errors: the
 fit stands where no way leads on, and IPOPT would search again in each iteration."""
@@ -80,7 +80,7 @@ class IpoptEstimator:
             return Solution(start, SolverVerdict("ipopt", "nothing is free", True, 0, 0.0))
         posed, random = PosedProblem(problem, records), np.random.default_rng(self._settings.seed)
         # The given start, then random ones a typical correction away from the nominal values.
-        starts = [posed.x(_definite(problem.parameters, start))]
+        starts = [np.clip(posed.x(start), *posed.bounds())]
         for _ in range(1, self._settings.starts):
             starts.append(np.clip(random.normal(size=len(posed.scales)), *posed.bounds()))
         solve_once = partial(_solve_once, self._settings, problem, tuple(records))
@@ -96,6 +96,20 @@ class IpoptEstimator:
 def _solve_once(settings: IpoptSettings, problem: Problem, records: tuple[FactorRecords, ...], start: Array) -> _Run:
     """From one start; on a copy of the records, so that no start warms another's equilibria."""
     posed = PosedProblem(problem, problem.subset(records, np.arange(records[0].count)))
+    iterations = 0
+
+    def solved(model: Posed, x: Array) -> Array:
+        nonlocal iterations
+        iterations += 1
+        return _searched(settings, model, x).x
+
+    if has_matrices(problem.parameters):
+        start = approached(posed, start, solved)
+    run = _searched(settings, posed, start)
+    return replace(run, iterations=run.iterations + iterations)
+
+
+def _searched(settings: IpoptSettings, posed: Posed, start: Array) -> _Run:
     objective = _Objective(posed, start, exact=settings.hessian == "exact")
     lower, upper = posed.bounds()
     # CasADi holds callbacks weakly: they must outlive the solve here.
@@ -161,18 +175,6 @@ class _Run:
     iterations: int
 
 
-def _definite(parameters: Parameters, values: Array) -> Array:
-    """The values, with no semidefinite matrix so near its cone's boundary that the gradient of its root vanishes."""
-    moved = values.copy()
-    for block in parameters.free:
-        if isinstance(block.domain, Semidefinite):
-            place = parameters.entries_of(block.name)
-            sizes, directions = np.linalg.eigh(symmetric(values[place]))
-            lifted = (directions * np.maximum(sizes, _LEAST_START * block.scale)) @ directions.T
-            moved[place] = lifted[np.triu_indices(3)]
-    return moved
-
-
 class _Objective:
     """Cost, gradient and Hessian, one evaluation for each point.
 
@@ -180,7 +182,7 @@ class _Objective:
     trial point of the line search wants the cost alone, which needs no derivatives.
     """
 
-    def __init__(self, posed: PosedProblem, start: Array, exact: bool) -> None:
+    def __init__(self, posed: Posed, start: Array, exact: bool) -> None:
         self._posed, self._exact = posed, exact
         self._at: Array | None = None
         self._tried: tuple[Array, float] | None = None
@@ -207,7 +209,7 @@ class _Objective:
     def settled(self, x: Array) -> bool:
         """Whether the best step within the bounds would lower the cost by no more than its rounding error."""
         model, (lower, upper) = self._evaluate(x), self._posed.bounds()
-        if not (np.isfinite(model.cost) and np.isfinite(model.hessian).all()):
+        if not (np.isfinite(model.cost) and np.isfinite(model.hessian).all()) or np.diag(model.hessian).min() < 0:
             return False
         # Most often one number alone can still lower it, which shows without the search for the best step of all.
         curvature = np.maximum(np.diag(model.hessian), _LEAST_CURVATURE)

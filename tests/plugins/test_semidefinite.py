@@ -15,8 +15,10 @@ import yaml
 from armcal.base.domains import Semidefinite, symmetric
 from armcal.estimate.estimator import estimate
 from armcal.problem.posed import PosedProblem
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal_cvxpy.estimator import CvxpyEstimator
+from armcal_ipopt.convex_steps import QuadraticModel
 from armcal_ipopt.estimator import IpoptEstimator
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
@@ -182,7 +184,35 @@ def test_the_curvature_of_a_root_is_that_of_differences_where_it_is_convex():
     assert eigenvalues.min() >= -1e-12, "a Hessian with it would not be convex"
 
 
+def test_all_of_the_curvature_is_that_of_differences_whatever_the_gradient(posed):
+    """The slopes of a quadratic model by increments, and those of its slopes."""
+    random, step = np.random.default_rng(7), 1e-5
+    at = somewhere(posed, random, 0.1)
+    model = QuadraticModel(posed, posed.coordinates(at), posed.convex_model(at))
+    x = somewhere(posed, random, 0.1)
+    there, ways = model.model(x), step * np.eye(len(x))
+    slopes = [(model.cost(x + way) - model.cost(x - way)) / (2 * step) for way in ways]
+    np.testing.assert_allclose(there.gradient, slopes, rtol=0, atol=1e-6 * np.abs(there.gradient).max())
+    bends = [(model.model(x + way).gradient - model.model(x - way).gradient) / (2 * step) for way in ways]
+    np.testing.assert_allclose(there.hessian, bends, rtol=0, atol=1e-6 * np.abs(there.hessian).max())
+
+
 # ---------------------------------------------------------------- the cone against the root
+
+
+def test_ipopt_evaluates_all_records_no_more_than_three_times_as_often_as_cvxpy(lrm, monkeypatch):
+    """It moves roots, along whose curves it would take some hundred steps."""
+    problem, records = springs_measured(lrm, 3, 60)
+    start, evaluated = problem.parameters.nominal(), []
+    whole = Problem.normal_equations
+    monkeypatch.setattr(Problem, "normal_equations", lambda *given: evaluated.append(1) or whole(*given))
+    answers, counts = [], []
+    for estimator in (CONE, ROOT):
+        evaluated.clear()
+        answers.append(found(estimator.solve(problem, records, start)))
+        counts.append(len(evaluated))
+    same_answer(problem, records, *answers)
+    assert counts[1] <= 3 * counts[0], counts
 
 
 def agree(lrm, seed, count, *overrides):

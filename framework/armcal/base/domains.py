@@ -84,8 +84,8 @@ class Domain(ABC):
         """d canonical entries / d coordinates (entries x dof)."""
         return self.retract_jacobian(base, delta)
 
-    def curvature(self, gradient: Array) -> Array | None:
-        """The convex part of sum over entries of gradient * d2 entry / d delta2 (dof x dof); None to neglect it."""
+    def curvature(self, gradient: Array, convex: bool = True) -> Array | None:
+        """Sum over entries of gradient * d2 entry / d delta2 (dof x dof), all or its convex part; None: neglect it."""
         return None
 
 
@@ -309,12 +309,14 @@ class Semidefinite(Domain):
         """One: on the cone's boundary too, a covariance reaches to both sides."""
         return np.eye(6)
 
-    def curvature(self, gradient: Array) -> Array | None:
+    def curvature(self, gradient: Array, convex: bool = True) -> Array | None:
         """Without it, what belongs at zero has no curvature there at all."""
         halves = np.array([1.0, 0.5, 0.5, 1.0, 0.5, 1.0])
-        size, directions = np.linalg.eigh(symmetric(gradient * halves))
-        convex = (directions * np.maximum(size, 0.0)) @ directions.T
-        return np.array([[2 * np.sum(convex * (one @ two)) for two in _UNITS] for one in _UNITS])
+        slope = symmetric(gradient * halves)
+        if convex:
+            size, directions = np.linalg.eigh(slope)
+            slope = (directions * np.maximum(size, 0.0)) @ directions.T
+        return np.asarray(2 * np.tensordot(_PRODUCTS, slope, 2))
 
 
 def symmetric(entries: Array) -> Array:
@@ -335,6 +337,7 @@ def _entries(matrix: Array) -> Array:
 _PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 """Where each entry of a symmetric matrix stands among the six."""
 _UNITS = tuple(symmetric(unit) for unit in np.eye(6))
+_PRODUCTS = np.array([[one @ two for two in _UNITS] for one in _UNITS])
 
 
 def two_across(direction: Array) -> Array:

@@ -296,12 +296,12 @@ class Parameters:
         delta = self.local(values)
         return self._diagonal(delta, lambda domain, base, part: domain.entries_jacobian(base, part))
 
-    def curvature(self, gradient: Array) -> Array:
+    def curvature(self, gradient: Array, convex: bool = True) -> Array:
         """What the retraction's curvature adds to a Hessian by increments; ``gradient`` is by free entries."""
         layout = self._layout
         total = np.zeros((layout.shape[1], layout.shape[1]))
         for block, _, entries, own in layout.others:
-            part = block.domain.curvature(gradient[entries])
+            part = block.domain.curvature(gradient[entries], convex)
             if part is not None:
                 total[own, own] = part
         return total

@@ -75,6 +75,16 @@ class PosedProblem:
         gradient = data.gradient + self._prior * self.coordinates(x)
         return NormalEquations(data.cost + self._prior_cost(x), gradient, data.hessian + np.diag(self._prior))
 
+    def by_increments(self, x: Array, model: NormalEquations) -> NormalEquations:
+        """A model by ``c`` at the place of ``x`` as one by ``x``, with all of the curvature of ``c``."""
+        chain = self._coordinates_jacobian(x)
+        by_entries = self.problem.parameters.entries_jacobian(self.values(x)) @ (
+            model.gradient / self.coordinate_scales
+        )
+        curvature = self.problem.parameters.curvature(by_entries, convex=False) * np.outer(self.scales, self.scales)
+        moved = model.chained(chain)
+        return NormalEquations(moved.cost, moved.gradient, moved.hessian + curvature)
+
     def exact_hessian(self, x: Array) -> Array:
         """The Hessian by ``x`` with the curvature of the residuals."""
         data = self.problem.normal_equations(self.values(x), self.records)
@@ -86,9 +96,14 @@ class PosedProblem:
         """Gradient and Hessian by ``x`` of data, by canonical entries, and priors, by coordinates."""
         parameters, delta = self.problem.parameters, x * self.scales
         by_data = data.chained(parameters.retract_jacobian(delta) * self.scales)
-        by_prior = parameters.coordinates_jacobian(delta) * self.scales / self.coordinate_scales[:, None]
+        by_prior = self._coordinates_jacobian(x)
         weighted = by_prior.T * self._prior
         return by_data.gradient + weighted @ self.coordinates(x), by_data.hessian + weighted @ by_prior
+
+    def _coordinates_jacobian(self, x: Array) -> Array:
+        """d ``c`` / d ``x``."""
+        jacobian = self.problem.parameters.coordinates_jacobian(x * self.scales)
+        return jacobian * self.scales / self.coordinate_scales[:, None]
 
     def _entry_gradient(self, x: Array, data: Array) -> Array:
         """The gradient by canonical entries, with that of the priors where entries are coordinates."""
