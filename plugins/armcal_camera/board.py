@@ -6,6 +6,7 @@ columns first. Nothing here needs OpenCV.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from types import MappingProxyType
@@ -71,6 +72,21 @@ class Board(Settings):
         """The ids of its tags, in their order on the board."""
         return range(0)
 
+    @property
+    def tag_corners(self) -> Array:
+        """Each tag's upper left, upper right, lower right and lower left corner as printed (T x 4 x 3, m)."""
+        return self.points.reshape(-1, 4, 3)
+
+    @property
+    def reach(self) -> float:
+        """How far around a point nothing is printed but the edges that cross there (m)."""
+        raise NotImplementedError
+
+    @property
+    def step(self) -> float:
+        """The distance of neighbouring points (m)."""
+        raise NotImplementedError
+
 
 class Chessboard(Board):
     """A chessboard of ``columns`` x ``rows`` inner corners.
@@ -92,9 +108,19 @@ class Chessboard(Board):
         return _grid(self.columns, self.rows, self.square)
 
     @property
+    @override
     def extent(self) -> tuple[float, float]:
-        """As of ``Board``: one square more than inner corners."""
         return (self.columns + 1) * self.square, (self.rows + 1) * self.square
+
+    @property
+    @override
+    def step(self) -> float:
+        return self.square
+
+    @property
+    @override
+    def reach(self) -> float:
+        return 0.7 * self.square
 
 
 class Charuco(Board):
@@ -130,6 +156,24 @@ class Charuco(Board):
     @override
     def extent(self) -> tuple[float, float]:
         return self.columns * self.square, self.rows * self.square
+
+    @property
+    @override
+    def step(self) -> float:
+        return self.square
+
+    @property
+    @override
+    def reach(self) -> float:
+        return min(0.7 * self.square, 0.65 * (self.square - self.marker))
+
+    @property
+    @override
+    def tag_corners(self) -> Array:
+        is_swapped = self.legacy and self.rows % 2 == 0
+        white = [(i, j) for j in range(self.rows) for i in range(self.columns) if (i + j) % 2 != is_swapped]
+        middles = self.square * (np.array([(i, j, 0.5) for i, j in white]) - 0.5)
+        return np.asarray(middles[:, None] + self.marker * np.array(_DOWNWARDS))
 
     @property
     @override
@@ -177,6 +221,16 @@ class Aprilgrid(Board):
 
     @property
     @override
+    def step(self) -> float:
+        return self.tag
+
+    @property
+    @override
+    def reach(self) -> float:
+        return min(_tag_reach(self.tag, self.family, self.border_bits), 0.7 * self.spacing)
+
+    @property
+    @override
     def tag_family(self) -> str:
         return self.family
 
@@ -206,12 +260,22 @@ class Tag(Board):
     @property
     def points(self) -> Array:
         """The corners: upper left, upper right, lower right, lower left."""
-        return self.tag * np.array([(-0.5, -0.5, 0.0), (0.5, -0.5, 0.0), (0.5, 0.5, 0.0), (-0.5, 0.5, 0.0)])
+        return self.tag * np.array(_DOWNWARDS)
 
     @property
     @override
     def extent(self) -> tuple[float, float]:
         return self.tag, self.tag
+
+    @property
+    @override
+    def step(self) -> float:
+        return self.tag
+
+    @property
+    @override
+    def reach(self) -> float:
+        return _tag_reach(self.tag, self.family, self.border_bits)
 
     @property
     @override
@@ -224,6 +288,7 @@ class Tag(Board):
         return range(self.id, self.id + 1)
 
 
+_DOWNWARDS = ((-0.5, -0.5, 0.0), (0.5, -0.5, 0.0), (0.5, 0.5, 0.0), (-0.5, 0.5, 0.0))
 _UPWARDS = ((0.0, 1.0, 0.0), (1.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
@@ -231,6 +296,18 @@ def _grid(columns: int, rows: int, step: float) -> Array:
     """Points of a grid, row by row (N x 3)."""
     x, y = np.meshgrid(np.arange(columns), np.arange(rows))
     return step * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+
+
+def tag_modules(family: str, border_bits: int = 1) -> int:
+    """Black and white cells along a tag's edge, its border included."""
+    match = _DICTIONARY.fullmatch(family)
+    inner = int(match[1]) if match else math.isqrt(int(family.split("h")[0]))
+    return inner + 2 * border_bits
+
+
+def _tag_reach(tag: float, family: str, border_bits: int) -> float:
+    """Within its border a tag's corner has nothing else around it."""
+    return 1.3 * tag * border_bits / tag_modules(family, border_bits)
 
 
 def _with_enough_tags(board: Any) -> Any:

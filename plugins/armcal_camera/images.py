@@ -1,0 +1,48 @@
+"""Images as grey values."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from armcal.errors import DataError, Location
+from numpy.typing import NDArray
+
+from armcal_camera.library import opencv
+
+Grey = NDArray[np.uint8]
+"""An image (H x W); the centre of the pixel in column u and row v is at (u, v)."""
+
+SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".pnm"))
+_ENDS = ((b"\x89PNG", b"IEND", 64), (b"\xff\xd8", b"\xff\xd9", 4096))
+_FEWEST_PIXELS = 1024
+
+
+def is_image(path: Path) -> bool:
+    """Whether a file's name says that it is an image."""
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+
+
+def grey_image(content: bytes, source: str) -> Grey:
+    """The grey values of an image file, as the sensor has them: an orientation that it states is not applied.
+
+    Colours are averaged as the eye sees them; of 16 bits a pixel the largest value becomes 255.
+
+    Raises:
+        DataError: it is no image, or cut off.
+    """
+    cv2 = opencv()
+    cut = any(content.startswith(head) and tail not in content[-last:] for head, tail, last in _ENDS)
+    image = None
+    if content and not cut:
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+        try:
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+        except cv2.error:  # what it does not know it refuses in many ways
+            image = None
+    if image is None or image.size < _FEWEST_PIXELS:
+        message = "the image is cut off." if cut else "it is not an image that can be read."
+        raise DataError(message, where=Location(source), hint="Save it as PNG again, or remove it.")
+    if image.dtype != np.uint8:
+        image = np.rint(image * (255.0 / max(float(image.max()), 1.0)))
+    return np.ascontiguousarray(image, dtype=np.uint8)

@@ -1,0 +1,26 @@
+"""The library OpenCV, which only what reads images needs."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from armcal.errors import PluginError
+
+
+def opencv() -> Any:
+    """The module ``cv2``.
+
+    Raises:
+        PluginError: it is not installed, or too old to know boards of tags.
+    """
+    try:
+        cv2 = importlib.import_module("cv2")
+    except ImportError as fault:
+        hint = "Run pip install 'armcal[camera]'."
+        raise PluginError(f"looking at images needs OpenCV ({fault}).", hint=hint) from fault
+    if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
+        version = getattr(cv2, "__version__", "of an unknown version")
+        hint = "Run pip install --upgrade 'armcal[camera]'."
+        raise PluginError(f"found OpenCV {version}, expected at least 4.8.", hint=hint)
+    return cv2

@@ -1,0 +1,169 @@
+"""Images of boards from a stated truth: a printed pattern through a lens, with blur, light and noise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from armcal.base.domains import Array
+
+from armcal_camera.board import Board
+from armcal_camera.images import Grey
+from armcal_camera.library import opencv
+from armcal_camera.pattern import dark_rectangles, outline
+
+_SAMPLES = 4  # along each side of a pixel
+_COARSE_PX = 4
+_MARGIN = 1  # coarse steps
+_MOST_TEXELS = 8192
+_ROUNDS = 12
+_WIDEST = 1.5  # rad from the axis
+
+
+@dataclass(frozen=True)
+class Lens:
+    """How rays become pixels.
+
+    Attributes:
+        focal: fx, fy (px).
+        centre: cx, cy (px; the first pixel's centre is at 0, 0).
+        distortion: k1, k2, p1, p2, k3 by Brown and Conrady, or k1 to k4 of a fisheye by Kannala and Brandt.
+        is_fisheye: which of the two.
+    """
+
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    is_fisheye: bool = False
+
+    def project(self, points: Array) -> Array:
+        """Pixels (N x 2) of points in the camera's frame (N x 3, m; z along the line of sight)."""
+        return self._distorted(points[:, :2] / points[:, 2:]) * np.array(self.focal) + np.array(self.centre)
+
+    def rays(self, pixels: Array) -> Array:
+        """x/z and y/z of the rays to pixels (N x 2), by fixed-point iteration."""
+        seen = (pixels - np.array(self.centre)) / np.array(self.focal)
+        if self.is_fisheye:
+            return self._straightened(seen)
+        ray = seen
+        for _ in range(_ROUNDS):
+            ray = ray - (self._distorted(ray) - seen)
+        return np.asarray(ray)
+
+    def _distorted(self, ray: Array) -> Array:
+        x, y = ray.T
+        square = x**2 + y**2
+        if self.is_fisheye:
+            radius = np.sqrt(square)
+            angle = np.arctan(radius)
+            return np.asarray(ray * (self._bent(angle) / np.where(radius > 0, radius, 1.0))[:, None])
+        k1, k2, p1, p2, k3 = self.distortion
+        radial = 1 + square * (k1 + square * (k2 + square * k3))
+        across = np.stack(
+            [2 * p1 * x * y + p2 * (square + 2 * x**2), p1 * (square + 2 * y**2) + 2 * p2 * x * y], axis=1
+        )
+        return np.asarray(ray * radial[:, None] + across)
+
+    def _bent(self, angle: Array) -> Array:
+        k1, k2, k3, k4 = self.distortion
+        square = angle**2
+        return np.asarray(angle * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))))
+
+    def _straightened(self, seen: Array) -> Array:
+        radius = np.linalg.norm(seen, axis=1)
+        angle = radius
+        for _ in range(_ROUNDS):
+            angle = np.clip(angle - (self._bent(angle) - radius), 0.0, _WIDEST)
+        return np.asarray(seen * (np.tan(angle) / np.where(radius > 0, radius, 1.0))[:, None])
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """What makes an image imperfect, and its grey values.
+
+    Attributes:
+        blur: standard deviation (px), beyond that of the pixels' own size.
+        noise: standard deviation (grey values).
+        light: how much brighter the right edge is than the left one, as a share of the mean.
+        dark, white, background: grey values.
+        seed: of the noise.
+    """
+
+    blur: float = 0.5
+    noise: float = 0.0
+    light: float = 0.0
+    dark: float = 30.0
+    white: float = 215.0
+    background: float = 110.0
+    seed: int = 0
+
+
+def render(placed: Sequence[tuple[Board, Array]], lens: Lens, size: tuple[int, int], exposure: Exposure) -> Grey:
+    """The image of boards.
+
+    Args:
+        placed: each board with camera_T_board (4 x 4, m), all of it in front of the camera; later ones cover others.
+        lens: of the camera.
+        size: width and height (px).
+        exposure: blur, light and noise.
+    """
+    cv2 = opencv()
+    rays = _fine_rays(lens, size)
+    fine = np.full(rays.shape[:2], exposure.background, np.float32)
+    for board, pose in placed:
+        texels = _texels_per_metre(board, lens, pose)
+        plane = pose[:3, [0, 1, 3]]
+        start = outline(board)[:2] - board.step / 2
+        to_texel = np.array([[texels, 0, -texels * start[0] - 0.5], [0, texels, -texels * start[1] - 0.5], [0, 0, 1.0]])
+        places = cv2.perspectiveTransform(rays, to_texel @ np.linalg.inv(plane))
+        texture = exposure.white + (exposure.dark - exposure.white) * _darkness(board, start, texels)
+        cv2.remap(
+            texture.astype(np.float32), places, None, cv2.INTER_LINEAR, dst=fine, borderMode=cv2.BORDER_TRANSPARENT
+        )
+    image = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
+    if exposure.blur:
+        image = cv2.GaussianBlur(image, (0, 0), exposure.blur)
+    image = image * (1 + exposure.light * (np.arange(size[0]) / size[0] - 0.5))
+    if exposure.noise:
+        image = image + np.random.default_rng(exposure.seed).normal(0.0, exposure.noise, image.shape)
+    return np.rint(image).clip(0, 255).astype(np.uint8)
+
+
+def _fine_rays(lens: Lens, size: tuple[int, int]) -> Array:
+    """The rays of all samples (H x W x 2); computed on a coarse grid, as they change slowly."""
+    cv2 = opencv()
+    columns, rows = (math.ceil(length / _COARSE_PX) + 2 * _MARGIN for length in size)
+    u, v = ((np.arange(n) - _MARGIN + 0.5) * _COARSE_PX - 0.5 for n in (columns, rows))
+    grid = np.stack(np.meshgrid(u, v), axis=2).reshape(-1, 2)
+    coarse = lens.rays(grid).reshape(rows, columns, 2).astype(np.float32)
+    step, cut = _COARSE_PX * _SAMPLES, _MARGIN * _COARSE_PX * _SAMPLES
+    fine = cv2.resize(coarse, (columns * step, rows * step), interpolation=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(fine[cut : cut + size[1] * _SAMPLES, cut : cut + size[0] * _SAMPLES])
+
+
+def _texels_per_metre(board: Board, lens: Lens, pose: Array) -> float:
+    """Two texels a pixel where the board is nearest."""
+    low, high = outline(board).reshape(2, 2)
+    corners = np.array([(x, y, 0.0, 1.0) for x in (low[0], high[0]) for y in (low[1], high[1])])
+    nearest = float((corners @ pose.T)[:, 2].min())
+    if nearest <= 0:
+        raise ValueError("the board is not all in front of the camera")
+    return min(2 * max(lens.focal) / nearest, _MOST_TEXELS / (max(board.extent) + board.step))
+
+
+def _darkness(board: Board, start: Array, texels: float) -> Array:
+    """How much of each texel is dark (H x W)."""
+    width, height = (math.ceil((extent + board.step) * texels) for extent in board.extent)
+    texture = np.zeros((height, width), np.float32)
+    for x0, y0, x1, y1 in (dark_rectangles(board) - [*start, *start]) * texels:
+        (columns, across), (rows, along) = _coverage(x0, x1), _coverage(y0, y1)
+        texture[rows, columns] += np.outer(along, across).astype(np.float32)
+    return texture
+
+
+def _coverage(low: float, high: float) -> tuple[slice, Array]:
+    """Which texels of a line an interval touches, and how much of each it covers."""
+    texels = np.arange(math.floor(low), math.ceil(high))
+    return slice(texels[0], texels[-1] + 1), np.minimum(texels + 1, high) - np.maximum(texels, low)

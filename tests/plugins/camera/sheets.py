@@ -1,0 +1,26 @@
+"""Boards and cameras for tests, and images of them."""
+
+from __future__ import annotations
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal_camera.board import AnyBoard, Aprilgrid, Board, Charuco, Chessboard, Tag
+from armcal_camera.pattern import outline
+from pydantic import TypeAdapter
+from scipy.spatial.transform import Rotation
+
+READ: TypeAdapter[Board] = TypeAdapter(AnyBoard)
+CHESSBOARD = Chessboard.si(type="chessboard", columns=9, rows=6, square=0.025)
+CHARUCO = Charuco.si(type="charuco", columns=9, rows=6, square=0.025, marker=0.018)
+APRILGRID = Aprilgrid.si(type="aprilgrid", columns=4, rows=3, tag=0.04, spacing=0.012)
+TAG = Tag.si(type="tag", id=7, tag=0.1)
+SIZE = (640, 480)
+
+
+def facing(board: Board, turn: tuple[float, float, float] = (0.0, 0.0, 0.0), distance: float = 0.45) -> Array:
+    """camera_T_board: its middle on the line of sight, turned by a rotation vector (rad)."""
+    upwards = np.diag([1.0, -1.0, -1.0]) if isinstance(board, Aprilgrid) else np.eye(3)
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec(turn).as_matrix() @ upwards
+    pose[:3, 3] = np.array([0, 0, distance]) - pose[:3, :2] @ outline(board).reshape(2, 2).mean(axis=0)
+    return pose
