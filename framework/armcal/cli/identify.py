@@ -10,6 +10,7 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.cli.common import FILE, Console, data, overrides, speaking
+from armcal.cli.identify_fixed import fixed_content, show_fixed
 from armcal.diagnose.minimal import Dropped, minimal_set
 from armcal.errors import ConfigError, Location
 from armcal.estimate.combination import Combination
@@ -32,6 +33,7 @@ from armcal.run.pipeline import Prepared, Stopwatch, assemble
     type=click.FloatRange(min=0, min_open=True),
     help="Leave out of the minimal set what stays more uncertain than so many typical scales.",
 )
+@click.option("--fixed", is_flag=True, help="Also fit, and judge which fixed parameters are worth freeing.")
 @overrides
 @speaking
 def identify(
@@ -42,9 +44,13 @@ def identify(
     prefer: tuple[str, ...],
     most: int | None,
     max_sd: float | None,
+    fixed: bool,
     overrides: tuple[str, ...],
 ) -> None:
-    """Report which combinations of CONFIG's free parameters its poses determine. Refuses no rank, solves nothing."""
+    """Report which combinations of CONFIG's free parameters its poses determine. Refuses no rank.
+
+    Solves nothing, but with --fixed.
+    """
     registry = console.registry()
     experiment = Experiment.load(config, overrides, data, registry)
     ready = assemble(experiment, Stopwatch())
@@ -69,12 +75,16 @@ def identify(
             "left_out": [_dropped(dropped) for dropped in smallest.left_out],
             "sd_ordinary_sizes": {name: _finite(sd) for name, sd in smallest.deviations.items()},
         }
+    if fixed:
+        content["fixed"] = fixed_content(console, experiment.of_records(ready.dataset), ready)
     for text in ready.warnings:
         console.warn(text)
     console.result(content)
     _show(console, content)
     if "minimal" in content:
         _show_minimal(console, content["minimal"])
+    if fixed:
+        show_fixed(console, content["fixed"])
 
 
 def _content(experiment: Experiment, ready: Prepared, triangle: Array, known: Identifiability) -> dict[str, Any]:

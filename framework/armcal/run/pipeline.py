@@ -119,7 +119,7 @@ def assemble(experiment: Experiment, watch: Stopwatch, accept: bool = False) -> 
         records = problem.records(dataset)
         start = aligned_start(problem, records, dataset)
         problem = started(start.problem, records)
-        records = _acting(problem, records, dataset)
+        records = acting(problem, records, dataset)
     with watch.stage("check"):
         unlearned(system)
         mixed_up = check_permuted_axes(problem, records, dataset, accept)
@@ -139,7 +139,7 @@ def assemble(experiment: Experiment, watch: Stopwatch, accept: bool = False) -> 
     return Prepared(dataset, problem, records, split, texts, start, tuple(mixed_up))
 
 
-def _acting(problem: Problem, records: tuple[FactorRecords, ...], dataset: Dataset) -> tuple[FactorRecords, ...]:
+def acting(problem: Problem, records: tuple[FactorRecords, ...], dataset: Dataset) -> tuple[FactorRecords, ...]:
     """Records with the noise of joint readings and the drift that they share."""
     records = with_joint_noise(problem, records, problem.parameters.nominal())
     return with_drift(problem, records, dataset, problem.parameters.nominal())
@@ -304,7 +304,7 @@ def _with_pose_residual(
             return ready, fitted, outcome
         arms = outcome.system(experiment.system).arms
         problem = replace(ready.problem, blueprint=replace(ready.problem.blueprint, arms=arms))
-        records = _acting(problem, problem.records(ready.dataset), ready.dataset)
+        records = acting(problem, problem.records(ready.dataset), ready.dataset)
         ready = replace(ready, problem=problem, records=records)
         estimator = spread(experiment.estimator, executor)
         again = fit(problem, ready.training, estimator, fitted.estimate.values, progress)

@@ -1,0 +1,97 @@
+"""Fixed parameters that the records of an experiment would rather have free, confirmed on records held out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from armcal.base.domains import Array
+from armcal.estimate.estimator import Progress, no_progress
+from armcal.estimate.freeing import Candidate, candidates, freeing
+from armcal.estimate.validation import cross_validate, folds
+from armcal.estimate.weighing import fit
+from armcal.problem.problem import Problem
+from armcal.run.experiment import Experiment
+from armcal.run.pipeline import Prepared, acting
+
+_FOLDS = 5
+_MOST_STEPS = 6
+_STANDARD_ERRORS, _LEAST_GAIN = 2.6, 0.01
+"""What a gain on records held out must be: in its standard errors, and of the error."""
+
+
+@dataclass(frozen=True)
+class FreedStep:
+    """A fixed parameter, freed beside those before it: mean error of records held out (m or rad; nan: not judged)."""
+
+    candidate: Candidate
+    unit: str
+    error: float
+
+
+@dataclass(frozen=True)
+class FixedParameters:
+    """What fixed parameters would gain.
+
+    Attributes:
+        error: mean error of records held out as configured (m, or rad where nothing measured is a length).
+        steps: parameters that explain residuals, in the order in which they are freed.
+        recommended: of these the ones to free: none if held-out errors do not fall by more than chance, and by 1 %.
+        others: names of what the records would determine too, and that gains nothing.
+    """
+
+    error: float
+    steps: tuple[FreedStep, ...]
+    recommended: tuple[str, ...]
+    others: tuple[str, ...]
+
+
+def fixed_parameters(experiment: Experiment, ready: Prepared, progress: Progress = no_progress) -> FixedParameters:
+    """Fit with what is configured, look for what it leaves, and cross-validate what is found.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at the fit.
+    """
+    parameters = ready.problem.parameters
+    wide = _with_candidates(experiment, ready)
+    train, narrow = ready.split.train, replace(wide, parameters=parameters)
+    records = wide.subset(acting(wide, wide.records(ready.dataset), ready.dataset), train)
+    start = next(iter(ready.start.values(ready.problem)), parameters.nominal())
+    fitted = fit(narrow, records, experiment.estimator, start, progress)
+    values, own = fitted.solution.values, [block.name for block in parameters.free]
+    chosen = freeing(wide, own, values, fitted.records)
+    others = tuple(one.name for one in chosen.others)
+    if not chosen.gaining:
+        return FixedParameters(float("nan"), (), (), others)
+    splits = folds(len(train), _FOLDS, 0, experiment.poses(ready.dataset.subset(train)))
+    names = [one.name for one in chosen.gaining]
+
+    def errors_with(count: int) -> Array:
+        freer = replace(wide, parameters=parameters.with_free([*own, *names[:count]]))
+        return cross_validate(freer, records, splits, experiment.estimator, values, progress).errors
+
+    counts = sorted({*range(min(len(names), _MOST_STEPS) + 1), len(names)})
+    errors, best = {count: errors_with(count) for count in counts}, 0
+    for count in counts[1:]:
+        best = count if _is_gain(errors[best], errors[count]) else best
+    means = {count: float(np.mean(error)) for count, error in errors.items()}
+    steps = [
+        FreedStep(one, parameters[one.name].unit, means.get(i, float("nan"))) for i, one in enumerate(chosen.gaining, 1)
+    ]
+    return FixedParameters(means[0], tuple(steps), tuple(names[:best]), others)
+
+
+def _with_candidates(experiment: Experiment, ready: Prepared) -> Problem:
+    """The problem with every candidate free, too: functions for whatever is chosen of them."""
+    parameters, system = ready.problem.parameters, experiment.system
+    names = [block.name for block in parameters.free]
+    freer = parameters.with_free([*names, *candidates(parameters)])
+    groups, evaluator = ready.problem.blueprint.groups, experiment.settings.evaluator
+    return Problem.build(system.arms, system.measurements, freer, system.environment, ready.dataset, evaluator, groups)
+
+
+def _is_gain(before: Array, after: Array) -> bool:
+    gains = before - after
+    sure = _STANDARD_ERRORS * float(np.std(gains)) / np.sqrt(len(gains))
+    return bool(np.mean(gains) > max(sure, _LEAST_GAIN * float(np.mean(before))))
