@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import click
 import numpy as np
 
 from armcal.base.domains import Array
+from armcal.base.parameters import Parameters
 from armcal.cli.common import FILE, Console, data, overrides, speaking
 from armcal.cli.identify_fixed import fixed_content, show_fixed
 from armcal.diagnose.minimal import Dropped, minimal_set
@@ -57,13 +59,7 @@ def identify(
     parameters = ready.problem.parameters
     if not parameters.free:
         raise ConfigError("no parameter is free.", where=Location(str(config)), hint="Name some under parameters.free.")
-    preferred = [parameters.select([glob]) for glob in prefer]
-    for glob, names in zip(prefer, preferred, strict=True):
-        if not any(parameters[name].free for name in names):
-            raise ConfigError(
-                f"--prefer {glob}: none of the parameters it names is free.",
-                hint="Name them under parameters.free as well; a minimal set is chosen from the free ones.",
-            )
+    preferred = _preferred(parameters, prefer)
     triangle = factor_at_zero(ready.problem, parameters.nominal(), ready.training)
     known = identify_from(triangle, parameters)
     content = _content(experiment, ready, triangle, known)
@@ -85,6 +81,17 @@ def identify(
         _show_minimal(console, content["minimal"])
     if fixed:
         show_fixed(console, content["fixed"])
+
+
+def _preferred(parameters: Parameters, globs: Sequence[str]) -> list[tuple[str, ...]]:
+    preferred = [parameters.select([glob]) for glob in globs]
+    for glob, names in zip(globs, preferred, strict=True):
+        if not any(parameters[name].free for name in names):
+            raise ConfigError(
+                f"--prefer {glob}: none of the parameters it names is free.",
+                hint="Name them under parameters.free as well; a minimal set is chosen from the free ones.",
+            )
+    return preferred
 
 
 def _content(experiment: Experiment, ready: Prepared, triangle: Array, known: Identifiability) -> dict[str, Any]:

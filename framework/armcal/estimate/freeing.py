@@ -108,7 +108,7 @@ class _Search:
         by_data = spread - np.diag(self.priors[own])
         if np.linalg.eigvalsh(by_data)[0] <= _OWN * np.diag(bends)[own].max():
             return None
-        cost = self.model.cost - slopes[beside] @ inverse @ slopes[beside] / 2
+        cost = self.model.cost - float(slopes[beside] @ inverse @ slopes[beside]) / 2
         spare = max(1, self.equations - len(beside) - len(own))
         gain = float(score @ np.linalg.solve(spread, score))
         variance = max(2 * cost - gain, 0.0) / spare
