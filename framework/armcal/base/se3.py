@@ -30,11 +30,13 @@ class Transform:
     translation: Expression
 
     def __matmul__(self, other: Transform) -> Transform:
-        """a_T_c = a_T_b @ b_T_c."""
-        return Transform(
-            ca.mtimes(self.rotation, other.rotation),
-            ca.mtimes(self.rotation, other.translation) + self.translation,
-        )
+        """a_T_c = a_T_b @ b_T_c; what turns or moves nothing is not multiplied, which takes most of the time."""
+        if self.rotation.is_eye():
+            rotation, moved = other.rotation, other.translation
+        else:
+            rotation = self.rotation if other.rotation.is_eye() else ca.mtimes(self.rotation, other.rotation)
+            moved = ca.mtimes(self.rotation, other.translation) if other.translation.nnz() else other.translation
+        return Transform(rotation, moved + self.translation if self.translation.nnz() else moved)
 
     def apply(self, point: Expression) -> Expression:
         """A point (3x1, m) given in frame b, in frame a."""
@@ -80,13 +82,12 @@ def cos_sin(angle: Expression) -> tuple[Expression, Expression]:
 def rotation_about(axis: str, angle: Expression) -> Transform:
     """A rotation (rad) about the x, y or z axis."""
     cosine, sine = cos_sin(angle)
-    zero, one = ca.SX(1, 1), ca.SX(1)
-    rows = {
-        "x": ((one, zero, zero), (zero, cosine, -sine), (zero, sine, cosine)),
-        "y": ((cosine, zero, sine), (zero, one, zero), (-sine, zero, cosine)),
-        "z": ((cosine, -sine, zero), (sine, cosine, zero), (zero, zero, one)),
+    places, numbers = {  # column by column
+        "x": (([0, 1, 2, 1, 2], [0, 1, 1, 2, 2]), (1, cosine, sine, -sine, cosine)),
+        "y": (([0, 2, 1, 0, 2], [0, 0, 1, 2, 2]), (cosine, -sine, 1, sine, cosine)),
+        "z": (([0, 1, 0, 1, 2], [0, 0, 1, 1, 2]), (cosine, sine, -sine, cosine, 1)),
     }[axis]
-    rotation = ca.vertcat(*[ca.horzcat(*row) for row in rows])
+    rotation = ca.SX(ca.Sparsity.triplet(3, 3, *places), ca.vertcat(*numbers))
     return Transform(ca.sparsify(rotation), ca.SX(3, 1))
 
 
