@@ -61,6 +61,8 @@ _ALL = (
     Unit("Nm", "torque"),
     Unit("C", "temperature"),
     Unit("per_K", "expansion"),
+    Unit("kpx", "image"),
+    Unit("px", "image", 1.0, 1000.0),
     Unit("1", DIMENSIONLESS),
 )
 

@@ -1,0 +1,264 @@
+"""Records from images: a folder of them, and a file that says where the arm stood for each."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, TypeGuard, runtime_checkable
+
+import numpy as np
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.settings import InputPath, Settings
+from armcal.base.units import from_unit
+from armcal.errors import DataError, Location
+from armcal.io.file_set import write_over
+from armcal.io.parallel import Automatic
+from armcal.io.plain_files import input_bytes, refuse
+from armcal.measure.reader import ReadRequest
+from pydantic import model_validator
+
+from armcal_camera.board import Board
+from armcal_camera.corners_csv import corners_text, read_corners
+from armcal_camera.detection import Detection, detect
+from armcal_camera.detection_cache import detection_key, forget_old, keep_detection, kept_detection
+from armcal_camera.images import grey_image, is_image
+from armcal_camera.pose_table import read_poses
+
+_MAX_BYTES = 512 * 1024**2
+_FEWEST = 3
+_BLURRED = 3.0
+_NAMED = 5
+_IMAGE = "image"
+
+
+class ImagesSettings(Settings):
+    """Where images and poses are.
+
+    ``folder`` has the images of a camera, in the order of their names with numbers counted as such (2.png before
+    10.png); with several cameras ``{camera: FOLDER}``. ``poses`` is a CSV file of joint angles, perhaps with a column
+    ``image`` that names the file; for an arm ``flange_pose`` a table of base_T_flange (12 or 16 numbers a row, m), or
+    columns x, y, z and qw, qx, qy, qz; or the settings of a reader, ``{type: pose_csv, path: FILE, euler: ...}``.
+    ``corners`` is a CSV file of corners that stands for the images; with ``folder`` it is written.
+    """
+
+    poses: InputPath | dict[str, Any]
+    folder: InputPath | dict[str, InputPath] | None = None
+    corners: InputPath | dict[str, InputPath] | None = None
+
+    @model_validator(mode="after")
+    def _some_images(self) -> ImagesSettings:
+        if self.folder is None and self.corners is None:
+            raise ValueError("found neither folder nor corners, expected the images, or the corners found in them")
+        return self
+
+
+@runtime_checkable
+class _SeesBoards(Protocol):
+    """A measurement whose channels ``u_K`` and ``v_K`` are the points of its boards."""
+
+    boards: Sequence[Board]
+
+
+@dataclass(frozen=True)
+class View:
+    """What one image says: corners over all boards (K x 2, px), why it says nothing, its size and its sharpness."""
+
+    corners: Array
+    fault: str = ""
+    size: tuple[int, int] | None = None
+    blur: float = float("nan")
+    sha256: str = ""
+
+
+class ImagesReader:
+    """The reader ``images``: a record an image, whose id is the image's name."""
+
+    Settings: ClassVar[type[ImagesSettings]] = ImagesSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {"poses": "/no/such/folder/poses.csv", "folder": "/no/such/folder"}
+
+    def __init__(self, settings: ImagesSettings) -> None:
+        self._settings = settings
+
+    def read(self, request: ReadRequest) -> Dataset:
+        """The records, in SI; images that say nothing are set aside, each with its reason.
+
+        Raises:
+            DataError: a file is refused, poses and images differ in number, or fewer than three images are left.
+            PluginError: OpenCV is not there.
+        """
+        cameras = {name: tuple(m.boards) for name, m in request.measurements.items() if _sees_boards(m)}
+        if not cameras:
+            message = "found no measurement that sees boards, expected one for the images."
+            raise DataError(message, hint="Add a measurement of type camera.")
+        dataset = read_poses(self._settings.poses, request, tuple(cameras))
+        count = len(dataset) + len(dataset.set_aside)
+        faults: list[dict[int, str]] = []
+        known = {w.channel for w in request.channels}
+        for name, boards in cameras.items():
+            views = _sharp_enough(self._views(name, boards, len(cameras)))
+            place = str(_own(self._settings.folder or self._settings.corners, name, len(cameras)))
+            chosen = _matched(dataset, views, place, count)
+            faults.append({i: views[image].fault for i, image in enumerate(chosen) if views[image].fault})
+            dataset = _with_corners(dataset, name, [views[image] for image in chosen], known)
+            ids = tuple(chosen)
+        blind = set.intersection(*(set(fault) for fault in faults))  # of several cameras one will do
+        return _left(replace(dataset, ids=ids), {i: "; ".join(fault[i] for fault in faults) for i in blind})
+
+    def _views(self, camera: str, boards: tuple[Board, ...], cameras: int) -> dict[str, View]:
+        """What each image of a camera says, by its name."""
+        folder = _own(self._settings.folder, camera, cameras)
+        corners = _own(self._settings.corners, camera, cameras)
+        if folder is None:
+            assert corners is not None
+            given, content = read_corners(corners, boards)
+            digest = hashlib.sha256(content).hexdigest()
+            return {name: View(pixels, _too_few(pixels), sha256=digest) for name, pixels in given.items()}
+        paths = _images_in(folder)
+        views = dict(zip([path.name for path in paths], Automatic().map(partial(look, boards), paths), strict=True))
+        forget_old()
+        views = _of_one_size(views)
+        if corners is not None:
+            seen = {name: view.corners for name, view in views.items() if not view.fault}
+            write_over({corners: corners_text(seen, boards).encode()})
+        return views
+
+
+def _sees_boards(measurement: object) -> TypeGuard[_SeesBoards]:
+    return isinstance(measurement, _SeesBoards)
+
+
+def _own(places: Path | Mapping[str, Path] | None, camera: str, cameras: int) -> Path | None:
+    """The folder or file of one camera."""
+    if isinstance(places, Mapping):
+        if camera not in places:
+            message = f"found {', '.join(places)}, expected the camera {camera} as well."
+            raise DataError(message, hint=f"Write {{{camera}: PATH}} in the data section.")
+        return places[camera]
+    if places is not None and cameras > 1:
+        message = f"found one path for {cameras} cameras, expected one for each."
+        raise DataError(message, hint=f"Write {{{camera}: PATH, ...}} in the data section.")
+    return places
+
+
+def look(boards: Sequence[Board], path: Path) -> View:
+    """What an image says of boards; from what was kept, if it was looked at before."""
+    content = input_bytes(path, _MAX_BYTES, "an image")
+    digest, nothing = hashlib.sha256(content).hexdigest(), np.full((sum(len(b.points) for b in boards), 2), np.nan)
+    keys = [detection_key(content, board) for board in boards]
+    detections = [kept_detection(key, board) for key, board in zip(keys, boards, strict=True)]
+    try:
+        image = grey_image(content, path.name)
+    except DataError as fault:
+        return View(nothing, fault.message.rstrip("."), sha256=digest)
+    made: list[Detection] = []
+    for key, board, kept in zip(keys, boards, detections, strict=True):
+        detection = kept or detect(image, board)
+        if kept is None:
+            keep_detection(key, detection)
+        made.append(detection)
+    seen = [detection for detection in made if not detection.fault]
+    if not seen:
+        return View(nothing, "; ".join(d.fault for d in made), image.shape[::-1], sha256=digest)
+    corners = np.vstack([np.where(d.fault != "", np.nan, d.corners) for d in made])
+    return View(corners, "", image.shape[::-1], max(d.blur for d in seen), digest)
+
+
+def _images_in(folder: Path) -> list[Path]:
+    try:
+        paths = [path for path in folder.iterdir() if is_image(path)]
+    except OSError as fault:
+        refuse(folder, f"it cannot be read as a folder ({fault.strerror}).", "Give the folder of the images.")
+    if not paths:
+        refuse(folder, "found no image in it.", "Give the folder of the images: PNG, JPEG, TIFF, BMP, WebP or PGM.")
+    return sorted(paths, key=lambda path: _natural(path.name))
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """A key by which 2.png stands before 10.png."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name.lower())]
+
+
+def _too_few(pixels: Array) -> str:
+    count = int(np.isfinite(pixels).all(axis=1).sum())
+    return "" if count >= 4 else f"it has {count} corners, at least 4 are needed"
+
+
+def _of_one_size(views: Mapping[str, View]) -> dict[str, View]:
+    """Views of images that are not as large as most say nothing: another camera took them, or another mode of it."""
+    sizes = [view.size for view in views.values() if view.size]
+    usual = max(sizes, key=sizes.count, default=None)
+    text = "it is {0} x {1} px, the others are {2} x {3}"
+    return {
+        name: replace(view, fault=text.format(*view.size, *usual))
+        if usual and view.size and view.size != usual
+        else view
+        for name, view in views.items()
+    }
+
+
+def _sharp_enough(views: Mapping[str, View]) -> dict[str, View]:
+    """Views that are far less sharp than most say nothing: the camera moved."""
+    usual = float(np.nanmedian([view.blur for view in views.values()] + [np.inf]))
+    text = "it is blurred: edges are {:.1f} px wide, {:.1f} px in most images"
+    return {
+        name: replace(view, fault=text.format(2 * view.blur, 2 * usual))
+        if not view.fault and view.blur > _BLURRED * usual
+        else view
+        for name, view in views.items()
+    }
+
+
+def _matched(dataset: Dataset, views: Mapping[str, View], place: str, count: int) -> list[str]:
+    """Each record's image: the one that it names, else the one at its place in the order of names."""
+    named = dataset.extra.get(_IMAGE)
+    if named is None:
+        if count != len(views):
+            message = f"found {count} poses in {dataset.source} and {len(views)} images, expected as many of each."
+            hint = "Remove what does not belong, or name each record's file in a column image."
+            raise DataError(message, where=Location(place), hint=hint)
+        rows = sorted([*dataset.rows, *(record.row for record in dataset.set_aside)])
+        names = list(views)
+        return [names[rows.index(row)] for row in dataset.rows]
+    by_stem = {Path(name).stem: name for name in views}
+    chosen = []
+    for row, text in zip(dataset.rows, named, strict=True):
+        name = Path(text.strip()).name
+        if name not in views and name not in by_stem:
+            message = f"found the image {text.strip()[:60]!r}, which is not among the {len(views)} in {place}."
+            refuse(dataset.source, message, "Correct its name, or remove the line.", row, _IMAGE)
+        chosen.append(name if name in views else by_stem[name])
+    return chosen
+
+
+def _with_corners(dataset: Dataset, camera: str, views: Sequence[View], known: set[str]) -> Dataset:
+    """The dataset with the channels of a camera that are asked for."""
+    pixels = [np.full_like(view.corners, np.nan) if view.fault else view.corners for view in views]
+    corners = from_unit(np.stack(pixels, axis=1), "px")
+    channels = {
+        f"{camera}.{axis}_{k}": np.ascontiguousarray(corners[k, :, i])
+        for k in range(len(corners))
+        for i, axis in enumerate("uv")
+        if f"{camera}.{axis}_{k}" in known
+    }
+    digest = hashlib.sha256("".join([dataset.sha256, *(view.sha256 for view in views)]).encode()).hexdigest()
+    return replace(dataset, channels={**dataset.channels, **channels}, sha256=digest)
+
+
+def _left(dataset: Dataset, faulty: Mapping[int, str]) -> Dataset:
+    """The dataset without images that say nothing, which are listed."""
+    reasons = [f"{dataset.ids[i]}: {reason}" for i, reason in sorted(faulty.items())]
+    shown = "; ".join(reasons[:_NAMED]) + (f"; and {len(reasons) - _NAMED} more" if len(reasons) > _NAMED else "")
+    kept = len(dataset) - len(faulty)
+    if kept < _FEWEST:
+        message = f"found {kept} of {len(dataset)} images that can be used, expected at least {_FEWEST} ({shown})."
+        hint = "Check the board's settings (armcal board writes them), and take sharper images of the whole board."
+        raise DataError(message, where=Location(dataset.source), hint=hint)
+    if not faulty:
+        return dataset
+    warning = f"{len(faulty)} of {len(dataset)} images are set aside: {shown}."
+    return replace(dataset.without(faulty), warnings=(*dataset.warnings, warning))

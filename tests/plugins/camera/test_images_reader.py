@@ -1,0 +1,242 @@
+"""Records from folders of images and files of poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from armcal.errors import DataError
+from armcal.measure.reader import ReadRequest, RequestedChannel
+
+pytest.importorskip("cv2")
+import cv2
+from armcal_camera import images_reader
+from armcal_camera.board import Board, Chessboard
+from armcal_camera.corners_csv import corners_text, read_corners
+from armcal_camera.images_reader import ImagesReader, ImagesSettings
+from armcal_camera.pose_table import FLANGE
+from armcal_camera.render import Exposure, Lens, render
+from scipy.spatial.transform import Rotation
+
+from tests.plugins.camera.sheets import CHARUCO, SIZE, facing
+
+BOARD = Chessboard.si(type="chessboard", columns=5, rows=4, square=0.04)
+LENS = Lens((600.0, 600.0), (320.0, 240.0))
+COUNT = 5
+TURNS = [(0.1 * i, 0.2 - 0.1 * i, 0.05 * i) for i in range(COUNT)]
+
+
+@dataclass
+class Camera:
+    boards: tuple[Board, ...] = (BOARD,)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("ARMCAL_CACHE_DIR", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Images 1.png to 5.png, and a file of joint angles beside them."""
+    place = tmp_path / "images"
+    place.mkdir()
+    for i, turn in enumerate(TURNS):
+        cv2.imwrite(str(place / f"{i + 8}.png"), render([(BOARD, facing(BOARD, turn))], LENS, SIZE, Exposure()))
+    rows = "".join(f"{10 * i},{5 - i},{20 + i}\n" for i in range(COUNT))
+    (place / "poses.csv").write_text(f"q1_deg,q2_deg,temperature_C\n{rows}")
+    return place
+
+
+def truth(i: int) -> Any:
+    pose = facing(BOARD, TURNS[i])
+    return LENS.project(BOARD.points @ pose[:3, :3].T + pose[:3, 3])
+
+
+def request_of(joints: tuple[str, ...] = ("q1", "q2"), camera: Camera | None = None) -> ReadRequest:
+    camera = camera or Camera()
+    dimensions = {name: "length" if name in ("x", "y", "z") else "angle" for name in joints}
+    channels = [RequestedChannel(f"arm.{name}", (name,), dimensions[name], True) for name in joints]
+    channels += [
+        RequestedChannel(f"arm.approach.{name}", (f"approach_{name}",), "dimensionless", False) for name in joints
+    ]
+    channels.append(RequestedChannel("temperature", ("temperature",), "temperature", False))
+    points = sum(len(board.points) for board in camera.boards)
+    channels += [
+        RequestedChannel(f"camera.{axis}_{k}", (f"{axis}_{k}",), "image", True, parts=("camera",))
+        for k in range(points)
+        for axis in "uv"
+    ]
+    arm = SimpleNamespace(name="arm", commanded=dict.fromkeys(joints))
+    return ReadRequest({"arm": arm}, {"camera": camera}, tuple(channels))  # type: ignore[dict-item]
+
+
+def read(request: ReadRequest | None = None, **settings: object) -> Any:
+    given = {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()}
+    return ImagesReader(ImagesSettings.model_validate(given)).read(request or request_of())
+
+
+def test_each_image_is_a_record_in_the_order_of_numbers(folder: Path) -> None:
+    dataset = read(folder=folder, poses=folder / "poses.csv")
+    assert dataset.ids == ("8.png", "9.png", "10.png", "11.png", "12.png")
+    np.testing.assert_allclose(np.degrees(dataset.column("arm.q1")), [0, 10, 20, 30, 40])
+    np.testing.assert_allclose(dataset.column("temperature"), [20, 21, 22, 23, 24])
+    for i in range(COUNT):
+        pixels = [[1000 * dataset.column(f"camera.{axis}_{k}")[i] for axis in "uv"] for k in range(20)]
+        np.testing.assert_allclose(pixels, truth(i), atol=0.05)
+
+
+def test_detections_are_kept_by_content(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = read(folder=folder, poses=folder / "poses.csv")
+
+    def never(image: object, board: object) -> None:
+        raise AssertionError("an image was looked at again")
+
+    monkeypatch.setattr(images_reader, "detect", never)
+    again = read(folder=folder, poses=folder / "poses.csv")
+    assert len(list((cache / "corners").iterdir())) == COUNT
+    for name, values in first.channels.items():
+        np.testing.assert_array_equal(values, again.channels[name])
+    assert first.sha256 == again.sha256
+    for path in (cache / "corners").iterdir():
+        path.write_text('{"corners": [[1, 2')
+    with pytest.raises(AssertionError, match="looked at again"):
+        read(folder=folder, poses=folder / "poses.csv")
+
+
+def test_a_column_may_name_the_image(folder: Path) -> None:
+    (folder / "poses.csv").write_text("image,q1_deg,q2_deg\n12.png,1,2\n10,3,4\nsub/8.png,5,6\n")
+    dataset = read(folder=folder, poses=folder / "poses.csv")
+    assert dataset.ids == ("12.png", "10.png", "8.png")
+    assert 1000 * dataset.column("camera.u_0")[1] == pytest.approx(truth(2)[0, 0], abs=0.05)
+    (folder / "poses.csv").write_text("image,q1_deg,q2_deg\n12.png,1,2\n7.png,3,4\n8.png,5,6\n")
+    with pytest.raises(DataError, match=r":3.*found the image '7.png'"):
+        read(folder=folder, poses=folder / "poses.csv")
+
+
+def test_what_says_nothing_is_set_aside_with_its_reason(folder: Path) -> None:
+    (folder / "notes.txt").write_text("a text among the images")
+    (folder / "8.png").write_bytes((folder / "8.png").read_bytes()[:5000])
+    cv2.imwrite(str(folder / "9.png"), np.full((480, 640), 99, np.uint8))
+    dataset = read(folder=folder, poses=folder / "poses.csv")
+    assert [(record.record_id, record.row) for record in dataset.set_aside] == [("8.png", 2), ("9.png", 3)]
+    assert "cut off" in dataset.set_aside[0].reason
+    assert "not found" in dataset.set_aside[1].reason
+    assert "2 of 5 images are set aside: 8.png: the image is cut off" in dataset.warnings[-1]
+    cv2.imwrite(str(folder / "10.png"), render([(BOARD, facing(BOARD))], LENS, (800, 480), Exposure()))
+    with pytest.raises(DataError, match=r"found 2 of 5 images .* 10.png: it is 800 x 480 px, the others are 640 x 480"):
+        read(folder=folder, poses=folder / "poses.csv")
+
+
+def test_a_blurred_image_among_sharp_ones_is_set_aside(folder: Path) -> None:
+    cv2.imwrite(str(folder / "11.png"), cv2.GaussianBlur(cv2.imread(str(folder / "11.png"), 0), (0, 0), 3.0))
+    dataset = read(folder=folder, poses=folder / "poses.csv")
+    assert "it is blurred: edges are 6." in dataset.set_aside[0].reason
+
+
+def test_poses_and_images_that_differ_in_number_are_refused(folder: Path) -> None:
+    (folder / "12.png").unlink()
+    with pytest.raises(DataError, match=r"found 5 poses in .*poses.csv and 4 images"):
+        read(folder=folder, poses=folder / "poses.csv")
+
+
+@pytest.mark.parametrize(
+    "change", [lambda f: [p.unlink() for p in f.glob("*.png")], lambda f: f.rename(f.parent / "x")]
+)
+def test_a_folder_without_images_is_refused(folder: Path, change: Callable[[Path], object]) -> None:
+    poses = folder.parent / "poses.csv"
+    poses.write_bytes((folder / "poses.csv").read_bytes())
+    change(folder)
+    with pytest.raises(DataError, match=r"no image in it|cannot be read as a folder"):
+        read(folder=folder, poses=poses)
+
+
+def test_corners_are_written_and_stand_for_the_images(folder: Path) -> None:
+    corners = folder / "corners.csv"
+    first = read(folder=folder, poses=folder / "poses.csv", corners=corners)
+    again = read(poses=folder / "poses.csv", corners=corners)
+    assert first.ids == again.ids
+    for name, values in first.channels.items():
+        np.testing.assert_allclose(values, again.channels[name], atol=6e-9)
+
+
+def test_corners_of_several_boards_read_back(tmp_path: Path) -> None:
+    boards = (BOARD, CHARUCO)
+    pixels = np.random.default_rng(2).uniform(0, 4000, (60, 2)).round(5)
+    pixels[[3, 25]] = np.nan
+    path = tmp_path / "corners.csv"
+    path.write_text(corners_text({"a.png": pixels, "b, c.png": pixels[::-1]}, boards))
+    corners, _ = read_corners(path, boards)
+    np.testing.assert_allclose(corners["a.png"], pixels, atol=6e-6)
+    np.testing.assert_allclose(corners["b, c.png"], pixels[::-1], atol=6e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("image,point,u_px\n", r":1.*expected v_px as well"),
+        (
+            "image,point,u_px,v_px\na,0,1,2\na,20,1,2\n",
+            r":3.*point.*found '20', expected a whole number from 0 to 19",
+        ),
+        ("image,point,u_px,v_px\na,0,1,2\na,0,1,2\n", r":3.*the point 0 of this image again"),
+        ("image,point,u_px,v_px\na,0,1,x\n", r":2.*v_px.*found 'x', expected a number"),
+        ("image,point,u_px,v_px\na,0,1\n", r":2.*found 3 cells, expected 4"),
+        ("image,point,u_px,v_px\n", "no corners"),
+    ],
+)
+def test_a_file_of_corners_is_refused_with_its_line(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "corners.csv"
+    path.write_text(text)
+    with pytest.raises(DataError, match=message):
+        read_corners(path, (BOARD,))
+
+
+POSES = [Rotation.from_euler("ZYX", (0.3 * i, -0.2, 3.0 + 0.1 * i)) for i in range(COUNT)]
+
+
+@pytest.mark.parametrize("form", ["matrix", "three rows", "quaternion", "euler"])
+def test_flange_poses_become_coordinates(folder: Path, form: str) -> None:
+    path, settings = folder / "flange.txt", None
+    matrices = [np.hstack([turn.as_matrix(), [[0.1 * i], [0.2], [0.5]]]) for i, turn in enumerate(POSES)]
+    if form in ("matrix", "three rows"):
+        rows = [[*m.ravel(), *([0, 0, 0, 1] if form == "matrix" else [])] for m in matrices]
+        text = "".join(" ".join(f"{x:.12f}" for x in row) + "\n" for row in rows)
+    elif form == "quaternion":
+        quaternions = [turn.as_quat()[[3, 0, 1, 2]] for turn in POSES]
+        lines = [",".join(repr(float(x)) for x in (*m[:, 3], *q)) for m, q in zip(matrices, quaternions, strict=True)]
+        text = "\n".join(["x_m,y_m,z_m,qw,qx,qy,qz", *lines, ""])
+    else:
+        angles = [turn.as_euler("XYZ", degrees=True) for turn in POSES]
+        lines = [",".join(repr(float(x)) for x in (*m[:, 3], *a)) for m, a in zip(matrices, angles, strict=True)]
+        text = "\n".join(["x_m,y_m,z_m,a,b,c", *lines, ""])
+        euler = {"columns": ["a", "b", "c"], "order": "XYZ", "unit": "deg"}
+        settings = {"type": "pose_csv", "path": str(path), "euler": euler}
+    path.write_text(text)
+    dataset = read(request_of(FLANGE), folder=folder, poses=settings or path)
+    values = {name: dataset.column(f"arm.{name}") for name in FLANGE}
+    np.testing.assert_allclose(values["x"], 0.1 * np.arange(COUNT), atol=1e-9)
+    turns = Rotation.from_euler("ZYX", np.stack([values["rz"], values["ry"], values["rx"]], axis=1))
+    assert max((turn.inv() * expected).magnitude() for turn, expected in zip(turns, POSES, strict=True)) < 1e-7
+    assert np.abs(np.diff(values["rx"])).max() < 1
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1 0 0 0 0 1 0 0 0 0 1", r":2.*found 11 cells, expected 12 or 16"),
+        ("1 0 0 0 0 1 0 0 0 0 2 0", r":2.*no rotation"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 1 1", r":2.*last row is not 0 0 0 1"),
+    ],
+)
+def test_a_flange_pose_that_is_none_is_refused(folder: Path, line: str, message: str) -> None:
+    path = folder / "flange.txt"
+    path.write_text(f"1 0 0 0 0 1 0 0 0 0 1 0\n{line}\n")
+    with pytest.raises(DataError, match=message):
+        read(request_of(FLANGE), folder=folder, poses=path)
