@@ -65,7 +65,7 @@ def test_the_page_takes_five_joints_from_a_table_to_a_calibrated_urdf(here: Path
     assert files <= {path.name for path in arm5.iterdir()}
     content = json.loads((arm5 / "runs" / "simulated" / "metrics.json").read_text(encoding="utf-8"))
     errors = content["error_mm"]
-    assert errors["nominal"]["holdout"]["mean"] > 2
+    assert errors["nominal"]["holdout"]["mean"] > 1
     assert errors["calibrated"]["holdout"]["mean"] == pytest.approx(NOISE_MM, rel=0.2)
     assert f"calibrated {errors['calibrated']['holdout']['mean']:.3f} mm (the noise alone: 0.160 mm)" in PAGE
     assert f"nominal {errors['nominal']['holdout']['mean']:.3f} mm" in PAGE
@@ -210,7 +210,7 @@ def test_a_scara_slides_in_either_convention(convention: str, here: Path) -> Non
     assert ran.exit_code == 0, ran.output
     content = json.loads(ran.stdout)
     assert content["works"]
-    assert content["holdout_calibrated_mm"] < 1.3 * NOISE_MM < 1 < content["holdout_nominal_mm"]
+    assert content["holdout_calibrated_mm"] < 1.3 * NOISE_MM < 4 * NOISE_MM < content["holdout_nominal_mm"]
     read = (here / "scara" / "simulated.csv").read_text(encoding="utf-8").splitlines()[0]
     assert "no_deg" in read and "q3_mm" in read
     text = (here / "scara" / "README.md").read_text(encoding="utf-8")
@@ -401,6 +401,17 @@ def test_a_target_off_the_last_axis_is_stated_and_estimated(here: Path) -> None:
     found = {each["name"]: each for each in kept["parameters"]}
     assert [found[f"tracker.target_{axis}"]["nominal"] for axis in "xyz"] == pytest.approx([0.03, -0.012, 0.055])
     assert all(found[f"tracker.target_{axis}"]["sd"] < 1e-4 for axis in "xyz")
+
+
+def test_a_target_that_was_not_stated_is_taken_to_sit_beside_the_last_axis(here: Path) -> None:
+    """Then all is free that a target beside the axis shows, as where its place was stated."""
+    rows = robot_of_rows(
+        "arm", "standard", read_rows(here / table(here, f"{HEADER}\n90,0,0,90\n90,160,0,0\n0,0,0,90\n"))
+    )
+    places = {"unstated": None, "beside": (0.03, -0.012, 0.055), "on": (0.0, 0.0, 0.055)}
+    free = {n: set(write_robot(replace(rows, target=at), here / n, REGISTRY).choice.kept) for n, at in places.items()}
+    assert free["unstated"] == free["beside"]
+    assert free["beside"] - free["on"] == {"arm.mdh.alpha2", "arm.mdh.a2"}
 
 
 @pytest.mark.parametrize("target", ["30,0", "30,0,0,0", "a,0,0", "30 deg,0,0", "nan,0,0", "1e9,0,0"])

@@ -68,7 +68,7 @@ class Robot:
         urdf_file: its name.
         tip: the link that is the tool.
         up: which way is up in the tracker's base frame (unit vector); None if not stated.
-        target: where the tracker's target sits in the tool's frame (m), roughly.
+        target: where the tracker's target sits in the tool's frame (m), roughly; None if not stated.
     """
 
     name: str
@@ -82,7 +82,7 @@ class Robot:
     urdf_file: str = ""
     tip: str = ""
     up: tuple[float, float, float] | None = None
-    target: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    target: tuple[float, float, float] | None = None
 
 
 def with_tilts(convention: Convention, rows: tuple[Row, ...]) -> tuple[Row, ...]:

@@ -81,22 +81,30 @@ def _fill(place: Path, robot: Robot, registry: PluginRegistry) -> FreeChoice:
     parameters = experiment.parameters
     masses = [b for b in parameters.blocks if b.name.startswith("arm.links.") and b.name.endswith(".mass")]
     weight_N = GRAVITY_M_S2 * sum(block.nominal[0] for block in masses)
-    true = truth.made_up(parameters, weight_N * _reach(experiment, robot))
+    reach = _reach(experiment, robot)
+    target = {} if robot.target else {name: share * reach for name, share in truth.UNSTATED_TARGET.items()}
+    true = truth.made_up(parameters, weight_N * reach, target)
     _write(place, robot, nothing, truth.as_text(parameters, true))
     experiment = Experiment.load(place / SIMULATED, registry=registry)
     dataset = experiment.simulator().simulate(experiment.simulation_request)
     write_csv(place / RECORDS, dataset, experiment.request(measured=True).channels)
     freed = f"parameters.free={json.dumps(truth.candidates(parameters))}"
-    chosen = _choose_free(Experiment.load(place / SIMULATED, [freed], registry=registry), robot)
+    chosen = _choose_free(Experiment.load(place / SIMULATED, [freed], registry=registry), robot, target)
     _write(place, robot, chosen, truth.as_text(parameters, true))
     return chosen
 
 
-def _choose_free(experiment: Experiment, robot: Robot) -> FreeChoice:
-    """A minimal set of the experiment's free parameters, for its training records (see ``armcal identify``)."""
+def _choose_free(experiment: Experiment, robot: Robot, target: Mapping[str, float]) -> FreeChoice:
+    """A minimal set of the experiment's free parameters, for its training records (see ``armcal identify``).
+
+    A target whose place was not stated is taken to sit there (m): on the last axis it would not show all that it does.
+    """
     ready = assemble(experiment, Stopwatch())
     parameters = ready.problem.parameters
-    triangle = factor_at_zero(ready.problem, parameters.nominal(), ready.training)
+    values = experiment.parameters.nominal()  # as drawn, not where the records place it: springs would seem loaded
+    for name, place in target.items():
+        values[parameters.entries_of(name)] = place
+    triangle = factor_at_zero(ready.problem, values, ready.training)
     free = [block.name for block in parameters.free]
     preferred = [
         [name for name in free if any(fnmatch.fnmatchcase(name, glob) for glob in globs)] for globs in robot.preferred

@@ -16,6 +16,8 @@ SEED = 1
 LENGTH_SD_M, ANGLE_SD_RAD = 0.001, 0.003
 SAG_RAD = 0.002
 """What a joint gives under half the moment that the arm's whole weight has at its full reach."""
+UNSTATED_TARGET = {"tracker.target_x": 0.06, "tracker.target_y": -0.04, "tracker.target_z": 0.03}
+"""Of the reach: where a target sits whose place was not stated. Most sit beside the last axis, and show more there."""
 _MOST_SD = 2.0
 _SPRING = (0.5, 1.5)
 _SHOWN = {"m": "mm", "rad": "deg", "rad_per_Nm": "rad_per_Nm"}
@@ -34,12 +36,13 @@ def candidates(parameters: Parameters) -> tuple[str, ...]:
     )
 
 
-def made_up(parameters: Parameters, load_Nm: float) -> dict[str, float]:
+def made_up(parameters: Parameters, load_Nm: float, target: Mapping[str, float]) -> dict[str, float]:
     """True values (SI) of every candidate that is one number; a rotation stays as it was stated.
 
     Args:
         parameters: of the robot, with their nominal values.
         load_Nm: the moment of its whole weight at its full reach; 0 if its masses are not known.
+        target: how far parameters of the target are off beside that (m).
     """
     random = np.random.default_rng(SEED)
     names = [name for name in candidates(parameters) if parameters[name].size == 1]
@@ -52,7 +55,7 @@ def made_up(parameters: Parameters, load_Nm: float) -> dict[str, float]:
         else:
             deviation = LENGTH_SD_M if block.unit == "m" else ANGLE_SD_RAD
             error = deviation * float(np.clip(random.normal(), -_MOST_SD, _MOST_SD))
-        values[name] = float(block.nominal[0]) + error
+        values[name] = float(block.nominal[0]) + error + target.get(name, 0.0)
     return values
 
 
