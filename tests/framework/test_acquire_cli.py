@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
 from armcal.cli.main import cli
@@ -259,9 +259,8 @@ def test_ctrl_c_parks_the_arm_and_resume_measures_the_rest(run: BenchRun) -> Non
 
 def test_a_missing_library_is_named(tmp_path: Path, plan: Path) -> None:
     (tmp_path / "serial.py").write_text("raise ModuleNotFoundError(\"No module named 'serial'\", name='serial')\n")
-    command = [*ARMCAL, "acquire", str(CONFIG), "--plan", str(plan), "--out", str(tmp_path / "o")]
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    done = subprocess.run([*command, "--yes"], capture_output=True, text=True, env=environment)
+    command = ("acquire", str(CONFIG), "--plan", str(plan), "--out", str(tmp_path / "o"), "--yes")
+    done = forked.armcal(*command, path=tmp_path)
     assert done.returncode in (1, 2) and "serial" in done.stderr and "Traceback" not in done.stderr
 
 

@@ -258,7 +258,7 @@ def test_killed_after_any_entry_nothing_is_measured_twice_and_nothing_is_lost(di
     assert again.fastest() <= RATE * 1.0001
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", [*range(10), *(pytest.param(s, marks=pytest.mark.slow) for s in range(10, 30))])
 def test_random_troubles_end_in_done_held_or_parked(seed: int) -> None:
     random = np.random.default_rng(seed)
     run = Run()

@@ -253,7 +253,9 @@ def test_a_run_leaves_the_bootstrap_beside_the_curvature(tmp_path: Path) -> None
         low, high = float(row["bootstrap_lower"]), float(row["bootstrap_upper"])
         assert low < float(row["value"]) + float(row["sd"]) * 8 and low < high
         assert told["parameters"][name]["sd"] == pytest.approx(float(row["bootstrap_sd"]), rel=1e-6)
-    again = CliRunner().invoke(cli, ["run", DEMO, "--out", str(out), "-q", "--set", "validation.folds=0"])
+    again = CliRunner().invoke(
+        cli, ["run", DEMO, "--out", str(out), "-q", "--set", FREE, "--set", "validation.folds=0", "--accept"]
+    )
     assert again.exit_code == 0 and not (out / "bootstrap.csv").exists(), "one of an earlier run was left beside"
     assert (out / "earlier" / "1" / "bootstrap.csv").is_file()
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import re
 import shutil
 import signal
@@ -14,6 +13,7 @@ import time
 from io import StringIO
 from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
 import yaml
@@ -196,8 +196,7 @@ def test_verbose_says_how_long_each_stage_took_and_plain_does_not(said: Result, 
 
 
 def test_errors_are_json_too_where_json_was_asked_for() -> None:
-    command = [sys.executable, "-m", "armcal.cli", "check", "nowhere.yaml", "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = forked.armcal("check", "nowhere.yaml", "--json")
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert "nowhere.yaml" in json.loads(done.stdout)["error"]["message"]
 
@@ -256,8 +255,7 @@ def test_a_missing_library_is_named_and_only_hurts_who_asks_for_it(tmp_path: Pat
         "    done = CliRunner().invoke(cli, run)\n"
         "    print(done.exit_code, 'no cvxpy on this machine' in done.stderr, 'Traceback' in done.stderr)\n"
     )
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment, timeout=120)
+    done = forked.run_code(script, path=tmp_path)
     assert done.stdout.splitlines() == ["2 True False", "0 False False"], done.stdout + done.stderr
 
 

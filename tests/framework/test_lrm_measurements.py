@@ -56,6 +56,7 @@ def test_a_model_that_misses_more_than_3_percent_of_the_reach_is_not_to_be_used(
     assert run(repository, lrm_data, option, tmp_path / "out")["verdict"]["usable"] == usable
 
 
+@pytest.mark.slow
 def test_the_published_training_set_gives_the_published_compliances(
     repository: Path, lrm_data: Path, tmp_path: Path
 ) -> None:

@@ -83,7 +83,6 @@ BEST = {
 }
 FIRST = (("panda", "front_center"), ("kinova", "left"))
 POLISHED = (("kuka", "front"), ("kinova", "left"))
-ROWS = (*FIRST, *POLISHED)
 MOVED = {("kinova", "front")}
 """Published figures that armcal refuses: a socket or the base moved while these records were taken."""
 SLOW = pytest.mark.slow
@@ -278,7 +277,9 @@ def _moved(urdf, x):
 # ---------------------------------------------------------------- the published figures
 
 
-@pytest.mark.parametrize(("name", "trained"), [pytest.param(*k, marks=[] if k in ROWS else SLOW) for k in PUBLISHED])
+@pytest.mark.parametrize(
+    ("name", "trained"), [pytest.param(*k, marks=[] if k in POLISHED else SLOW) for k in PUBLISHED]
+)
 def test_every_row_of_the_published_table(run, name, trained):
     told, _ = published(run, name, trained)
     (*figures, distance), positions = PUBLISHED[name, trained]

@@ -161,12 +161,14 @@ def test_components_reach_every_output(repository, tmp_path):
     Calibration.load(tmp_path / "out" / "calibration.yaml")
 
 
-def test_noise_for_each_axis_is_one_number_thrice_or_a_list(repository, tmp_path):
-    data = repository / "configs" / "lrm_arm" / "demo.csv"
-    few = "validation.folds=0"
-    one, _ = run(repository, data, tmp_path / "one", few)
-    same, _ = run(repository, data, tmp_path / "same", "measurements.tracker.noise_mm=[0.5, 0.5, 0.5]", few)
-    other, _ = run(repository, data, tmp_path / "other", "measurements.tracker.noise_mm=[0.5, 0.5, 5]", few)
+def test_noise_for_each_axis_is_one_number_thrice_or_a_list(repository):
+    def judged(*overrides):
+        config = repository / "configs" / "lrm_arm" / "demo.yaml"
+        return outputs.metrics(calibrate(Experiment.load(config, ["validation.folds=0", *overrides])))
+
+    one = judged()
+    same = judged("measurements.tracker.noise_mm=[0.5, 0.5, 0.5]")
+    other = judged("measurements.tracker.noise_mm=[0.5, 0.5, 5]")
     assert same["error_mm"] == one["error_mm"] and same["noise"] == one["noise"]
     assert other["error_mm"]["calibrated"]["train"]["rms"] > one["error_mm"]["calibrated"]["train"]["rms"]
 

@@ -274,7 +274,7 @@ late = pytest.mark.xfail(reason="measured over 15 runs: decided within 5 records
 @pytest.mark.parametrize(
     ("bump", "seeds"),
     [
-        *((bump, 1) for bump in BUMPS),
+        *(pytest.param(bump, 1, marks=[pytest.mark.slow] if bump == "20 mm" else []) for bump in BUMPS),
         *(pytest.param(b, 15, marks=[pytest.mark.slow, *([late] if b == "3 mm" else [])]) for b in BUMPS),
     ],
 )

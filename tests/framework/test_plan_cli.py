@@ -255,7 +255,7 @@ def test_a_plan_about_a_calibration_takes_its_values(tmp_path: Path, demo_run: P
 
 
 @pytest.mark.parametrize("command", ["check", "identify", "plan", "run", "study"])
-@pytest.mark.quick("check", "plan", "run")
+@pytest.mark.quick("check", "plan")
 def test_another_data_file_wins_over_an_absolute_path_that_leads_nowhere(command: str, tmp_path: Path) -> None:
     """The configured path is not even looked at."""
     away = f"data.path={tmp_path / 'away' / 'records.csv'}"

@@ -435,12 +435,10 @@ def test_predictions_know_when_they_cannot_say_how_good_they_are(recording: Path
         assert wrong.exit_code == 2 and "NAME=COLUMN" in wrong.output and "Traceback" not in wrong.output
 
 
-def test_a_calibration_without_drift_says_that_recordings_are_alike(tmp_path: Path) -> None:
-    run = armcal("run", DEMO, "--out", str(tmp_path / "run"), *setting("evaluator=interpreted", "validation.folds=0"))
-    assert run.exit_code == 0
-    result, within = predicted(tmp_path, "--recording", "calibrated", poses=POSES)
+def test_a_calibration_without_drift_says_that_recordings_are_alike(demo_calibration: Path, tmp_path: Path) -> None:
+    result, within = predicted(tmp_path, "--recording", "calibrated", calibration=demo_calibration, poses=POSES)
     assert result.exit_code == 0 and "no parameter drifts" in " ".join(result.output.split())
-    _, new = predicted(tmp_path, poses=POSES)
+    _, new = predicted(tmp_path, calibration=demo_calibration, poses=POSES)
     assert within == new
 
 

@@ -101,6 +101,7 @@ def test_after_the_end_the_estimate_goes_back_to_the_last_good_record_and_forth_
     assert armcal("replay", folder).exit_code == 0
 
 
+@pytest.mark.slow
 def test_after_a_kill_too(command: list[str], ended: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     started = [sys.executable, "-m", "armcal.cli", *command, str(folder), "--follow"]

@@ -135,12 +135,12 @@ def test_a_prior_is_kept_and_a_contradiction_said() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda p: p[[1, 0, 2]], "a left-handed frame"),
+        pytest.param(lambda p: p[[1, 0, 2]], "a left-handed frame", marks=pytest.mark.slow),
         (lambda p: p * np.array([[1], [1], [-1]]), "a left-handed frame"),
         (lambda p: np.roll(p, 1, axis=1), "the positions of the row after"),
-        (lambda p: np.roll(p, -1, axis=1), "the positions of the row before"),
+        pytest.param(lambda p: np.roll(p, -1, axis=1), "the positions of the row before", marks=pytest.mark.slow),
         (lambda p: p / 25.4, "positions 25.4 times as large"),
-        (lambda p: p * 1000, "positions 0.001 times as large"),
+        pytest.param(lambda p: p * 1000, "positions 0.001 times as large", marks=pytest.mark.slow),
     ],
 )
 def test_mistakes_are_named_in_any_frame(anywhere: Prepared, change, words: str) -> None:

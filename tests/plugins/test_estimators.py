@@ -433,7 +433,12 @@ def known_of(lrm, names):
     return found, problem, records, start
 
 
-@pytest.mark.parametrize("planted", UNDETERMINED, ids=str)
+def quick_and_slow(choices):
+    """The first few for every run of the tests, the others for a long one."""
+    return [*choices[:6], *(pytest.param(choice, marks=pytest.mark.slow) for choice in choices[6:])]
+
+
+@pytest.mark.parametrize("planted", quick_and_slow(UNDETERMINED), ids=str)
 def test_a_planted_undetermined_combination_is_found_and_named(lrm, planted):
     found, problem, records, start = known_of(lrm, (*planted, *COMPANY))
     assert len(found.undetermined) == 1
@@ -446,7 +451,7 @@ def test_a_planted_undetermined_combination_is_found_and_named(lrm, planted):
         require_solvable(problem, records, start)
 
 
-@pytest.mark.parametrize("names", SOUND, ids=lambda n: str(n[:4]))
+@pytest.mark.parametrize("names", quick_and_slow(SOUND), ids=lambda n: str(n[:4]))
 def test_a_sound_choice_of_parameters_is_not_suspected(lrm, names):
     found, problem, records, start = known_of(lrm, tuple(dict.fromkeys((*names, *COMPANY))))
     assert found.undetermined == ()
