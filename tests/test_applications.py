@@ -12,6 +12,7 @@ from forked import run_code
 CONFIG = Path(__file__).parents[1] / "configs" / "lrm_arm" / "demo.yaml"
 APPLICATIONS = {
     "bench": {"acquire", "record", "rehearse", "servo", "simulated-bench"},
+    "camera": {"board"},
     "capability": {"acceptance", "capability"},
     "online": {"control", "mission", "recalibrate", "replay", "watch", "what-if"},
     "serve": {"serve"},
