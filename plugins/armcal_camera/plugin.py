@@ -13,3 +13,23 @@ def armcal_register_readers(register: Register) -> None:
 def armcal_register_commands(register: Register) -> None:
     """Announce the command."""
     register("board", "armcal_camera.board_command:board", "Write a board to print, and its settings.")
+
+
+@hookimpl
+def armcal_register_models(register: Register) -> None:
+    """Announce the arm model."""
+    register("flange_pose", "armcal_camera.flange_pose:FlangePose", "an arm of which only flange poses are recorded")
+
+
+@hookimpl
+def armcal_register_measurements(register: Register) -> None:
+    """Announce the measurement."""
+    register("camera", "armcal_camera.camera:Camera", "corners of boards in the images of a camera")
+
+
+@hookimpl
+def armcal_register_exporters(register: Register) -> None:
+    """Announce the exporters."""
+    register("camera_info", "armcal_camera.export:CameraInfoExporter", "a camera's intrinsics as ROS camera_info YAML")
+    register("opencv", "armcal_camera.export:OpenCvExporter", "a camera's intrinsics and poses as OpenCV YAML")
+    register("hand_eye", "armcal_camera.export:HandEyeExporter", "where a camera sits: YAML, URDF joint, ROS 2 command")

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import casadi as ca
 import numpy as np
+from armcal.arm.assembly import Arm
 from armcal.arm.evaluator import Evaluator
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
@@ -16,7 +17,9 @@ from armcal.base.settings import Length, Settings
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.estimate.simulation import SimulationRequest, measured_with_noise
+from armcal.measure.points import LimitedView
 from armcal.problem.problem import Problem
+from armcal.problem.visibility import as_seen
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
@@ -150,3 +153,24 @@ def measured_while_moving(request: SimulationRequest, commands: Dataset, values:
         read = Evaluator(row_by_row, factor.outputs)(np.zeros(0), np.concatenate([record, own]), start)
         shown |= dict(zip(factor.output_channels, read, strict=True))
     return shown
+
+
+def out_of_view(request: SimulationRequest, dataset: Dataset) -> dict[str, Array]:
+    """Readings of instruments with a limited view, by channel (N each), missing (NaN) where it is out of view."""
+    seen, _ = as_seen(*_as_built(request, dataset), dataset)
+    return {channel: values for channel, values in seen.channels.items() if values is not dataset.channels[channel]}
+
+
+def seen_poses(request: SimulationRequest, arm: Arm, commands: Array) -> NDArray[np.bool_]:
+    """In which of these commands of an arm (joints x N) an instrument sees anything (N)."""
+    if not any(isinstance(measurement, LimitedView) for measurement in request.measurements.values()):
+        return np.ones(commands.shape[1], dtype=bool)
+    moved = {f"{arm.name}.{joint}": row for joint, row in zip(arm.commanded, commands, strict=True)}
+    dataset = Dataset(tuple(map(str, range(commands.shape[1]))), moved)
+    return as_seen(*_as_built(request, dataset), dataset)[1]
+
+
+def _as_built(request: SimulationRequest, dataset: Dataset) -> tuple[Problem, Array]:
+    fixed = request.parameters.with_free(())
+    parts = (request.arms, request.measurements, fixed, request.environment, dataset)
+    return Problem.build(*parts, evaluator="interpreted"), fixed.nominal()

@@ -19,7 +19,18 @@ from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.testing import EXAMPLE_TRUTH
 from pydantic import Field
 
-from armcal_simulation.readings import OutlierSettings, approach_of, at_truth, disturbed, is_orientation, with_outliers
+from armcal_simulation.readings import (
+    OutlierSettings,
+    approach_of,
+    at_truth,
+    disturbed,
+    is_orientation,
+    out_of_view,
+    seen_poses,
+    with_outliers,
+)
+
+_MOST_DRAWS = 100
 
 
 class PoseSettings(Settings):
@@ -98,8 +109,8 @@ class ElasticArmSimulator:
         settings, random = self._settings, np.random.default_rng(self._settings.seed)
         arm = next(iter(request.arms.values()))
         named = [f"{arm.name}.{joint}" for joint in arm.commanded]
-        given = request.poses
-        commands = settings.poses.commands(arm, random) if given is None else given.stacked(named)
+        given, true = request.poses, at_truth(request, settings.truth)
+        commands = _in_view(true, settings.poses, arm, random) if given is None else given.stacked(named)
         reached, step = commands.copy(), settings.quantisation
         if step:
             turning = [dimension == "angle" for dimension in arm.commanded.values()]
@@ -112,8 +123,31 @@ class ElasticArmSimulator:
             standing = Dataset(ids, {**moved_to, **channels}, source="simulation")
         else:
             standing = replace(given, channels={**channels, **given.channels, **moved_to}, source="simulation")
-        true = at_truth(request, settings.truth)
-        read = disturbed(true, standing, measured_without_noise(true, standing), settings.noise, random)
+        exact = measured_without_noise(true, standing)
+        read = disturbed(true, standing, exact, settings.noise, random)
+        read = {**read, **out_of_view(true, with_channels(standing, read))}
         moved = {channel: values for channel, values in read.items() if not is_orientation(channel)}
         pushed, _ = with_outliers(moved, settings.outliers, random)
         return with_channels(standing, {**dict(zip(named, commands, strict=True)), **read, **pushed})
+
+
+def _in_view(true: SimulationRequest, poses: PoseSettings, arm: Arm, random: np.random.Generator) -> Array:
+    """Commands (joints x poses) in which an instrument sees something; drawn again until there are enough.
+
+    Raises:
+        ConfigError: hardly any pose is one.
+    """
+    commands = poses.commands(arm, random)
+    kept = commands[:, seen_poses(true, arm, commands)]
+    for _ in range(_MOST_DRAWS):
+        if kept.shape[1] >= poses.count:
+            break
+        more = poses.commands(arm, random)
+        kept = np.unique(np.hstack([kept, more[:, seen_poses(true, arm, more)]]), axis=1)
+    if kept.shape[1] < poses.count:
+        raise ConfigError(
+            f"simulation.poses: in {kept.shape[1]} of {(_MOST_DRAWS + 1) * poses.count} poses drawn an instrument sees "
+            f"anything, expected {poses.count}.",
+            hint="Give narrower levels about poses from which it does, or place what it sees elsewhere.",
+        )
+    return np.asarray(kept[:, : poses.count])

@@ -409,7 +409,7 @@ def test_a_hook_specification_that_is_only_imported_is_no_fault(
 def test_an_unknown_type_gives_the_nearest_name() -> None:
     with pytest.raises(PluginError, match="Did you mean 'mdh'"):
         discover().find("model", "mhd")
-    with pytest.raises(PluginError, match="Known: mdh"):
+    with pytest.raises(PluginError, match="Known: flange_pose, mdh"):
         discover().find("model", "zzzzzz")
 
 

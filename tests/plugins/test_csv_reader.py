@@ -239,7 +239,7 @@ REFUSED_BYTES = {
         table().replace(",", ";").replace(".", ",").encode(),
         ["poses.csv:1:", "decimal comma (10,0)", 'Set delimiter: ";"', 'and decimal: ","'],
     ),
-    "columns": (",".join(f"c{i}" for i in range(1001)).encode(), ["poses.csv:1:", "1001 columns"]),
+    "columns": (",".join(f"c{i}" for i in range(4001)).encode(), ["poses.csv:1:", "4001 columns"]),
 }
 
 

@@ -69,7 +69,14 @@ _ALL = (
 UNITS: Mapping[str, Unit] = MappingProxyType({unit.name: unit for unit in _ALL})
 """Every unit by name; within a dimension the SI unit comes first."""
 
-_DISPLAY: Mapping[str, str] = MappingProxyType({"length": "mm", "angle": "deg", "mass": "g"})
+_DISPLAY: Mapping[str, str] = MappingProxyType({"length": "mm", "angle": "deg", "mass": "g", "image": "px"})
+ERROR_UNITS: Mapping[str, str] = MappingProxyType({"length": "mm", "angle": "mrad", "image": "px"})
+"""What residuals may measure, and the unit of their errors: a thousandth of the one inside, in every dimension.
+
+That is why places in an image are held in thousands of pixels.
+"""
+ERROR_NAMES: Mapping[str, str] = MappingProxyType({"mm": "Tip", "mrad": "Angle", "px": "Reprojection"})
+"""What an error in each of these units is an error of."""
 _SPELLINGS: Mapping[str, str] = MappingProxyType(
     {
         "µm": "um",

@@ -64,8 +64,8 @@ class InformationRecord(Settings):
 class CalibrationFile(Settings):
     """The schema of calibration.yaml.
 
-    ``accepted`` says why and when it was last accepted by hand; errors are ``quality_mrad`` where nothing measured is a
-    length.
+    ``accepted`` says why and when it was last accepted by hand; errors are ``quality_px`` or ``quality_mrad`` where
+    nothing measured is a length.
     """
 
     armcal_calibration: int
@@ -78,6 +78,7 @@ class CalibrationFile(Settings):
     noise: dict[str, Any]
     quality_mm: dict[str, Any] = Field(default_factory=dict)
     quality_mrad: dict[str, Any] = Field(default_factory=dict)
+    quality_px: dict[str, Any] = Field(default_factory=dict)
     verdict: dict[str, Any]
     arms: dict[str, Any]
     measurements: dict[str, Any]
@@ -189,7 +190,14 @@ def _quoted(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
 
 
+def _in_line(dumper: yaml.SafeDumper, entries: list[Any]) -> yaml.SequenceNode:
+    """Numbers side by side, everything else one below the other."""
+    are_numbers = bool(entries) and all(isinstance(entry, int | float) for entry in entries)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", entries, flow_style=are_numbers)
+
+
 _Dumper.add_representer(str, _quoted)
+_Dumper.add_representer(list, _in_line)
 
 
 def _uncertainty(estimate: Estimate, index: int) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.calibration.calibration import Calibration, arm_named
-from armcal.calibration.calibration_file import ParameterRecord
+from armcal.calibration.calibration_file import CalibrationFile, ParameterRecord
 from armcal.calibration.rigid_chain import tool_poses
 from armcal.calibration.tool_expression import ToolExpression, arm_expression
 from armcal.errors import NotConvergedError
@@ -49,6 +49,21 @@ class Origin:
 
 
 @dataclass(frozen=True)
+class Instrument:
+    """A measurement as calibrated.
+
+    Attributes:
+        settings: its section of the configuration, in SI units (``type`` among them).
+        numbers: canonical entries by local name (``fx``, ``camera_rotation[w]``).
+        deviations: their standard deviations; None where a number is held.
+    """
+
+    settings: Mapping[str, Any]
+    numbers: Mapping[str, float]
+    deviations: Mapping[str, float | None]
+
+
+@dataclass(frozen=True)
 class ExportRequest:
     """What is to be written: an arm, its instance name, and its calibrated parameters by full name.
 
@@ -63,6 +78,7 @@ class ExportRequest:
         description: the arm as a configuration in SI units: ``model``, ``effects``, ``links``.
         origin: where the numbers come from.
         out: the name of the file that is written, for formats whose files name one another.
+        instruments: measurements by name: their settings, and what the calibration says of their numbers.
     """
 
     name: str
@@ -75,6 +91,7 @@ class ExportRequest:
     description: Mapping[str, Any] = field(default_factory=dict)
     origin: Origin = field(default_factory=Origin)
     out: str = ""
+    instruments: Mapping[str, Instrument] = field(default_factory=dict)
 
     def expression(self, conditions: Sequence[str] = ()) -> ToolExpression:
         """The arm as expressions of commands, load and elastic state; ``conditions`` are told, not taken as known."""
@@ -155,7 +172,14 @@ def request_of(calibration: Calibration, arm: str | None, out: str = "") -> Expo
         entries=tuple(e for e in record.parameters if e.name.partition("[")[0] in own),
         origin=Origin(record.experiment, record.created, record.software, record.identity),
         out=out,
+        instruments={name: _instrument(record, name) for name in record.measurements},
     )
+
+
+def _instrument(record: CalibrationFile, name: str) -> Instrument:
+    own = {e.name.removeprefix(f"{name}."): e for e in record.parameters if e.name.startswith(f"{name}.")}
+    numbers = {local: entry.value for local, entry in own.items()}
+    return Instrument(record.measurements[name], numbers, {local: entry.sd for local, entry in own.items()})
 
 
 def random_commands(arm: Arm, count: int = POSES, seed: int = 1) -> Array:

@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from armcal.base.domains import Semidefinite, symmetric
+from armcal.base.units import ERROR_NAMES
 from armcal.cli.common import Console
 from armcal.cli.console import columned
 from armcal.estimate.bootstrap import Bootstrap
@@ -27,7 +28,7 @@ def show_run(console: Console, result: RunResult, folder: Path, seconds: float) 
     """The end of a run: errors, compliances, verdict, where the report is."""
     out = console.out
     unit = result.errors.unit
-    out.print(_errors(f"{'Tip' if unit == 'mm' else 'Angle'} error, {unit}: {result.name}", result.table))
+    out.print(_errors(f"{ERROR_NAMES[unit]} error, {unit}: {result.name}", result.table))
     if result.table.turns is not None:
         out.print(_errors(f"Orientation error, deg: {result.name}", result.table.turns))
     if result.groups.errors:

@@ -20,11 +20,13 @@ from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.score_tests import family_test, linear_fit
 from armcal.estimate.estimator import Estimate
 from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.thinning import with_few_points
 
 LEVEL = 0.05
 MATTERS = 1.1
 """Standard deviations that grow by less are left as they are."""
 FEWEST_RECORDS = 30
+LEAST_LEFT = 1e-3
 _MOST_RECORDS, _MOST_FITTED = 1000, 300
 _SHARES = (0.1, 0.25, 0.5, 0.75, 0.9, 0.98)
 _DISTANCES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
@@ -41,6 +43,8 @@ def widened(
         estimate: what it found.
         position: how many of all records were recorded before each (N).
     """
+    estimate = _of_alike_points(problem, records, estimate)
+    problem, records = with_few_points(problem, records)
     taking_part = np.any([record.weight[: record.count] > 0 for record in records], axis=0)
     chosen = np.flatnonzero(taking_part)
     chosen = chosen[np.argsort(position[chosen], kind="stable")][:_MOST_RECORDS]
@@ -60,9 +64,36 @@ def widened(
     # The part of priors does not grow.
     whole = np.maximum(scale * apart + of_priors, 1e-300)
     factors = np.sqrt(1 + scale * np.maximum(together - apart, 0.0) / whole)
-    by_coordinate, by_entry = factors[: problem.increments], factors[problem.increments :]
-    if by_entry.max() < MATTERS:
-        return replace(estimate, widened=())
+    return _wider(replace(estimate, widened=()), factors[: problem.increments], factors[problem.increments :])
+
+
+def _of_alike_points(problem: Problem, records: Sequence[FactorRecords], estimate: Estimate) -> Estimate:
+    """The estimate with the wider covariance where the points of a record err alike, as by a lens or a detector.
+
+    The sandwich of the weights and of the residuals' own products within each record, each residual divided by the root
+    of what the fit left of it [Bell2002].
+    """
+    if all(kernel.factor.points is None for kernel in problem.kernels) or not estimate.names:
+        return estimate
+    rows = FitRows.of(problem, records, estimate)
+    chain = problem.parameters.entries_jacobian(estimate.values) * problem.parameters.scales()
+    inverse = np.linalg.pinv(rows.slopes)
+    sums = np.vstack([np.eye(problem.increments), chain]) @ inverse[: problem.increments]
+    together = np.zeros(len(sums))
+    for own in rows.by_record:
+        values, axes = np.linalg.eigh(np.eye(len(own)) - rows.slopes[own] @ inverse[:, own])
+        left = (axes / np.sqrt(np.maximum(values, LEAST_LEFT))) @ (axes.T @ rows.residual[own])
+        together += (sums[:, own] @ left) ** 2
+    of_priors = np.sum(sums[:, len(rows.record_of) :] ** 2, axis=1)
+    apart = estimate.noise_scale**2 * np.sum(sums[:, : len(rows.record_of)] ** 2, axis=1)
+    factors = np.sqrt(np.maximum((together + of_priors) / np.maximum(apart + of_priors, 1e-300), 1.0))
+    return _wider(estimate, factors[: problem.increments], factors[problem.increments :])
+
+
+def _wider(estimate: Estimate, by_coordinate: Array, by_entry: Array) -> Estimate:
+    """The estimate with standard deviations so many times as large; as it is where hardly any grows."""
+    if by_entry.max(initial=1.0) < MATTERS:
+        return estimate
     return replace(
         estimate,
         covariance=estimate.covariance * np.outer(by_entry, by_entry),

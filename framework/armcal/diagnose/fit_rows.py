@@ -30,6 +30,7 @@ class FitRows:
     record_of: NDArray[np.intp]
     by_record: NDArray[np.intp]
     whitening: tuple[Array, ...]
+    points: tuple[Array, ...]
 
     @classmethod
     def of(cls, problem: Problem, records: Sequence[FactorRecords], estimate: Estimate) -> FitRows:
@@ -65,6 +66,7 @@ class FitRows:
             np.tile(np.arange(count), sum(sizes)),
             numbers.T,
             tuple(_whitening(k.factor.noise, record) for k, record in zip(problem.kernels, records, strict=True)),
+            tuple(record.points_of(k.factor).astype(float) for k, record in zip(problem.kernels, records, strict=True)),
         )
 
     def columns(self, raw: Sequence[Array]) -> Array:
@@ -83,14 +85,14 @@ class FitRows:
     def errors(self, residual: Array) -> Array:
         """The length of each record's (N, m)."""
         squares, place, count = [], 0, len(self.by_record)
-        for whitening in self.whitening:
+        for whitening, points in zip(self.whitening, self.points, strict=True):
             size = len(whitening)
             own = residual[place : place + size * count].reshape(size, count)
             counted = np.flatnonzero(np.abs(np.linalg.det(np.moveaxis(whitening, 2, 0))) > 0)
             raw = np.zeros_like(own)
             inverse = np.linalg.inv(np.moveaxis(whitening[:, :, counted], 2, 0))
             raw[:, counted] = np.einsum("nrs,sn->rn", inverse, own[:, counted])
-            squares.append(np.sum(raw**2, axis=0))
+            squares.append(np.sum(raw**2, axis=0) / np.maximum(points, 1))
             place += size * count
         return np.asarray(np.sqrt(np.mean(squares, axis=0)))
 

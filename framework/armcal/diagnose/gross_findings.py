@@ -52,7 +52,8 @@ def gross_error(
     if not len(seen) or figure.reach_mm <= 0:
         return []
     mean, scale = float(np.mean(seen)), estimate.noise_scale
-    whole, name = (figure.reach_mm, "the arm's reach") if unit == "mm" else (1000.0, "a radian")
+    wholes = {"mm": (figure.reach_mm, "the arm's reach"), "mrad": (1000.0, "a radian")}
+    whole, name = wholes.get(unit, (1000.0, f"a thousand {unit}"))
     share = mean / whole
     error = f"The mean error of records that did not train is {mean:.3g} {unit}, {100 * share:.2g} % of {name}"
     if share > OF_REACH:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtr, chdtri, ndtri
 
 from armcal.base.domains import Array
+from armcal.base.units import ERROR_NAMES
 from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.evidence_findings import (
     MOST_TOLD,
@@ -111,7 +112,7 @@ def _errors_text(judged_mm: Array, judged_on: str, unit: str) -> str:
     errors = summarise(judged_mm)
     most = "all of them" if errors.p95 is None else "95 % of poses"
     return (
-        f"{'Tip' if unit == 'mm' else 'Angle'} error {errors.mean:.2f} {unit} on average, {most} below "
+        f"{ERROR_NAMES[unit]} error {errors.mean:.2f} {unit} on average, {most} below "
         f"{errors.max if errors.p95 is None else errors.p95:.2f} {unit}, judged on {judged_on}."
     )
 

@@ -281,7 +281,7 @@ class Predictor:
 def is_position(kernel: Kernel) -> bool:
     """Whether a factor's residual is measured minus predicted position."""
     channels = [channel.rpartition(".")[2] for channel in kernel.factor.output_channels]
-    return channels == _POSITION and kernel.factor.residual.numel() == len(_POSITION)
+    return channels == _POSITION and kernel.factor.rows == len(_POSITION)
 
 
 def _without_itself(noise: Array, known: Array, factor_records: FactorRecords) -> Array:

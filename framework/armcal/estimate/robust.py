@@ -62,7 +62,7 @@ class RobustFit:
 
 def losses(problem: Problem, name: LossName) -> tuple[Loss, ...]:
     """The tuned loss of each factor."""
-    return tuple(tuned(name, kernel.factor.residual.numel()) for kernel in problem.kernels)
+    return tuple(tuned(name, kernel.factor.rows) for kernel in problem.kernels)
 
 
 def ones(records: Sequence[FactorRecords]) -> Weights:
@@ -89,7 +89,7 @@ def scales_of(
     scales: list[float] = []
     for kernel, record, length in zip(problem.kernels, records, lengths, strict=True):
         counted = length[record.weight[: record.count] > 0]
-        typical = float(np.median(counted)) / median_norm(kernel.factor.residual.numel()) if len(counted) else 1.0
+        typical = float(np.median(counted)) / median_norm(kernel.factor.rows) if len(counted) else 1.0
         scales.append(max(typical * float(np.sqrt(count / freedom)), SMALLEST_SCALE))
     return tuple(scales)
 

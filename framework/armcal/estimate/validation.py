@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armcal.base.domains import Array
+from armcal.base.units import ERROR_UNITS
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.estimator import Estimator, Progress, Solution, no_progress
 from armcal.estimate.nuisance import restricted, settled
@@ -65,7 +66,7 @@ def record_errors(
 ) -> Array:
     """How far each record's measurement lies from the prediction; root mean square over several measurements (N).
 
-    In m, angles left out; in rad where nothing measured is a length (``error_unit``). Groups that the problem holds,
+    In m, angles left out; of images, or angles alone, in their unit (``error_unit``). Groups that the problem holds,
     as those that no training record touched, are fitted to these records first: what is left is how far the records
     of a group disagree. ``training`` are the records that determine how far drifting parameters had drifted; without
     them they are at rest.
@@ -93,20 +94,23 @@ def measures_turns(problem: Problem) -> bool:
 
 
 def _sizes(problem: Problem, records: Sequence[FactorRecords], raw: Sequence[Array], counted: str) -> Array:
-    """Of each record's residual, the entries of one dimension; root mean square over its measurements (N)."""
+    """Of each record's residual, the entries of one dimension; root mean square over its measurements (N).
+
+    Of a measurement of many points, over those that the record has.
+    """
     squares, count = np.zeros((2, records[0].count))
     for kernel, record, residual in zip(problem.kernels, records, raw, strict=True):
         rows = np.array([dimension == counted for dimension in kernel.factor.dimensions], dtype=bool)
         if rows.any():
             squares += np.where(record.measured, np.sum(residual[rows] ** 2, axis=0), 0.0)
-            count += record.measured
+            count += np.where(record.measured, record.points_of(kernel.factor), 0)
     with np.errstate(invalid="ignore"):
         return np.asarray(np.sqrt(squares / count))
 
 
 def error_unit(problem: Problem) -> str:
-    """The unit in which errors are shown: mm, or mrad where nothing measured is a length; a thousandth of SI each."""
-    return {"length": "mm", "angle": "mrad"}[error_dimension(problem)]
+    """The unit in which errors are shown, a thousandth of that inside: mm; px or mrad where no length is measured."""
+    return ERROR_UNITS[error_dimension(problem)]
 
 
 def in_unit(content: Any, unit: str) -> Any:
@@ -119,9 +123,9 @@ def in_unit(content: Any, unit: str) -> Any:
 
 
 def error_dimension(problem: Problem) -> str:
-    """``length``, or ``angle`` where nothing measured is a length."""
-    lengths = any("length" in kernel.factor.dimensions for kernel in problem.kernels)
-    return "length" if lengths else "angle"
+    """``length``, ``image`` where nothing measured is a length, or ``angle`` where neither is."""
+    measured = {dimension for kernel in problem.kernels for dimension in kernel.factor.dimensions}
+    return next((dimension for dimension in ("length", "image") if dimension in measured), "angle")
 
 
 def hold_out(count: int, fraction: float, seed: int, poses: Indices | None = None) -> Split:

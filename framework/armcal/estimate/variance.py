@@ -22,6 +22,7 @@ from armcal.estimate.identifiability import correlated_pairs
 from armcal.estimate.likelihood import Term, maximise
 from armcal.problem.factor_records import by_covariance, noise_roots, transformed, whitening_of
 from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.thinning import with_few_points
 
 Axes = Literal["together", "apart"]
 
@@ -101,6 +102,7 @@ def estimate_components(
     Raises:
         ProblemError: there are not more equations than parameters and components, or parameters drift.
     """
+    problem, records = with_few_points(problem, records)
     sources = [s for s in _sources(problem, values, records, axes) if of_joints or s.kind == "instrument"]
     sizes = np.array([_mean_variance(source.bases, records) for source in sources])
     joints = np.array([source.kind == "joint" for source in sources])
@@ -154,10 +156,10 @@ class _Source:
 def _sources(problem: Problem, values: Array, records: Sequence[FactorRecords], axes: Axes) -> list[_Source]:
     """Instruments, or their axes, then joints."""
     pairs = list(zip(problem.kernels, records, strict=True))
-    nothing = [np.zeros((kernel.factor.residual.numel(),) * 2 + (record.count,)) for kernel, record in pairs]
+    nothing = [np.zeros((kernel.factor.rows,) * 2 + (record.count,)) for kernel, record in pairs]
     sources = []
     for place, (kernel, record) in enumerate(pairs):
-        name, count = kernel.factor.name, kernel.factor.residual.numel()
+        name, count = kernel.factor.name, kernel.factor.rows
         parts = [(name, np.ones(count))]
         if axes == "apart":
             channels = [channel.name for channel in problem.blueprint.measurements[name].channels()]

@@ -16,7 +16,7 @@ from armcal.io.cells import is_number
 from armcal.measure.checks import refuse_joint_count
 from armcal.measure.reader import ID_NAMES, RequestedChannel
 
-MAX_COLUMNS = 1000
+MAX_COLUMNS = 4000
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from armcal.base.domains import Array
 from armcal.measure.layout import Layout, set_aside, warned
 from armcal.measure.reader import RequestedChannel
 
+_MOST_NAMED = 12
 Mask = NDArray[np.bool_]
 
 
@@ -21,14 +22,19 @@ def set_aside_not_finite(dataset: Dataset, layout: Layout) -> Dataset:
 
     A missing value (NaN) in a channel that no measurement owns costs the record. One in a channel of measurements
     (``Layout.parts``) costs it only if no measurement has all it needs; else those that lack something are left out
-    of this record, with a warning where they have a part of their own values.
+    of this record, with a warning where they have a part of their own values. Of points a record may lack some.
     """
     if all(np.isfinite(values).all() for values in dataset.channels.values()):
         return dataset
     complete: dict[str, Mask] = {}  # of each measurement whether a record has all it needs (N)
+    seen: dict[str, Mask] = {}  # of each that reads points whether a record has any of them (N)
     for channel, parts in layout.parts.items():
         known = np.isfinite(dataset.column(channel))
-        complete |= {part: complete.get(part, True) & known for part in parts}
+        if channel in layout.of_points:
+            seen |= {part: seen.get(part, False) | known for part in parts}
+        else:
+            complete |= {part: complete.get(part, True) & known for part in parts}
+    complete |= {part: complete.get(part, True) & some for part, some in seen.items()}
     lost = np.zeros(len(dataset), dtype=bool)
     if complete:
         lost |= ~np.any(list(complete.values()), axis=0)
@@ -46,7 +52,8 @@ def _reason(dataset: Dataset, layout: Layout, index: int) -> str:
         if not np.isfinite(values[index]):
             kind = "is empty or NaN" if np.isnan(values[index]) else "is infinite"
             texts.append(f"{layout.column(channel)} {kind}")
-    return ", ".join(texts)
+    beyond = f" and {len(texts) - _MOST_NAMED} more" if len(texts) > _MOST_NAMED else ""
+    return ", ".join(texts[:_MOST_NAMED]) + beyond
 
 
 def _without_incomplete(dataset: Dataset, layout: Layout, complete: Mapping[str, Mask]) -> Dataset:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -10,6 +11,7 @@ from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.base.units import DIMENSIONLESS, units_of
 from armcal.measure.measurement import Measurement, noise_channels
+from armcal.measure.points import PointMeasurement
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,7 @@ class RequestedChannel:
         is_endless: whether it is the angle of a joint that may turn on and on.
         parts: the measurements (instances) that need it; none if the record as a whole does, or nothing does.
         effects: the joint effects (``arm.thermal``) that read it.
+        is_of_point: whether it belongs to one of many points, of which a record may lack some.
     """
 
     channel: str
@@ -35,6 +38,7 @@ class RequestedChannel:
     is_endless: bool = False
     parts: tuple[str, ...] = ()
     effects: tuple[str, ...] = ()
+    is_of_point: bool = False
 
     @property
     def what(self) -> str:
@@ -126,12 +130,16 @@ def requested_channels(
         RequestedChannel(name, (name,), dimension, measured and name in read, effects=tuple(read.get(name, ())))
         for name, dimension in surroundings(arms).items()
     ]
-    local = [c.name for m in measurements.values() for c in m.channels()]
-    for instance, measurement in measurements.items():
-        for channel in measurement.channels():
+    read_channels = {instance: tuple(m.channels()) for instance, m in measurements.items()}
+    local = Counter(channel.name for channels in read_channels.values() for channel in channels)
+    for instance, channels in read_channels.items():
+        of_point = isinstance(measurements[instance], PointMeasurement)
+        for channel in channels:
             own = f"{instance}.{channel.name}"
-            names = _names(own, (channel.name,), local.count(channel.name) == 1)
-            requested.append(RequestedChannel(own, names, channel.dimension, measured, parts=(instance,)))
+            names, parts = _names(own, (channel.name,), local[channel.name] == 1), (instance,)
+            requested.append(
+                RequestedChannel(own, names, channel.dimension, measured, parts=parts, is_of_point=of_point)
+            )
     return (*requested, *_deviations(measurements)) if measured else tuple(requested)
 
 

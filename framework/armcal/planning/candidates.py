@@ -13,12 +13,14 @@ from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.problem.problem import Problem, triangular
 from armcal.problem.projection import as_predicted
+from armcal.problem.visibility import as_seen
 
 Indices = NDArray[np.intp]
 RIDGE = 1e-9
 """Information in typical scales that stands in for what nothing determines yet, relative to the candidates' mean:
 below what any real measurement gives, far above rounding."""
 _ROWS_AT_ONCE = 8192
+_FEW_ROWS = 8
 _SEEN = 1e-9
 _TAKES_PART = 1e-6
 
@@ -103,11 +105,17 @@ def deviations(triangle: Array) -> Array:
 def whitened_rows(problem: Problem, values: Array, dataset: Dataset) -> Array:
     """Whitened Jacobians by coordinates in typical scales, all factors stacked (n_r x N x n).
 
-    Of poses that are only thought of nothing was measured: what the model predicts stands in for it.
+    Of poses that are only thought of nothing was measured: what the model predicts stands in for it, and what would be
+    out of view is left out. Where a record
+    has more rows than there are coordinates, n triangular ones with the same information stand in for them.
     """
     chain = problem.parameters.entries_jacobian(values) * problem.parameters.scales()
-    records = as_predicted(problem, values, problem.records(dataset))
-    return np.array([row.T @ chain for jacobian in problem.jacobians(values, records) for row in jacobian])
+    records = as_predicted(problem, values, problem.records(as_seen(problem, values, dataset)[0]))
+    rows = np.array([row.T @ chain for jacobian in problem.jacobians(values, records) for row in jacobian])
+    if len(rows) <= max(rows.shape[2], _FEW_ROWS):
+        return rows
+    triangles = np.asarray(np.linalg.qr(rows.transpose(1, 0, 2), mode="r"))
+    return np.ascontiguousarray(triangles.transpose(1, 0, 2))
 
 
 def over_draws(problem: Problem, draws: Sequence[Array], dataset: Dataset) -> Array:

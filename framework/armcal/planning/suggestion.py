@@ -45,7 +45,9 @@ def suggest(
     considered.
     """
     poses = _candidates(dataset, tuple(joints), seed)
-    rows = whitened_rows(problem, estimate.values, poses) / (estimate.noise_scale or 1.0)
+    # What widens the intervals of these records would widen those of further ones.
+    scale = (estimate.noise_scale or 1.0) * float(np.median(estimate.widened or (1.0,)))
+    rows = whitened_rows(problem, estimate.values, poses) / scale
     base = estimate.square_root_information * estimate.parameters.scales()
     candidates = Candidates(base[None], rows[None])
     chosen = built_up(Task(candidates, criterion("D"), min(count, len(poses))))

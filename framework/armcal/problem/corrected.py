@@ -78,9 +78,7 @@ def unexplained(
     or whose pose residual has not learned, add nothing.
     """
     count = records[0].count
-    total = [
-        np.zeros((count, kernel.factor.residual.numel(), kernel.factor.residual.numel())) for kernel in problem.kernels
-    ]
+    total = [np.zeros((count, kernel.factor.rows, kernel.factor.rows)) for kernel in problem.kernels]
     for arm in problem.blueprint.arms.values():
         residual = (learned or {}).get(arm.name, arm.residual)
         if residual is None or not residual.is_learned:

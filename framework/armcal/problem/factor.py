@@ -27,11 +27,14 @@ from armcal.arm.statics import Load
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.se3 import Expression
+from armcal.base.units import ERROR_UNITS
 from armcal.errors import ProblemError
 from armcal.measure.measurement import GroupedMeasurement, Measurement, noise_channels, residual_dimensions
 from armcal.measure.partners import OTHER
+from armcal.measure.points import LimitedView, PointMeasurement
 
 CORRECTION = "correction."
+_POINT = "point."
 """Channels ``ARM.correction.shift_x`` and so on, of arms with a pose residual: see ``corrections.py``."""
 
 
@@ -55,6 +58,10 @@ class Factor(ElasticPass):
         nuisance_names: local names of the parameters of these entries, one an entry.
         mean_weight: how many times more the mean of a group's residuals weighs.
         joints: channels of commanded joints, each with ``angle`` or ``length``.
+        points: what distinguishes the points of a measurement that reads the same of many (P x k); None of any other.
+            Channels, noise and dimensions are then those of all points, and ``of_point`` has the expressions.
+        of_point: the factor of one point: its channels are the shared ones, its own, and the k numbers of the point.
+        margin: of one point, above zero where it is in view; None where the view is not limited.
     """
 
     name: str
@@ -70,6 +77,24 @@ class Factor(ElasticPass):
     nuisance_names: tuple[str, ...] = ()
     mean_weight: float = 1.0
     joints: tuple[tuple[str, str], ...] = ()
+    points: Array | None = None
+    of_point: Factor | None = None
+    margin: Expression = None
+
+    @property
+    def rows(self) -> int:
+        """How many entries the residual of a record has."""
+        return len(self.noise)
+
+    @property
+    def shared(self) -> int:
+        """How many channels, the first ones, all points of a record have in common."""
+        return len(set(self.channels) & set(self.expressed.channels))
+
+    @property
+    def expressed(self) -> Factor:
+        """The factor that has the expressions: of one point, where there are many; else this one."""
+        return self.of_point or self
 
     @property
     def position_channels(self) -> tuple[str, ...]:
@@ -152,6 +177,9 @@ class _Records:
         self._available = available
         self.symbols: dict[str, Expression] = {}
 
+    def has(self, channel: str) -> bool:
+        return channel in self._available
+
     def number(self, channel: str) -> Expression:
         return self.symbols.setdefault(channel, ca.SX.sym(channel))
 
@@ -175,43 +203,128 @@ def build_factor(
     parameters: Parameters,
     environment: Environment,
     available: frozenset[str],
+    unrolled: bool = False,
 ) -> Factor:
-    """The expressions of one measurement; ``available`` are the channels of the records, ``environment`` the rest."""
-    symbols, values = _symbols("values", [block for block in parameters.free if not block.nuisance])
-    values |= {b.name: ca.SX(list(b.nominal)) for b in parameters.blocks if not (b.free or b.nuisance)}
+    """The expressions of one measurement; ``available`` are the channels of the records, ``environment`` the rest.
+
+    ``unrolled`` has those of all points of a measurement that reads the same of many, as if it had no points.
+    """
+    symbols, values = _free_and_fixed(parameters)
     groups = measurement if isinstance(measurement, GroupedMeasurement) else None
     group, of_group = _symbols("group", groups.group_parameters("") if groups else ())
     records, states, deflections = _arm_states(measurement, arms, values, environment, available)
     local = {**scoped(values, f"{name}."), **of_group}
-    predicted = measurement.outputs(states, local)
-    measured = {c.name: records.optional(f"{name}.{c.name}", 0.0) for c in measurement.channels()}
-    residual = _checked(name, measurement, measurement.residual(states, measured, local))
+    points = measurement.points if isinstance(measurement, PointMeasurement) and not unrolled else None
+    reading = _reading(name, measurement, records, states, local, points)
     next_state = ca.densify(ca.vertcat(*[states[a].next_deflection for a in measurement.arms]))
-    outputs = ca.vertcat(*predicted.values())
     tools = ca.vertcat(*[ca.vec(states[a].base_T_tool.matrix()[:3, :]) for a in measurement.arms])
-    starts = {n: ca.SX(entries) for n, entries in groups.group_starts(states, local).items()} if groups else {}
-    nuisance_starts = ca.densify(ca.vertcat(ca.SX(0, 1), *starts.values()))
-    used = records.used_by(ca.vertcat(residual, next_state, outputs, tools, nuisance_starts))
-    own = [(arm_name, arms[arm_name.removesuffix(OTHER)]) for arm_name in measurement.arms]
-    return Factor(
+    nuisance_names, nuisance_starts = _nuisance_starts(groups, states, local)
+    used = records.used_by(ca.vertcat(reading.everything, next_state, tools, nuisance_starts))
+    own = {arm_name: arms[arm_name.removesuffix(OTHER)] for arm_name in measurement.arms}
+    factor = Factor(
         name=name,
         channels=tuple(used),
-        output_channels=tuple(f"{name}.{channel}" for channel in predicted),
+        output_channels=tuple(f"{name}.{channel}" for channel in reading.channels),
         values=ca.vertcat(symbols, group),
         record=ca.vertcat(*used.values()),
         state=ca.vertcat(*deflections),
         next_state=next_state,
-        residual=residual,
-        outputs=outputs,
+        residual=reading.residual,
+        outputs=reading.outputs,
         tools=tools,
         noise=tuple(measurement.noise()),
         noise_channels=tuple(tuple(f"{name}.{c.name}" for c in row) for row in noise_channels(measurement)),
         dimensions=residual_dimensions(measurement),
+        margin=reading.margin,
         nuisance_starts=nuisance_starts,
-        nuisance_names=tuple(n for n, entries in starts.items() for _ in range(entries.numel())),
+        nuisance_names=nuisance_names,
         mean_weight=groups.mean_weight if groups else 1.0,
-        springs=tuple(spring for _, arm in own for spring in arm.spring_names),
-        joints=tuple((f"{a.name}.{j}{n.removeprefix(a.name)}", d) for n, a in own for j, d in a.commanded.items()),
+        springs=tuple(spring for arm in own.values() for spring in arm.spring_names),
+        joints=_joints(own),
+    )
+    return factor if points is None else _of_points(factor, measurement, points)
+
+
+def _joints(arms: Mapping[str, Arm]) -> tuple[tuple[str, str], ...]:
+    """Channels of commanded joints, each with ``angle`` or ``length``, of arms by their names in a measurement."""
+    return tuple((f"{a.name}.{j}{n.removeprefix(a.name)}", d) for n, a in arms.items() for j, d in a.commanded.items())
+
+
+def _free_and_fixed(parameters: Parameters) -> tuple[Expression, dict[str, Expression]]:
+    """Symbols of the free entries, and each block's value, a number where it is fixed; nuisances are left out."""
+    symbols, values = _symbols("values", [block for block in parameters.free if not block.nuisance])
+    fixed = {b.name: ca.SX(list(b.nominal)) for b in parameters.blocks if not (b.free or b.nuisance)}
+    return symbols, {**values, **fixed}
+
+
+def _nuisance_starts(
+    groups: GroupedMeasurement | None, states: Mapping[str, ArmState], local: Mapping[str, Expression]
+) -> tuple[tuple[str, ...], Expression]:
+    """Where a record alone has its group's parameters start: local names, one an entry, and entries."""
+    starts = {n: ca.SX(entries) for n, entries in groups.group_starts(states, local).items()} if groups else {}
+    names = tuple(n for n, entries in starts.items() for _ in range(entries.numel()))
+    return names, ca.densify(ca.vertcat(ca.SX(0, 1), *starts.values()))
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """What an instrument reads, by local names, its residual, and whether it is in view: of one point of many."""
+
+    channels: tuple[str, ...]
+    outputs: Expression
+    residual: Expression
+    margin: Expression = None
+
+    @property
+    def everything(self) -> Expression:
+        return ca.vertcat(self.outputs, self.residual, ca.SX(0, 1) if self.margin is None else self.margin)
+
+
+def _reading(
+    name: str,
+    measurement: Measurement,
+    records: _Records,
+    states: Mapping[str, ArmState],
+    local: Mapping[str, Expression],
+    points: Array | None,
+) -> _Reading:
+    """Of the whole record, or of one point, whose numbers are channels, where there are points."""
+    if points is None:
+        predicted = measurement.outputs(states, local)
+        measured = {c.name: records.optional(f"{name}.{c.name}", 0.0) for c in measurement.channels()}
+        residual = _checked(name, measurement, measurement.residual(states, measured, local))
+        return _Reading(tuple(predicted), ca.vertcat(*predicted.values()), residual)
+    assert isinstance(measurement, PointMeasurement)
+    point = ca.vertcat(*[records.number(f"{name}.{_POINT}{i}") for i in range(points.shape[1])])
+    shown, own = measurement.point_outputs(states, local, point), [c.name for c in measurement.point_channels()]
+    is_read = any(records.has(f"{name}.{channel.name}") for channel in measurement.channels())
+    read = [records.number(f"{name}.{channel}") if is_read else ca.SX(0) for channel in own]
+    margin = measurement.point_margin(states, local, point) if isinstance(measurement, LimitedView) else None
+    return _Reading(tuple(own), shown, ca.vertcat(*read) - shown, margin)
+
+
+def _of_points(factor: Factor, measurement: Measurement, points: Array) -> Factor:
+    """The factor of records with all points, from that of one point, which it keeps."""
+    name, rows, own = factor.name, factor.residual.numel(), factor.output_channels
+    numbers = {f"{name}.{_POINT}{i}": i for i in range(points.shape[1])}
+    shared = tuple(channel for channel in factor.channels if channel not in own and channel not in numbers)
+    used = tuple(channel for channel in factor.channels if channel in numbers)
+    read = tuple(channel for channel in own if channel in factor.channels)
+    order = [factor.channels.index(channel) for channel in (*shared, *read, *used)]
+    of_point = replace(
+        factor,
+        channels=(*shared, *read, *used),
+        record=ca.vertcat(*[factor.record[i] for i in order]),
+        noise=factor.noise[:rows],
+        dimensions=factor.dimensions[:rows],
+    )
+    every = tuple(f"{name}.{channel.name}" for channel in measurement.channels())
+    return replace(
+        factor,
+        channels=(*shared, *every) if read else shared,
+        output_channels=every,
+        points=points[:, [numbers[channel] for channel in used]],
+        of_point=of_point,
     )
 
 
@@ -224,7 +337,7 @@ def _checked(name: str, measurement: Measurement, residual: Expression) -> Expre
     rows, dimensions, own = residual.numel(), residual_dimensions(measurement), noise_channels(measurement)
     counts = {"noise": len(measurement.noise()), "dimensions": len(dimensions), "noise columns": len(own) or rows}
     odd = [f"{kind} of {count} entries" for kind, count in counts.items() if count != rows]
-    odd += [f"dimension {kind!r}" for kind in dimensions if kind not in ("length", "angle")]
+    odd += [f"dimension {kind!r}" for kind in dimensions if kind not in ERROR_UNITS]
     odd += [
         f"noise column {channel.name} of dimension {channel.dimension}"
         for channels, kind in zip(own, dimensions, strict=False)

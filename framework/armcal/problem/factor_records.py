@@ -18,6 +18,8 @@ from armcal.measure.groups import NO_GROUP
 from armcal.problem.correlation import Correlation
 from armcal.problem.factor import Factor
 
+_FEW_ROWS = 8
+"""Up to so many rows records are faster side by side than matrix by matrix."""
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
@@ -30,7 +32,8 @@ class FactorRecords:
     one of unit covariance; None stands for the factor's own noise, the same in every record. ``correlation`` is what
     the records of all factors share, the same object in each; None where they are independent. ``group`` (width) is
     the place of each record's group, -1 for none; None for a measurement without groups. ``applies`` (width) says
-    which records have what the measurement needs; the others weigh nothing.
+    which records have what the measurement needs; the others weigh nothing. ``present`` (n_r x width) says which rows
+    of the residual are there where a record lacks points; the others are zero.
     """
 
     count: int
@@ -41,6 +44,21 @@ class FactorRecords:
     correlation: Correlation | None = None
     group: Indices | None = None
     applies: Mask | None = None
+    present: Mask | None = None
+
+    def equations(self, rows: int) -> int:
+        """How many residual numbers these are, of so many a record; those of weight zero are none."""
+        counted = self.weight != 0
+        return int(self.present[:, counted].sum()) if self.present is not None else rows * int(counted.sum())
+
+    def points_of(self, factor: Factor) -> NDArray[np.intp]:
+        """How many points each record has (N); one of a measurement without points."""
+        if factor.points is None:
+            return np.ones(self.count, dtype=np.intp)
+        rows = len(factor.noise) // len(factor.points)
+        if self.present is None:
+            return np.full(self.count, len(factor.points), dtype=np.intp)
+        return np.asarray(self.present[::rows, : self.count].sum(axis=0))
 
     @property
     def measured(self) -> Mask:
@@ -51,8 +69,19 @@ class FactorRecords:
 
 def applicable(factor: Factor, dataset: Dataset, numbers: Indices | None) -> Mask:
     """Which records have what a measurement needs: every channel, and a group where it has groups (N)."""
-    mask = ~np.isnan(dataset.stacked(factor.channels)).any(axis=0)
+    missing = np.isnan(dataset.stacked(factor.channels))
+    if factor.points is not None and len(missing) > factor.shared:
+        present = _present(factor, missing[factor.shared :])
+        missing = np.vstack([missing[: factor.shared], ~present.any(axis=0, keepdims=True)])
+    mask = ~missing.any(axis=0)
     return np.asarray(mask if numbers is None else mask & (numbers != NO_GROUP))
+
+
+def _present(factor: Factor, missing: Mask) -> Mask:
+    """Which rows of the residual a record has (n_r x N): those of points of which no channel is missing."""
+    each = len(missing) // max(1, len(factor.points if factor.points is not None else ()))
+    whole = ~missing.reshape(-1, each, missing.shape[1]).any(axis=1)
+    return np.repeat(whole, each, axis=0)
 
 
 def factor_records(
@@ -70,8 +99,13 @@ def factor_records(
     count = len(dataset)
     fill = _filled(np.arange(count, dtype=np.intp), count - 1)
     record, lacking = np.take(dataset.stacked(factor.channels), fill, axis=1), ~applies[fill]
-    weight = np.zeros(len(fill))
+    weight, present = np.zeros(len(fill)), None
     weight[:count] = 1.0 if weights is None else weights
+    if factor.points is not None and len(record) > factor.shared:
+        read = record[factor.shared :]
+        rows = _present(factor, np.isnan(read))
+        read[np.isnan(read)] = 0.0
+        present = None if rows[:, ~lacking].all() else rows
     # Any record will do in place of one that is not there.
     stand_in = fill
     if lacking.any():
@@ -87,6 +121,7 @@ def factor_records(
         None if lacking.any() and lacking.all() else _whitening(factor, dataset, stand_in),
         group=None if numbers is None else numbers[fill],
         applies=np.asarray(~lacking) if lacking.any() else None,
+        present=present,
     )
 
 
@@ -111,6 +146,7 @@ def subset(records: Sequence[FactorRecords], chosen: Indices) -> tuple[FactorRec
             correlation,
             None if record.group is None else record.group[fill],
             None if record.applies is None else record.applies[fill],
+            None if record.present is None else record.present[:, fill],
         )
         parts.append(part)
     return tuple(parts)
@@ -201,6 +237,10 @@ def by_covariance(covariances: Array) -> Array:
 
 def transformed(matrices: Array, rows: Array) -> Array:
     """Each record's matrix (n_r x n_r x N) times its rows (n_r x ... x N)."""
+    if len(rows) > _FEW_ROWS:
+        flat = rows.reshape(len(rows), -1, rows.shape[-1])
+        many = np.matmul(np.moveaxis(matrices, 2, 0), np.moveaxis(flat, 2, 0))
+        return np.ascontiguousarray(np.moveaxis(many, 0, 2)).reshape(rows.shape)
     result = np.zeros_like(rows)
     for i in range(len(rows)):
         for j, row in enumerate(rows):

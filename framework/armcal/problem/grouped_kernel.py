@@ -51,6 +51,12 @@ class GroupedKernel:
     spare: Array
 
     @property
+    def _block_records(self) -> int:
+        """How many records a block has: fewer where each has many points."""
+        points = 1 if self.kernel.points is None else self.kernel.points.count
+        return max(LANES, BLOCK_RECORDS // points // LANES * LANES)
+
+    @property
     def is_plain(self) -> bool:
         """Whether the kernel's values are just the free entries, in order."""
         return len(self.free) == 1 and np.array_equal(self.free[0], np.arange(self.width))
@@ -68,25 +74,26 @@ class GroupedKernel:
         Raises:
             NotConvergedError: a record has no elastic equilibrium.
         """
-        residual = np.empty((self.kernel.factor.residual.numel(), records.record.shape[1]))
+        residual = np.empty((self.kernel.factor.rows, records.record.shape[1]))
         self._evaluate(self.kernel.residuals, values, records, residual)
-        return residual
+        return residual if records.present is None else np.where(records.present, residual, 0.0)
 
     def require_held(self, values: Array, records: FactorRecords) -> None:
         """Refuse states in equilibrium that springs do not hold (NotConvergedError)."""
-        self._evaluate(self.kernel.evaluator.require_held, values, records)
+        self._evaluate(self.kernel.require_held, values, records)
 
     def channel_slopes(self, values: Array, records: FactorRecords, channels: Sequence[str]) -> Array:
         """d raw residual / d channels at states that are in equilibrium already (n_r x channels x width)."""
-        shape = (self.kernel.factor.residual.numel(), len(channels), records.record.shape[1])
+        shape = (self.kernel.factor.rows, len(channels), records.record.shape[1])
         slopes = np.empty((shape[0] * shape[1], shape[2]))
         self._evaluate(partial(self.kernel.channel_slopes, channels=channels), values, records, slopes)
-        return slopes.reshape(shape)
+        slopes = slopes.reshape(shape)
+        return slopes if records.present is None else np.where(records.present[:, None], slopes, 0.0)
 
     def predict(self, values: Array, records: FactorRecords) -> Array:
         """Outputs, then tool poses (n_o + 12 an arm x width)."""
         factor = self.kernel.factor
-        shown = np.empty((factor.outputs.numel() + factor.tools.numel(), records.record.shape[1]))
+        shown = np.empty((len(factor.output_channels) + factor.tools.numel(), records.record.shape[1]))
         self._evaluate(self.kernel.predict, values, records, shown)
         return shown
 
@@ -98,7 +105,13 @@ class GroupedKernel:
         return starts
 
     def exact_hessian(self, values: Array, records: FactorRecords) -> Array:
-        """Hessian of half the squared whitened residuals by the free entries (n x n), at states in equilibrium."""
+        """Hessian of half the squared whitened residuals by the free entries (n x n), at states in equilibrium.
+
+        Of measurements of many points the Gauss-Newton one: their residuals are near zero where it counts.
+        """
+        if self.kernel.points is not None:
+            blocks = (jacobian for jacobian, _ in self.linearised(values, records))
+            return sum((np.einsum("rvn,rwn->vw", b, b, optimize=True) for b in blocks), np.zeros((self.width,) * 2))
         total, noise = np.zeros((self.width, self.width)), declared(self.kernel.factor.noise)
         for number, columns in self._parts(records.group, records.count):
             own, free = self.values(values, number), self.free[number]
@@ -111,7 +124,7 @@ class GroupedKernel:
 
     def linearised(self, values: Array, records: FactorRecords) -> Iterator[Block]:
         """Blocks of records in order, computed two at a time in threads; only a few are alive at once."""
-        starts = range(0, records.record.shape[1], BLOCK_RECORDS)
+        starts = range(0, records.record.shape[1], self._block_records)
         work = partial(self._block, values, records)
         if len(starts) <= _THREADS or self.kernel.backend.name != "compiled":
             yield from map(work, starts)
@@ -133,11 +146,11 @@ class GroupedKernel:
         return [(jacobian @ share, residual @ share) for share in shares]
 
     def _block(self, values: Array, records: FactorRecords, start: int) -> Block:
-        part = slice(start, start + BLOCK_RECORDS)
+        part = slice(start, start + self._block_records)
         group = None if records.group is None else records.group[part]
         # Views: the states of the records are left in equilibrium.
         some = replace(records, record=records.record[:, part], state=records.state[:, part], group=group)
-        n_residual, n_values, width = self.kernel.factor.residual.numel(), self.entries.shape[1], some.record.shape[1]
+        n_residual, n_values, width = self.kernel.factor.rows, self.entries.shape[1], some.record.shape[1]
         jacobian, residual = np.empty((n_residual * n_values, width)), np.empty((n_residual, width))
         self._evaluate(self.kernel.linearise, values, some, residual, jacobian)
         scattered = jacobian.reshape(n_residual, n_values, width)
@@ -147,6 +160,9 @@ class GroupedKernel:
             for number, columns in self._parts(group, width):
                 seen = np.flatnonzero(self.free[number] != HELD)
                 scattered[np.ix_(every, self.free[number][seen], columns)] = own[np.ix_(every, seen, columns)]
+        if records.present is not None:
+            residual *= records.present[:, part]
+            scattered *= records.present[:, None, part]
         weight = np.sqrt(records.weight[part])
         if records.whitening is not None:
             whitening = records.whitening[:, :, part] * weight

@@ -25,6 +25,7 @@ from armcal.functions.batch_function import EvaluatorChoice, quietly
 from armcal.functions.interpreted import InterpretedFunction
 from armcal.problem import kernel_trial
 from armcal.problem.factor import Factor
+from armcal.problem.point_records import PointRecords
 
 AS_IT_STANDS = 1e300
 """Any state is at rest: take the one given, to which repeated passes might not lead."""
@@ -129,23 +130,49 @@ class Kernel:
 
     @cached_property
     def evaluator(self) -> Evaluator:
-        """What the instrument would read, and where the tools are, in equilibrium."""
-        return Evaluator(self.factor, ca.vertcat(self.factor.outputs, self.factor.tools))
+        """What the instrument would read (of one point where there are many) and where tools are, in equilibrium."""
+        own = self.factor.expressed
+        return Evaluator(own, ca.vertcat(own.outputs, own.tools))
 
     @cached_property
     def hessian(self) -> ca.Function:
         """The exact Hessian of one record."""
         return self.factor.hessian_function()
 
+    @cached_property
+    def points(self) -> PointRecords | None:
+        """How records of many points are evaluated; None of a factor without points."""
+        factor = self.factor
+        if factor.points is None:
+            return None
+        return PointRecords(factor.shared, factor.points)
+
     def channel_slopes(
         self, values: Array, record: Array, state: Array, slopes: Array, channels: Sequence[str]
     ) -> None:
         """d residual / d channels (n_r * channels x records) at states in equilibrium."""
-        if slopes.size:
-            chosen = tuple(channels)
-            if chosen not in self._by_channels:
-                self._by_channels[chosen] = InterpretedFunction(self.factor.channel_slope_function(chosen), 1)
-            slopes[:] = self._by_channels[chosen](values, record, state)[0]
+        if not slopes.size:
+            return
+        points, chosen = self.points, tuple(channels)
+        if points is None:
+            slopes[:] = self._channel_slopes(chosen)(values, record, state)[0]
+            return
+        # A reading moves its own row, and no other.
+        shared = tuple(channel for channel in chosen if channel not in self.factor.output_channels)
+        whole = slopes.reshape(self.factor.rows, len(chosen), -1)
+        whole[:] = 0.0
+        for place, channel in enumerate(chosen):
+            if channel not in shared:
+                whole[self.factor.output_channels.index(channel), place] = 1.0
+        if shared:
+            (narrow,) = self._channel_slopes(shared)(values, points.split(record), points.repeated(state))
+            places = [chosen.index(channel) for channel in shared]
+            whole[:, places] = points.joined(narrow).reshape(self.factor.rows, len(shared), -1)
+
+    def _channel_slopes(self, channels: tuple[str, ...]) -> InterpretedFunction:
+        if channels not in self._by_channels:
+            self._by_channels[channels] = InterpretedFunction(self.factor.expressed.channel_slope_function(channels), 1)
+        return self._by_channels[channels]
 
     def residuals(self, values: Array, record: Array, state: Array, residual: Array) -> None:
         """Residuals in equilibrium.
@@ -153,10 +180,7 @@ class Kernel:
         Raises:
             NotConvergedError: a record has none.
         """
-        before = state.copy()
-        if self.backend.residuals(values, record, state, residual, REST_RAD) or _out_of_hand(state):
-            self.evaluator.recover(values, record, state, before)
-            self.backend.residuals(values, record, state, residual, AS_IT_STANDS)
+        self._over_points(self._residuals, values, record, state, residual)
 
     def linearise(self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array) -> None:
         """Residuals and Jacobian in equilibrium.
@@ -164,10 +188,7 @@ class Kernel:
         Raises:
             NotConvergedError: a record has none.
         """
-        before = state.copy()
-        if self.backend.linearise(values, record, state, residual, jacobian, NEAR_REST_RAD) or _out_of_hand(state):
-            self.evaluator.recover(values, record, state, before)
-            self.backend.linearise(values, record, state, residual, jacobian, AS_IT_STANDS)
+        self._over_points(self._linearise, values, record, state, residual, jacobian)
 
     def predict(self, values: Array, record: Array, state: Array, shown: Array) -> None:
         """Outputs and tool poses in equilibrium (n_o + 12 an arm x records).
@@ -175,11 +196,50 @@ class Kernel:
         Raises:
             NotConvergedError: a record has no equilibrium.
         """
-        shown[:] = self.evaluator(values, record, state)
+        points = self.points
+        if points is None:
+            shown[:] = self.evaluator(values, record, state)
+            return
+        here, readings = points.repeated(state), len(self.factor.output_channels)
+        narrow, own = self.evaluator(values, points.split(record), here), self.factor.expressed.outputs.numel()
+        state[:] = here[:, :: points.count]
+        shown[:readings] = points.joined(narrow[:own])
+        shown[readings:] = narrow[own:, :: points.count]
+
+    def require_held(self, values: Array, record: Array, state: Array) -> None:
+        """Refuse states in equilibrium that springs do not hold (NotConvergedError)."""
+        self._over_points(self.evaluator.require_held, values, record, state)
 
     def nuisance_starts(self, values: Array, record: Array, state: Array, starts: Array) -> None:
         """Where each record alone has its group's parameters start, in equilibrium (entries x records)."""
         starts[:] = Evaluator(self.factor, self.factor.nuisance_starts)(values, record, state)
+
+    def _over_points(
+        self, evaluate: Callable[..., None], values: Array, record: Array, state: Array, *outputs: Array
+    ) -> None:
+        """Call ``evaluate(values, record, state, *outputs)`` on records of one point each where there are many."""
+        points = self.points
+        if points is None:
+            evaluate(values, record, state, *outputs)
+            return
+        here, wide = points.repeated(state), record.shape[1] * points.count
+        own = [np.empty((len(target) // points.count, wide)) for target in outputs]
+        evaluate(values, points.split(record), here, *own)
+        state[:] = here[:, :: points.count]
+        for target, narrow in zip(outputs, own, strict=True):
+            target[:] = points.joined(narrow)
+
+    def _residuals(self, values: Array, record: Array, state: Array, residual: Array) -> None:
+        before = state.copy()
+        if self.backend.residuals(values, record, state, residual, REST_RAD) or _out_of_hand(state):
+            self.evaluator.recover(values, record, state, before)
+            self.backend.residuals(values, record, state, residual, AS_IT_STANDS)
+
+    def _linearise(self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array) -> None:
+        before = state.copy()
+        if self.backend.linearise(values, record, state, residual, jacobian, NEAR_REST_RAD) or _out_of_hand(state):
+            self.evaluator.recover(values, record, state, before)
+            self.backend.linearise(values, record, state, residual, jacobian, AS_IT_STANDS)
 
 
 def _out_of_hand(state: Array) -> bool:
@@ -192,19 +252,20 @@ def build_kernel(factor: Factor, records: int, choice: EvaluatorChoice = "auto")
     ``auto`` takes a cached library, else waits for the compiler only where that pays, else interprets and lets
     the compiler work for the next run. ``compiled`` waits; without a compiler it interprets.
     """
-    interpreter = Interpreter(factor)
+    own = factor.expressed
+    interpreter = Interpreter(own)
     if choice == "interpreted" or compiler.find_compiler() is None:
         return Kernel(factor, interpreter)
-    functions = (factor.pass_function(), factor.linearise_function())
+    functions = (own.pass_function(), own.linearise_function())
     text = "".join(f.serialize() for f in functions) + c_source.support_source() + driver_source()
     text += f"{c_source.LANES} lanes" + c_source.generator_source()
     key = compiler.library_key(text)
 
     def source() -> str:
-        return kernel_source(factor, *functions)
+        return kernel_source(own, *functions)
 
     def trial() -> compiler.Trial:
-        return kernel_trial.trial(factor, interpreter.linearise, (NEAR_REST_RAD, MOST_PASSES))
+        return kernel_trial.trial(own, interpreter.linearise, (NEAR_REST_RAD, MOST_PASSES))
 
     library = compiler.load_cached(key)
     if library is None:
@@ -217,7 +278,7 @@ def build_kernel(factor: Factor, records: int, choice: EvaluatorChoice = "auto")
     compiled = Compiled(library)
     return (
         Kernel(factor, compiled, key)
-        if kernel_trial.agree(factor, interpreter.linearise, compiled.linearise)
+        if kernel_trial.agree(own, interpreter.linearise, compiled.linearise)
         else Kernel(factor, interpreter)
     )
 

@@ -7,6 +7,7 @@ is a function of values and record alone, to the last bit.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -23,18 +24,15 @@ class OneRecord:
     def __init__(self, kernel: Kernel) -> None:
         factor = kernel.factor
         self._kernel = kernel
-        self._sizes = (factor.residual.numel(), factor.values.numel())
+        self._sizes = (factor.rows, factor.values.numel())
         width = LANES if isinstance(kernel.backend, Compiled) else 1
         self._values = np.zeros(self._sizes[1])
-        self._record = np.zeros((factor.record.numel(), width))
+        self._record = np.zeros((len(factor.channels), width))
         self._state = np.zeros((factor.state.numel(), width))
         self._residual = np.zeros((self._sizes[0], width))
         self._jacobian = np.zeros((self._sizes[0] * self._sizes[1], width))
         arrays = self._values, self._record, self._state, self._residual, self._jacobian
-        backend = kernel.backend
-        self._evaluate = (
-            backend.prepared(*arrays) if isinstance(backend, Compiled) else partial(backend.linearise, *arrays)
-        )
+        self._evaluate = _linearised(kernel, arrays)
 
     def linearise(self, values: Array, record: Array) -> tuple[Array, Array]:
         """Residual (n_r) and its Jacobian by the kernel's values (n_r x n_v), in equilibrium.
@@ -54,3 +52,16 @@ class OneRecord:
             self._state[:] = 0.0
             self._kernel.linearise(self._values, self._record, self._state, self._residual, self._jacobian)
         return self._residual[:, 0].copy(), self._jacobian[:, 0].reshape(self._sizes).copy()
+
+
+def _linearised(kernel: Kernel, arrays: tuple[Array, Array, Array, Array, Array]) -> Callable[[], int]:
+    """What evaluates a kernel in these buffers, again and again, and gives how many records did not settle."""
+    if kernel.points is not None:
+        return partial(_over_points, kernel, arrays)
+    backend = kernel.backend
+    return backend.prepared(*arrays) if isinstance(backend, Compiled) else partial(backend.linearise, *arrays)
+
+
+def _over_points(kernel: Kernel, arrays: tuple[Array, Array, Array, Array, Array]) -> int:
+    kernel.linearise(*arrays)
+    return 0

@@ -134,8 +134,7 @@ class Problem:
     def equations(self, records: Sequence[FactorRecords]) -> int:
         """How many residual numbers the records give; those of weight zero are no evidence."""
         return sum(
-            int(np.count_nonzero(record.weight)) * len(kernel.factor.noise)
-            for kernel, record in zip(self.kernels, records, strict=True)
+            record.equations(len(kernel.factor.noise)) for kernel, record in zip(self.kernels, records, strict=True)
         ) + sum(len(tie.noise) for tie in self.ties)
 
     def residuals(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:

@@ -46,11 +46,11 @@ def as_predicted(problem: Problem, values: Array, records: Sequence[FactorRecord
     Raises:
         NotConvergedError: a record has no elastic equilibrium at these values.
     """
-    if not any(_bilinear(kernel.factor) for kernel in problem.kernels):
+    if not any(_bilinear(kernel.factor.expressed) for kernel in problem.kernels):
         return tuple(records)
     predicted = predicted_records(problem, values, records)
     return tuple(
-        after if _bilinear(kernel.factor) else before
+        after if _bilinear(kernel.factor.expressed) else before
         for kernel, before, after in zip(problem.kernels, records, predicted, strict=True)
     )
 

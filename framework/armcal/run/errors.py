@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.base.units import ERROR_UNITS
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import gave_up
 from armcal.estimate.nuisance import settled, untrained
@@ -30,7 +31,6 @@ from armcal.problem.problem import FactorRecords, Problem
 
 _MM = 1000.0
 """Thousandths of m; of rad where errors are angles."""
-_UNITS = {"length": "mm", "angle": "mrad"}
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def errors_of(run: FittedRecords, crossed: CrossValidation | None) -> RecordErro
     if crossed is not None:
         judged[train], judged_at_rest[train] = crossed.errors * _MM, crossed.at_rest * _MM
     dimensions = [dimension for kernel in problem.kernels for dimension in kernel.factor.dimensions]
-    columns = tuple(f"residual{i}_{_UNITS[dimension]}" for i, dimension in enumerate(dimensions, start=1))
+    columns = tuple(f"residual{i}_{ERROR_UNITS[dimension]}" for i, dimension in enumerate(dimensions, start=1))
     first = len(problem.kernels[0].factor.output_channels)
     try:
         before, after = settled(unfitted, nominal, records), settled(problem, values, records)

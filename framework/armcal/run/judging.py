@@ -33,6 +33,7 @@ from armcal.planning.suggestion import Suggestion, suggest
 from armcal.problem.drift import residuals
 from armcal.problem.motion import Motion, recorded_position
 from armcal.problem.problem import FactorRecords
+from armcal.problem.thinning import with_few_points
 from armcal.run.data_checks import gravity_findings
 from armcal.run.errors import FittedRecords, RecordErrors
 from armcal.run.intervals import IntervalResult
@@ -96,18 +97,19 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     problem, estimate, dataset = run.problem, run.fitted.estimate, run.dataset
     if not estimate.verdict.converged:
         return Evidence(unit=error_unit(problem))
-    position, motion = recorded_position(dataset), Motion.of(problem, estimate.values, run.records, dataset)
-    judged = Judged(judged_mm, problem.residuals(estimate.values, run.records), position)
+    few, records = with_few_points(problem, run.records)
+    position, motion = recorded_position(dataset), Motion.of(few, estimate.values, records, dataset)
+    judged = Judged(judged_mm, few.residuals(estimate.values, records), position)
     limit_mm = None if limit is None else limit * _MM
-    missed = large_errors(problem, run.records, estimate, dataset, motion, judged, limit_mm)
+    missed = large_errors(few, records, estimate, dataset, motion, judged, limit_mm)
     training, train = dataset.subset(run.split.train), run.split.train
     alone = None
     if len(estimate.identifiability.null):
         poses = (unseen_poses(training, motion.channels, between) for between in (False, True))
         alone = priors_alone(problem, estimate, *poses)
-    acting = problem.weighted(run.fitted.records, run.fitted.weights)
+    few, acting = with_few_points(problem, problem.weighted(run.fitted.records, run.fitted.weights))
     own = (training, motion.subset(train), position[train])
-    left = structure(problem, acting, estimate, *own, modelled=effect_types(system))
+    left = structure(few, acting, estimate, *own, modelled=effect_types(system))
     new = predictor(problem, run.fitted).new_recording(run.records, np.flatnonzero(np.isfinite(judged_mm)))
     return Evidence(left, missed, alone, error_unit(problem), new)
 
@@ -118,7 +120,7 @@ def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array
     looked_at = thinned(train, MOST_RECORDS)
     figure = figure_of(problem, estimate, problem.subset(run.records, looked_at))
     own = thinned(np.arange(len(train)), MOST_RECORDS)
-    acting = problem.subset(acting, own)
+    problem, acting = with_few_points(problem, problem.subset(acting, own))
     rows = FitRows.of(problem, acting, estimate)
     dataset = run.dataset.subset(looked_at)
     position = recorded_position(run.dataset)[looked_at]

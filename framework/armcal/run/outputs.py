@@ -203,6 +203,7 @@ def calibration_content(result: RunResult, experiment: Experiment, accepted: boo
         noise=in_unit(_noise(result), unit),
         quality_mm=result.table.as_dict() if unit == "mm" else {},
         quality_mrad=result.table.as_dict() if unit == "mrad" else {},
+        quality_px=result.table.as_dict() if unit == "px" else {},
         verdict={
             "headline": result.verdict.headline,
             "usable": not result.verdict.bad,

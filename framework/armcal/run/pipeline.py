@@ -20,6 +20,7 @@ from armcal.estimate.estimator import Progress, no_progress, spread
 from armcal.estimate.nuisance import restricted, started
 from armcal.estimate.polish import hopeless, typical_off
 from armcal.estimate.profile import Profile, profiled, profiles
+from armcal.estimate.proposing import with_proposals
 from armcal.estimate.start import FAR, Start, aligned_start
 from armcal.estimate.structure import require_solvable
 from armcal.estimate.validation import (
@@ -117,7 +118,7 @@ def assemble(experiment: Experiment, watch: Stopwatch, accept: bool = False) -> 
         settings = (experiment.parameters, system.environment)
         problem = Problem.build(system.arms, system.measurements, *settings, dataset, experiment.settings.evaluator)
         records = problem.records(dataset)
-        start = aligned_start(problem, records, dataset)
+        start = with_proposals(aligned_start(problem, records, dataset), records, dataset)
         problem = started(start.problem, records)
         records = acting(problem, records, dataset)
     with watch.stage("check"):

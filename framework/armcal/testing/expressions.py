@@ -21,11 +21,13 @@ C = TypeVar("C")
 
 JACOBIAN_TOLERANCE = 1e-6
 _STEP = 1e-5
-_LEAST_GAIN: Mapping[str, float] = MappingProxyType({"m": 5e-3, "rad": 0.05})
+_LEAST_GAIN: Mapping[str, float] = MappingProxyType({"m": 5e-3, "rad": 0.05, "kpx": 0.05})
 _MOST_GAIN = 20.0
 """What a unit of a parameter moves, in the same unit: about one. A degree is 0.017 rad, a millimetre 0.001 m."""
 _NOTHING = 1e-9
-_LARGEST: Mapping[str, tuple[float, float]] = MappingProxyType({"m": (100.0, 1.0), "rad": (4 * math.pi, math.pi)})
+_LARGEST: Mapping[str, tuple[float, float]] = MappingProxyType(
+    {"m": (100.0, 1.0), "rad": (4 * math.pi, math.pi), "kpx": (20.0, 5.0)}
+)
 """By unit: the largest nominal value, and the largest ordinary correction, that any arm could mean."""
 _CHOICES = {
     getattr(ca, name): name.removeprefix("OP_").lower()

@@ -37,9 +37,9 @@ from armcal.testing.settings_checks import Subject
 ARM_NAMES = ((ARM,), ("left", "right"))
 """The arms that a measurement is built for: one, or if it refuses that, two."""
 _RATIO = "1"
-_UNITS: Mapping[str, str] = MappingProxyType({"length": "m", "angle": "rad"})
-_NOISIEST: Mapping[str, float] = MappingProxyType({"length": 0.1, "angle": 0.5})
-"""By dimension: the largest standard deviation (m, rad) of an example that is worth calibrating with."""
+_UNITS: Mapping[str, str] = MappingProxyType({"length": "m", "angle": "rad", "image": "kpx"})
+_NOISIEST: Mapping[str, float] = MappingProxyType({"length": 0.1, "angle": 0.5, "image": 0.05})
+"""By dimension: the largest standard deviation (m, rad, kpx) of an example that is worth calibrating with."""
 _POINTS = 6
 _INSTRUMENT = "instrument"
 _GROUP = "front/hole"
@@ -211,7 +211,7 @@ def _case(
     parameters = Parameters((*of_arms, *prefixed(f"{_INSTRUMENT}.", own)))
     parameters = parameters.with_free(parameters.names)
     available = frozenset(f"{_INSTRUMENT}.{channel.name}" for channel in channels)
-    factor = build_factor(_INSTRUMENT, measurement, arms, parameters, GRAVITY, available)
+    factor = build_factor(_INSTRUMENT, measurement, arms, parameters, GRAVITY, available, unrolled=True)
     rows, columns = factor.residual.shape
     expect(rows > 0 and columns == 1, f"found a residual of {rows} x {columns}, expected n x 1")
     return _Case(measurement, own, channels, parameters, factor)

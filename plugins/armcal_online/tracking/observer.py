@@ -79,7 +79,7 @@ class Observer:
         self._freedoms = [freedoms[factor.name] for factor in factors]
         self._one_record = [OneRecord(kernel) for kernel in problem.kernels]
         self._plain = [grouped.entries[0] if grouped.is_plain else None for grouped in problem.grouped]
-        self.shifts = [gauss_markov.shifts(factor.name, factor.residual.numel()) for factor in factors]
+        self.shifts = [gauss_markov.shifts(factor.name, factor.rows) for factor in factors]
         self.drifts, self.noisy_drifts = gauss_markov.drifts, noisy.drifts
         self._noisy_joints = {
             f"{arm.name}.{joint}": joint_scale * arm.joint_noise
@@ -142,7 +142,7 @@ class Observer:
         for reading in self.readings({**measured, **channels}, {}):
             kernel, own, record, state = self._repeated(values, reading)
             factor = kernel.factor
-            outputs = np.empty((factor.outputs.numel() + factor.tools.numel(), LANES))
+            outputs = np.empty((len(factor.output_channels) + factor.tools.numel(), LANES))
             kernel.predict(own, record, state, outputs)
             read = reading.record.copy()
             for row, channel in enumerate(factor.output_channels):
@@ -162,7 +162,7 @@ class Observer:
         names, added = tuple(self._noisy_joints), []
         for reading in readings:
             kernel, own, record, state = self._repeated(values, reading)
-            rows = kernel.factor.residual.numel()
+            rows = kernel.factor.rows
             kernel.residuals(own, record, state, np.empty((rows, LANES)))
             slopes = np.empty((rows * len(names), LANES))
             kernel.channel_slopes(own, record, state, slopes, names)

@@ -1,0 +1,88 @@
+"""Starts that measurements find by themselves, from what they read: a camera's intrinsics and hand-eye pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.estimate.start import BETTER, Start
+from armcal.estimate.validation import record_errors
+from armcal.measure.points import Proposing
+from armcal.problem.problem import FactorRecords, Problem
+
+_TOOL_ROWS = 12
+
+
+def with_proposals(start: Start, records: Sequence[FactorRecords], dataset: Dataset) -> Start:
+    """The start with what measurements propose, where it is much nearer than the configuration.
+
+    A parameter with a prior keeps its nominal value, and starts where it was proposed.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at the nominal values.
+    """
+    for number, kernel in enumerate(start.problem.kernels):
+        measurement = start.problem.blueprint.measurements[kernel.factor.name]
+        if isinstance(measurement, Proposing):
+            start = _with_proposal(start, records, dataset, number, measurement)
+    return start
+
+
+def _with_proposal(
+    start: Start, records: Sequence[FactorRecords], dataset: Dataset, number: int, measurement: Proposing
+) -> Start:
+    problem, name = start.problem, start.problem.kernels[number].factor.name
+    parameters, nominal = problem.parameters, problem.parameters.nominal()
+    before = start.vectors[0] if start.vectors else nominal
+    own = {b.name.removeprefix(f"{name}."): b for b in parameters.blocks if b.name.startswith(f"{name}.")}
+    seen = np.flatnonzero(records[number].measured)
+    factor = problem.kernels[number].factor
+    proposal = measurement.propose(
+        _tools(problem, before, problem.subset(records, seen), number),
+        {c.removeprefix(f"{name}."): dataset.column(c)[seen] for c in factor.output_channels},
+        {local: nominal[parameters.entries_of(block.name)] for local, block in own.items()},
+        frozenset(local for local, block in own.items() if block.free),
+    )
+    start = replace(start, warnings=(*start.warnings, *(f"{name}: {text}." for text in proposal.open)))
+    if not proposal.values:
+        return start
+    vector, moved = before.copy(), nominal.copy()
+    for local, value in proposal.values.items():
+        place = parameters.entries_of(own[local].name)
+        vector[place] = value
+        if own[local].prior_sd is None:
+            moved[place] = value
+    configured, left = (_typical(problem, values, records) for values in (nominal, vector))
+    if left * BETTER > configured:
+        return start
+    names = tuple(own[local].name for local in proposal.values)
+    placed = replace(problem, parameters=parameters.with_nominal(moved))
+    vectors = (vector, *start.vectors)
+    return replace(
+        start,
+        problem=placed,
+        names=(*start.names, *names),
+        vectors=vectors,
+        configured=configured,
+        left=left,
+        taken=True,
+    )
+
+
+def _tools(problem: Problem, values: Array, records: Sequence[FactorRecords], number: int) -> Array:
+    """base_T_tool of each record (N x 4 x 4, m)."""
+    first = len(problem.kernels[number].factor.output_channels)
+    shown = problem.grouped[number].predict(values, records[number])[:, : records[number].count]
+    tools = np.tile(np.eye(4), (records[number].count, 1, 1))
+    tools[:, :3] = shown[first : first + _TOOL_ROWS].reshape(4, 3, -1).transpose(2, 1, 0)
+    return tools
+
+
+def _typical(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> float:
+    """The median error of records, those without one left out."""
+    errors = record_errors(problem, values, records)
+    return float(np.median(np.where(np.isfinite(errors), errors, np.inf)))

@@ -1,0 +1,56 @@
+"""Records with few of their many points: enough to judge how records err, in a fraction of the time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from armcal.measure.points import spread_points
+from armcal.problem.factor import Factor
+from armcal.problem.factor_records import FactorRecords, by_covariance
+from armcal.problem.problem import Problem
+
+FEW_POINTS = 12
+
+
+def with_few_points(
+    problem: Problem, records: Sequence[FactorRecords], most: int = FEW_POINTS
+) -> tuple[Problem, tuple[FactorRecords, ...]]:
+    """The problem and its records with at most so many points of each measurement, spread over all of them.
+
+    The same objects where nothing is to be left out, and where a drift correlates the records.
+    """
+    many = [kernel.factor.points is not None and len(kernel.factor.points) > most for kernel in problem.kernels]
+    if not any(many) or any(record.correlation is not None for record in records):
+        return problem, tuple(records)
+    pairs = [
+        _thinned(kernel.factor, record, most) if thin else (kernel.factor, record)
+        for kernel, record, thin in zip(problem.kernels, records, many, strict=True)
+    ]
+    kernels = tuple(replace(kernel, factor=factor) for kernel, (factor, _) in zip(problem.kernels, pairs, strict=True))
+    return replace(problem, kernels=kernels), tuple(record for _, record in pairs)
+
+
+def _thinned(factor: Factor, record: FactorRecords, most: int) -> tuple[Factor, FactorRecords]:
+    assert factor.points is not None
+    chosen, each = spread_points(factor.points, most), len(factor.noise) // len(factor.points)
+    rows = (each * chosen[:, None] + np.arange(each)).ravel()
+    read = len(record.record) > factor.shared
+    channels = factor.channels[: factor.shared]
+    small = replace(
+        factor,
+        channels=(*channels, *(factor.output_channels[row] for row in rows)) if read else channels,
+        output_channels=tuple(factor.output_channels[row] for row in rows),
+        noise=factor.noise[: len(rows)],
+        dimensions=factor.dimensions[: len(rows)],
+        points=factor.points[chosen],
+    )
+    kept = [*range(factor.shared), *(factor.shared + rows if read else [])]
+    whitening = record.whitening
+    if whitening is not None:
+        roots = np.linalg.inv(np.moveaxis(whitening, 2, 0))[:, rows]
+        whitening = by_covariance(np.moveaxis(roots @ roots.transpose(0, 2, 1), 0, 2))
+    present = None if record.present is None else record.present[rows]
+    return small, replace(record, record=record.record[kept], whitening=whitening, present=present)

@@ -1,0 +1,214 @@
+"""A camera that sees boards: on the hand and the boards in the world, or the other way round."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Literal
+
+import casadi as ca
+import numpy as np
+from armcal.arm.assembly import ArmState
+from armcal.base.domains import Array, Interval
+from armcal.base.parameters import ParameterBlock, scalar
+from armcal.base.pose_blocks import pose_transform
+from armcal.base.pose_settings import PoseSettings
+from armcal.base.settings import Settings, UnitOf
+from armcal.measure.instrument import InstrumentSettings
+from armcal.measure.measurement import Channel
+from armcal.measure.points import PointInstrument, Proposal, spread_points
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from armcal_camera.board import Board, BoardOrFile, require_distinct
+from armcal_camera.first_guess import Setup, first_guess
+from armcal_camera.lens import DISTORTION, projected
+
+_Image = Annotated[float, UnitOf("image")]
+_PIXELS_SCALE, _DISTORTION_SCALE, _SCALE_SCALE = 0.01, 0.05, 0.01
+_NEAREST_M, _LEAST_FACING, _FEWEST_POINTS = 0.02, 0.3, 4
+_POSITIVE = Interval(1e-6, np.inf)
+
+
+class IntrinsicsSettings(Settings):
+    """Focal lengths, principal point and distortion, as OpenCV and ROS state them."""
+
+    fx: Annotated[_Image, Field(gt=0)]
+    fy: Annotated[_Image, Field(gt=0)]
+    cx: _Image
+    cy: _Image
+    distortion: tuple[float, ...] = ()
+
+
+class CameraSettings(InstrumentSettings):
+    """Which camera, what it sees, and how well corners are found.
+
+    ``noise`` is the standard deviation of a corner's u and v. ``mounting`` says what moves: ``eye_in_hand`` has the
+    camera on the tool and boards in the world, ``eye_to_hand`` the camera in the world and boards on the tool. Poses
+    and intrinsics that are not stated are found from the images, where they are free. Of a board with more than
+    ``most_points`` points so many are used, spread evenly over it. ``image`` is its width and height.
+    """
+
+    noise: Annotated[_Image, Field(gt=0)]
+    mounting: Literal["eye_in_hand", "eye_to_hand"] = "eye_in_hand"
+    lens: Literal["pinhole", "fisheye"] = "pinhole"
+    board: BoardOrFile | None = None
+    boards: tuple[BoardOrFile, ...] = ()
+    intrinsics: IntrinsicsSettings | None = None
+    pose: PoseSettings = PoseSettings()
+    board_poses: tuple[PoseSettings, ...] = ()
+    image: tuple[_Image, _Image] | None = None
+    most_points: Annotated[int, Field(ge=4)] = 120
+
+    @model_validator(mode="after")
+    def _complete(self) -> CameraSettings:
+        if (self.board is None) == (not self.boards):
+            raise ValueError("found board and boards, or neither, expected one of them: what the camera sees")
+        require_distinct(self.boards)
+        number = len(self.boards) or 1
+        if self.board_poses and len(self.board_poses) != number:
+            raise ValueError(f"found {len(self.board_poses)} board_poses, expected one of each board: {number}")
+        names, given = DISTORTION[self.lens], self.intrinsics.distortion if self.intrinsics else ()
+        if given and len(given) != len(names) and (self.lens, len(given)) != ("pinhole", 4):
+            raise ValueError(f"found {len(given)} distortion coefficients, expected {len(names)}: {', '.join(names)}")
+        return self
+
+
+class Camera(PointInstrument):
+    """The measurement ``camera``: channels u_K and v_K (px) of each point K of its boards, counted over all of them.
+
+    Parameters: ``camera_*`` (tool_T_camera, or base_T_camera of one that stands beside the arm), ``board_*``
+    (base_T_board, or tool_T_board; ``board1_*``, ``board2_*`` where there are several), ``board_scale`` (printed size
+    over stated size), ``fx``, ``fy``, ``cx``, ``cy`` and the distortion coefficients.
+    """
+
+    Settings = CameraSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {
+        "noise_px": 0.1,
+        "board": {"type": "chessboard", "columns": 4, "rows": 3, "square_mm": 40},
+        "intrinsics": {
+            "fx_px": 900,
+            "fy_px": 905,
+            "cx_px": 640,
+            "cy_px": 400,
+            "distortion": [-0.1, 0.01, 0.001, -0.001, 0.0],
+        },
+        "pose": {"position_mm": [20, 0, 60], "rpy_deg": [5, -3, 90]},
+        "board_poses": [{"position_mm": [300, 200, 2000], "rpy_deg": [10, 15, 0]}],
+    }
+
+    @cached_property
+    def boards(self) -> tuple[Board, ...]:
+        """What it sees, in the order in which points are counted."""
+        return self.settings.boards or (self.settings.board,)
+
+    @property
+    def board_names(self) -> tuple[str, ...]:
+        """The first part of the names of each board's parameters."""
+        return ("board",) if len(self.boards) == 1 else tuple(f"board{i}" for i in range(1, len(self.boards) + 1))
+
+    @cached_property
+    def used(self) -> tuple[NDArray[np.intp], ...]:
+        """Which points of each board are used, in order."""
+        return tuple(spread_points(board.points, self.settings.most_points) for board in self.boards)
+
+    @cached_property
+    def points(self) -> Array:
+        """Of each point its place on its board (m), and 1 in the column of its board where there are several."""
+        blocks = []
+        for number, (board, used) in enumerate(zip(self.boards, self.used, strict=True)):
+            own = np.zeros((len(used), len(self.boards) if len(self.boards) > 1 else 0))
+            own[:, number : number + 1] = 1.0
+            blocks.append(np.hstack([board.points[used], own]))
+        return np.vstack(blocks)
+
+    @property
+    def point_names(self) -> Sequence[str]:
+        """The number of each point, counted over all boards."""
+        starts = np.cumsum([0, *(len(board.points) for board in self.boards)])
+        return [str(start + k) for start, used in zip(starts, self.used, strict=False) for k in used]
+
+    def parameters(self) -> tuple[ParameterBlock, ...]:
+        """Poses (m, unit quaternions), scale, intrinsics (thousands of pixels) and distortion."""
+        own, s = [*self.settings.pose.blocks("camera")], self.settings
+        poses = s.board_poses or (PoseSettings(),) * len(self.boards)
+        for name, pose in zip(self.board_names, poses, strict=True):
+            own += pose.blocks(name)
+        own.append(scalar("board_scale", "1", 1.0, _SCALE_SCALE, _POSITIVE))
+        given = s.intrinsics
+        for name, guess in (("fx", 1.0), ("fy", 1.0), ("cx", 0.5), ("cy", 0.5)):
+            value = guess if given is None else float(getattr(given, name))
+            domain = _POSITIVE if name.startswith("f") else Interval()
+            own.append(scalar(name, "kpx", value, _PIXELS_SCALE, domain))
+        known = given.distortion if given else ()
+        for i, name in enumerate(DISTORTION[s.lens]):
+            own.append(scalar(name, "1", known[i] if i < len(known) else 0.0, _DISTORTION_SCALE))
+        return tuple(own)
+
+    def point_channels(self) -> tuple[Channel, ...]:
+        """Column and row in the image."""
+        return Channel("u", "image"), Channel("v", "image")
+
+    def point_noise(self) -> tuple[float, ...]:
+        """Of u and of v (thousands of pixels)."""
+        return (float(self.settings.noise),) * 2
+
+    def point_outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Any], point: Any) -> Any:
+        """Where a point of a board appears (2x1, thousands of pixels)."""
+        in_camera, _ = self._in_camera(arms, values, point)
+        focal, centre = (values["fx"], values["fy"]), (values["cx"], values["cy"])
+        distortion = [values[name] for name in DISTORTION[self.settings.lens]]
+        return projected(self.settings.lens, in_camera, focal, centre, distortion)
+
+    def _in_camera(self, arms: Mapping[str, ArmState], values: Mapping[str, Any], point: Any) -> tuple[Any, Any]:
+        """A point of a board (3x1, m) and the board's normal (3x1) in the camera's frame."""
+        place, camera = point[:3] * values["board_scale"], pose_transform("camera", values)
+        poses = [pose_transform(name, values) for name in self.board_names]
+        there, normals = [pose.apply(place) for pose in poses], [pose.rotation[:, 2] for pose in poses]
+        if len(poses) > 1:  # the point says which board is its own
+            there, normals = ([sum(point[3 + i] * x for i, x in enumerate(parts))] for parts in (there, normals))
+        tool = self.base_T_tool(arms)
+        to_camera = (tool @ camera).inverse() if self.settings.mounting == "eye_in_hand" else camera.inverse() @ tool
+        return to_camera.apply(there[0]), ca.mtimes(to_camera.rotation, normals[0])
+
+    def point_margin(self, arms: Mapping[str, ArmState], values: Mapping[str, Any], point: Any) -> Any:
+        """Above zero where a point is in front of the camera, within the image and not seen too obliquely."""
+        seen = self.point_outputs(arms, values, point)
+        in_camera, normal = self._in_camera(arms, values, point)
+        facing = ca.fabs(ca.dot(normal, in_camera)) / ca.norm_2(in_camera)
+        margin = ca.fmin(in_camera[2] - _NEAREST_M, facing - _LEAST_FACING)
+        size = self.image
+        for i in range(2) if size is not None else ():
+            margin = ca.fmin(margin, ca.fmin(seen[i], size[i] - seen[i]))
+        return margin
+
+    @property
+    def image(self) -> tuple[float, float] | None:
+        """Width and height (thousands of pixels), as stated, else about the principal point; None if neither is."""
+        s = self.settings
+        if s.image is not None:
+            return s.image
+        return None if s.intrinsics is None else (2 * s.intrinsics.cx, 2 * s.intrinsics.cy)
+
+    def visible(self, margins: Array) -> NDArray[np.bool_]:
+        """Which points can be read (P x N): of a chessboard all or none, of others those in view, if there are four."""
+        visible, start = margins > 0, 0
+        for board, used in zip(self.boards, self.used, strict=True):
+            own = visible[start : start + len(used)]
+            enough = own.all(axis=0) if board.type == "chessboard" else own.sum(axis=0) >= _FEWEST_POINTS
+            visible[start : start + len(used)] = own & enough
+            start += len(used)
+        return np.asarray(visible)
+
+    def dimensions(self) -> Sequence[str]:
+        """Places in an image."""
+        return ("image",) * len(self.noise())
+
+    def propose(
+        self, tools: Array, read: Mapping[str, Array], values: Mapping[str, Array], free: frozenset[str]
+    ) -> Proposal:
+        """Where a fit may start, from the images alone; see ``PointMeasurement``."""
+        s = self.settings
+        points = tuple(board.points[used] for board, used in zip(self.boards, self.used, strict=True))
+        in_hand, is_stated = s.mounting == "eye_in_hand", s.intrinsics is not None
+        return first_guess(Setup(self.board_names, points, s.lens, in_hand, is_stated), tools, read, values, free)

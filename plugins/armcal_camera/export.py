@@ -1,0 +1,195 @@
+"""Calibrated cameras in the formats of others: ROS ``camera_info``, OpenCV's YAML, and where the camera sits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import yaml
+from armcal.base.domains import Array
+from armcal.base.settings import Settings
+from armcal.calibration.exporter import Exported, ExportRequest, Instrument
+from armcal.errors import ConfigError
+from scipy.spatial.transform import Rotation
+
+from armcal_camera.lens import DISTORTION
+
+_PX = 1000.0
+_MODELS = {"pinhole": "plumb_bob", "fisheye": "equidistant"}
+
+
+class CameraExportSettings(Settings):
+    """Which camera (the only one unless said)."""
+
+    camera: str | None = None
+
+
+class FramesSettings(CameraExportSettings):
+    """Which camera, and the names of frames in the other program."""
+
+    base_frame: str = "base_link"
+    tool_frame: str = "tool0"
+    camera_frame: str = "camera_optical_frame"
+    board_frame: str = "board"
+
+
+class _CameraExporter:
+    """What the exporters share; they need nothing of the arm, so no effect of it is left out."""
+
+    Settings: ClassVar[type[CameraExportSettings]] = CameraExportSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {}
+    holds_residual = True
+
+    def __init__(self, settings: Any) -> None:
+        self._settings = settings
+
+    def _camera(self, request: ExportRequest) -> tuple[str, Instrument]:
+        """The camera that is meant.
+
+        Raises:
+            ConfigError: there is none, or several and none is named.
+        """
+        cameras = {name: i for name, i in request.instruments.items() if i.settings.get("type") == "camera"}
+        chosen = self._settings.camera or (next(iter(cameras)) if len(cameras) == 1 else None)
+        if chosen not in cameras:
+            have = ", ".join(cameras) or "none"
+            raise ConfigError(
+                f"found the cameras {have} in the calibration, expected {self._settings.camera or 'one'}.",
+                hint="Name one of them: camera=NAME." if cameras else "Calibrate a measurement of type camera.",
+            )
+        return chosen, cameras[chosen]
+
+
+class CameraInfoExporter(_CameraExporter):
+    """The exporter ``camera_info``: the YAML of ROS's ``camera_info_manager``."""
+
+    def export(self, request: ExportRequest) -> Exported:
+        """Width, height, matrix, distortion; rectification is the identity.
+
+        Raises:
+            ConfigError: no such camera, or its image size is not stated.
+        """
+        name, camera = self._camera(request)
+        matrix, distortion, size = _intrinsics(camera)
+        if size is None:
+            raise ConfigError(
+                f"the camera {name} does not state its image size, which camera_info needs.",
+                hint="Give image_px: [1280, 960] in the measurement.",
+            )
+        flat = [float(x) for x in matrix.ravel()]
+        projection = [*flat[:3], 0.0, *flat[3:6], 0.0, *flat[6:], 0.0]
+        content = {
+            "image_width": size[0],
+            "image_height": size[1],
+            "camera_name": name,
+            "camera_matrix": {"rows": 3, "cols": 3, "data": flat},
+            "distortion_model": _MODELS[camera.settings.get("lens", "pinhole")],
+            "distortion_coefficients": {"rows": 1, "cols": len(distortion), "data": distortion},
+            "rectification_matrix": {"rows": 3, "cols": 3, "data": [float(x) for x in np.eye(3).ravel()]},
+            "projection_matrix": {"rows": 3, "cols": 4, "data": projection},
+        }
+        return Exported(yaml.safe_dump(content, sort_keys=False).encode(), 4 + len(distortion))
+
+
+class OpenCvExporter(_CameraExporter):
+    """The exporter ``opencv``: YAML that ``cv::FileStorage`` reads."""
+
+    def export(self, request: ExportRequest) -> Exported:
+        """``camera_matrix``, ``distortion_coefficients``, and the poses of camera and boards as 4 x 4 matrices (m).
+
+        Raises:
+            ConfigError: no such camera.
+        """
+        _, camera = self._camera(request)
+        matrix, distortion, size = _intrinsics(camera)
+        lines = ["%YAML:1.0", "---"]
+        if size is not None:
+            lines += [f"image_width: {size[0]}", f"image_height: {size[1]}"]
+        lines += _opencv_matrix("camera_matrix", matrix)
+        lines += _opencv_matrix("distortion_coefficients", np.array([distortion]))
+        for name, pose in _poses(camera).items():
+            lines += _opencv_matrix(name, pose)
+        return Exported(("\n".join(lines) + "\n").encode(), 4 + len(distortion))
+
+
+class HandEyeExporter(_CameraExporter):
+    """The exporter ``hand_eye``: where the camera sits, as easy_handeye writes it, with a URDF joint beside it."""
+
+    Settings: ClassVar[type[CameraExportSettings]] = FramesSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {"tool_frame": "tool0"}
+
+    def export(self, request: ExportRequest) -> Exported:
+        """The pose of the camera on the hand, or in the world, as translation (m) and quaternion; with its deviations.
+
+        Raises:
+            ConfigError: no such camera.
+        """
+        name, camera = self._camera(request)
+        on_hand = camera.settings.get("mounting", "eye_in_hand") == "eye_in_hand"
+        parent = self._settings.tool_frame if on_hand else self._settings.base_frame
+        pose, child = _pose("camera", camera.numbers), self._settings.camera_frame
+        place, quaternion = [float(x) for x in pose[:3, 3]], Rotation.from_matrix(pose[:3, :3]).as_quat()
+        keys = ("qx", "qy", "qz", "qw")
+        content = {
+            "parameters": {
+                "eye_on_hand": on_hand,
+                "robot_base_frame": self._settings.base_frame,
+                "robot_effector_frame": self._settings.tool_frame,
+                "tracking_base_frame": child,
+                "tracking_marker_frame": self._settings.board_frame,
+            },
+            "transformation": {
+                **dict(zip("xyz", place, strict=True)),
+                **{key: float(x) for key, x in zip(keys, quaternion, strict=True)},
+            },
+            "standard_deviation_m": {axis: camera.deviations.get(f"camera_{axis}") for axis in "xyz"},
+        }
+        text = f"# {parent} to {child}, in metres: the camera {name}.\n" + yaml.safe_dump(content, sort_keys=False)
+        numbers = " ".join(f"{x:.9g}" for x in (*place, *quaternion))
+        command = f"ros2 run tf2_ros static_transform_publisher {numbers} {parent} {child}"
+        stem = request.out.rpartition("/")[2].rpartition(".")[0] or "camera"
+        companions = {f"{stem}_joint.urdf": _urdf_joint(parent, child, pose).encode()}
+        return Exported(text.encode(), 7, companions=companions, remarks=(f"To publish it: {command}",))
+
+
+def _intrinsics(camera: Instrument) -> tuple[Array, list[float], tuple[int, int] | None]:
+    """Camera matrix (px), distortion coefficients, and width and height (px) where they are stated."""
+    n = camera.numbers
+    matrix = np.array([[_PX * n["fx"], 0, _PX * n["cx"]], [0, _PX * n["fy"], _PX * n["cy"]], [0, 0, 1.0]])
+    distortion = [n[name] for name in DISTORTION[camera.settings.get("lens", "pinhole")]]
+    size = next((camera.settings[key] for key in ("image", "image_kpx") if camera.settings.get(key)), None)
+    return matrix, distortion, None if size is None else (round(_PX * size[0]), round(_PX * size[1]))
+
+
+def _poses(camera: Instrument) -> dict[str, Array]:
+    """The camera's pose and each board's, by what they map from and to."""
+    on_hand = camera.settings.get("mounting", "eye_in_hand") == "eye_in_hand"
+    frames = ("tool", "base") if on_hand else ("base", "tool")
+    boards = [name.removesuffix("_x") for name in camera.numbers if name.startswith("board") and name.endswith("_x")]
+    poses = {f"{frames[0]}_T_camera": _pose("camera", camera.numbers)}
+    return {**poses, **{f"{frames[1]}_T_{board}": _pose(board, camera.numbers) for board in boards}}
+
+
+def _pose(name: str, numbers: Mapping[str, float]) -> Array:
+    pose = np.eye(4)
+    turned = [numbers[f"{name}_rotation[{axis}]"] for axis in "xyzw"]
+    pose[:3, :3], pose[:3, 3] = Rotation.from_quat(turned).as_matrix(), [numbers[f"{name}_{axis}"] for axis in "xyz"]
+    return pose
+
+
+def _opencv_matrix(name: str, matrix: Array) -> Sequence[str]:
+    data = ", ".join(repr(float(x)) for x in matrix.ravel())
+    rows, columns = matrix.shape
+    kinds = [f"   rows: {rows}", f"   cols: {columns}", "   dt: d", f"   data: [ {data} ]"]
+    return [f"{name}: !!opencv-matrix", *kinds]
+
+
+def _urdf_joint(parent: str, child: str, pose: Array) -> str:
+    """A fixed joint; URDF's roll, pitch and yaw turn about fixed axes."""
+    rpy = Rotation.from_matrix(pose[:3, :3]).as_euler("xyz")
+    place, turn = (" ".join(f"{x:.9g}" for x in numbers) for numbers in (pose[:3, 3], rpy))
+    return (
+        f'<joint name="{child}_joint" type="fixed">\n  <parent link="{parent}"/>\n  <child link="{child}"/>\n'
+        f'  <origin xyz="{place}" rpy="{turn}"/>\n</joint>\n'
+    )

@@ -1,0 +1,146 @@
+"""Where a fit of a camera starts: intrinsics from homographies, poses of boards, hand-eye in closed form."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.base.pose_settings import quaternion_of
+from armcal.base.quaternions import rotation_matrix
+from armcal.measure.points import Proposal
+
+from armcal_camera.hand_eye import hand_eye, open_motion
+from armcal_camera.lens import DISTORTION, normalised
+from armcal_camera.views import FEWEST_POINTS, board_pose, homography, intrinsics
+
+_INTRINSICS = ("fx", "fy", "cx", "cy")
+_FEWEST_VIEWS = 3
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What of a camera's settings a start depends on.
+
+    Attributes:
+        names: the first part of the names of each board's parameters.
+        points: of each board those that are used (P x 3, m).
+        lens: ``pinhole`` or ``fisheye``.
+        in_hand: whether the camera is on the tool.
+        is_stated: whether its intrinsics are.
+    """
+
+    names: tuple[str, ...]
+    points: tuple[Array, ...]
+    lens: str
+    in_hand: bool
+    is_stated: bool
+
+
+@dataclass(frozen=True)
+class _View:
+    """A board in a record: its points (n x 2, m) and where they appear (n x 2, thousands of pixels)."""
+
+    record: int
+    board: int
+    points: Array
+    image: Array
+
+
+def first_guess(
+    setup: Setup, tools: Array, read: Mapping[str, Array], values: Mapping[str, Array], free: frozenset[str]
+) -> Proposal:
+    """Free parameters of a camera from what it saw; the others are held. See ``Proposing.propose``."""
+    own = dict(values)
+    views = _views(setup, read, float(own["board_scale"][0]))
+    if free & set(_INTRINSICS) and not setup.is_stated:
+        own |= _intrinsics(views, free)
+    poses = _poses(setup, views, own)
+    proposed = {name: own[name] for name in _INTRINSICS if name in free}
+    is_open = open_motion(tools)
+    if is_open is not None:
+        return Proposal(proposed, (is_open,))
+    in_hand, camera_pose = setup.in_hand, None
+    for number, name in sorted(enumerate(setup.names), key=lambda b: -len(poses[b[0]])):
+        records = list(poses[number])
+        if not records:
+            continue
+        a, b = tools[records], np.array([poses[number][i] for i in records])
+        if camera_pose is None and _placed("camera", free):
+            solved = hand_eye(a, np.linalg.inv(b) if in_hand else b)
+            if solved is None:
+                continue
+            camera_pose, board_pose_ = (solved.x, solved.y) if in_hand else (solved.y, solved.x)
+            proposed |= _pose_values("camera", camera_pose)
+        else:
+            held = _matrix("camera", own) if camera_pose is None else camera_pose
+            every = a @ held @ b if in_hand else np.linalg.inv(a) @ held @ b
+            board_pose_ = every[_middle(every)]
+        if _placed(name, free):
+            proposed |= _pose_values(name, board_pose_)
+    return Proposal(proposed)
+
+
+def _placed(name: str, free: frozenset[str]) -> bool:
+    return {f"{name}_x", f"{name}_y", f"{name}_z", f"{name}_rotation"} <= free
+
+
+def _views(setup: Setup, read: Mapping[str, Array], scale: float) -> list[_View]:
+    """Every board in every record of which enough points are there."""
+    total = sum(map(len, setup.points))
+    image = np.array(list(read.values())).reshape(total, 2, -1)
+    views, start = [], 0
+    for number, board in enumerate(setup.points):
+        part, points = image[start : start + len(board)], scale * board[:, :2]
+        start += len(points)
+        for record in range(image.shape[2]):
+            there = np.isfinite(part[:, :, record]).all(axis=1)
+            if there.sum() >= FEWEST_POINTS and np.linalg.matrix_rank(np.c_[points[there], np.ones(there.sum())]) == 3:
+                views.append(_View(record, number, points[there], part[there, :, record]))
+    return views
+
+
+def _intrinsics(views: list[_View], free: frozenset[str]) -> dict[str, Array]:
+    """Those that homographies determine; where they do not, a lens of ordinary width about the middle."""
+    whole = np.concatenate([view.image for view in views]) if views else np.array([[0.5, 0.5]])
+    middle = (whole.min(axis=0) + whole.max(axis=0)) / 2
+    size = float(np.max(whole.max(axis=0) - whole.min(axis=0)))
+    solved = (
+        intrinsics([homography(v.points, v.image - middle) for v in views]) if len(views) >= _FEWEST_VIEWS else None
+    )
+    off = np.inf if solved is None else max(abs(solved[2]), abs(solved[3]))
+    if solved is None or off > size or not 0.2 * size < min(solved[:2]) <= max(solved[:2]) < 50 * size:
+        solved = (1.2 * size, 1.2 * size, 0.0, 0.0)
+    found = dict(zip(_INTRINSICS, (solved[0], solved[1], *(middle + solved[2:])), strict=True))
+    return {name: np.array([value]) for name, value in found.items() if name in free}
+
+
+def _poses(setup: Setup, views: list[_View], values: Mapping[str, Array]) -> list[dict[int, Array]]:
+    """camera_T_board of each board, by record (4 x 4, m)."""
+    focal, centre = (np.concatenate([values[a], values[b]]) for a, b in (("fx", "fy"), ("cx", "cy")))
+    lens = setup.lens
+    distortion = np.concatenate([values[name] for name in DISTORTION[lens]])
+    poses: list[dict[int, Array]] = [{} for _ in setup.names]
+    for view in views:
+        seen = normalised(lens, view.image.T, focal, centre, distortion).T
+        poses[view.board][view.record] = board_pose(view.points, seen)
+    return poses
+
+
+def _matrix(name: str, values: Mapping[str, Array]) -> Array:
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_matrix(np.asarray(values[f"{name}_rotation"]))
+    pose[:3, 3] = [float(values[f"{name}_{axis}"][0]) for axis in "xyz"]
+    return pose
+
+
+def _pose_values(name: str, pose: Array) -> dict[str, Array]:
+    place = {f"{name}_{axis}": pose[i : i + 1, 3] for i, axis in enumerate("xyz")}
+    return {**place, f"{name}_rotation": np.array(quaternion_of(pose[:3, :3]))}
+
+
+def _middle(poses: Array) -> int:
+    """Of poses that should be one (N x 4 x 4), the one nearest to the others."""
+    apart = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2)
+    return int(np.argmin(np.median(apart, axis=1)))

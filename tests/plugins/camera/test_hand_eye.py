@@ -1,0 +1,78 @@
+"""Closed forms of hand-eye calibration: exact on exact poses, near with errors, and honest about open motions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from armcal.base.domains import Array
+from armcal_camera.hand_eye import hand_eye, open_motion
+from armcal_camera.views import board_pose, homography, intrinsics
+from scipy.spatial.transform import Rotation
+
+BOARD = np.array([[25e-3 * x, 25e-3 * y] for y in range(6) for x in range(9)])
+
+
+def pose(random: np.random.Generator, turn: float = 1.0, shift: float = 0.5) -> Array:
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(turn * random.normal(size=3)).as_matrix()
+    matrix[:3, 3] = shift * random.normal(size=3)
+    return matrix
+
+
+def noisy(matrix: Array, random: np.random.Generator, mm: float, deg: float) -> Array:
+    off = np.eye(4)
+    off[:3, :3] = Rotation.from_rotvec(np.deg2rad(deg) * random.normal(size=3)).as_matrix()
+    off[:3, 3] = mm / 1000 * random.normal(size=3)
+    return matrix @ off
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_exact_poses_give_the_exact_answer(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    x, y, a = pose(random), pose(random), np.array([pose(random) for _ in range(8)])
+    solved = hand_eye(a, np.linalg.inv(y) @ a @ x)
+    assert solved is not None
+    assert np.allclose(solved.x, x, atol=1e-9) and np.allclose(solved.y, y, atol=1e-9)
+
+
+def test_poses_with_errors_give_one_near_by() -> None:
+    random = np.random.default_rng(1)
+    x, y, a = pose(random), pose(random), np.array([pose(random) for _ in range(30)])
+    b = np.array([noisy(one, random, 1.0, 0.1) for one in np.linalg.inv(y) @ a @ x])
+    solved = hand_eye(a, b)
+    assert solved is not None
+    assert np.linalg.norm(solved.x[:3, 3] - x[:3, 3]) < 2e-3
+    assert Rotation.from_matrix(solved.x[:3, :3].T @ x[:3, :3]).magnitude() < np.deg2rad(0.2)
+
+
+def test_motions_that_leave_the_pose_open_are_named() -> None:
+    random = np.random.default_rng(2)
+    shifted = np.array([pose(random, turn=0.0) for _ in range(10)])
+    about_z = np.array([pose(random, turn=0.0) for _ in range(10)])
+    about_z[:, :3, :3] = Rotation.from_euler("z", random.uniform(-1, 1, (10, 1))).as_matrix()
+    assert "hardly turned" in str(open_motion(shifted))
+    assert "one axis" in str(open_motion(about_z)) and "1.00" in str(open_motion(about_z)).replace("-", "")
+    assert hand_eye(shifted, shifted) is None and hand_eye(about_z, about_z) is None
+    assert open_motion(np.array([pose(random) for _ in range(10)])) is None
+
+
+def test_a_board_seen_from_any_side_has_its_pose_found() -> None:
+    random = np.random.default_rng(4)
+    for _ in range(20):
+        true = np.eye(4)
+        true[:3, :3] = Rotation.from_rotvec(random.uniform(-0.9, 0.9, 3)).as_matrix()
+        true[:3, 3] = random.uniform([-0.2, -0.2, 0.4], [0.1, 0.1, 1.0])
+        there = BOARD @ true[:3, :2].T + true[:3, 3]
+        assert np.allclose(board_pose(BOARD, there[:, :2] / there[:, 2:]), true, atol=1e-7)
+
+
+def test_views_of_a_board_determine_the_intrinsics() -> None:
+    random = np.random.default_rng(5)
+    homographies = []
+    for _ in range(6):
+        turn = Rotation.from_rotvec(random.uniform(-0.6, 0.6, 3)).as_matrix()
+        there = BOARD @ turn[:, :2].T + random.uniform([-0.1, -0.1, 0.5], [0.0, 0.0, 0.8])
+        seen = there[:, :2] / there[:, 2:] * [1.1, 1.15] + [0.63, 0.47]
+        homographies.append(homography(BOARD, seen))
+    assert np.allclose(intrinsics(homographies), (1.1, 1.15, 0.63, 0.47), atol=1e-6)
+    assert intrinsics(homographies[:2]) is None
