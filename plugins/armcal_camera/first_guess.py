@@ -112,8 +112,8 @@ def _intrinsics(views: list[_View], free: frozenset[str]) -> dict[str, Array]:
     off = np.inf if solved is None else max(abs(solved[2]), abs(solved[3]))
     if solved is None or off > size or not 0.2 * size < min(solved[:2]) <= max(solved[:2]) < 50 * size:
         solved = (1.2 * size, 1.2 * size, 0.0, 0.0)
-    found = dict(zip(_INTRINSICS, (solved[0], solved[1], *(middle + solved[2:])), strict=True))
-    return {name: np.array([value]) for name, value in found.items() if name in free}
+    start = dict(zip(_INTRINSICS, (solved[0], solved[1], *(middle + solved[2:])), strict=True))
+    return {name: np.array([value]) for name, value in start.items() if name in free}
 
 
 def _poses(setup: Setup, views: list[_View], values: Mapping[str, Array]) -> list[dict[int, Array]]:

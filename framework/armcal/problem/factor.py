@@ -207,15 +207,13 @@ def build_factor(
 ) -> Factor:
     """The expressions of one measurement; ``available`` are the channels of the records, ``environment`` the rest.
 
-    ``unrolled`` has those of all points of a measurement that reads the same of many, as if it had no points.
-    """
+    ``unrolled`` has those of all points of a measurement of many, as if it had no points."""
     symbols, values = _free_and_fixed(parameters)
     groups = measurement if isinstance(measurement, GroupedMeasurement) else None
     group, of_group = _symbols("group", groups.group_parameters("") if groups else ())
     records, states, deflections = _arm_states(measurement, arms, values, environment, available)
     local = {**scoped(values, f"{name}."), **of_group}
-    points = measurement.points if isinstance(measurement, PointMeasurement) and not unrolled else None
-    reading = _reading(name, measurement, records, states, local, points)
+    reading = _reading(name, measurement, records, states, local, unrolled)
     next_state = ca.densify(ca.vertcat(*[states[a].next_deflection for a in measurement.arms]))
     tools = ca.vertcat(*[ca.vec(states[a].base_T_tool.matrix()[:3, :]) for a in measurement.arms])
     nuisance_names, nuisance_starts = _nuisance_starts(groups, states, local)
@@ -242,7 +240,7 @@ def build_factor(
         springs=tuple(spring for arm in own.values() for spring in arm.spring_names),
         joints=_joints(own),
     )
-    return factor if points is None else _of_points(factor, measurement, points)
+    return factor if reading.points is None else _of_points(factor, measurement, reading.points)
 
 
 def _joints(arms: Mapping[str, Arm]) -> tuple[tuple[str, str], ...]:
@@ -274,6 +272,7 @@ class _Reading:
     outputs: Expression
     residual: Expression
     margin: Expression = None
+    points: Array | None = None
 
     @property
     def everything(self) -> Expression:
@@ -286,21 +285,21 @@ def _reading(
     records: _Records,
     states: Mapping[str, ArmState],
     local: Mapping[str, Expression],
-    points: Array | None,
+    unrolled: bool,
 ) -> _Reading:
     """Of the whole record, or of one point, whose numbers are channels, where there are points."""
-    if points is None:
+    if unrolled or not isinstance(measurement, PointMeasurement):
         predicted = measurement.outputs(states, local)
         measured = {c.name: records.optional(f"{name}.{c.name}", 0.0) for c in measurement.channels()}
         residual = _checked(name, measurement, measurement.residual(states, measured, local))
         return _Reading(tuple(predicted), ca.vertcat(*predicted.values()), residual)
-    assert isinstance(measurement, PointMeasurement)
+    points = measurement.points
     point = ca.vertcat(*[records.number(f"{name}.{_POINT}{i}") for i in range(points.shape[1])])
     shown, own = measurement.point_outputs(states, local, point), [c.name for c in measurement.point_channels()]
     is_read = any(records.has(f"{name}.{channel.name}") for channel in measurement.channels())
     read = [records.number(f"{name}.{channel}") if is_read else ca.SX(0) for channel in own]
     margin = measurement.point_margin(states, local, point) if isinstance(measurement, LimitedView) else None
-    return _Reading(tuple(own), shown, ca.vertcat(*read) - shown, margin)
+    return _Reading(tuple(own), shown, ca.vertcat(*read) - shown, margin, points)
 
 
 def _of_points(factor: Factor, measurement: Measurement, points: Array) -> Factor:

@@ -79,9 +79,9 @@ def applicable(factor: Factor, dataset: Dataset, numbers: Indices | None) -> Mas
 
 def _present(factor: Factor, missing: Mask) -> Mask:
     """Which rows of the residual a record has (n_r x N): those of points of which no channel is missing."""
-    each = len(missing) // max(1, len(factor.points if factor.points is not None else ()))
-    whole = ~missing.reshape(-1, each, missing.shape[1]).any(axis=1)
-    return np.repeat(whole, each, axis=0)
+    per_point = len(missing) // max(1, len(factor.points if factor.points is not None else ()))
+    whole = ~missing.reshape(-1, per_point, missing.shape[1]).any(axis=1)
+    return np.repeat(whole, per_point, axis=0)
 
 
 def factor_records(

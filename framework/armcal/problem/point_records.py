@@ -28,12 +28,12 @@ class PointRecords:
 
     def split(self, record: Array) -> Array:
         """Channels (shared + P c x N) as those of one point each (shared + c + k x N P)."""
-        number, each = record.shape[1], (len(record) - self.shared) // self.count
-        own = record[self.shared :].reshape(self.count, each, number)
+        number, per_point = record.shape[1], (len(record) - self.shared) // self.count
+        own = record[self.shared :].reshape(self.count, per_point, number)
         return np.concatenate(
             [
                 np.repeat(record[: self.shared], self.count, axis=1),
-                own.transpose(1, 2, 0).reshape(each, -1 if each else number * self.count),
+                own.transpose(1, 2, 0).reshape(per_point, -1 if per_point else number * self.count),
                 np.tile(self.points.T, number),
             ]
         )

@@ -35,8 +35,8 @@ def with_few_points(
 
 def _thinned(factor: Factor, record: FactorRecords, most: int) -> tuple[Factor, FactorRecords]:
     assert factor.points is not None
-    chosen, each = spread_points(factor.points, most), len(factor.noise) // len(factor.points)
-    rows = (each * chosen[:, None] + np.arange(each)).ravel()
+    chosen, per_point = spread_points(factor.points, most), len(factor.noise) // len(factor.points)
+    rows = (per_point * chosen[:, None] + np.arange(per_point)).ravel()
     read = len(record.record) > factor.shared
     channels = factor.channels[: factor.shared]
     small = replace(

@@ -30,9 +30,9 @@ def as_seen(problem: Problem, values: Array, dataset: Dataset) -> tuple[Dataset,
         evaluate = Evaluator(own, own.margin)
         margins = kernel.points.joined(evaluate(grouped.values(values, 0), kernel.points.split(record.record), here))
         visible = measurement.visible(margins[:, : record.count])
-        each = len(kernel.factor.output_channels) // kernel.points.count
+        per_point = len(kernel.factor.output_channels) // kernel.points.count
         for row, channel in enumerate(kernel.factor.output_channels):
             if channel in channels:
-                channels[channel] = np.where(visible[row // each], channels[channel], np.nan)
+                channels[channel] = np.where(visible[row // per_point], channels[channel], np.nan)
         seen |= visible.any(axis=0)
     return (replace(dataset, channels=channels), seen) if limited else (dataset, np.ones(len(dataset), dtype=bool))
