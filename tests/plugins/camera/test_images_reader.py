@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from armcal.errors import DataError
+from armcal.errors import DataError, PluginError
 from armcal.measure.reader import ReadRequest, RequestedChannel
 
 pytest.importorskip("cv2")
@@ -240,3 +241,12 @@ def test_a_flange_pose_that_is_none_is_refused(folder: Path, line: str, message:
     path.write_text(f"1 0 0 0 0 1 0 0 0 0 1 0\n{line}\n")
     with pytest.raises(DataError, match=message):
         read(request_of(FLANGE), folder=folder, poses=path)
+
+
+def test_without_opencv_corners_are_read_and_images_are_not(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = read(folder=folder, poses=folder / "poses.csv", corners=folder / "corners.csv")
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    again = read(poses=folder / "poses.csv", corners=folder / "corners.csv")
+    np.testing.assert_allclose(first.column("camera.u_7"), again.column("camera.u_7"), atol=6e-9)
+    with pytest.raises(PluginError, match=r"pip install 'armcal\[camera\]'"):
+        read(folder=folder, poses=folder / "poses.csv")
