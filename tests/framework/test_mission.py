@@ -46,7 +46,7 @@ SHORT = (
     f"simulation.events={EVENTS}",
     "simulation.power_cuts=[0.7, 1.55]",
     "mission.poses=20",
-    "mission.refit={records: 60, every: 200}",
+    "mission.refit={records: 60, every: 100}",
 )
 INTERPRETED = ("evaluator=interpreted", "recalibrate.evaluator=interpreted")
 DECIDED_AFTER = 3

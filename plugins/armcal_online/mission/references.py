@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from armcal.base.domains import Array
@@ -69,19 +69,29 @@ def refits(
     everything = [settings.records]
     while (following := max(int(_GROWTH * everything[-1]), everything[-1] + settings.every)) <= count:
         everything.append(following)
-    return {
-        "refit": _series(problem, records, mission, [(0, last) for last in everything]),
-        "refit_recent": _series(problem, records, mission, [(last - settings.records, last) for last in recent]),
+    launch = problem.parameters.nominal()
+    earliest = robust_fit(problem, problem.subset(records, np.arange(settings.records)), [launch])
+    spans = {
+        "refit": [(0, last) for last in everything],
+        "refit_recent": [(last - settings.records, last) for last in recent],
     }
+    return {name: _series(problem, records, mission, own, earliest) for name, own in spans.items()}
 
 
 def _series(
-    problem: Problem, records: Sequence[FactorRecords], mission: Mission, spans: Iterable[tuple[int, int]]
+    problem: Problem,
+    records: Sequence[FactorRecords],
+    mission: Mission,
+    spans: Sequence[tuple[int, int]],
+    earliest: Array,
 ) -> Series:
-    """A fit of each span of records, from the one before it; used from the span's last record on."""
-    launch = values = problem.parameters.nominal()
-    series: list[tuple[float, Array]] = [(0.0, launch)]
-    for first, last in spans:
+    """A fit of each span of records, from the one before it; used from the span's last record on.
+
+    ``earliest`` is that of the first span.
+    """
+    launch, values = problem.parameters.nominal(), earliest
+    series: list[tuple[float, Array]] = [(0.0, launch), (float(mission.times[spans[0][1] - 1]), earliest)]
+    for first, last in spans[1:]:
         values = robust_fit(problem, problem.subset(records, np.arange(first, last)), (values, launch))
         series.append((float(mission.times[last - 1]), values))
     return tuple(series)
