@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from armcal import api
 from armcal.errors import DataError, PluginError
 from armcal.measure.reader import ReadRequest, RequestedChannel
 
@@ -250,3 +251,25 @@ def test_without_opencv_corners_are_read_and_images_are_not(folder: Path, monkey
     np.testing.assert_allclose(first.column("camera.u_7"), again.column("camera.u_7"), atol=6e-9)
     with pytest.raises(PluginError, match=r"pip install 'armcal\[camera\]'"):
         read(folder=folder, poses=folder / "poses.csv")
+
+
+@pytest.mark.shared
+@pytest.mark.slow
+def test_from_images_and_flange_poses_to_the_camera_on_the_hand(shared_data: Path, tmp_path: Path) -> None:
+    """The set was rendered with the camera on the flange, half a turn about x."""
+    config = tmp_path / "hand_eye.yaml"
+    (tmp_path / "images").mkdir()
+    for path in (shared_data / "camera" / "synthetic_1").iterdir():
+        (tmp_path / "images" / path.name).write_bytes(path.read_bytes())
+    config.write_text(
+        "arms: {arm: {model: {type: flange_pose}}}\n"
+        "data: {type: images, folder: images, poses: images/flange_poses.txt}\n"
+        "measurements: {camera: {type: camera, noise_px: 0.02,"
+        " board: {type: chessboard, columns: 9, rows: 6, square_mm: 200}}}\n"
+        'parameters: {free: ["camera.camera_*", "camera.board_[xyzr]*", "camera.[fc][xy]", "camera.[kp][123]"]}\n'
+    )
+    run = api.Experiment.load(config).run()
+    values = dict(zip(run.estimate.parameters.entry_names, run.estimate.values, strict=True))
+    assert 1000 * np.linalg.norm([values[f"camera.camera_{axis}"] for axis in "xyz"]) < 0.1
+    assert 2 * np.hypot(*(values[f"camera.camera_rotation[{axis}]"] for axis in "wy")) < np.radians(0.01)
+    assert run.metrics["error_px"]["calibrated"]["train"]["rms"] < 0.015
