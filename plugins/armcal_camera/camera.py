@@ -27,6 +27,7 @@ from armcal_camera.lens import DISTORTION, projected
 _Image = Annotated[float, UnitOf("image")]
 _PIXELS_SCALE, _DISTORTION_SCALE, _SCALE_SCALE = 0.01, 0.05, 0.01
 _NEAREST_M, _LEAST_FACING, _FEWEST_POINTS = 0.02, 0.3, 4
+_NORMAL_95 = 1.96
 _POSITIVE = Interval(1e-6, np.inf)
 
 
@@ -177,18 +178,10 @@ class Camera(PointInstrument):
         in_camera, normal = self._in_camera(arms, values, point)
         facing = ca.fabs(ca.dot(normal, in_camera)) / ca.norm_2(in_camera)
         margin = ca.fmin(in_camera[2] - _NEAREST_M, facing - _LEAST_FACING)
-        size = self.image
-        for i in range(2) if size is not None else ():
+        size = self.settings.image or (2 * values["cx"], 2 * values["cy"])  # about, where it is not stated
+        for i in range(2):
             margin = ca.fmin(margin, ca.fmin(seen[i], size[i] - seen[i]))
         return margin
-
-    @property
-    def image(self) -> tuple[float, float] | None:
-        """Width and height (thousands of pixels), as stated, else about the principal point; None if neither is."""
-        s = self.settings
-        if s.image is not None:
-            return s.image
-        return None if s.intrinsics is None else (2 * s.intrinsics.cx, 2 * s.intrinsics.cy)
 
     def visible(self, margins: Array) -> NDArray[np.bool_]:
         """Which points can be read (P x N): of a chessboard all or none, of others those in view, if there are four."""
@@ -203,6 +196,16 @@ class Camera(PointInstrument):
     def dimensions(self) -> Sequence[str]:
         """Places in an image."""
         return ("image",) * len(self.noise())
+
+    def accuracy(self, deviations: Mapping[str, float]) -> str:
+        """How well the camera's pose is known (95 %)."""
+        place = [deviations.get(f"camera_{axis}") for axis in "xyz"]
+        turn = [deviations.get(f"camera_rotation<r{axis}>") for axis in "xyz"]
+        if any(sd is None for sd in (*place, *turn)):
+            return ""
+        mm, deg = (_NORMAL_95 * float(np.linalg.norm(np.array(sds, dtype=float))) for sds in (place, turn))
+        where = "on the hand" if self.settings.mounting == "eye_in_hand" else "beside the arm"
+        return f"its place {where} is known to {1000 * mm:.2g} mm and {np.rad2deg(deg):.2g} deg (95 %)."
 
     def propose(
         self, tools: Array, read: Mapping[str, Array], values: Mapping[str, Array], free: frozenset[str]

@@ -33,3 +33,9 @@ def armcal_register_exporters(register: Register) -> None:
     register("camera_info", "armcal_camera.export:CameraInfoExporter", "a camera's intrinsics as ROS camera_info YAML")
     register("opencv", "armcal_camera.export:OpenCvExporter", "a camera's intrinsics and poses as OpenCV YAML")
     register("hand_eye", "armcal_camera.export:HandEyeExporter", "where a camera sits: YAML, URDF joint, ROS 2 command")
+
+
+@hookimpl
+def armcal_register_report_sections(register: Register) -> None:
+    """Announce the section of the report."""
+    register("cameras", "armcal_camera.report:cameras", "reprojection residuals over the sensor and by image")

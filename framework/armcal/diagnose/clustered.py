@@ -70,24 +70,22 @@ def widened(
 def _of_alike_points(problem: Problem, records: Sequence[FactorRecords], estimate: Estimate) -> Estimate:
     """The estimate with the wider covariance where the points of a record err alike, as by a lens or a detector.
 
-    The sandwich of the weights and of the residuals' own products within each record, each residual divided by the root
-    of what the fit left of it [Bell2002].
+    By one factor, the mean over all combinations of parameters: that of the sandwich of the weights and of the own
+    products of residuals within each record, each residual divided by the root of what the fit left of it [Bell2002].
+    Factors of their own would undo that parameters which correlate hardly matter together.
     """
     if all(kernel.factor.points is None for kernel in problem.kernels) or not estimate.names:
         return estimate
     rows = FitRows.of(problem, records, estimate)
-    chain = problem.parameters.entries_jacobian(estimate.values) * problem.parameters.scales()
-    inverse = np.linalg.pinv(rows.slopes)
-    sums = np.vstack([np.eye(problem.increments), chain]) @ inverse[: problem.increments]
-    together = np.zeros(len(sums))
+    basis = np.linalg.qr(rows.slopes)[0]
+    together = 0.0
     for own in rows.by_record:
-        values, axes = np.linalg.eigh(np.eye(len(own)) - rows.slopes[own] @ inverse[:, own])
+        values, axes = np.linalg.eigh(np.eye(len(own)) - basis[own] @ basis[own].T)
         left = (axes / np.sqrt(np.maximum(values, LEAST_LEFT))) @ (axes.T @ rows.residual[own])
-        together += (sums[:, own] @ left) ** 2
-    of_priors = np.sum(sums[:, len(rows.record_of) :] ** 2, axis=1)
-    apart = estimate.noise_scale**2 * np.sum(sums[:, : len(rows.record_of)] ** 2, axis=1)
-    factors = np.sqrt(np.maximum((together + of_priors) / np.maximum(apart + of_priors, 1e-300), 1.0))
-    return _wider(estimate, factors[: problem.increments], factors[problem.increments :])
+        together += float(np.sum((basis[own].T @ left) ** 2))
+    apart = estimate.noise_scale**2 * float(np.sum(basis[: len(rows.record_of)] ** 2))
+    factor = np.sqrt(max(together / max(apart, 1e-300), 1.0))
+    return _wider(estimate, np.full(problem.increments, factor), np.full(len(estimate.free_entries), factor))
 
 
 def _wider(estimate: Estimate, by_coordinate: Array, by_entry: Array) -> Estimate:

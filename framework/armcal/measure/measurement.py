@@ -117,6 +117,18 @@ class DimensionedResidual(Protocol):
         """``length`` or ``angle`` of each entry of the residual."""
 
 
+@runtime_checkable
+class StatesAccuracy(Protocol):
+    """What a measurement may provide beside the rest if its own parameters are what a user wants to know."""
+
+    def accuracy(self, deviations: Mapping[str, float]) -> str:
+        """How well they are known, as a sentence; empty if none is free.
+
+        Args:
+            deviations: standard deviations of free coordinates by local name (``camera_x``, ``camera_rotation<rx>``).
+        """
+
+
 def residual_dimensions(measurement: Measurement) -> tuple[str, ...]:
     """Of each entry of the residual; lengths if the measurement does not say."""
     if isinstance(measurement, DimensionedResidual):

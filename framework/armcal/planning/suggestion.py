@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
 from armcal.base.units import display_unit, to_unit
 from armcal.estimate.estimator import Estimate
 from armcal.planning.candidates import Candidates, deviations, whitened_rows
 from armcal.planning.criterion import criterion
 from armcal.planning.planning import built_up
 from armcal.planning.relaxation import Task
-from armcal.problem.problem import Problem
+from armcal.problem.problem import Problem, triangular
 
 CANDIDATES = 400
 LEAST_GAIN = 0.05
@@ -45,10 +46,11 @@ def suggest(
     considered.
     """
     poses = _candidates(dataset, tuple(joints), seed)
-    # What widens the intervals of these records would widen those of further ones.
-    scale = (estimate.noise_scale or 1.0) * float(np.median(estimate.widened or (1.0,)))
-    rows = whitened_rows(problem, estimate.values, poses) / scale
     base = estimate.square_root_information * estimate.parameters.scales()
+    scale = estimate.noise_scale or 1.0
+    if any(kernel.points is not None for kernel in problem.kernels):
+        scale = _as_these(problem, dataset, estimate, base)
+    rows = whitened_rows(problem, estimate.values, poses) / scale
     candidates = Candidates(base[None], rows[None])
     chosen = built_up(Task(candidates, criterion("D"), min(count, len(poses))))
     before = deviations(base)
@@ -66,6 +68,17 @@ def suggest(
             text = f"({', '.join(parts)}) {next(iter(units.values()))}"
         suggestions.append(Suggestion(commands, text, shrink))
     return tuple(suggestions)
+
+
+def _as_these(problem: Problem, dataset: Dataset, estimate: Estimate, base: Array) -> float:
+    """How many times the declared noise further records will have, if they are like these (``base``: R of these).
+
+    Points of a record err together, so that many of them say less than as many records would.
+    """
+    rows = whitened_rows(problem, estimate.values, dataset)
+    prior = np.diag(np.sqrt(problem.parameters.prior_information()) * problem.parameters.scales())
+    declared = deviations(triangular(np.vstack([prior, rows.reshape(-1, rows.shape[2])])))
+    return float(np.median(deviations(base) / np.maximum(declared, 1e-300)))
 
 
 def _candidates(dataset: Dataset, joints: tuple[str, ...], seed: int) -> Dataset:

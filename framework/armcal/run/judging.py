@@ -29,6 +29,8 @@ from armcal.diagnose.outside import predicted_positions
 from armcal.diagnose.residual_structure import structure
 from armcal.diagnose.verdict import Verdict, judge
 from armcal.estimate.validation import error_unit
+from armcal.measure.measurement import StatesAccuracy
+from armcal.planning.candidates import deviations as deviations_of
 from armcal.planning.suggestion import Suggestion, suggest
 from armcal.problem.drift import residuals
 from armcal.problem.motion import Motion, recorded_position
@@ -63,11 +65,11 @@ def verdict_of(
     estimate, acting = fitted.estimate, run.problem.weighted(fitted.records, fitted.weights)
     judged = _judged(run, errors)
     evidence = gather(run, judged, system, limit)
-    drifts = any(block.drift is not None for block in problem.parameters.free)
-    gross, moved, suggestions = list[Finding](), list[Finding](), tuple[Suggestion, ...]()
+    drifts = _AT_REST if any(block.drift is not None for block in problem.parameters.free) else ""
+    gross, moved, suggestions = list[Finding](), _accuracies(run), tuple[Suggestion, ...]()
     if estimate.verdict.converged:
         gross = _gross(run, acting, judged, evidence)
-        moved = moved_findings(moved_groups(problem, estimate.values, acting))
+        moved += moved_findings(moved_groups(problem, estimate.values, acting))
         # In a contact no pose can be chosen that does not touch.
         if estimate.names and all(kernel.factor.output_channels for kernel in problem.kernels):
             joints = {f"{name}.{j}": kind for name, arm in system.arms.items() for j, kind in arm.commanded.items()}
@@ -79,7 +81,7 @@ def verdict_of(
         errors.calibrated_mm,
         train,
         judged[np.isfinite(judged)],
-        (f"{held} held-out records" if held else "cross-validation") + (_AT_REST if drifts else ""),
+        (f"{held} held-out records" if held else "cross-validation") + drifts,
         run.dataset.ids,
         suggestions,
         fitted,
@@ -87,6 +89,21 @@ def verdict_of(
         evidence,
     )
     return verdict, evidence
+
+
+def _accuracies(run: FittedRecords) -> list[Finding]:
+    """How well the parameters of measurements are known that are what a user wants to know."""
+    problem, estimate = run.problem, run.fitted.estimate
+    if not estimate.verdict.converged or not estimate.names:
+        return []
+    names, findings = estimate.parameters.coordinate_names, []
+    deviations = dict(zip(names, deviations_of(estimate.square_root_information), strict=True))
+    for name, measurement in problem.blueprint.measurements.items():
+        if isinstance(measurement, StatesAccuracy):
+            own = {n.removeprefix(f"{name}."): float(sd) for n, sd in deviations.items() if n.startswith(f"{name}.")}
+            text = measurement.accuracy(own)
+            findings += [Finding("note", f"{name}: {text}")] if text else []
+    return findings
 
 
 def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | None) -> Evidence:

@@ -1,0 +1,129 @@
+"""What a calibrated camera becomes: files that other libraries read, a report, a verdict; and rendered images."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import armcal
+import numpy as np
+import pytest
+import yaml
+from armcal.api import Run
+from armcal.base.domains import Array
+from armcal.calibration.exporter import request_of
+from armcal.errors import ConfigError
+from scipy.spatial.transform import Rotation
+
+ROOT = Path(__file__).resolve().parents[3]
+DEMO = ROOT / "configs" / "camera" / "demo.yaml"
+SHARED = ROOT.parent / "shared" / "data" / "camera"
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    return armcal.Experiment.load(DEMO, ["validation.folds=0"]).run()
+
+
+@pytest.fixture(scope="module")
+def calibration(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return run.write(tmp_path_factory.mktemp("camera") / "run") / "calibration.yaml"
+
+
+def exported(calibration: Path, kind: str, out: Path, *options: str) -> None:
+    command = [sys.executable, "-m", "armcal.cli", "export", str(calibration), "--format", kind, "--out", str(out)]
+    subprocess.run([*command, *options], check=True, capture_output=True, timeout=120)
+
+
+def numbers(calibration: Path) -> dict[str, float]:
+    return {e["name"]: e["value"] for e in yaml.safe_load(calibration.read_text())["parameters"]}
+
+
+def matrix_of(place: list[float], rotation: Array) -> Array:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, place
+    return pose
+
+
+def test_opencv_reads_its_file(calibration: Path, tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install 'armcal[camera]'")
+    exported(calibration, "opencv", tmp_path / "camera.yaml")
+    storage, known = cv2.FileStorage(str(tmp_path / "camera.yaml"), cv2.FILE_STORAGE_READ), numbers(calibration)
+    matrix, pose = storage.getNode("camera_matrix").mat(), storage.getNode("tool_T_camera").mat()
+    assert matrix[0, 0] == pytest.approx(1000 * known["camera.fx"], abs=1e-9)
+    assert matrix[1, 2] == pytest.approx(1000 * known["camera.cy"], abs=1e-9)
+    assert storage.getNode("distortion_coefficients").mat().shape == (1, 5)
+    assert np.allclose(pose[:3, 3], [known[f"camera.camera_{axis}"] for axis in "xyz"], atol=1e-12)
+    assert storage.getNode("image_width").real() == 1280
+
+
+def test_ros_files_agree_with_each_other(calibration: Path, tmp_path: Path) -> None:
+    exported(calibration, "hand_eye", tmp_path / "where.yaml", "--option", "tool_frame=flange")
+    exported(calibration, "camera_info", tmp_path / "info.yaml")
+    where = yaml.safe_load((tmp_path / "where.yaml").read_text())["transformation"]
+    joint = ElementTree.fromstring((tmp_path / "where_joint.urdf").read_text())
+    assert joint.find("parent").get("link") == "flange"  # type: ignore[union-attr]
+    origin = joint.find("origin")
+    assert origin is not None
+    xyz, rpy = ([float(x) for x in str(origin.get(key)).split()] for key in ("xyz", "rpy"))
+    one = matrix_of([where[axis] for axis in "xyz"], Rotation.from_quat([where[f"q{a}"] for a in "xyzw"]).as_matrix())
+    assert np.allclose(one, matrix_of(xyz, Rotation.from_euler("xyz", rpy).as_matrix()), atol=1e-8)
+    info = yaml.safe_load((tmp_path / "info.yaml").read_text())
+    assert (info["image_width"], info["image_height"], info["distortion_model"]) == (1280, 960, "plumb_bob")
+    assert info["camera_matrix"]["data"][0] == pytest.approx(1000 * numbers(calibration)["camera.fx"])
+
+
+def test_a_camera_that_is_not_there_is_refused(calibration: Path) -> None:
+    from armcal_camera.export import CameraExportSettings, CameraInfoExporter
+
+    request = request_of(armcal.Calibration.load(calibration), None)
+    with pytest.raises(ConfigError, match="found the cameras camera"):
+        CameraInfoExporter(CameraExportSettings(camera="other")).export(request)
+
+
+def test_report_and_verdict_speak_of_pixels_and_of_the_camera(run: Run, calibration: Path) -> None:
+    page = (calibration.parent / "report.html").read_text()
+    assert "Reprojection residuals over the sensor" in page
+    assert run.verdict.headline.startswith("Reprojection error") and " px" in run.verdict.headline
+    texts = [finding.text for finding in run.verdict.findings]
+    assert any(text.startswith("camera: its place on the hand is known to") for text in texts)
+    assert "error_px" in run.metrics
+    rows = (calibration.parent / "residuals.csv").read_text().splitlines()
+    assert len(rows) == 41 and "calibrated_px" in rows[0]
+
+
+@pytest.mark.skipif(
+    not SHARED.exists(), reason="the measured images are not beside the checkout (../shared/data/camera)"
+)
+@pytest.mark.parametrize("name", ["synthetic_1"])
+def test_rendered_images_give_the_camera_where_it_is(name: str, tmp_path: Path) -> None:
+    pytest.importorskip("cv2", reason="OpenCV is not installed: pip install 'armcal[camera]'")
+    config = {
+        "name": name,
+        "data": {"type": "images", "folder": "images", "poses": "images/flange_poses.txt"},
+        "arms": {"arm": {"model": {"type": "flange_pose"}}},
+        "measurements": {
+            "camera": {
+                "type": "camera",
+                "noise_px": 0.015,
+                "board": {"type": "chessboard", "columns": 9, "rows": 6, "square_mm": 200},
+            }
+        },
+        "parameters": {"free": ["camera.camera_*", "camera.board_[xyzr]*", "camera.[fc][xy]", "camera.k[12]"]},
+        "validation": {"holdout": 0.25, "folds": 0},
+    }
+    shutil.copytree(SHARED / name, tmp_path / "images")
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
+    run = armcal.Experiment.load(tmp_path / "config.yaml").run()
+    estimate, entries = run.estimate, run.estimate.parameters.entry_names
+    place = [entries.index(f"camera.camera_{axis}") for axis in "xyz"]
+    off = estimate.values[place]
+    deviations = np.sqrt(np.diag(estimate.covariance))[[list(estimate.free_entries).index(i) for i in place]]
+    assert np.linalg.norm(off) < 1e-4, "0.34 mm by a bundle adjustment with OpenCV's corners"
+    assert (np.abs(off) < 3 * deviations).all()
+    turned = Rotation.from_quat([estimate.values[entries.index(f"camera.camera_rotation[{a}]")] for a in "xyzw"])
+    assert np.rad2deg((turned.inv() * Rotation.from_euler("x", 180, degrees=True)).magnitude()) < 0.01
+    assert run.metrics["error_px"]["calibrated"]["holdout"]["rms"] < 0.02
