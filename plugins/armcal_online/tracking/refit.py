@@ -157,7 +157,7 @@ class Refitter:
         group = None if len(grouped.entries) <= 1 else np.array([reading.group for reading in fill], dtype=np.intp)
         state = np.zeros((kernel.factor.state.numel(), len(fill)))
         packed = FactorRecords(count, record, np.ones(len(fill)), state, group=group)
-        ((jacobian, residual),) = grouped.linearised(values, packed)
+        jacobian, residual = (np.concatenate(p, axis=-1) for p in zip(*grouped.linearised(values, packed), strict=True))
         stated = np.array(kernel.factor.noise)
         raw = np.moveaxis(residual[:, :count] * stated[:, None], 1, 0)
         rows = np.moveaxis(jacobian[:, :, :count] * stated[:, None, None], 2, 0)
