@@ -15,6 +15,7 @@ from armcal_camera.hand_eye import hand_eye, open_motion
 from armcal_camera.lens import DISTORTION, normalised
 from armcal_camera.views import FEWEST_POINTS, board_pose, homography, intrinsics
 
+_PLACE = ("camera_x", "camera_y", "camera_z", "camera_rotation")
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _FEWEST_VIEWS = 3
 
@@ -60,7 +61,7 @@ def first_guess(
     proposed = {name: own[name] for name in _INTRINSICS if name in free}
     is_open = open_motion(tools)
     if is_open is not None:
-        return Proposal(proposed, (is_open,))
+        return Proposal(proposed, *is_open, tuple(name for name in _PLACE if name in free))
     in_hand, camera_pose = setup.in_hand, None
     for number, name in sorted(enumerate(setup.names), key=lambda b: -len(poses[b[0]])):
         records = list(poses[number])

@@ -47,8 +47,8 @@ def hand_eye(a: Array, b: Array) -> HandEye | None:
     return min(solved, key=lambda one: one.left_m)
 
 
-def open_motion(a: Array) -> str | None:
-    """What the motions of the hand leave open of a hand-eye pose, with the motion that would close it; None if nothing.
+def open_motion(a: Array) -> tuple[str, str] | None:
+    """What the motions of the hand leave open of a hand-eye pose, and the motion that would close it; None if nothing.
 
     Two turns about axes that are not parallel determine all [Tsai1989].
     """
@@ -56,16 +56,17 @@ def open_motion(a: Array) -> str | None:
     turns = turns[np.linalg.norm(turns, axis=1) > _TURNED_RAD]
     if not len(turns):
         return (
-            "the hand only moved, and hardly turned: where the camera sits is not determined. Turn the hand about two "
-            "axes that are not parallel, 30 deg and more each"
+            "the hand only moved, and hardly turned: where the camera sits is not determined.",
+            "Turn the hand about two axes that are not parallel, 30 deg and more each.",
         )
     spread = np.linalg.svd(turns, compute_uv=False) ** 2
     if spread[1] < _PARALLEL * spread[0]:
         axis = np.linalg.svd(turns)[2][0]
         named = ", ".join(f"{x:.2f}" for x in axis)
         return (
-            f"all turns of the hand are about one axis, ({named}) in the tool's frame: the shift along it and the turn "
-            "about it are not determined. Turn the hand about another axis too, 30 deg and more"
+            f"all turns of the hand are about one axis, ({named}) in the tool's frame: where the camera sits along it, "
+            "and its turn about it, are not determined.",
+            "Turn the hand about another axis too, 30 deg and more.",
         )
     return None
 

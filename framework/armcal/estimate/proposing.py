@@ -9,6 +9,7 @@ import numpy as np
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.errors import Location, ProblemError
 from armcal.estimate.start import BETTER, Start
 from armcal.estimate.validation import record_errors
 from armcal.measure.points import Proposing
@@ -24,6 +25,7 @@ def with_proposals(start: Start, records: Sequence[FactorRecords], dataset: Data
 
     Raises:
         NotConvergedError: a record has no elastic equilibrium at the nominal values.
+        ProblemError: the records leave free parameters open that nothing else holds.
     """
     for number, kernel in enumerate(start.problem.kernels):
         measurement = start.problem.blueprint.measurements[kernel.factor.name]
@@ -47,7 +49,9 @@ def _with_proposal(
         {local: nominal[parameters.entries_of(block.name)] for local, block in own.items()},
         frozenset(local for local, block in own.items() if block.free),
     )
-    start = replace(start, warnings=(*start.warnings, *(f"{name}: {text}." for text in proposal.open)))
+    if any(own[local].prior_sd is None for local in proposal.undetermined):
+        hint = f"{proposal.close} Or give priors, or hold {', '.join(proposal.undetermined)}."
+        raise ProblemError(f"{name}: {proposal.open}", where=Location(dataset.source or None), hint=hint)
     if not proposal.values:
         return start
     vector, moved = before.copy(), nominal.copy()

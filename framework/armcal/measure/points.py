@@ -25,11 +25,15 @@ class Proposal:
 
     Attributes:
         values: canonical entries by local name; none where nothing could be found.
-        open: what the records leave open, in sentences that say which further ones would close it.
+        open: what the records leave open, a sentence; empty if nothing.
+        close: which further records would close it, a sentence.
+        undetermined: local names of the parameters that are left open.
     """
 
     values: Mapping[str, Array] = field(default_factory=dict)
-    open: tuple[str, ...] = ()
+    open: str = ""
+    close: str = ""
+    undetermined: tuple[str, ...] = ()
 
 
 @runtime_checkable

@@ -13,7 +13,9 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.calibration.calibration import Calibration
 from armcal.config.yaml_source import load_config
-from armcal.errors import ConfigError
+from armcal.errors import ConfigError, ProblemError
+from armcal.estimate.proposing import with_proposals
+from armcal.estimate.start import Start
 from armcal.estimate.validation import record_errors
 from armcal.problem.factor import build_factor
 from armcal.problem.problem import Problem
@@ -186,3 +188,22 @@ def test_arm_camera_and_board_together_come_to_the_truth(calibrated: Path) -> No
     assert len(off) == 4 + 6 + 4
     assert max(off) < 4 and np.mean(np.array(off) < 2) >= 0.8
     assert calibration.record.quality_px["calibrated"]["holdout"]["mean"] < 0.32
+
+
+def test_a_hand_that_did_not_turn_is_refused_with_the_motion_that_is_missing(dataset: Dataset, tmp_path: Path) -> None:
+    still = {f"arm.{joint}": np.full(12, 0.1) for joint in ("rz", "ry", "rx")}
+    moved = {f"arm.{axis}": np.random.default_rng(0).uniform(-0.1, 0.1, 12) for axis in "xyz"}
+    shown = {name: values[:12] for name, values in dataset.channels.items() if name.startswith("camera.")}
+    config = tmp_path / "shifted.yaml"
+    config.write_text(
+        "name: shifted\narms: {arm: {model: {type: flange_pose}}}\n"
+        "measurements:\n  camera:\n    type: camera\n    noise_px: 0.2\n"
+        "    board: {type: chessboard, columns: 9, rows: 6, square_mm: 25}\n"
+        'parameters: {free: ["camera.camera_*", "camera.board_[xyzr]*"]}\n'
+    )
+    experiment = Experiment.load(config)
+    records = Dataset(tuple(map(str, range(12))), {**still, **moved, **shown})
+    problem = problem_of(experiment, records)
+    with pytest.raises(ProblemError, match="hardly turned") as refused:
+        with_proposals(Start(problem), problem.records(records), records)
+    assert "30 deg" in refused.value.hint
