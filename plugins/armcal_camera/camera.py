@@ -13,7 +13,6 @@ from armcal.base.domains import Array, Interval
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.pose_blocks import pose_transform
 from armcal.base.pose_settings import PoseSettings
-from armcal.base.settings import Settings, UnitOf
 from armcal.measure.instrument import InstrumentSettings
 from armcal.measure.measurement import Channel
 from armcal.measure.points import PointInstrument, Proposal, spread_points
@@ -22,23 +21,13 @@ from pydantic import Field, model_validator
 
 from armcal_camera.board import Board, BoardOrFile, require_distinct
 from armcal_camera.first_guess import Setup, first_guess
+from armcal_camera.intrinsics import IntrinsicsOrFile, Lens, Pixels
 from armcal_camera.lens import DISTORTION, projected
 
-_Image = Annotated[float, UnitOf("image")]
 _PIXELS_SCALE, _DISTORTION_SCALE, _SCALE_SCALE = 0.01, 0.05, 0.01
 _NEAREST_M, _LEAST_FACING, _FEWEST_POINTS = 0.02, 0.3, 4
 _NORMAL_95 = 1.96
 _POSITIVE = Interval(1e-6, np.inf)
-
-
-class IntrinsicsSettings(Settings):
-    """Focal lengths, principal point and distortion, as OpenCV and ROS state them."""
-
-    fx: Annotated[_Image, Field(gt=0)]
-    fy: Annotated[_Image, Field(gt=0)]
-    cx: _Image
-    cy: _Image
-    distortion: tuple[float, ...] = ()
 
 
 class CameraSettings(InstrumentSettings):
@@ -50,15 +39,15 @@ class CameraSettings(InstrumentSettings):
     ``most_points`` points so many are used, spread evenly over it. ``image`` is its width and height.
     """
 
-    noise: Annotated[_Image, Field(gt=0)]
+    noise: Annotated[Pixels, Field(gt=0)]
     mounting: Literal["eye_in_hand", "eye_to_hand"] = "eye_in_hand"
-    lens: Literal["pinhole", "fisheye"] = "pinhole"
+    lens: Lens | None = None
     board: BoardOrFile | None = None
     boards: tuple[BoardOrFile, ...] = ()
-    intrinsics: IntrinsicsSettings | None = None
+    intrinsics: IntrinsicsOrFile | None = None
     pose: PoseSettings = PoseSettings()
     board_poses: tuple[PoseSettings, ...] = ()
-    image: tuple[_Image, _Image] | None = None
+    image: tuple[Pixels, Pixels] | None = None
     most_points: Annotated[int, Field(ge=4)] = 120
 
     @model_validator(mode="after")
@@ -69,10 +58,15 @@ class CameraSettings(InstrumentSettings):
         number = len(self.boards) or 1
         if self.board_poses and len(self.board_poses) != number:
             raise ValueError(f"found {len(self.board_poses)} board_poses, expected one of each board: {number}")
-        names, given = DISTORTION[self.lens], self.intrinsics.distortion if self.intrinsics else ()
-        if given and len(given) != len(names) and (self.lens, len(given)) != ("pinhole", 4):
+        names, given = DISTORTION[self.model], self.intrinsics.distortion if self.intrinsics else ()
+        if given and len(given) != len(names) and (self.model, len(given)) != ("pinhole", 4):
             raise ValueError(f"found {len(given)} distortion coefficients, expected {len(names)}: {', '.join(names)}")
         return self
+
+    @property
+    def model(self) -> Lens:
+        """The lens: as stated, else as the file of intrinsics states it, else a pinhole."""
+        return self.lens or (self.intrinsics.model if self.intrinsics else None) or "pinhole"
 
 
 class Camera(PointInstrument):
@@ -142,7 +136,7 @@ class Camera(PointInstrument):
             domain = _POSITIVE if name.startswith("f") else Interval()
             own.append(scalar(name, "kpx", value, _PIXELS_SCALE, domain))
         known = given.distortion if given else ()
-        for i, name in enumerate(DISTORTION[s.lens]):
+        for i, name in enumerate(DISTORTION[s.model]):
             own.append(scalar(name, "1", known[i] if i < len(known) else 0.0, _DISTORTION_SCALE))
         return tuple(own)
 
@@ -158,8 +152,8 @@ class Camera(PointInstrument):
         """Where a point of a board appears (2x1, thousands of pixels)."""
         in_camera, _ = self._in_camera(arms, values, point)
         focal, centre = (values["fx"], values["fy"]), (values["cx"], values["cy"])
-        distortion = [values[name] for name in DISTORTION[self.settings.lens]]
-        return projected(self.settings.lens, in_camera, focal, centre, distortion)
+        distortion = [values[name] for name in DISTORTION[self.settings.model]]
+        return projected(self.settings.model, in_camera, focal, centre, distortion)
 
     def _in_camera(self, arms: Mapping[str, ArmState], values: Mapping[str, Any], point: Any) -> tuple[Any, Any]:
         """A point of a board (3x1, m) and the board's normal (3x1) in the camera's frame."""
@@ -178,10 +172,16 @@ class Camera(PointInstrument):
         in_camera, normal = self._in_camera(arms, values, point)
         facing = ca.fabs(ca.dot(normal, in_camera)) / ca.norm_2(in_camera)
         margin = ca.fmin(in_camera[2] - _NEAREST_M, facing - _LEAST_FACING)
-        size = self.settings.image or (2 * values["cx"], 2 * values["cy"])  # about, where it is not stated
+        size = self.image or (2 * values["cx"], 2 * values["cy"])  # about, where it is not stated
         for i in range(2):
             margin = ca.fmin(margin, ca.fmin(seen[i], size[i] - seen[i]))
         return margin
+
+    @property
+    def image(self) -> tuple[float, float] | None:
+        """Width and height (thousands of pixels), as stated or as the file of intrinsics states them."""
+        s = self.settings
+        return s.image or (s.intrinsics.image if s.intrinsics else None)
 
     def visible(self, margins: Array) -> NDArray[np.bool_]:
         """Which points can be read (P x N): of a chessboard all or none, of others those in view, if there are four."""
@@ -214,4 +214,4 @@ class Camera(PointInstrument):
         s = self.settings
         points = tuple(board.points[used] for board, used in zip(self.boards, self.used, strict=True))
         in_hand, is_stated = s.mounting == "eye_in_hand", s.intrinsics is not None
-        return first_guess(Setup(self.board_names, points, s.lens, in_hand, is_stated), tools, read, values, free)
+        return first_guess(Setup(self.board_names, points, s.model, in_hand, is_stated), tools, read, values, free)

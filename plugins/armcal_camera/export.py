@@ -84,7 +84,7 @@ class CameraInfoExporter(_CameraExporter):
             "image_height": size[1],
             "camera_name": name,
             "camera_matrix": {"rows": 3, "cols": 3, "data": flat},
-            "distortion_model": _MODELS[camera.settings.get("lens", "pinhole")],
+            "distortion_model": _MODELS[_model(camera)],
             "distortion_coefficients": {"rows": 1, "cols": len(distortion), "data": distortion},
             "rectification_matrix": {"rows": 3, "cols": 3, "data": [float(x) for x in np.eye(3).ravel()]},
             "projection_matrix": {"rows": 3, "cols": 4, "data": projection},
@@ -157,9 +157,15 @@ def _intrinsics(camera: Instrument) -> tuple[Array, list[float], tuple[int, int]
     """Camera matrix (px), distortion coefficients, and width and height (px) where they are stated."""
     n = camera.numbers
     matrix = np.array([[_PX * n["fx"], 0, _PX * n["cx"]], [0, _PX * n["fy"], _PX * n["cy"]], [0, 0, 1.0]])
-    distortion = [n[name] for name in DISTORTION[camera.settings.get("lens", "pinhole")]]
-    size = next((camera.settings[key] for key in ("image", "image_kpx") if camera.settings.get(key)), None)
+    distortion = [n[name] for name in DISTORTION[_model(camera)]]
+    stated = camera.settings.get("intrinsics") or {}
+    size = camera.settings.get("image_kpx") or stated.get("image_kpx")
     return matrix, distortion, None if size is None else (round(_PX * size[0]), round(_PX * size[1]))
+
+
+def _model(camera: Instrument) -> str:
+    stated = camera.settings.get("intrinsics") or {}
+    return str(camera.settings.get("lens") or stated.get("model") or "pinhole")
 
 
 def _poses(camera: Instrument) -> dict[str, Array]:

@@ -147,11 +147,12 @@ def measured_while_moving(request: SimulationRequest, commands: Dataset, values:
     own = values[:, list(parameters.free_entries)].T
     shown: dict[str, Array] = {}
     for kernel, records in zip(problem.kernels, problem.records(commands), strict=True):
-        factor, record = kernel.factor, records.record[:, : records.count]
+        factor, record, points = kernel.factor.expressed, records.record[:, : records.count], kernel.points
         row_by_row = replace(factor, record=ca.vertcat(factor.record, factor.values), values=ca.SX(0, 1))
-        start = np.zeros((factor.state.numel(), records.count))
-        read = Evaluator(row_by_row, factor.outputs)(np.zeros(0), np.concatenate([record, own]), start)
-        shown |= dict(zip(factor.output_channels, read, strict=True))
+        rows = (record, own) if points is None else (points.split(record), points.repeated(own))
+        start = np.zeros((factor.state.numel(), rows[0].shape[1]))
+        read = Evaluator(row_by_row, factor.outputs)(np.zeros(0), np.concatenate(rows), start)
+        shown |= dict(zip(kernel.factor.output_channels, read if points is None else points.joined(read), strict=True))
     return shown
 
 

@@ -1,0 +1,122 @@
+"""Intrinsics of a camera as stated in a configuration, or in a file: ROS ``camera_info``, OpenCV, Kalibr."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+import yaml
+from armcal.base.config_text import resolve_path
+from armcal.base.settings import Settings, UnitOf
+from armcal.errors import ArmcalError, DataError, Location
+from armcal.io.plain_files import input_bytes
+from pydantic import BeforeValidator, Field
+
+Lens: TypeAlias = Literal["pinhole", "fisheye"]
+Pixels: TypeAlias = Annotated[float, UnitOf("image")]
+_MOST_BYTES = 1024**2
+_FISHEYE = {"equidistant", "fisheye"}
+_PINHOLE = {"plumb_bob", "radtan", "none"}
+_MATRIX = ("camera_matrix", "cameraMatrix", "K", "M1")
+_DISTORTION = ("distortion_coefficients", "distCoeffs", "distortion", "D", "D1")
+
+
+class IntrinsicsSettings(Settings):
+    """Focal lengths, principal point and distortion, as OpenCV states them; ``model`` and ``image`` of a file."""
+
+    fx: Annotated[Pixels, Field(gt=0)]
+    fy: Annotated[Pixels, Field(gt=0)]
+    cx: Pixels
+    cy: Pixels
+    distortion: tuple[float, ...] = ()
+    model: Lens | None = None
+    image: tuple[Pixels, Pixels] | None = None
+
+
+class _Loader(yaml.SafeLoader):
+    """Takes OpenCV's matrices for mappings."""
+
+
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", yaml.SafeLoader.construct_yaml_map)
+
+
+def read_intrinsics(path: str | Path) -> IntrinsicsSettings:
+    """The intrinsics of a file.
+
+    Raises:
+        DataError: it is none of the three, or states another distortion model than these have.
+    """
+    text = input_bytes(Path(path), _MOST_BYTES, "a file of intrinsics").decode("utf-8", "replace")
+    try:
+        content = yaml.load("\n".join(x for x in text.splitlines() if not x.startswith("%YAML")), _Loader)
+    except yaml.YAMLError as fault:
+        raise _refused(path, f"it is not YAML ({fault}).") from fault
+    if isinstance(content, Mapping):
+        content = content.get("cam0", content)
+        for read in (_of_matrix, _of_kalibr):
+            made = read(content) if isinstance(content, Mapping) else None
+            if made is not None:
+                return _with_model(path, content, made)
+    raise _refused(path, "found no camera matrix in it.")
+
+
+def _of_matrix(content: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Of ROS and of OpenCV."""
+    matrix = next((_numbers(content[key]) for key in _MATRIX if key in content), [])
+    if len(matrix) != 9:
+        return None
+    distortion = next((_numbers(content[key]) for key in _DISTORTION if key in content), [])
+    size = [content.get("image_width"), content.get("image_height")]
+    return {"numbers": (matrix[0], matrix[4], matrix[2], matrix[5]), "distortion": distortion, "image": size}
+
+
+def _of_kalibr(content: Mapping[str, Any]) -> dict[str, Any] | None:
+    intrinsics = _numbers(content.get("intrinsics"))
+    if len(intrinsics) != 4 or content.get("camera_model", "pinhole") != "pinhole":
+        return None
+    distortion, size = _numbers(content.get("distortion_coeffs")), _numbers(content.get("resolution"))
+    return {"numbers": tuple(intrinsics), "distortion": distortion, "image": size}
+
+
+def _with_model(path: str | Path, content: Mapping[str, Any], made: Mapping[str, Any]) -> IntrinsicsSettings:
+    stated = str(content.get("distortion_model", "plumb_bob")).lower()
+    if stated not in _FISHEYE | _PINHOLE:
+        known = ", ".join(sorted(_FISHEYE | _PINHOLE))
+        raise _refused(path, f"found the distortion model {stated!r}, expected one of {known}.")
+    size = made["image"]
+    known_size = len(size) == 2 and all(isinstance(x, int | float) and x > 0 for x in size)
+    numbers = {key: x / 1000 for key, x in zip(("fx", "fy", "cx", "cy"), made["numbers"], strict=True)}
+    return IntrinsicsSettings.si(
+        **numbers,
+        distortion=tuple(made["distortion"]),
+        model="fisheye" if stated in _FISHEYE else "pinhole",
+        image=tuple(x / 1000 for x in size) if known_size else None,
+    )
+
+
+def _numbers(value: Any) -> list[float]:
+    """A list of numbers, or the ``data`` of a matrix, row by row; empty where it is neither."""
+    entries = value.get("data") if isinstance(value, Mapping) else value
+    if not isinstance(entries, Sequence) or isinstance(entries, str):
+        return []
+    flat = [x for row in entries for x in (row if isinstance(row, Sequence) else [row])]
+    return [float(x) for x in flat if isinstance(x, int | float)]
+
+
+def _refused(path: str | Path, what: str) -> DataError:
+    hint = "Give a camera_info YAML of ROS, an OpenCV YAML with camera_matrix, or a camchain of Kalibr."
+    return DataError(f"{what}", where=Location(str(path)), hint=hint)
+
+
+def _from_file(value: Any) -> Any:
+    if not isinstance(value, str):
+        return value
+    try:
+        return read_intrinsics(resolve_path(value))
+    except ArmcalError as fault:  # pydantic places it; it would not catch an error of ours
+        raise ValueError(str(fault)) from fault
+
+
+IntrinsicsOrFile: TypeAlias = Annotated[IntrinsicsSettings, BeforeValidator(_from_file)]
+"""A field of settings with intrinsics, or the path of a file of them; relative to the configuration it stands in."""

@@ -1,0 +1,79 @@
+"""Intrinsics from files of ROS, OpenCV and Kalibr."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from armcal.errors import ConfigError, DataError
+from armcal.run.experiment import Experiment
+from armcal_camera.intrinsics import read_intrinsics
+
+DEMO = Path(__file__).resolve().parents[3] / "configs" / "camera" / "demo.yaml"
+MATRIX = [900.0, 0, 640.5, 0, 910.0, 400.25, 0, 0, 1]
+ROS = {
+    "image_width": 1280,
+    "image_height": 800,
+    "camera_matrix": {"rows": 3, "cols": 3, "data": MATRIX},
+    "distortion_model": "plumb_bob",
+    "distortion_coefficients": {"rows": 1, "cols": 5, "data": [-0.1, 0.02, 0.001, -0.001, 0.0]},
+}
+KALIBR = {
+    "cam0": {
+        "camera_model": "pinhole",
+        "intrinsics": [900.0, 910.0, 640.5, 400.25],
+        "distortion_model": "equidistant",
+        "distortion_coeffs": [0.01, -0.002, 0.0, 0.0],
+        "resolution": [1280, 800],
+    }
+}
+
+
+def written(folder: Path, content: object) -> Path:
+    path = folder / "intrinsics.yaml"
+    path.write_text(content if isinstance(content, str) else yaml.safe_dump(content))
+    return path
+
+
+@pytest.mark.parametrize(("content", "model", "count"), [(ROS, "pinhole", 5), (KALIBR, "fisheye", 4)])
+def test_files_of_ros_and_kalibr(tmp_path: Path, content: object, model: str, count: int) -> None:
+    read = read_intrinsics(written(tmp_path, content))
+    assert np.allclose([read.fx, read.fy, read.cx, read.cy], [0.9, 0.91, 0.6405, 0.40025])
+    assert (read.model, len(read.distortion), read.image) == (model, count, (1.28, 0.8))
+
+
+def test_a_file_that_opencv_wrote(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install 'armcal[camera]'")
+    storage = cv2.FileStorage(str(tmp_path / "camera.yaml"), cv2.FILE_STORAGE_WRITE)
+    storage.write("camera_matrix", np.array(MATRIX).reshape(3, 3))
+    storage.write("distortion_coefficients", np.array([[-0.1, 0.02, 0.001, -0.001, 0.0]]))
+    storage.release()
+    read = read_intrinsics(tmp_path / "camera.yaml")
+    assert read.fy == pytest.approx(0.91) and read.distortion[1] == pytest.approx(0.02) and read.image is None
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("a: [", "it is not YAML"),
+        ({"some": 1}, "no camera matrix"),
+        ({**ROS, "distortion_model": "rational_polynomial"}, "the distortion model 'rational_polynomial'"),
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, content: object, expected: str) -> None:
+    with pytest.raises(DataError, match=expected) as refused:
+        read_intrinsics(written(tmp_path, content))
+    assert "camera_info" in refused.value.hint
+
+
+def test_a_configuration_names_the_file(tmp_path: Path) -> None:
+    text = DEMO.parent.joinpath("arm.yaml").read_text() + "    intrinsics: intrinsics.yaml\n"
+    (tmp_path / "arm.yaml").write_text(text.replace("    image_px: [1280, 960]\n", ""))
+    written(tmp_path, KALIBR)
+    camera = Experiment.load(tmp_path / "arm.yaml").system.measurements["camera"]
+    assert camera.settings.model == "fisheye" and camera.image == (1.28, 0.8)  # type: ignore[attr-defined]
+    (tmp_path / "intrinsics.yaml").unlink()
+    with pytest.raises(ConfigError, match="intrinsics"):
+        Experiment.load(tmp_path / "arm.yaml")
