@@ -186,9 +186,9 @@ def test_noise_for_each_axis_is_one_number_thrice_or_a_list(repository):
         ("measurements.tracker.noise_mm=[0.5, 0, 0.5]", "is not above zero"),
     ],
 )
-def test_bad_settings_are_refused_at_their_place(repository, override, said):
+def test_bad_settings_are_refused_at_their_place(repository, tmp_path, override, said):
     config = str(repository / "configs" / "lrm_arm" / "demo.yaml")
-    done = CliRunner().invoke(cli, ["run", config, "--set", override])
+    done = CliRunner().invoke(cli, ["run", config, "--set", override, "--out", str(tmp_path / "run")])
     assert done.exit_code == 2, done.output
     assert said in done.output and override.partition("=")[0] in done.output
 

@@ -108,7 +108,7 @@ def test_files_get_the_rights_of_new_files(calibration, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        (("--format", "cc", "--out", "x.c"), "The formats are c, json, mujoco, ros2, urdf, yaml"),
+        (("--format", "cc", "--out", "x.c"), "The formats are c, camera_info, hand_eye, json, mujoco, opencv, ros2"),
         (("--format", "c", "--out", "."), "it is a directory"),
         (("--format", "c", "--out", "a" * 300 + ".c"), "cannot be written"),
         (("--format", "c", "--out", "no/x.c"), "cannot be written"),
