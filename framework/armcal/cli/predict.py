@@ -27,6 +27,7 @@ from armcal.measure.reader import ReadRequest, RequestedChannel, requested_chann
 from armcal.plugins import PluginRegistry
 
 _MOST_BYTES, _LONGEST_HEADER = 1 << 31, 1 << 20
+_MOST_NAMED = 8
 _RECORDINGS: Mapping[str, Literal["same", "new"]] = {"calibrated": "same", "new": "new"}
 
 
@@ -103,7 +104,8 @@ def _show(
         }
     )
     console.out.print(f"{len(commands)} poses predicted: {out}")
-    text = ", ".join(f"{column} {half:.2g}" for column, half in medians.items())
+    named = [f"{column} {half:.2g}" for column, half in medians.items()]
+    text = ", ".join(named[:_MOST_NAMED]) + (f" and {len(named) - _MOST_NAMED} more" if named[_MOST_NAMED:] else "")
     if typical:  # of a position; else of every column
         text = (
             f"{typical['half_width_90_mm']:.2f} mm a coordinate (90 %), {typical['radius_95_mm']:.2f} mm in all (95 %)"

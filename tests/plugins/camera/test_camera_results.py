@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import sys
@@ -127,3 +128,22 @@ def test_rendered_images_give_the_camera_where_it_is(name: str, tmp_path: Path) 
     turned = Rotation.from_quat([estimate.values[entries.index(f"camera.camera_rotation[{a}]")] for a in "xyzw"])
     assert np.rad2deg((turned.inv() * Rotation.from_euler("x", 180, degrees=True)).magnitude()) < 0.01
     assert run.metrics["error_px"]["calibrated"]["holdout"]["rms"] < 0.02
+
+
+def test_commands_that_go_on_from_a_camera_take_its_records(calibration: Path, tmp_path: Path) -> None:
+    records, out = str(DEMO.with_suffix(".csv")), tmp_path / "predicted.csv"
+    predicted = armcal_says("predict", str(calibration), "--poses", records, "--out", str(out))
+    assert "and 100 more" in predicted and len(out.read_text().splitlines()) == 41
+    folder = tmp_path / "recalibrated"
+    events = armcal_says("recalibrate", str(calibration), "--from", records, "--out", str(folder))
+    verdicts = [json.loads(line) for line in events.splitlines() if '"event": "record"' in line]
+    assert len(verdicts) == 40
+    assert sum(event["verdict"] == "accepted" for event in verdicts) >= 39
+    plan = tmp_path / "plan.csv"
+    armcal_says("plan", str(DEMO), "--poses", "6", "--calibration", str(calibration), "--out", str(plan))
+    assert len(plan.read_text().splitlines()) == 7
+
+
+def armcal_says(*arguments: str) -> str:
+    command = [sys.executable, "-m", "armcal.cli", *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True, timeout=200).stdout
