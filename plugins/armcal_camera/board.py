@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
@@ -18,7 +19,7 @@ from armcal.base.domains import Array
 from armcal.base.settings import Length, Settings
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
-from armcal.errors import ConfigError
+from armcal.errors import ArmcalError
 from pydantic import BeforeValidator, Field, model_validator
 from typing_extensions import override
 
@@ -319,19 +320,23 @@ def _with_enough_tags(board: Any) -> Any:
     return board
 
 
-def _from_file(value: Any) -> Any:
-    """A text names a file that ``armcal board`` wrote; its board stands in its place."""
-    if not isinstance(value, str):
-        return value
-    try:
-        return read_board(resolve_path(value))
-    except ConfigError as fault:  # pydantic places it; it would not catch an error of ours
-        raise ValueError(str(fault)) from fault
+def or_file(read: Callable[[Path], Settings]) -> BeforeValidator:
+    """A field of settings that may also be the path of a file, which ``read`` makes into them."""
+
+    def settings(value: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        try:
+            return read(resolve_path(value))
+        except ArmcalError as fault:  # pydantic places it; it would not catch an error of ours
+            raise ValueError(str(fault)) from fault
+
+    return BeforeValidator(settings)
 
 
 AnyBoard: TypeAlias = Annotated[Chessboard | Charuco | Aprilgrid | Tag, Field(discriminator="type")]
 """A field of settings that is a board."""
-BoardOrFile: TypeAlias = Annotated[AnyBoard, BeforeValidator(_from_file)]
+BoardOrFile: TypeAlias = Annotated[AnyBoard, or_file(lambda path: read_board(path))]
 """A field of settings that is a board, or the path of a file of one; relative to the configuration it stands in."""
 
 

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import yaml
-from armcal.base.config_text import resolve_path
 from armcal.base.settings import Settings, UnitOf
-from armcal.errors import ArmcalError, DataError, Location
+from armcal.errors import DataError, Location
 from armcal.io.plain_files import input_bytes
-from pydantic import BeforeValidator, Field
+from pydantic import Field
+
+from armcal_camera.board import or_file
 
 Lens: TypeAlias = Literal["pinhole", "fisheye"]
 Pixels: TypeAlias = Annotated[float, UnitOf("image")]
@@ -109,14 +110,5 @@ def _refused(path: str | Path, what: str) -> DataError:
     return DataError(f"{what}", where=Location(str(path)), hint=hint)
 
 
-def _from_file(value: Any) -> Any:
-    if not isinstance(value, str):
-        return value
-    try:
-        return read_intrinsics(resolve_path(value))
-    except ArmcalError as fault:  # pydantic places it; it would not catch an error of ours
-        raise ValueError(str(fault)) from fault
-
-
-IntrinsicsOrFile: TypeAlias = Annotated[IntrinsicsSettings, BeforeValidator(_from_file)]
+IntrinsicsOrFile: TypeAlias = Annotated[IntrinsicsSettings, or_file(read_intrinsics)]
 """A field of settings with intrinsics, or the path of a file of them; relative to the configuration it stands in."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -113,7 +114,7 @@ def errors_of(run: FittedRecords, crossed: CrossValidation | None) -> RecordErro
     if crossed is not None:
         judged[train], judged_at_rest[train] = crossed.errors * _MM, crossed.at_rest * _MM
     dimensions = [dimension for kernel in problem.kernels for dimension in kernel.factor.dimensions]
-    columns = tuple(f"residual{i}_{ERROR_UNITS[dimension]}" for i, dimension in enumerate(dimensions, start=1))
+    columns = _columns(problem)
     first = len(problem.kernels[0].factor.output_channels)
     try:
         before, after = settled(unfitted, nominal, records), settled(problem, values, records)
@@ -125,8 +126,8 @@ def errors_of(run: FittedRecords, crossed: CrossValidation | None) -> RecordErro
             nominal_mm=nominal_errors * _MM,
             calibrated_mm=errors * _MM,
             cross_validated_mm=judged,
-            nominal_residual_mm=np.vstack(problem.residuals(before, records)) * _MM,
-            calibrated_residual_mm=np.vstack(residuals(problem, after, records, fitted.records)) * _MM,
+            nominal_residual_mm=_known(problem.residuals(before, records), records) * _MM,
+            calibrated_residual_mm=_known(residuals(problem, after, records, fitted.records), records) * _MM,
             position_mm=problem.predict(values, records)[0][first + 9 : first + 12] * _MM,
             failed_folds=0 if crossed is None else crossed.failed_folds,
             at_rest_mm=record_errors(problem, values, records) * _MM if drifts else None,
@@ -196,3 +197,23 @@ def _summaries(of: Array, crossed: Array, split: Split, judged: NDArray[np.bool_
         "holdout": summarise(of[split.holdout]),
         "cross_validated": summarise(crossed[judged]),
     }
+
+
+def _known(raw: Sequence[Array], records: Sequence[FactorRecords]) -> Array:
+    """Residuals of all measurements, one below the other (n_r x N), those of points that a record lacks unknown."""
+    pairs = zip(raw, records, strict=True)
+    return np.vstack(
+        [r if own.present is None else np.where(own.present[:, : own.count], r, np.nan) for r, own in pairs]
+    )
+
+
+def _columns(problem: Problem) -> tuple[str, ...]:
+    """What the rows of the residuals are called, with their units: by number, or by point where there are many."""
+    columns: list[str] = []
+    for kernel in problem.kernels:
+        factor = kernel.factor
+        names = [channel.rpartition(".")[2] for channel in factor.output_channels] if factor.points is not None else []
+        start = len(columns) + 1
+        for i, dimension in enumerate(factor.dimensions):
+            columns.append(f"residual{f'_{names[i]}' if names else start + i}_{ERROR_UNITS[dimension]}")
+    return tuple(columns)

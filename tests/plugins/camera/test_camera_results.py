@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 import subprocess
@@ -147,3 +148,17 @@ def test_commands_that_go_on_from_a_camera_take_its_records(calibration: Path, t
 def armcal_says(*arguments: str) -> str:
     command = [sys.executable, "-m", "armcal.cli", *arguments]
     return subprocess.run(command, check=True, capture_output=True, text=True, timeout=200).stdout
+
+
+def test_what_a_record_lacks_is_empty_in_the_residuals(tmp_path: Path) -> None:
+    rows = list(csv.reader(DEMO.with_suffix(".csv").read_text().splitlines()))
+    place = rows[0].index("u_7_px")
+    rows[3][place] = rows[3][place + 1] = ""
+    (tmp_path / "demo.csv").write_text("\n".join(",".join(row) for row in rows) + "\n")
+    for name in ("arm.yaml", "demo.yaml", "truth.yaml"):
+        shutil.copy(DEMO.parent / name, tmp_path / name)
+    run = armcal.Experiment.load(tmp_path / "demo.yaml", ["validation.folds=0"]).run()
+    written = list(csv.DictReader((run.write(tmp_path / "run") / "residuals.csv").read_text().splitlines()))
+    assert [i for i, row in enumerate(written) if row["residual_u_7_px"] == ""] == [2]
+    assert all(value != "" for key, value in written[1].items() if key.startswith("residual_"))
+    assert run.metrics["records"]["train"] == 30
