@@ -13,14 +13,14 @@ from typing import Any, ClassVar, Protocol, TypeGuard, runtime_checkable
 import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.base.settings import InputPath, Settings
+from armcal.base.settings import Angle, InputPath, Settings
 from armcal.base.units import from_unit
 from armcal.errors import DataError, Location
 from armcal.io.file_set import write_over
 from armcal.io.parallel import Automatic
 from armcal.io.plain_files import input_bytes, refuse
 from armcal.measure.reader import ReadRequest
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from armcal_camera.board import Board
 from armcal_camera.corners_csv import corners_text, read_corners
@@ -43,12 +43,14 @@ class ImagesSettings(Settings):
     10.png); with several cameras ``{camera: FOLDER}``. ``poses`` is a CSV file of joint angles, perhaps with a column
     ``image`` that names the file; for an arm ``flange_pose`` a table of base_T_flange (12 or 16 numbers a row, m), or
     columns x, y, z and qw, qx, qy, qz; or the settings of a reader, ``{type: pose_csv, path: FILE, euler: ...}``.
-    ``corners`` is a CSV file of corners that stands for the images; with ``folder`` it is written.
+    ``corners`` is a CSV file of corners that stands for the images; with ``folder`` it is written. Poses of an arm
+    with joints give their angles; ``first`` says about where they are in the first pose.
     """
 
     poses: InputPath | dict[str, Any]
     folder: InputPath | dict[str, InputPath] | None = None
     corners: InputPath | dict[str, InputPath] | None = None
+    first: dict[str, Angle] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _some_images(self) -> ImagesSettings:
@@ -95,7 +97,7 @@ class ImagesReader:
         if not cameras:
             message = "found no measurement that sees boards, expected one for the images."
             raise DataError(message, hint="Add a measurement of type camera.")
-        dataset = read_poses(self._settings.poses, request, tuple(cameras))
+        dataset = read_poses(self._settings.poses, request, tuple(cameras), self._settings.first)
         count = len(dataset) + len(dataset.set_aside)
         faults: list[dict[int, str]] = []
         known = {w.channel for w in request.channels}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,16 +16,20 @@ from armcal.base.units import DIMENSIONLESS
 from armcal.io.cells import is_number
 from armcal.io.plain_files import input_bytes, refuse, text_of
 from armcal.measure.checks import check_dataset, layout_of
+from armcal.measure.layout import warned
 from armcal.measure.measurement import Channel
 from armcal.measure.reader import ReadRequest, RequestedChannel
 from armcal.plugins import discover
 from scipy.spatial.transform import Rotation
+
+from armcal_camera.recovered_joints import recovered_joints
 
 FLANGE = ("x", "y", "z", "rz", "ry", "rx")
 """Joints of an arm whose flange's pose is read: base_T_flange turns by Rz(rz) Ry(ry) Rx(rx)."""
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _MAX_BYTES = 256 * 1024**2
 _INSTANCE = "flange"
+_UNREACHED = "the nominal arm reaches this pose in no posture within its joints' limits"
 
 
 @dataclass(frozen=True)
@@ -38,13 +43,49 @@ class _FlangeReading:
         return (*(Channel(name, "length") for name in "xyz"), *(Channel(name, DIMENSIONLESS) for name in _QUATERNION))
 
 
-def read_poses(poses: Path | dict[str, Any], request: ReadRequest, cameras: tuple[str, ...]) -> Dataset:
+@dataclass(frozen=True)
+class _Posed:
+    """An arm whose tool's pose is read, and about where its joints are in the first pose, by name."""
+
+    arm: Arm
+    first: Mapping[str, float]
+
+    def in_joints(self, dataset: Dataset, places: Array, turns: Rotation) -> Dataset:
+        """Records (N) with the joints at which the tool is in these poses (3 x N, m); those without any set aside."""
+        names = [f"{self.arm.name}.{name}" for name in self.arm.commanded]
+        if tuple(self.arm.commanded) == FLANGE:
+            rows = [*places, *np.unwrap(turns.as_euler("ZYX"), axis=0).T]
+            return _with(dataset, names, rows)
+        tools = np.tile(np.eye(4), (len(dataset), 1, 1))
+        tools[:, :3, :3], tools[:, :3, 3] = turns.as_matrix(), places.T
+        near = np.array([self.first.get(name, 0.0) for name in self.arm.commanded])
+        commands, postures = recovered_joints(self.arm, tools, near)
+        text = (
+            "joint angles are recovered from poses by the nominal arm: of up to "
+            f"{int(postures.max(initial=0))} postures a pose the ones that move the joints least. "
+            "Check them, or give first: {JOINT: ANGLE} of the first pose and the joints' limits in the model."
+        )
+        unreached = dict.fromkeys(map(int, np.flatnonzero(~np.isfinite(commands[0]))), _UNREACHED)
+        return warned(_with(dataset, names, [*commands]).without(unreached), text)
+
+
+def _with(dataset: Dataset, names: Sequence[str], rows: Sequence[Array]) -> Dataset:
+    own = {name: np.ascontiguousarray(row) for name, row in zip(names, rows, strict=True)}
+    return replace(dataset, channels={**dataset.channels, **own})
+
+
+def read_poses(
+    poses: Path | dict[str, Any], request: ReadRequest, cameras: tuple[str, ...], first: Mapping[str, float]
+) -> Dataset:
     """The records of a file of poses, without what the cameras read.
+
+    Of an arm with joints, poses are those of its nominal tool, and give its joint angles (``recovered_joints``).
 
     Args:
         poses: the file, or the settings of a reader (``type: csv``, ``type: pose_csv``).
         request: what is asked for.
         cameras: instances whose channels the file has not.
+        first: about where joints are in the first pose, by name (rad or m); empty if nothing is known.
 
     Raises:
         DataError: with file, line and column.
@@ -53,19 +94,20 @@ def read_poses(poses: Path | dict[str, Any], request: ReadRequest, cameras: tupl
     channels = tuple(w for w in request.channels if w.channel.partition(".")[0] not in cameras)
     rest = {name: m for name, m in request.measurements.items() if name not in cameras}
     request = ReadRequest(request.arms, rest, channels)
-    flange = next((arm for arm in request.arms.values() if tuple(arm.commanded) == FLANGE), None)
+    arm = next(iter(request.arms.values())) if len(request.arms) == 1 else None
+    posed = None if arm is None else _Posed(arm, first)
     if isinstance(poses, Path):
-        first = _first_line(poses)
-        if flange is not None and first and all(is_number(cell) for cell in first):
-            return _table(poses, flange, request)
+        header = _first_line(poses)
+        if posed is not None and header and all(is_number(cell) for cell in header):
+            return _table(poses, posed, request)
         settings: dict[str, Any] = {"type": "csv", "path": str(poses)}
-        if flange is not None and set(_QUATERNION) <= set(first):
+        if posed is not None and set(_QUATERNION) <= set(header):
             quaternion = {"columns": _QUATERNION, "order": "wxyz"}
             settings = {"type": "pose_csv", "path": str(poses), "quaternion": quaternion}
     else:
         settings = dict(poses)
-    if flange is not None and settings.get("type") == "pose_csv":
-        return _flange_poses(settings, flange, request)
+    if posed is not None and settings.get("type") == "pose_csv":
+        return _flange_poses(settings, posed, request)
     return _reader(settings).read(request)
 
 
@@ -80,8 +122,9 @@ def _first_line(path: Path) -> list[str]:
     return next((line.replace(",", " ").split() for line in text.splitlines() if line.strip()), [])
 
 
-def _flange_poses(settings: dict[str, Any], arm: Arm, request: ReadRequest) -> Dataset:
-    """What a reader of poses makes of the file, as the flange's coordinates."""
+def _flange_poses(settings: dict[str, Any], posed: _Posed, request: ReadRequest) -> Dataset:
+    """What a reader of poses makes of the file, as joints."""
+    arm = posed.arm
     reading: Any = _FlangeReading()
     others = tuple(w for w in request.channels if not w.channel.startswith(f"{arm.name}."))
     own = tuple(
@@ -93,15 +136,10 @@ def _flange_poses(settings: dict[str, Any], arm: Arm, request: ReadRequest) -> D
     turns = Rotation.from_quat(np.stack([values[name] for name in ("qx", "qy", "qz", "qw")], axis=1))
     kept = {name: numbers for name, numbers in dataset.channels.items() if not name.startswith(f"{_INSTANCE}.")}
     places = np.stack([values[name] for name in "xyz"])
-    return replace(dataset, channels={**kept, **_coordinates(arm, places, turns)})
+    return posed.in_joints(replace(dataset, channels=kept), places, turns)
 
 
-def _coordinates(arm: Arm, places: Array, turns: Rotation) -> dict[str, Array]:
-    rows = [*places, *np.unwrap(turns.as_euler("ZYX"), axis=0).T]
-    return {f"{arm.name}.{name}": np.ascontiguousarray(row) for name, row in zip(FLANGE, rows, strict=True)}
-
-
-def _table(path: Path, arm: Arm, request: ReadRequest) -> Dataset:
+def _table(path: Path, posed: _Posed, request: ReadRequest) -> Dataset:
     """Rows of 12 or 16 numbers: base_T_flange row by row, metres."""
     content = input_bytes(path, _MAX_BYTES, "a table of flange poses")
     matrices, lines = [], []
@@ -123,6 +161,6 @@ def _table(path: Path, arm: Arm, request: ReadRequest) -> Dataset:
         matrices.append(matrix[:3])
         lines.append(line)
     poses = np.array(matrices)
-    channels = _coordinates(arm, poses[:, :, 3].T, Rotation.from_matrix(poses[:, :, :3]))
-    dataset = Dataset(tuple(map(str, lines)), channels, rows=tuple(lines), source=str(path))
+    bare = Dataset(tuple(map(str, lines)), {}, rows=tuple(lines), source=str(path))
+    dataset = posed.in_joints(bare, poses[:, :, 3].T, Rotation.from_matrix(poses[:, :, :3]))
     return check_dataset(dataset, layout_of(request.channels, dataset, {}, {}, by_line=True))
