@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,14 +102,19 @@ def _views(setup: Setup, read: Mapping[str, Array], scale: float) -> list[_View]
     return views
 
 
+def _fullest(views: Sequence[_View]) -> list[_View]:
+    """Those with at least half as many points as the fullest: few points say little of a pose or of a lens."""
+    most = max((len(view.points) for view in views), default=0)
+    return [view for view in views if 2 * len(view.points) >= most]
+
+
 def _intrinsics(views: list[_View], free: frozenset[str]) -> dict[str, Array]:
     """Those that homographies determine; where they do not, a lens of ordinary width about the middle."""
     whole = np.concatenate([view.image for view in views]) if views else np.array([[0.5, 0.5]])
     middle = (whole.min(axis=0) + whole.max(axis=0)) / 2
     size = float(np.max(whole.max(axis=0) - whole.min(axis=0)))
-    solved = (
-        intrinsics([homography(v.points, v.image - middle) for v in views]) if len(views) >= _FEWEST_VIEWS else None
-    )
+    full = _fullest(views)
+    solved = intrinsics([homography(v.points, v.image - middle) for v in full]) if len(full) >= _FEWEST_VIEWS else None
     off = np.inf if solved is None else max(abs(solved[2]), abs(solved[3]))
     if solved is None or off > size or not 0.2 * size < min(solved[:2]) <= max(solved[:2]) < 50 * size:
         solved = (1.2 * size, 1.2 * size, 0.0, 0.0)
@@ -123,7 +128,7 @@ def _poses(setup: Setup, views: list[_View], values: Mapping[str, Array]) -> lis
     lens = setup.lens
     distortion = np.concatenate([values[name] for name in DISTORTION[lens]])
     poses: list[dict[int, Array]] = [{} for _ in setup.names]
-    for view in views:
+    for view in _fullest(views):
         seen = normalised(lens, view.image.T, focal, centre, distortion).T
         poses[view.board][view.record] = board_pose(view.points, seen)
     return poses

@@ -13,6 +13,7 @@ from armcal.base.domains import Array
 from scipy.spatial.transform import Rotation
 
 FEWEST = 3
+_FEWEST_KEPT, _ROUNDS, _FAR, _LEAST_M = 5, 4, 4.0, 1e-6
 _PARALLEL = 1e-3
 _TURNED_RAD = 0.02
 
@@ -42,9 +43,20 @@ def hand_eye(a: Array, b: Array) -> HandEye | None:
     """
     if len(a) < FEWEST or open_motion(a) is not None:
         return None
+    best = _better(a, b)
+    for _ in range(_ROUNDS):  # poses that are far off, as of a board of which little was seen, decide nothing
+        off = np.linalg.norm((a @ best.x)[:, :3, 3] - (best.y @ b)[:, :3, 3], axis=1)
+        kept = off <= _FAR * max(best.left_m, _LEAST_M)
+        if kept.all() or kept.sum() < max(_FEWEST_KEPT, len(a) / 2) or open_motion(a[kept]) is not None:
+            break
+        a, b = a[kept], b[kept]
+        best = _better(a, b)
+    return best
+
+
+def _better(a: Array, b: Array) -> HandEye:
     rotations = {"Park": _park(a, b), "Shah": _shah(a, b)}
-    solved = [_with_translations(a, b, name, *turns) for name, turns in rotations.items()]
-    return min(solved, key=lambda one: one.left_m)
+    return min((_with_translations(a, b, name, *turns) for name, turns in rotations.items()), key=lambda s: s.left_m)
 
 
 def open_motion(a: Array) -> tuple[str, str] | None:

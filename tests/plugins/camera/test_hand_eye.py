@@ -76,3 +76,13 @@ def test_views_of_a_board_determine_the_intrinsics() -> None:
         homographies.append(homography(BOARD, seen))
     assert np.allclose(intrinsics(homographies), (1.1, 1.15, 0.63, 0.47), atol=1e-6)
     assert intrinsics(homographies[:2]) is None
+
+
+def test_few_wrong_poses_decide_nothing() -> None:
+    random = np.random.default_rng(7)
+    x, y, a = pose(random), pose(random), np.array([pose(random) for _ in range(20)])
+    b = np.array([noisy(one, random, 1.0, 0.1) for one in np.linalg.inv(y) @ a @ x])
+    for wrong in (2, 9, 15):
+        b[wrong] = noisy(b[wrong], random, 2000.0, 60.0)
+    solved = hand_eye(a, b)
+    assert solved is not None and np.linalg.norm(solved.x[:3, 3] - x[:3, 3]) < 3e-3
