@@ -356,7 +356,7 @@ def read_board(path: Any) -> Board:
 
 
 def require_distinct(boards: Sequence[Board]) -> None:
-    """That boards of one measurement can be told apart in an image.
+    """That boards of one measurement can be distinguished in an image.
 
     Raises:
         ValueError: two of them share tags, or look alike.

@@ -210,7 +210,7 @@ class Camera(PointInstrument):
     def propose(
         self, tools: Array, read: Mapping[str, Array], values: Mapping[str, Array], free: frozenset[str]
     ) -> Proposal:
-        """Where a fit may start, from the images alone; see ``PointMeasurement``."""
+        """Where a fit may start, from the images alone; see ``Proposing``."""
         s = self.settings
         points = tuple(board.points[used] for board, used in zip(self.boards, self.used, strict=True))
         in_hand, is_stated = s.mounting == "eye_in_hand", s.intrinsics is not None

@@ -103,9 +103,11 @@ def _views(setup: Setup, read: Mapping[str, Array], scale: float) -> list[_View]
 
 
 def _fullest(views: Sequence[_View]) -> list[_View]:
-    """Those with at least half as many points as the fullest: few points say little of a pose or of a lens."""
-    most = max((len(view.points) for view in views), default=0)
-    return [view for view in views if 2 * len(view.points) >= most]
+    """Those with at least half as many points as their board's fullest: few say little of a pose or of a lens."""
+    most: dict[int, int] = {}
+    for view in views:
+        most[view.board] = max(len(view.points), most.get(view.board, 0))
+    return [view for view in views if 2 * len(view.points) >= most[view.board]]
 
 
 def _intrinsics(views: list[_View], free: frozenset[str]) -> dict[str, Array]:

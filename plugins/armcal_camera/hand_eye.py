@@ -64,7 +64,7 @@ def open_motion(a: Array) -> tuple[str, str] | None:
 
     Two turns about axes that are not parallel determine all [Tsai1989].
     """
-    turns = _relative(a[:, :3, :3])
+    turns = _relative(a[:, :3, :3]) if len(a) > 1 else np.zeros((0, 3))
     turns = turns[np.linalg.norm(turns, axis=1) > _TURNED_RAD]
     if not len(turns):
         return (

@@ -13,6 +13,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.pose_settings import nearest_rotation
 from armcal.base.units import DIMENSIONLESS
+from armcal.errors import DataError
 from armcal.io.cells import is_number
 from armcal.io.plain_files import input_bytes, refuse, text_of
 from armcal.measure.checks import check_dataset, layout_of
@@ -58,6 +59,10 @@ class _Posed:
             return _with(dataset, names, rows)
         tools = np.tile(np.eye(4), (len(dataset), 1, 1))
         tools[:, :3, :3], tools[:, :3, 3] = turns.as_matrix(), places.T
+        unknown = sorted(set(self.first) - set(self.arm.commanded))
+        if unknown:
+            have = ", ".join(self.arm.commanded)
+            raise DataError(f"data.first: found {', '.join(unknown)}, expected joints of the arm: {have}.")
         near = np.array([self.first.get(name, 0.0) for name in self.arm.commanded])
         commands, postures = recovered_joints(self.arm, tools, near)
         text = (

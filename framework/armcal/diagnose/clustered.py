@@ -64,7 +64,8 @@ def widened(
     # The part of priors does not grow.
     whole = np.maximum(scale * apart + of_priors, 1e-300)
     factors = np.sqrt(1 + scale * np.maximum(together - apart, 0.0) / whole)
-    return _wider(replace(estimate, widened=()), factors[: problem.increments], factors[problem.increments :])
+    judged = replace(estimate, widened=estimate.widened or ())
+    return _wider(judged, factors[: problem.increments], factors[problem.increments :])
 
 
 def _of_alike_points(problem: Problem, records: Sequence[FactorRecords], estimate: Estimate) -> Estimate:
@@ -96,7 +97,7 @@ def _wider(estimate: Estimate, by_coordinate: Array, by_entry: Array) -> Estimat
         estimate,
         covariance=estimate.covariance * np.outer(by_entry, by_entry),
         square_root_information=estimate.square_root_information / by_coordinate,
-        widened=tuple(float(x) for x in by_entry),
+        widened=tuple(float(x) for x in by_entry * np.array(estimate.widened or 1.0)),
     )
 
 

@@ -12,6 +12,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import ConfigError, DataError, Location
 from armcal.estimate.estimator import Progress, no_progress
+from armcal.estimate.proposing import with_proposals
 from armcal.estimate.simulation import SimulationRequest, with_channels
 from armcal.estimate.start import aligned_start
 from armcal.estimate.structure import require_solvable
@@ -148,7 +149,8 @@ def _prepared(experiment: Experiment, dataset: Dataset, groups: Sequence[Indices
     system, parameters = experiment.system, experiment.parameters
     choice = interpreted_first(experiment).evaluator
     problem = Problem.build(system.arms, system.measurements, parameters, system.environment, dataset, choice)
-    start = aligned_start(problem, problem.records(dataset), dataset)
+    records = problem.records(dataset)
+    start = with_proposals(aligned_start(problem, records, dataset), records, dataset)
     problem, nominal = start.problem, start.problem.parameters.nominal()
     records = with_drift(problem, problem.records(dataset), dataset, nominal)
     for group in groups:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from armcal.base.domains import Array
+from armcal_camera.first_guess import Setup, first_guess
 from armcal_camera.hand_eye import hand_eye, open_motion
+from armcal_camera.lens import DISTORTION
 from armcal_camera.views import board_pose, homography, intrinsics
 from scipy.spatial.transform import Rotation
 
@@ -54,6 +56,7 @@ def test_motions_that_leave_the_pose_open_are_named() -> None:
     assert "one axis" in str(open_motion(about_z)) and "1.00" in str(open_motion(about_z)).replace("-", "")
     assert hand_eye(shifted, shifted) is None and hand_eye(about_z, about_z) is None
     assert open_motion(np.array([pose(random) for _ in range(10)])) is None
+    assert "hardly turned" in str(open_motion(shifted[:1])) and "hardly turned" in str(open_motion(shifted[:0]))
 
 
 def test_a_board_seen_from_any_side_has_its_pose_found() -> None:
@@ -86,3 +89,27 @@ def test_few_wrong_poses_decide_nothing() -> None:
         b[wrong] = noisy(b[wrong], random, 2000.0, 60.0)
     solved = hand_eye(a, b)
     assert solved is not None and np.linalg.norm(solved.x[:3, 3] - x[:3, 3]) < 3e-3
+
+
+def test_a_small_board_beside_a_large_one_has_its_pose_found() -> None:
+    """Each board is judged by its own fullest view: a tag never has as many points as a chessboard."""
+    random, corners = np.random.default_rng(8), np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    boards, x, tag = (BOARD, 0.04 * corners), pose(random), pose(random, 0.2, 0.05)
+    tools, image, ahead = np.array([pose(random, 0.1, 0.05) for _ in range(8)]), np.zeros((8, 58, 2)), np.eye(4)
+    ahead[:3, 3] = (-0.1, -0.1, 0.8)
+    y = tools[0] @ x @ ahead
+    for i, tool in enumerate(tools):
+        for part, base_T_board, points in ((slice(0, 54), y, boards[0]), (slice(54, 58), y @ tag, boards[1])):
+            seen = np.linalg.inv(tool @ x) @ base_T_board
+            there = points @ seen[:3, :2].T + seen[:3, 3]
+            image[i, part] = there[:, :2] / there[:, 2:]
+    names = ("board1", "board2")
+    setup = Setup(names, tuple(np.c_[points, np.zeros(len(points))] for points in boards), "pinhole", True, True)
+    place = {f"{n}_{a}": np.zeros(1) for n in ("camera", *names) for a in "xyz"}
+    turns = {f"{n}_rotation": np.array([1.0, 0, 0, 0]) for n in ("camera", *names)}
+    lens = {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0, "board_scale": 1.0, **dict.fromkeys(DISTORTION["pinhole"], 0.0)}
+    values = {**place, **turns, **{name: np.array([value]) for name, value in lens.items()}}
+    read = {f"{axis}_{k}": image[:, k, j] for k in range(58) for j, axis in enumerate("uv")}
+    proposal = first_guess(setup, tools, read, values, frozenset({*place, *turns}))
+    for name, expected in (("camera", x), ("board1", y), ("board2", y @ tag)):
+        assert np.allclose([proposal.values[f"{name}_{a}"][0] for a in "xyz"], expected[:3, 3], atol=1e-5), name

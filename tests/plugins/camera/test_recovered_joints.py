@@ -9,6 +9,7 @@ import pytest
 from armcal.arm.assembly import Arm
 from armcal.base.domains import Array
 from armcal.calibration.exporter import rigid_tools
+from armcal.errors import DataError
 from armcal.run.experiment import Experiment
 from armcal_camera.recovered_joints import recovered_joints
 
@@ -68,3 +69,5 @@ def test_images_with_poses_of_an_arm_with_joints(arm: Arm, path: Array, tmp_path
     assert np.abs(dataset.stacked([f"arm.q{i}" for i in range(1, 7)]) - path).max() < 1e-6
     assert any("recovered from poses" in text for text in dataset.warnings)
     assert dataset.column("camera.u_9")[2] == pytest.approx(0.102)
+    with pytest.raises(DataError, match="found Q1, expected joints of the arm: q1"):
+        Experiment.load(tmp_path / "config.yaml", ("data.first={Q1: 10 deg}",)).read()
