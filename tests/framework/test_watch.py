@@ -87,6 +87,15 @@ def test_a_watcher_that_was_away_goes_on_with_what_is_left(tmp_path: Path) -> No
     assert all_lines(EventTail(tmp_path)) == left.splitlines()
 
 
+def test_a_new_file_with_the_inode_number_of_the_read_one_does_not_hide_the_rotated_one(tmp_path: Path) -> None:
+    newest, tail = tmp_path / "events.jsonl", EventTail(tmp_path)
+    newest.write_text("read\n")
+    assert all_lines(tail) == ["read"]
+    (tmp_path / "events.1.jsonl").write_text("rotated\n")
+    newest.write_text("newest\n")  # in place: the number is the same for certain
+    assert all_lines(tail) == ["rotated", "newest"]
+
+
 def test_a_file_that_was_cut_or_written_anew_is_read_from_its_start(tmp_path: Path) -> None:
     path, tail = tmp_path / "events.jsonl", EventTail(tmp_path)
     path.write_text("one\ntwo\nthr")

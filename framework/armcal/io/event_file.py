@@ -89,10 +89,9 @@ class _Mark:
     head: bytes
 
     def fits(self, file: BinaryIO | None) -> bool:
-        return file is not None and self.is_at(file) and os.pread(file.fileno(), len(self.head), 0) == self.head
-
-    def is_at(self, file: BinaryIO) -> bool:
-        return self.place == _place(file)
+        if file is None or self.place != _place(file):
+            return False
+        return os.pread(file.fileno(), len(self.head), 0) == self.head
 
 
 class EventTail:
@@ -137,9 +136,7 @@ class EventTail:
                 if os.fstat(file.fileno()).st_size < self._position:
                     self._begin(file)
                 return file
-        if newest is not None and self._reading is not None and self._reading.is_at(newest):
-            self._begin(newest)
-            return newest
+        # An inode number may come again after a rotation: what is at the old place is not the old file for that reason.
         was_read = self._before is not None and self._before.fits(earlier)
         first = newest if earlier is None or was_read else earlier
         if first is not None:
