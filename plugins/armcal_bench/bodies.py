@@ -11,9 +11,8 @@ from armcal.base.domains import Array
 from armcal.base.pose_settings import PoseSettings
 from armcal.base.settings import Settings
 from armcal.devices.tracker import TrackerFrame
+from armcal.measure.stillness import far_off, mean_rotation
 from pydantic import Field, model_validator
-
-from armcal_bench.stillness import far_off, mean_rotation
 
 _LEAST_OUTLIER_M = 2e-4
 _NAMES_SHOWN = 8

@@ -14,11 +14,11 @@ from armcal.devices.clock import Clock
 from armcal.devices.joint_stream import JointSample, RestStream
 from armcal.devices.line_source import Begin, FileLines, LineJointStream, SourceName, open_lines
 from armcal.errors import ConfigError, DataError
+from armcal.measure.rests import LiveRests, Rows
 from typing_extensions import override
 
 from armcal_dualarm.log_columns import LogColumns
 from armcal_dualarm.log_table import Column, cells_of, delimiter_of, is_header, number_of, place_of, text_of
-from armcal_dualarm.still import LiveRests, Rows
 
 
 class TwoArmStreamSettings(LogColumns):

@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 import numpy as np
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
+from armcal.measure.rests import StillSettings
 from pydantic import Field, model_validator
 
 from armcal_dualarm.log_table import Column
-from armcal_dualarm.still import StillSettings
 
 
 class ArmColumns(Settings):

@@ -15,10 +15,10 @@ from armcal.errors import DataError, Location
 from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.missing import with_absent
 from armcal.measure.reader import ReadRequest
+from armcal.measure.rests import Rest, rests
 
 from armcal_dualarm.log_columns import LogColumns
 from armcal_dualarm.log_table import LogTable, read_table
-from armcal_dualarm.still import Rest, rests
 
 _FULL_TURN = 2 * math.pi
 

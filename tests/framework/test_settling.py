@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import pytest
 from armcal.devices.tracker import REPEATED, TrackerFrame
+from armcal.measure.stillness import deviations_of_mean, mean_pose
 from armcal_bench.acquisition.settings import SettleSettings
 from armcal_bench.acquisition.tracker_monitor import TrackerHealth
 from armcal_bench.bodies import BodySettings
 from armcal_bench.settling import Settled, Settling, drift_of
-from armcal_bench.stillness import deviations_of_mean, mean_pose
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation

@@ -14,11 +14,11 @@ from armcal.arm.assembly import Arm
 from armcal.devices.joint_stream import RestStream
 from armcal.errors import ConfigError, InputError
 from armcal.measure.reader import ReadRequest, requested_channels
+from armcal.measure.rests import LiveRests, Rows, StillSettings, rests
 from armcal_contact.json_joints import JsonLinesJoints, JsonLinesJointSettings
 from armcal_dualarm.closure import ClosedChain, ClosedChainSettings
 from armcal_dualarm.live import TwoArmLogStream, TwoArmStreamSettings
 from armcal_dualarm.log_reader import TwoArmLogReader, TwoArmLogSettings
-from armcal_dualarm.still import LiveRests, Rows, StillSettings, rests
 from armcal_mdh.model import MdhModel, MdhSettings
 
 CHANNELS = ("arm.j1", "arm.j2")

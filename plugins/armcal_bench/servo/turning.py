@@ -11,10 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from armcal.base.domains import Array
+from armcal.measure.stillness import mean_rotation
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-
-from armcal_bench.stillness import mean_rotation
 
 _ROUNDS = 20
 _LEAST_TURN = math.radians(1.0)

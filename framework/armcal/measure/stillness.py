@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
-from armcal.base.domains import Array
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
+from armcal.base.domains import Array
 
 LEVER_M = 0.1
 """A turn counts as much as it moves points this far from the target."""
