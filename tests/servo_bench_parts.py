@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from armcal_simulation.i2c_bus import I2cBus
 from armcal_simulation.pca9685_model import Pca9685Model
-from armcal_simulation.serial_line import SerialLine
+from armcal_simulation.serial_line import SerialLine, delimited
 from armcal_simulation.servo_bench import BoardFirmware
 
 ADDRESS = 0x40
@@ -29,7 +29,7 @@ class BoardAtPty:
         self.chip = Pca9685Model(self.clock, address=ADDRESS)
         self.bus = I2cBus(self.clock, [self.chip])
         self.board = make(self)
-        self.line = SerialLine(path, self.board.delimiter, np.random.default_rng(1))
+        self.line = SerialLine(path, delimited(self.board.delimiter), np.random.default_rng(1))
         self.line.plug_in()
         self.path = path
         self.host = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)

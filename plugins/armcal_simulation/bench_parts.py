@@ -1,7 +1,8 @@
-"""The settings of a simulated servo bench, and its parts, built from them and an experiment."""
+"""The settings of simulated benches, and their parts, built from them and an experiment."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Annotated, Literal
 
@@ -22,7 +23,7 @@ from armcal_simulation.bench_physics import BenchPhysics, Seen, Torques
 from armcal_simulation.dtrack_sender import DTrackSenderSettings
 from armcal_simulation.elastic_pose import ElasticPose, TrackedArm, without_effects
 from armcal_simulation.safety import Bounds, SafetySettings
-from armcal_simulation.servo_model import ServoJointSettings, ServoModel
+from armcal_simulation.servo_model import JointServo, ServoJointSettings
 
 ALL = "all"
 """In the place of a joint's name: settings of all joints, beneath each joint's own."""
@@ -44,29 +45,36 @@ class BenchTrackerSettings(DTrackSenderSettings):
         return self
 
 
-class ServoBenchSettings(Settings):
-    """The truth of a bench: boards, servos, arm, tracker, and what counts as unsafe.
+class BenchTruthSettings(Settings):
+    """The truth of a bench: arm, tracker, and what counts as unsafe.
 
-    ``servos`` is a servo file with the true oscillators and pulse tables; ``truth`` has the arm's true parameters by
-    name, and ``without_effects`` what the servos here do themselves. ``joints`` has the kind of servo, by
-    joint or for ``all``. Before the first pulse the arm hangs as it falls from ``start``. ``measurement`` is the one
-    whose body the tracker sees, the only one by default. ``board_id`` and ``states_oscillator_hz`` are what a framed
-    board reports of itself (0: nothing).
+    ``truth`` has the arm's true parameters by name, and ``without_effects`` what the servos here do themselves. Before
+    servos are powered the arm hangs as it falls from ``start``. ``measurement`` is the one whose body the tracker sees,
+    the only one by default.
+    """
+
+    truth: InputPath | None = None
+    without_effects: tuple[str, ...] = ()
+    measurement: str | None = None
+    start: dict[str, Angle] = Field(default_factory=dict)
+    world_T_base: PoseSettings = Field(default_factory=PoseSettings)
+    tracker: BenchTrackerSettings = Field(default_factory=BenchTrackerSettings.si)
+    safety: SafetySettings = Field(default_factory=SafetySettings)
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+class ServoBenchSettings(BenchTruthSettings):
+    """The truth of a bench with boards whose pulses drive hobby servos.
+
+    ``servos`` is a servo file with the true oscillators and pulse tables. ``joints`` has the kind of servo, by joint or
+    for ``all``. ``board_id`` and ``states_oscillator_hz`` are what a framed board reports of itself (0: nothing).
     """
 
     firmware: Literal["firmata", "framed"] = "framed"
     board_id: str = "SIMULATED"
     states_oscillator_hz: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
     servos: InputPath
-    truth: InputPath | None = None
-    without_effects: tuple[str, ...] = ()
-    measurement: str | None = None
     joints: dict[str, ServoJointSettings] = Field(default_factory=dict)
-    start: dict[str, Angle] = Field(default_factory=dict)
-    world_T_base: PoseSettings = Field(default_factory=PoseSettings)
-    tracker: BenchTrackerSettings = Field(default_factory=BenchTrackerSettings.si)
-    safety: SafetySettings = Field(default_factory=SafetySettings)
-    seed: Annotated[int, Field(ge=0)] = 0
 
     def servo_of(self, joint: str) -> ServoJointSettings:
         """What kind of servo drives a joint: its own settings above those of all."""
@@ -95,7 +103,7 @@ def true_servos(settings: ServoBenchSettings, arm: Arm) -> ServoFile:
     return file
 
 
-def tracked_arm(settings: ServoBenchSettings, experiment: Experiment) -> TrackedArm:
+def tracked_arm(settings: BenchTruthSettings, experiment: Experiment) -> TrackedArm:
     """The arm at its true parameters, and the measurement whose body is seen.
 
     Raises:
@@ -120,16 +128,14 @@ def tracked_arm(settings: ServoBenchSettings, experiment: Experiment) -> Tracked
     return TrackedArm(arm, name, measurements[name], parameters, experiment.system.environment)
 
 
-def physics(settings: ServoBenchSettings, tracked: TrackedArm, servos: ServoFile, seen: Seen) -> BenchPhysics:
+def physics(
+    settings: BenchTruthSettings, tracked: TrackedArm, servos: Mapping[str, JointServo], seen: Seen
+) -> BenchPhysics:
     """Servos under the arm's weight, hanging as they fell, and the pose they give the arm.
 
     Torques are those of the true masses on the nominal geometry, from which they hardly differ.
     """
     arm, environment = tracked.arm, tracked.environment
-    models = {
-        joint: ServoModel(settings.servo_of(joint), servos.servos[joint].table, settings.start.get(joint, 0.0))
-        for joint in arm.commanded
-    }
     values = {block.name: float(block.nominal[0]) for block in tracked.parameters.blocks if block.size == 1}
     masses = []
     for mass in arm.masses:
@@ -139,13 +145,12 @@ def physics(settings: ServoBenchSettings, tracked: TrackedArm, servos: ServoFile
     function = holding_function(
         replace(arm, masses=tuple(masses)), environment.gravity, environment.payload_mass, environment.payload_com
     )
-    return BenchPhysics(models, Torques(function), ElasticPose(tracked), 1 / settings.tracker.rate_hz, seen)
+    return BenchPhysics(servos, Torques(function), ElasticPose(tracked), 1 / settings.tracker.rate_hz, seen)
 
 
-def bounds(experiment: Experiment, file: ServoFile) -> Bounds:
-    """What the plan allows, and what the servos bear."""
+def bounds(experiment: Experiment, pulses: Mapping[str, tuple[float, float]]) -> Bounds:
+    """What the plan allows, and what the servos bear (pulses, s)."""
     plan = experiment.settings.plan
-    pulses = {joint: servo.pulse_range for joint, servo in file.servos.items()}
     if plan is None:
         return Bounds({}, None, pulses)
     clearance = plan.clearance and clearance_check(plan.clearance, experiment.system.arms, experiment.source)

@@ -12,7 +12,7 @@ from armcal.errors import NotConvergedError
 from armcal.functions.interpreted import BoundFunction
 
 from armcal_simulation.elastic_pose import ElasticPose
-from armcal_simulation.servo_model import ServoHeat, ServoModel
+from armcal_simulation.servo_model import JointServo, ServoHeat
 
 FALL_STEP_S = 0.02
 """How often the torque on a servo that gives way is looked up."""
@@ -53,7 +53,7 @@ class BenchPhysics:
     """
 
     def __init__(
-        self, servos: Mapping[str, ServoModel], torques: Torques, pose: ElasticPose, frame_s: float, seen: Seen
+        self, servos: Mapping[str, JointServo], torques: Torques, pose: ElasticPose, frame_s: float, seen: Seen
     ) -> None:
         self.servos = dict(servos)
         self.heat = {joint: ServoHeat(servo.settings) for joint, servo in servos.items()}
@@ -81,9 +81,8 @@ class BenchPhysics:
         due = min(self._frames * self._frame_s, self._slow * SLOW_S)
         return min(due, self._now + FALL_STEP_S) if self._yielding else due
 
-    def set_pulse(self, joint: str, pulse: float | None) -> None:
-        """Other pulses (s) at a servo's pin, or none."""
-        self.servos[joint].set_pulse(pulse)
+    def commands_changed(self) -> None:
+        """To be called when servos are sent elsewhere, or are let go."""
         self._yielding = self._gives_way()
 
     def move_to(self, now: float) -> None:
@@ -140,10 +139,7 @@ class BenchPhysics:
         return {"joints": joints, "base_T_tool": None if base_T_body is None else base_T_body.tolist()}
 
     def _gives_way(self) -> bool:
-        return any(
-            not servo.holds(self.torques[joint]) and (servo.powered or not servo.rests(self.torques[joint]))
-            for joint, servo in self._all
-        )
+        return any(servo.gives_way(self.torques[joint]) for joint, servo in self._all)
 
     def _look_up_torques(self) -> None:
         torques = self._find_torques([servo.angle for _, servo in self._all])

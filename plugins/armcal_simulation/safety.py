@@ -14,7 +14,7 @@ from armcal.arm.clearance import ClearanceCheck
 from armcal.base.settings import Angle, Duration, Length, Settings
 
 from armcal_simulation.pca9685_model import COUNTS, Commit
-from armcal_simulation.servo_model import Positive, ServoModel
+from armcal_simulation.servo_model import JointServo, Positive
 
 SPEED_SLACK = 1.05
 _TICK_S = 0.02
@@ -64,7 +64,7 @@ class Safety:
     """
 
     def __init__(
-        self, settings: SafetySettings, bounds: Bounds, servos: Mapping[str, ServoModel], log: Callable[[str], None]
+        self, settings: SafetySettings, bounds: Bounds, servos: Mapping[str, JointServo], log: Callable[[str], None]
     ) -> None:
         self.offences: Counter[str] = Counter()
         self.events: Counter[str] = Counter()

@@ -10,8 +10,10 @@ import errno
 import fcntl
 import os
 import select
+import sys
 import termios
 import tty
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -20,9 +22,26 @@ import numpy as np
 
 _AT_ONCE = 65536
 _MOST_WAITING = 1 << 20
+_TCGETS2, _TERMIOS2_SIZE = 0x802C542A, 44
+"""Linux: settings of a line, whose last number is its speed, be it a standard one or not."""
 
-LineFault = Literal["drop", "duplicate", "reorder", "flip", "split"]
+LineFault = Literal["drop", "duplicate", "reorder", "flip", "split", "late"]
 LINE_FAULTS: tuple[LineFault, ...] = get_args(LineFault)
+
+
+Split = Callable[[bytes], tuple[list[bytes], bytes]]
+"""Gives whole messages, and the beginning of one that is not whole yet."""
+
+
+def delimited(delimiter: int) -> Split:
+    """How messages are told apart that end with a byte."""
+    end = bytes((delimiter,))
+
+    def split(data: bytes) -> tuple[list[bytes], bytes]:
+        *whole, rest = data.split(end)
+        return [message + end for message in whole], rest
+
+    return split
 
 
 @dataclass
@@ -34,18 +53,20 @@ class _Plan:
 
 
 class FaultyStream:
-    """One direction of a line, on which messages or bytes are lost, doubled, swapped, damaged or torn apart.
+    """One direction of a line, on which messages or bytes are lost, doubled, swapped, damaged, torn apart or late.
+
+    A late one arrives ahead of the next.
 
     Args:
-        delimiter: the byte that ends a message.
+        split: gives messages.
         random: chooses the bit that is damaged.
     """
 
-    def __init__(self, delimiter: int, random: np.random.Generator) -> None:
-        self._delimiter, self._random = delimiter, random
+    def __init__(self, split: Split, random: np.random.Generator) -> None:
+        self._split, self._random = split, random
         self._plans: list[_Plan] = []
         self._unfinished = b""
-        self._held = b""
+        self._held = self._late = b""
 
     def plan(self, kind: LineFault, count: int, after: int = 0, *, frames: bool = True) -> None:
         """Do this to the next ``count`` messages, or bytes, once ``after`` of them have passed."""
@@ -54,23 +75,22 @@ class FaultyStream:
     def clear(self) -> None:
         """No more faults; what was held back is lost."""
         self._plans.clear()
-        self._unfinished = self._held = b""
+        self._unfinished = self._held = self._late = b""
 
     def through(self, data: bytes) -> list[bytes]:
         """What arrives, in pieces that arrive one after another."""
-        if not self._plans and not self._unfinished and not self._held:
+        if not (self._plans or self._unfinished or self._held or self._late):
             return [data] if data else []
         waiting, self._unfinished = self._unfinished + data, b""
         if self._plans and not self._plans[0].frames:
             messages = [bytes((byte,)) for byte in waiting]
         else:
-            end = bytes((self._delimiter,))
-            *whole, self._unfinished = waiting.split(end)
-            messages = [message + end for message in whole]
+            messages, self._unfinished = self._split(waiting)
         delivered: list[bytes] = []
         for message in messages:
-            late, self._held = self._held, b""
-            delivered += [*self._harmed(message), late]
+            after, self._held = self._held, b""
+            before, self._late = self._late, b""
+            delivered += [before, *self._harmed(message), after]
         if not self._plans and not self._held:
             delivered.append(self._unfinished)
             self._unfinished = b""
@@ -94,6 +114,9 @@ class FaultyStream:
         if plan.kind == "reorder":
             self._held = message
             return []
+        if plan.kind == "late":
+            self._late = message
+            return []
         if plan.kind == "split":
             return [bytes((byte,)) for byte in message]
         place, bit = int(self._random.integers(len(message))), int(self._random.integers(8))
@@ -110,12 +133,12 @@ class SerialLine:
 
     Args:
         path: where the symlink is to be.
-        delimiter: the byte that ends a message, for the faults.
+        split: gives messages, for the faults.
         random: for the faults.
     """
 
-    def __init__(self, path: Path, delimiter: int, random: np.random.Generator) -> None:
-        self.to_board, self.to_host = FaultyStream(delimiter, random), FaultyStream(delimiter, random)
+    def __init__(self, path: Path, split: Split, random: np.random.Generator) -> None:
+        self.to_board, self.to_host = FaultyStream(split, random), FaultyStream(split, random)
         self._path = path
         self._master: int | None = None
         self._ports = 0
@@ -126,6 +149,13 @@ class SerialLine:
     def port(self) -> tuple[int, int] | None:
         """What to watch for bytes, and how many ports there have been; None while it is unplugged."""
         return None if self._master is None else (self._master, self._ports)
+
+    @property
+    def baud(self) -> int:
+        """What the host has set; 0 while the line is unplugged."""
+        if self._master is None:
+            return 0
+        return int.from_bytes(fcntl.ioctl(self._master, _TCGETS2, bytes(_TERMIOS2_SIZE))[-4:], sys.byteorder)
 
     def plug_in(self) -> None:
         """A new pty under the path; the one before is gone."""

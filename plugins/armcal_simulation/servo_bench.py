@@ -3,35 +3,28 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
-import numpy as np
-from armcal.base.domains import Array
-from armcal.devices.simulated import BOARD, CLOCK, LOG, BenchRequest
-from armcal.io.signals import Signals
+from armcal.config.servo_file import ServoFile
+from armcal.devices.simulated import BenchRequest
 from armcal.run.experiment import Experiment
 from armcal.testing import EXAMPLE_TRUTH
 
 from armcal_simulation import bench_parts
-from armcal_simulation.bench_faults import FaultCalendar, FaultRequest
+from armcal_simulation.bench_faults import FaultRequest
 from armcal_simulation.bench_parts import ServoBenchSettings
-from armcal_simulation.clock_server import ClockServer
-from armcal_simulation.dtrack_sender import DTrackSender
+from armcal_simulation.bench_world import BenchWorld, serve_world
 from armcal_simulation.firmata_board import FirmataBoard
 from armcal_simulation.framed_board import BoardIdentity, FramedBoard
 from armcal_simulation.i2c_bus import I2cBus
 from armcal_simulation.pca9685_model import Commit, Pca9685Model
-from armcal_simulation.safety import Safety, appended_to
-from armcal_simulation.serial_line import LINE_FAULTS, SerialLine
+from armcal_simulation.serial_line import delimited
+from armcal_simulation.servo_model import ServoModel
 
 EXAMPLE_SERVOS = Path(__file__).with_name("example_servos.yaml")
-WALL_AT_START = 1893456000.0
-"""2030-01-01, 0:00 UTC: no bench is there at two times, and results are the same whenever they are made."""
-LONGEST_ADVANCE_S = 86400.0
 _EEPROM = "eeprom.json"
 _SHOWN_VIOLATIONS = 20
 
@@ -55,179 +48,117 @@ class BoardFirmware(Protocol):
         """Do what is due now."""
 
 
-class BenchWorld:
-    """A bench as a whole: its time, and what happens in it on requests of the port and the clock's socket.
-
-    Attributes:
-        now: simulated seconds since the bench began.
-        stopped: a client has asked for the end.
+class PulseBoards:
+    """Boards whose pulses drive hobby servos, behind one firmware: the electronics of a ``servo_bench``.
 
     Args:
-        settings: the truth.
-        experiment: whose arm it is.
-        folder: for the log, and for what the board keeps when it is off.
-
-    Raises:
-        ConfigError: the settings do not fit the experiment.
+        models: the servos by joint.
+        file: boards and servos as they are.
+        folder: for what the board keeps when it is off.
     """
 
-    def __init__(self, settings: ServoBenchSettings, experiment: Experiment, folder: Path) -> None:
-        self.now, self.stopped = 0.0, False
-        self._settings, self._eeprom = settings, folder / _EEPROM
-        tracked = bench_parts.tracked_arm(settings, experiment)
-        file = bench_parts.true_servos(settings, tracked.arm)
-        self._chips = {n: Pca9685Model(self._clock, b.oscillator_hz, b.address) for n, b in file.boards.items()}
+    def __init__(
+        self,
+        world: BenchWorld,
+        settings: ServoBenchSettings,
+        models: Mapping[str, ServoModel],
+        file: ServoFile,
+        folder: Path,
+    ) -> None:
+        self._world, self._eeprom, self._models = world, folder / _EEPROM, models
+        clock = world.clock
+        self._chips = {n: Pca9685Model(clock, b.oscillator_hz, b.address) for n, b in file.boards.items()}
         for name, chip in self._chips.items():
             chip.on_commit = partial(self._committed, name)
         self._joints = {(servo.board, servo.channel): joint for joint, servo in file.servos.items()}
-        self._bus = I2cBus(self._clock, list(self._chips.values()))
-        self._sender = DTrackSender(settings.tracker, settings.tracker.host, settings.tracker.port, settings.seed)
-        self._world_T_base = settings.world_T_base.matrix
-        self._physics = bench_parts.physics(settings, tracked, file, self._track)
-        limits = bench_parts.bounds(experiment, file)
-        self._safety = Safety(settings.safety, limits, self._physics.servos, appended_to(folder / LOG))
-        self._physics.on_failure = self._safety.failed
-        self._faults = FaultCalendar(self._clock, self._fail)
+        self._bus = I2cBus(clock, list(self._chips.values()))
         self._board: BoardFirmware
         if settings.firmware == "firmata":
-            self._board = FirmataBoard(self._bus, self._send)
+            self._board = FirmataBoard(self._bus, world.send)
         else:
             identity = BoardIdentity(settings.board_id, settings.states_oscillator_hz)
             try:
                 boots = int(json.loads(self._eeprom.read_text(encoding="utf-8"))["boots"])
             except (OSError, ValueError, KeyError, TypeError):
                 boots = 0
-            self._board = FramedBoard(self._clock, self._bus, self._send, identity, boots)
-        self._line: SerialLine | None = None
+            self._board = FramedBoard(clock, self._bus, world.send, identity, boots)
+        self.split = delimited(self._board.delimiter)
 
-    def start(self, path: Path) -> None:
-        """Plug the board in, under this path."""
-        random = np.random.default_rng([self._settings.seed, 1])
-        self._line = SerialLine(path, self._board.delimiter, random)
-        self._line.plug_in()
-        self._boot()
+    def boot(self) -> None:
+        """See ``Electronics``."""
+        self._board.boot()
+        if isinstance(self._board, FramedBoard):
+            self._eeprom.write_text(json.dumps({"boots": self._board.boots}) + "\n", encoding="utf-8")
 
-    def close(self) -> None:
-        """Let go of everything."""
-        if self._line is not None:
-            self._line.unplug()
-        self._sender.close()
-        self._safety.judge_clearance()
+    def receive(self, data: bytes) -> None:
+        """See ``Electronics``."""
+        self._board.receive(data)
 
-    def port(self) -> tuple[int, int] | None:
-        """What to watch; see ``SerialLine.port``."""
-        return None if self._line is None else self._line.port
+    def next_event(self) -> float:
+        """See ``Electronics``."""
+        return self._board.next_event()
 
-    def attend_line(self) -> None:
-        """Do what the host has written; it takes no time."""
-        if self._line is None:
-            return
-        self._line.flush()
-        for piece in self._line.receive():
-            self._board.receive(piece)
+    def run_timers(self) -> None:
+        """See ``Electronics``."""
+        self._board.run_timers()
 
-    def answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """To a client of the clock's socket.
+    def moved(self) -> None:
+        """Servos drive by themselves: nothing is to be noted."""
 
-        Raises:
-            ValueError: the request is none.
-        """
-        self.attend_line()
-        if "advance" in request:
-            self._advance(request["advance"])
-        elif "fault" in request:
-            self._faults.plan(request["fault"])
-        elif request.get("stop"):
-            self.stopped = True
-        elif not request.get("state"):
-            raise ValueError("found none of advance, state, fault and stop")
-        times = {"now": self.now, "wall": WALL_AT_START + self.now}
-        if not request.get("state"):
-            return times
+    def fail(self, fault: FaultRequest) -> None:
+        """See ``Electronics``."""
+        if fault.kind in ("reset", "brown_out"):
+            if fault.kind == "brown_out":
+                for chip in self._chips.values():
+                    chip.power_cycle()
+            self.boot()
+        elif fault.kind == "nack":
+            self._bus.plan_nack(fault.byte, fault.after)
+        elif fault.kind == "stuck":
+            self._bus.hold_down(fault.seconds)
+
+    def state(self) -> dict[str, Any]:
+        """See ``Electronics``."""
         board = self._board
         framed = {"boots": board.boots, "took_over": board.guard.took_over} if isinstance(board, FramedBoard) else {}
         broken = [[v.time, name, v.rule] for name, chip in self._chips.items() for v in chip.violations]
         return {
-            **times,
-            **self._physics.state(),
             "pulses_s": {joint: self._chips[b].pulse_s(channel) for (b, channel), joint in self._joints.items()},
-            "failed": [joint for joint, servo in self._physics.servos.items() if servo.failed],
-            **self._safety.summary(),
             "violations": len(broken),
             "violated": broken[-_SHOWN_VIOLATIONS:],
             "board": framed,
         }
 
-    def _clock(self) -> float:
-        return self.now
-
-    def _advance(self, seconds: Any) -> None:
-        number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
-        if not number or not math.isfinite(seconds) or not 0 <= seconds <= LONGEST_ADVANCE_S:
-            raise ValueError(f"found advance {seconds!r}, expected seconds, at most {LONGEST_ADVANCE_S:.0f}")
-        end = self.now + seconds
-        self._safety.passed(self.now)
-        while self.now < end:
-            due = min(self._physics.next_event(), self._board.next_event(), self._faults.next_event())
-            self.now = min(end, max(due, self.now))
-            self._physics.move_to(self.now)
-            self._faults.run()
-            if self._board.next_event() <= self.now:
-                self._board.run_timers()
-                self._safety.passed(self.now)
-
-    def _track(self, now: float, base_T_body: Array | None) -> None:
-        tracker = self._settings.tracker
-        tool = None if base_T_body is None else self._world_T_base @ base_T_body
-        bodies = {tracker.tool: tool}
-        if tracker.base is not None:
-            bodies[tracker.base] = self._world_T_base
-        self._sender.send(WALL_AT_START + now, bodies)
-
     def _committed(self, board: str, commit: Commit) -> None:
         joint = self._joints.get((board, commit.channel))
         if joint is not None:
-            self._safety.committed(joint, commit, self._chips[board].period_s, self._physics.torques[joint])
-            self._physics.set_pulse(joint, commit.after)
+            physics = self._world.physics
+            self._world.safety.committed(joint, commit, self._chips[board].period_s, physics.torques[joint])
+            self._models[joint].set_pulse(commit.after)
+            physics.commands_changed()
 
-    def _boot(self) -> None:
-        self._board.boot()
-        if isinstance(self._board, FramedBoard):
-            self._eeprom.write_text(json.dumps({"boots": self._board.boots}) + "\n", encoding="utf-8")
 
-    def _send(self, data: bytes) -> None:
-        if self._line is not None:
-            self._line.send(data)
+def pulse_bench(settings: ServoBenchSettings, experiment: Experiment, folder: Path) -> BenchWorld:
+    """A bench of hobby servos.
 
-    def _fail(self, fault: FaultRequest) -> None:
-        line, tracker = self._line, self._sender.faults
-        if fault.kind in LINE_FAULTS and line is not None:
-            stream = line.to_host if fault.direction == "to_host" else line.to_board
-            stream.plan(fault.kind, fault.count, fault.after, frames=fault.unit == "frames")
-        elif fault.kind == "unplug" and line is not None:
-            line.unplug()
-        elif fault.kind == "replug" and line is not None:
-            line.plug_in()
-        elif fault.kind in ("reset", "brown_out"):
-            if fault.kind == "brown_out":
-                for chip in self._chips.values():
-                    chip.power_cycle()
-            self._boot()
-        elif fault.kind == "nack":
-            self._bus.plan_nack(fault.byte, fault.after)
-        elif fault.kind == "stuck":
-            self._bus.hold_down(fault.seconds)
-        elif fault.kind == "lost":
-            tracker.hidden |= {fault.body} if fault.body else set(self._settings.tracker.bodies)
-        elif fault.kind == "silent":
-            tracker.silent = True
-        elif fault.kind == "frozen":
-            tracker.frozen = fault.counter
-        elif fault.kind == "skew":
-            tracker.skew_ppm = fault.ppm
-        elif fault.kind == "seen":
-            tracker.silent, tracker.frozen, tracker.skew_ppm = False, "no", 0.0
-            tracker.hidden -= {fault.body} if fault.body else set(tracker.hidden)
+    Raises:
+        ConfigError: the settings do not fit the experiment.
+    """
+    tracked = bench_parts.tracked_arm(settings, experiment)
+    file = bench_parts.true_servos(settings, tracked.arm)
+    models = {
+        joint: ServoModel(settings.servo_of(joint), file.servos[joint].table, settings.start.get(joint, 0.0))
+        for joint in tracked.arm.commanded
+    }
+    pulses = {joint: servo.pulse_range for joint, servo in file.servos.items()}
+    return BenchWorld(
+        settings,
+        tracked,
+        models,
+        bench_parts.bounds(experiment, pulses),
+        folder,
+        lambda world: PulseBoards(world, settings, models, file, folder),
+    )
 
 
 class ServoBench:
@@ -257,15 +188,4 @@ class ServoBench:
             ConfigError: the settings do not fit the experiment.
             InputError: the folder cannot be used.
         """
-        world = BenchWorld(self._settings, request.experiment, request.folder)
-        try:
-            server = ClockServer(request.folder / CLOCK, world.answer)
-            try:
-                with Signals() as signals:
-                    world.start(request.folder / BOARD)
-                    server.listen()  # after the board: who finds the clock finds the board as well
-                    server.serve(world.port, world.attend_line, lambda: world.stopped or signals.finish)
-            finally:
-                server.close()
-        finally:
-            world.close()
+        serve_world(pulse_bench(self._settings, request.experiment, request.folder), request.folder)

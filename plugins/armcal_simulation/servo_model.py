@@ -13,6 +13,7 @@ from typing import Annotated
 from armcal.arm.servo import PulseTable
 from armcal.base.settings import Angle, Duration, Settings, Torque
 from pydantic import Field, model_validator
+from typing_extensions import override
 
 Positive = Annotated[float, Field(gt=0)]
 _NEAR = 1e-12
@@ -56,47 +57,36 @@ class ServoJointSettings(Settings):
         return self.winding_time / self.winding_share, self.case_time / (1 - self.winding_share)
 
 
-class ServoModel:
+class JointServo:
     """One servo under a load.
 
     Attributes:
         settings: what kind of servo it is.
         angle: of its horn (rad).
-        target: where its pulses send it (rad), within its stops; None without pulses.
+        target: where it is sent (rad), within its stops; None while it is not powered.
         approach: the sign of its last motion; 0 before the first.
         failed: it has burnt out, and holds nothing.
 
     Args:
-        table: the angle that it takes at each pulse length, in truth.
         angle: where it stands.
     """
 
-    def __init__(self, settings: ServoJointSettings, table: PulseTable, angle: float) -> None:
+    def __init__(self, settings: ServoJointSettings, angle: float) -> None:
         self.settings, self.angle, self.approach, self.failed = settings, angle, 0, False
         self.target: float | None = None
         self._horn, self._slipped, self._creep = angle, 0.0, math.radians(settings.creep_deg_per_min) / 60.0
         self._gear = angle  # where the gear stands, without its backlash (rad)
         self._driving = False
         self._speed, self._fall_speed = math.radians(settings.speed_deg_per_s), math.radians(settings.fall_deg_per_s)
-        rising = table.pulses[0] < table.pulses[-1]
-        order = slice(None) if rising else slice(None, None, -1)
-        self._pulses, self._angles = table.pulses[order], table.angles[order]
 
     @property
     def powered(self) -> bool:
         """Whether it holds anything."""
         return self.target is not None and not self.failed
 
-    def angle_of(self, pulse: float) -> float:
-        """The angle (rad) that a pulse (s) commands; linear between the table's knots and beyond them."""
-        at = min(max(bisect_right(self._pulses, pulse), 1), len(self._pulses) - 1)
-        p0, p1, a0, a1 = self._pulses[at - 1], self._pulses[at], self._angles[at - 1], self._angles[at]
-        return a0 + (pulse - p0) * (a1 - a0) / (p1 - p0)
-
-    def set_pulse(self, pulse: float | None) -> None:
-        """Other pulses (s), or none."""
-        low, high = self.settings.travel
-        self.target = None if pulse is None else min(max(self.angle_of(pulse), low), high)
+    def angle_of(self, command: float) -> float:
+        """The angle (rad) that a command asks for, as it reaches the servo: here an angle itself."""
+        return command
 
     def rests(self, torque: float) -> bool:
         """Whether it stays where it is under a torque (N m), as it is driven now."""
@@ -107,6 +97,10 @@ class ServoModel:
         at_stop = self._gear >= high - _NEAR if torque > 0 else self._gear <= low + _NEAR
         return at_stop or abs(torque) <= self.settings.friction
 
+    def gives_way(self, torque: float) -> bool:
+        """Whether the torque on it (N m) must be looked up at short intervals: it turns under its load."""
+        return not self.holds(torque) and (self.powered or not self.rests(torque))
+
     def advance(self, seconds: float, torque: float) -> bool:
         """Let time pass under a torque of its load (N m, turning towards larger angles); whether it moved."""
         slips = self._slip(seconds, torque)
@@ -114,10 +108,7 @@ class ServoModel:
             return slips
         before = self._gear
         if self.holds(torque):
-            error = (self.target or 0.0) - before
-            step = self._speed * seconds
-            self._driving = abs(error) > step
-            self._gear += math.copysign(step, error) if self._driving else error
+            self._drive(seconds, torque)
         else:
             step = self._fall_speed * seconds
             low, high = self.settings.travel
@@ -131,6 +122,13 @@ class ServoModel:
         self.angle = self._horn + self._slipped
         return bool(moved) or slips
 
+    def _drive(self, seconds: float, torque: float) -> None:
+        """Turn the gear towards the target."""
+        error = (self.target or 0.0) - self._gear
+        step = self._speed * seconds
+        self._driving = abs(error) > step
+        self._gear += math.copysign(step, error) if self._driving else error
+
     def _slip(self, seconds: float, torque: float) -> bool:
         """Let the horn slip on the gear; whether it did."""
         if not self._creep or not self.powered or not torque:
@@ -142,6 +140,28 @@ class ServoModel:
     def holds(self, torque: float) -> bool:
         """Whether it is strong enough for a torque (N m), as it is powered now."""
         return self.powered and abs(torque) <= self.settings.stall
+
+
+class ServoModel(JointServo):
+    """A hobby servo, which takes pulses. ``table``: the angle that it takes at each pulse length, in truth."""
+
+    def __init__(self, settings: ServoJointSettings, table: PulseTable, angle: float) -> None:
+        super().__init__(settings, angle)
+        rising = table.pulses[0] < table.pulses[-1]
+        order = slice(None) if rising else slice(None, None, -1)
+        self._pulses, self._angles = table.pulses[order], table.angles[order]
+
+    @override
+    def angle_of(self, command: float) -> float:
+        """The angle (rad) that a pulse (s) commands; linear between the table's knots and beyond them."""
+        at = min(max(bisect_right(self._pulses, command), 1), len(self._pulses) - 1)
+        p0, p1, a0, a1 = self._pulses[at - 1], self._pulses[at], self._angles[at - 1], self._angles[at]
+        return a0 + (command - p0) * (a1 - a0) / (p1 - p0)
+
+    def set_pulse(self, pulse: float | None) -> None:
+        """Other pulses (s), or none."""
+        low, high = self.settings.travel
+        self.target = None if pulse is None else min(max(self.angle_of(pulse), low), high)
 
 
 class ServoHeat:

@@ -25,8 +25,9 @@ from armcal.devices.simulated import BenchRequest
 from armcal.run.experiment import Experiment
 from armcal.run.plan_clearance import clearance_check
 from armcal_simulation.bench_parts import ServoBenchSettings
+from armcal_simulation.bench_world import BenchWorld
 from armcal_simulation.clock_server import ClockServer
-from armcal_simulation.servo_bench import BenchWorld, ServoBench
+from armcal_simulation.servo_bench import ServoBench, pulse_bench
 from click.testing import CliRunner
 from servo_bench_parts import ADDRESS, read_all
 
@@ -136,7 +137,7 @@ def make(experiment: Experiment, tmp_path: Path, ear: socket.socket) -> Iterator
     def build(**given: Any) -> Host:
         folder = tmp_path / f"bench{len(hosts)}"
         folder.mkdir()
-        world = BenchWorld(bench_settings(ear, **given), experiment, folder)
+        world = pulse_bench(bench_settings(ear, **given), experiment, folder)
         world.start(folder / "board")
         hosts.append(Host(world, folder))
         return hosts[-1]
@@ -360,7 +361,7 @@ class TestFaults:
     ) -> None:
         boots = []
         for _ in range(3):
-            world = BenchWorld(bench_settings(ear), experiment, tmp_path)
+            world = pulse_bench(bench_settings(ear), experiment, tmp_path)
             world.start(tmp_path / "board")
             boots.append(world.answer({"state": True})["board"]["boots"])
             world.close()

@@ -1,0 +1,223 @@
+"""A simulated bench as a whole: its time, its arm and tracker, its line, and what is wrong at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.devices.simulated import BOARD, CLOCK, LOG
+from armcal.io.signals import Signals
+
+from armcal_simulation import bench_parts
+from armcal_simulation.bench_faults import FaultCalendar, FaultRequest
+from armcal_simulation.bench_parts import BenchTruthSettings
+from armcal_simulation.clock_server import ClockServer
+from armcal_simulation.dtrack_sender import DTrackSender
+from armcal_simulation.elastic_pose import TrackedArm
+from armcal_simulation.safety import Bounds, Safety, appended_to
+from armcal_simulation.serial_line import LINE_FAULTS, SerialLine, Split
+from armcal_simulation.servo_model import JointServo
+
+WALL_AT_START = 1893456000.0
+"""2030-01-01, 0:00 UTC: no bench is there at two times, and results are the same whenever they are made."""
+LONGEST_ADVANCE_S = 86400.0
+
+
+class Electronics(Protocol):
+    """What stands between the host's serial line and the motors: it answers at once, and may have timers."""
+
+    split: Split
+    """Messages on the line."""
+
+    def boot(self) -> None:
+        """Start anew: power-up, or a reset."""
+
+    def receive(self, data: bytes) -> None:
+        """Bytes from the host."""
+
+    def next_event(self) -> float:
+        """When a timer is due (s)."""
+
+    def run_timers(self) -> None:
+        """Do what is due now."""
+
+    def moved(self) -> None:
+        """Time has passed for the motors."""
+
+    def fail(self, fault: FaultRequest) -> None:
+        """Do a fault that is neither the line's nor the tracker's."""
+
+    def state(self) -> dict[str, Any]:
+        """The truth, as JSON."""
+
+
+class BenchWorld:
+    """A bench as a whole: its time, and what happens in it on requests of the port and the clock's socket.
+
+    Attributes:
+        now: simulated seconds since the bench began.
+        stopped: a client has asked for the end.
+
+    Args:
+        settings: the truth.
+        tracked: the arm.
+        servos: by joint, in the arm's order.
+        bounds: what the experiment allows.
+        folder: for the log.
+        electronics: makes what stands between line and servos.
+    """
+
+    def __init__(
+        self,
+        settings: BenchTruthSettings,
+        tracked: TrackedArm,
+        servos: Mapping[str, JointServo],
+        bounds: Bounds,
+        folder: Path,
+        electronics: Callable[[BenchWorld], Electronics],
+    ) -> None:
+        self.now, self.stopped = 0.0, False
+        self._settings = settings
+        self._sender = DTrackSender(settings.tracker, settings.tracker.host, settings.tracker.port, settings.seed)
+        self._world_T_base = settings.world_T_base.matrix
+        self.physics = bench_parts.physics(settings, tracked, servos, self._track)
+        self.safety = Safety(settings.safety, bounds, self.physics.servos, appended_to(folder / LOG))
+        self.physics.on_failure = self.safety.failed
+        self._faults = FaultCalendar(self.clock, self._fail)
+        self._line: SerialLine | None = None
+        self._electronics = electronics(self)
+
+    def clock(self) -> float:
+        """Seconds, as parts of the bench ask for them."""
+        return self.now
+
+    def send(self, data: bytes) -> None:
+        """To the host."""
+        if self._line is not None:
+            self._line.send(data)
+
+    def baud(self) -> int:
+        """The host's."""
+        return 0 if self._line is None else self._line.baud
+
+    def start(self, path: Path) -> None:
+        """Plug the board in, under this path."""
+        random = np.random.default_rng([self._settings.seed, 1])
+        self._line = SerialLine(path, self._electronics.split, random)
+        self._line.plug_in()
+        self._electronics.boot()
+
+    def close(self) -> None:
+        """Let go of everything."""
+        if self._line is not None:
+            self._line.unplug()
+        self._sender.close()
+        self.safety.judge_clearance()
+
+    def port(self) -> tuple[int, int] | None:
+        """What to watch; see ``SerialLine.port``."""
+        return None if self._line is None else self._line.port
+
+    def attend_line(self) -> None:
+        """Do what the host has written; it takes no time."""
+        if self._line is None:
+            return
+        self._line.flush()
+        for piece in self._line.receive():
+            self._electronics.receive(piece)
+
+    def answer(self, request: dict[str, Any]) -> dict[str, Any]:
+        """To a client of the clock's socket.
+
+        Raises:
+            ValueError: the request is none.
+        """
+        self.attend_line()
+        if "advance" in request:
+            self._advance(request["advance"])
+        elif "fault" in request:
+            self._faults.plan(request["fault"])
+        elif request.get("stop"):
+            self.stopped = True
+        elif not request.get("state"):
+            raise ValueError("found none of advance, state, fault and stop")
+        times = {"now": self.now, "wall": WALL_AT_START + self.now}
+        if not request.get("state"):
+            return times
+        return {
+            **times,
+            **self.physics.state(),
+            "failed": [joint for joint, servo in self.physics.servos.items() if servo.failed],
+            **self.safety.summary(),
+            **self._electronics.state(),
+        }
+
+    def _advance(self, seconds: Any) -> None:
+        number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
+        if not number or not math.isfinite(seconds) or not 0 <= seconds <= LONGEST_ADVANCE_S:
+            raise ValueError(f"found advance {seconds!r}, expected seconds, at most {LONGEST_ADVANCE_S:.0f}")
+        end = self.now + seconds
+        self.safety.passed(self.now)
+        while self.now < end:
+            due = min(self.physics.next_event(), self._electronics.next_event(), self._faults.next_event())
+            self.now = min(end, max(due, self.now))
+            self.physics.move_to(self.now)
+            self._electronics.moved()
+            self._faults.run()
+            if self._electronics.next_event() <= self.now:
+                self._electronics.run_timers()
+                self.safety.passed(self.now)
+
+    def _track(self, now: float, base_T_body: Array | None) -> None:
+        tracker = self._settings.tracker
+        tool = None if base_T_body is None else self._world_T_base @ base_T_body
+        bodies = {tracker.tool: tool}
+        if tracker.base is not None:
+            bodies[tracker.base] = self._world_T_base
+        self._sender.send(WALL_AT_START + now, bodies)
+
+    def _fail(self, fault: FaultRequest) -> None:
+        line, tracker = self._line, self._sender.faults
+        if fault.kind in LINE_FAULTS and line is not None:
+            stream = line.to_host if fault.direction == "to_host" else line.to_board
+            stream.plan(fault.kind, fault.count, fault.after, frames=fault.unit == "frames")
+        elif fault.kind == "unplug" and line is not None:
+            line.unplug()
+        elif fault.kind == "replug" and line is not None:
+            line.plug_in()
+        elif fault.kind == "lost":
+            tracker.hidden |= {fault.body} if fault.body else set(self._settings.tracker.bodies)
+        elif fault.kind == "silent":
+            tracker.silent = True
+        elif fault.kind == "frozen":
+            tracker.frozen = fault.counter
+        elif fault.kind == "skew":
+            tracker.skew_ppm = fault.ppm
+        elif fault.kind == "seen":
+            tracker.silent, tracker.frozen, tracker.skew_ppm = False, "no", 0.0
+            tracker.hidden -= {fault.body} if fault.body else set(tracker.hidden)
+        else:
+            self._electronics.fail(fault)
+
+
+def serve_world(world: BenchWorld, folder: Path) -> None:
+    """Answer on the port and the clock's socket in a folder until the end; see ``SimulatedBench``.
+
+    Raises:
+        InputError: the folder cannot be used.
+    """
+    try:
+        server = ClockServer(folder / CLOCK, world.answer)
+        try:
+            with Signals() as signals:
+                world.start(folder / BOARD)
+                server.listen()  # after the board: who finds the clock finds the board as well
+                server.serve(world.port, world.attend_line, lambda: world.stopped or signals.finish)
+        finally:
+            server.close()
+    finally:
+        world.close()
