@@ -233,9 +233,9 @@ COMPONENTS: Mapping[str, ComponentKind] = MappingProxyType(
         ),
         "device": ComponentKind(
             "armcal_register_devices",
-            "Device(settings, joint_names, link)",
+            "Device(settings, joint_names, link or None)",
             "armcal.devices.device:JointDevice",
-            ("armcal.devices.device:PulseDevice",),
+            ("armcal.devices.device:PulseDevice", "armcal.devices.device:MeasuringDevice"),
         ),
         "tracker": ComponentKind("armcal_register_trackers", "Tracker(settings)", "armcal.devices.tracker:Tracker"),
         "joints": ComponentKind(

@@ -107,12 +107,13 @@ class Bench:
             clock.close()
 
     def device(self) -> JointDevice:
-        """The device, on its link.
+        """The device, on its link if one is configured.
 
         Raises:
             ConfigError: refused, or none is configured.
         """
-        built: JointDevice = self._built("device", tuple(self.arm.commanded), self._built("link"))
+        link = None if self.settings.link is None else self._built("link")
+        built: JointDevice = self._built("device", tuple(self.arm.commanded), link)
         return built
 
     def tracker(self) -> Tracker:

@@ -115,7 +115,9 @@ class Pca9685Device(JointDevice, PulseDevice):
     Settings: ClassVar[type[Pca9685Settings]] = Pca9685Settings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"servos": str(Path(__file__).with_name("example_servos.yaml"))}
 
-    def __init__(self, settings: Pca9685Settings, joint_names: Sequence[str], link: Link) -> None:
+    def __init__(self, settings: Pca9685Settings, joint_names: Sequence[str], link: Link | None) -> None:
+        if link is None:
+            raise ValueError("found no link of the bench; give bench: {link: {type: NAME, ...}}")
         self._settings, self._link = settings, link
         self._file: ServoFile = load_servo_file(settings.servos)
         missing = [joint for joint in joint_names if joint not in self._file.servos]

@@ -85,7 +85,10 @@ def test_our_plugins_keep_the_contract() -> None:
         assert report["ran"] > 2 * len(commands) + 10 * (components > commands)
         # the reader of images reads a folder and a file, and has tests of its own
         of_images = {"its settings have no path", "no known file was read"} if plugin == "camera" else set()
-        assert {check["not_run"] for check in report["checks"]} <= {None, "it reads nothing", *of_images}
+        not_run = {check["not_run"] for check in report["checks"]}
+        if plugin == "servobus":  # its bus is a port of its own
+            not_run = {text for text in not_run if "no such serial port" not in (text or "")}
+        assert not_run <= {None, "it reads nothing", *of_images}
 
 
 def test_a_check_tells_how_many_ran_and_why_one_did_not() -> None:

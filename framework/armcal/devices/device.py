@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from armcal.devices.clock import Clock
 
@@ -105,3 +105,11 @@ class PulseDevice(Protocol):
 
     def release(self, joint: str) -> None:
         """End a joint's pulses."""
+
+
+@runtime_checkable
+class MeasuringDevice(Protocol):
+    """A device whose servos know where they stand, with pulses and without."""
+
+    def measured(self) -> dict[str, float]:
+        """Where all joints stand by their own encoders (rad)."""

@@ -1,0 +1,267 @@
+"""A bus of servos on a serial port: instructions and answers, time-outs, repeats, and what went wrong on the way."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from typing import Annotated, NoReturn
+
+from armcal.base.settings import Duration
+from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError
+from armcal.devices.serial_port import SerialPort, SerialPortSettings
+from armcal.errors import Location
+from pydantic import Field
+
+from armcal_servobus.packets import BROADCAST, DAMAGED, FRAMINGS, Instruction, ProtocolName, Received, Status
+
+_BITS = 10
+"""On the line, of a byte."""
+_ECHO_ID = 0xFD
+"""Nobody's: what comes back when it is asked is an echo."""
+_NOBODY = frozenset((-1,))
+
+
+class BusSettings(SerialPortSettings):
+    """The port, its baud rate, the protocol, and for how long an answer is waited for.
+
+    ``reply`` passes after the last byte of the answer could have come, twice as much at each repeat; ``tries`` is
+    how often an instruction is sent at most.
+    """
+
+    baud: Annotated[int, Field(ge=300, le=4_500_000)] = 1_000_000
+    protocol: ProtocolName = "feetech"
+    reply: Annotated[Duration, Field(ge=0.001, le=1)] = 0.05
+    tries: Annotated[int, Field(ge=1, le=10)] = 3
+
+
+class Bus:
+    """One bus. Each call is bounded in time: three tries take 0.4 s at most with the settings that it has by itself.
+
+    Attributes:
+        settings: as they are now; ``baud`` changes with ``set_baud``.
+        counts: ``silent``, ``damaged``, ``repeated``, ``extra``: how often answers were so.
+        alarms: the last one of each servo that answered, by id.
+    """
+
+    def __init__(self, settings: BusSettings, names: Mapping[int, str] | None = None) -> None:
+        self.settings = settings
+        self.counts: Counter[str] = Counter()
+        self.alarms: dict[int, int] = {}
+        self._names = names or {}
+        self._framing = FRAMINGS[settings.protocol]
+        self._port = SerialPort(settings)
+        self._echoes, self._is_clean = False, True
+
+    @property
+    def where(self) -> Location:
+        """For messages."""
+        return Location(self.settings.meant)
+
+    def open(self) -> str:
+        """Open its port, and find out whether the adapter sends back what is sent; gives its serial number.
+
+        Raises:
+            DeviceRefusedError: there is no such port, it is taken, or does not know the baud rate.
+            DeviceLostError: it was open before, and is gone.
+        """
+        try:
+            number = self._port.open()
+        except ValueError as fault:
+            hint = "Choose one that the servos and the adapter know."
+            raise DeviceRefusedError(
+                f"the port cannot be set to {self.settings.baud} baud ({fault}).", where=self.where, hint=hint
+            ) from fault
+        self._echoes, self._is_clean = False, True
+        if self._framing.echo_is_an_answer:
+            place = self._framing.place(0, 1)
+            packet = self._framing.encoded(_ECHO_ID, Instruction.READ, place)
+            self._send(packet)
+            self._echoes = self._heard(self.settings.reply, len(packet)).startswith(packet)
+        return number
+
+    def set_baud(self, baud: int) -> None:
+        """Go on at another baud rate; see ``open``."""
+        self._port.close()
+        self.settings = self.settings.model_copy(update={"baud": baud})
+        self._port = SerialPort(self.settings)
+        self.open()
+
+    def close(self) -> None:
+        """Let go of the port. May be called twice."""
+        self._port.close()
+
+    def probe(self, servo: int, reply_s: float) -> Received:
+        """Ping an id once, or all with ``BROADCAST``, and take whatever comes in this time."""
+        packet = self._framing.encoded(servo, Instruction.PING)
+        self._send(packet)
+        answers, damaged = self._collect(packet, _NOBODY, lambda answer: False, reply_s)
+        self._is_clean = True  # all of that time was waited for
+        return Received(tuple(answers), damaged, b"")
+
+    def ping(self, servo: int) -> bool:
+        """Whether a servo answers."""
+        try:
+            self._ask(servo, Instruction.PING, b"", None)
+        except DeviceLostError:
+            return False
+        except DeviceError:  # damaged answers are answers
+            return True
+        return True
+
+    def read(self, servo: int, address: int, count: int) -> bytes:
+        """Bytes of a servo's registers.
+
+        Raises:
+            DeviceLostError: it does not answer.
+            DeviceError: it refuses, or all its answers are damaged.
+        """
+        return self._ask(servo, Instruction.READ, self._framing.place(address, count), count).data
+
+    def write(self, servo: int, address: int, data: bytes) -> None:
+        """Write to a servo's registers; one that does not acknowledge it is read back.
+
+        Raises:
+            DeviceLostError: it does not answer.
+            DeviceError: it refuses, or holds another value.
+        """
+        try:
+            self._ask(servo, Instruction.WRITE, self._framing.address(address) + data, 0)
+        except DeviceLostError:
+            if (read_back := self.read(servo, address, len(data))) != data:
+                raise DeviceError(
+                    f"{self.name(servo)} holds {read_back.hex(' ')} at register {address} after {data.hex(' ')} was "
+                    "written.",
+                    where=self.where,
+                    hint="Look at its plug and its power; a register may be locked while torque is on.",
+                ) from None
+
+    def read_all(self, servos: Iterable[int], address: int, count: int, *, together: bool = True) -> dict[int, bytes]:
+        """Registers of several servos, by id: in one exchange where they can, else one by one; see ``read``."""
+        missing = list(servos)
+        if not together or len(missing) < 2:
+            return {servo: self.read(servo, address, count) for servo in missing}
+        data: dict[int, bytes] = {}
+        place = self._framing.place(address, count)
+        for attempt in range(self.settings.tries):
+            packet = self._framing.encoded(BROADCAST, Instruction.SYNC_READ, place + bytes(missing))
+            wait = self._wait(len(packet) + len(missing) * (count + self._framing.overhead), attempt)
+            self._send(packet)
+            answers, _ = self._collect(packet, frozenset(missing), lambda answer: len(answer.data) == count, wait)
+            data |= {answer.id: answer.data for answer in answers if len(answer.data) == count}
+            missing = [servo for servo in missing if servo not in data]
+            if not missing:
+                return data
+            self.counts["repeated"] += 1
+        return data | {servo: self.read(servo, address, count) for servo in missing}
+
+    def write_all(self, address: int, data: Mapping[int, bytes]) -> None:
+        """Write registers of several servos at once; nobody acknowledges that."""
+        if not data:
+            return
+        sizes = {len(value) for value in data.values()}
+        if len(sizes) != 1:
+            raise ValueError(f"found values of {sizes} bytes, expected one size")
+        listed = b"".join(bytes((servo,)) + value for servo, value in data.items())
+        place = self._framing.place(address, sizes.pop())
+        packet = self._framing.encoded(BROADCAST, Instruction.SYNC_WRITE, place + listed)
+        self._send(packet)
+        if self._echoes:
+            self._is_clean = self._heard(self.settings.reply, len(packet)) == packet
+
+    def name(self, servo: int) -> str:
+        """A servo, for people."""
+        return f"{self._names[servo]} (id {servo})" if servo in self._names else f"the servo with id {servo}"
+
+    def _ask(self, servo: int, instruction: Instruction, parameters: bytes, count: int | None) -> Status:
+        """An answer of so many bytes (None: any), after as many tries as are allowed."""
+        packet = self._framing.encoded(servo, instruction, parameters)
+        was_damaged = 0
+
+        def is_it(answer: Status) -> bool:
+            return answer.id == servo and (bool(answer.refusal) or count is None or len(answer.data) == count)
+
+        for attempt in range(self.settings.tries):
+            self.counts["repeated"] += attempt > 0
+            self._send(packet)
+            wait = self._wait(len(packet) + (count or 0) + self._framing.overhead, attempt)
+            answers, damaged = self._collect(packet, frozenset((servo,)), is_it, wait)
+            answer = next(filter(is_it, answers), None)
+            was_damaged += damaged > 0
+            if answer is None or answer.refusal in DAMAGED:
+                continue
+            if answer.refusal:
+                raise DeviceError(
+                    f"{self.name(servo)} refuses to {instruction.name.lower()}: {answer.refusal}.",
+                    where=self.where,
+                    hint="Check that its model is the configured one; some registers are locked while torque is on.",
+                )
+            return answer
+        self._give_up(servo, was_damaged)
+
+    def _give_up(self, servo: int, damaged: int) -> NoReturn:
+        tries = self.settings.tries
+        if damaged:
+            raise DeviceError(
+                f"the answers of {self.name(servo)} arrive damaged ({damaged} of {tries} tries).",
+                where=self.where,
+                hint="If others answer well, two servos have this id: unplug one and change it. Otherwise look at the "
+                "cable, its ground, and the servos' supply.",
+            )
+        raise DeviceLostError(
+            f"{self.name(servo)} does not answer ({tries} tries).",
+            where=self.where,
+            hint="Look at its plug and its power; armcal bus find shows who answers, and at which baud rate.",
+        )
+
+    def _wait(self, size: int, attempt: int) -> float:
+        """How long an exchange of so many bytes may take (s)."""
+        return size * _BITS / self.settings.baud + self.settings.reply * (1 << attempt)
+
+    def _send(self, packet: bytes) -> None:
+        """After what came too late has been passed over; an answer bears no number by which it would be known."""
+        self._heard(0.0 if self._is_clean else self.settings.reply)
+        self._is_clean = True
+        self._port.write(packet)
+
+    def _heard(self, quiet_s: float, most: int = 1 << 16) -> bytes:
+        """What comes until it has been quiet for so long."""
+        heard = b""
+        while len(heard) < most and (data := self._port.read(quiet_s)):
+            heard += data
+        return heard
+
+    def _collect(
+        self, packet: bytes, servos: frozenset[int], is_it: Callable[[Status], bool], wait_s: float
+    ) -> tuple[list[Status], int]:
+        """Answers until those of all servos are there or time is up, and how many were damaged.
+
+        Args:
+            packet: what was sent; an echo of it is taken away.
+            servos: whose answers; where it is one, a damaged one ends the waiting.
+            is_it: whether an answer can be that to this packet.
+            wait_s: at most.
+        """
+        answers: list[Status] = []
+        missing, rest, damaged, echo = set(servos), b"", 0, len(packet) if self._echoes else 0
+        until = time.monotonic() + wait_s
+        while missing and (left := until - time.monotonic()) > 0 and not (damaged and len(servos) == 1):
+            rest += self._port.read(left)
+            if echo:
+                if len(rest) < echo:
+                    continue
+                if not rest.startswith(packet):  # somebody else talked at the same time
+                    damaged += 1
+                    break
+                rest, echo = rest[echo:], 0
+            received = self._framing.received(rest)
+            answers += received.answers
+            damaged, rest = damaged + received.damaged, received.rest
+            missing -= {answer.id for answer in received.answers if is_it(answer)}
+        damaged += bool(rest and missing)
+        self._is_clean = not missing and not rest
+        self.alarms |= {answer.id: answer.alarm for answer in answers}
+        self.counts["damaged"] += damaged
+        self.counts["extra"] += not missing and (bool(rest) or len(answers) > len(servos))
+        self.counts["silent"] += bool(missing) and not damaged
+        return answers, damaged

@@ -1,0 +1,175 @@
+"""Who is on a bus: baud rates tried, ids, models; two servos with one id are seen by how they answer together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+from armcal.devices.faults import DeviceError, DeviceRefusedError
+
+from armcal_servobus.bus import Bus
+from armcal_servobus.models import BASE_MODELS, ServoModel, model_of
+from armcal_servobus.packets import BROADCAST
+
+_FIRST_IDS = range(31)
+"""Asked one by one at each baud rate, where nothing else is said; beyond that only those that answer to all."""
+_BROADCAST_S = 0.25
+_ONE_S = 0.015
+_AGAIN = 4
+"""So often a servo is read: two with one id do not always collide. So many damaged answers are no chance."""
+
+
+@dataclass(frozen=True)
+class FoundServo:
+    """A servo that answers, as it was read without writing anything to it.
+
+    Attributes:
+        model: None: its number is not known.
+        number: of its model.
+        position: as it reports it (counts).
+        voltage: V.
+        temperature: deg C.
+        alarms: in words.
+        damaged: so many of its answers were damaged, or followed by another one.
+    """
+
+    baud: int
+    id: int
+    number: int
+    model: ServoModel | None
+    firmware: str = ""
+    position: int | None = None
+    voltage: float | None = None
+    temperature: int | None = None
+    alarms: tuple[str, ...] = ()
+    damaged: int = 0
+
+    @property
+    def is_doubled(self) -> bool:
+        """Whether it answers as two do."""
+        return self.damaged >= _AGAIN
+
+    @property
+    def model_name(self) -> str:
+        """For people."""
+        return self.model.name if self.model else f"model {self.number}"
+
+
+def find(
+    bus: Bus, bauds: Iterable[int], ids: Iterable[int] = _FIRST_IDS, progress: Callable[[int], None] = lambda baud: None
+) -> Iterator[FoundServo]:
+    """All servos that answer at these baud rates, by baud rate and id. A baud rate that the port lacks is left out.
+
+    Args:
+        ids: those that are asked one by one, too.
+        progress: called with each baud rate before it is tried.
+
+    Raises:
+        DeviceRefusedError: the port cannot be opened.
+        DeviceLostError: the port is gone.
+    """
+    bus.open()
+    candidates = tuple(ids)
+    for baud in bauds:
+        progress(baud)
+        try:
+            bus.set_baud(baud)
+        except DeviceRefusedError as refusal:
+            if isinstance(refusal.__cause__, ValueError):
+                continue
+            raise
+        for servo in present(bus, candidates):
+            yield looked_at(bus, servo)
+
+
+def present(bus: Bus, ids: Iterable[int] = _FIRST_IDS) -> list[int]:
+    """Ids that answer at the bus's baud rate, or from which something comes.
+
+    Feetech servos that are asked all at once may talk all at once: what they say then is only a hint.
+    """
+    hints = {answer.id for answer in bus.probe(BROADCAST, _BROADCAST_S).answers}
+    there = []
+    for servo in sorted({*ids, *hints}):
+        heard = bus.probe(servo, _ONE_S)
+        if heard.damaged and not heard.answers:  # noise is not there again
+            heard = bus.probe(servo, _ONE_S)
+        if heard.damaged or servo in {answer.id for answer in heard.answers}:
+            there.append(servo)
+    return there
+
+
+def looked_at(bus: Bus, servo: int, times: int = _AGAIN) -> FoundServo:
+    """What a servo says of itself. It is read several times, for two with one id do not answer alike."""
+    before = bus.counts["damaged"] + bus.counts["extra"]
+    number, model, numbers = 0, None, {}
+    base = BASE_MODELS[bus.settings.protocol]
+    for _ in range(times):
+        try:
+            number, model = read_model(bus, servo)
+            numbers = _numbers(bus, servo, model or base, ("firmware", "position", "voltage", "temperature"))
+        except DeviceError:
+            continue
+    damaged = bus.counts["damaged"] + bus.counts["extra"] - before
+    if not numbers:
+        return FoundServo(bus.settings.baud, servo, number, model, damaged=max(damaged, 1))
+    return FoundServo(
+        baud=bus.settings.baud,
+        id=servo,
+        number=number,
+        model=model,
+        firmware=str(numbers["firmware"]) if bus.settings.protocol != "feetech" else _version(bus, servo),
+        position=numbers["position"],
+        voltage=round(numbers["voltage"] * base.registers["voltage"].unit, 3),
+        temperature=numbers["temperature"],
+        alarms=alarms_of(bus, servo, model or base),
+        damaged=damaged,
+    )
+
+
+def read_model(bus: Bus, servo: int) -> tuple[int, ServoModel | None]:
+    """The number of a servo's model, and the model if it is known.
+
+    Raises:
+        DeviceError: it does not answer well.
+    """
+    base = BASE_MODELS[bus.settings.protocol]
+    register = base.registers["model"]
+    data = bus.read(servo, register.address, register.size)
+    numbers = [int.from_bytes(data, "little")]
+    if bus.settings.protocol == "feetech":  # SCS servos have the upper byte first
+        numbers.append(int.from_bytes(data, "big"))
+    models = [model_of(bus.settings.protocol, number) for number in numbers]
+    known = next((model for model in models if model is not None), None)
+    return (known.number if known else numbers[0]), known
+
+
+def alarms_of(bus: Bus, servo: int, model: ServoModel) -> tuple[str, ...]:
+    """What a servo's last answer says that is wrong with it, in words.
+
+    Raises:
+        DeviceError: it does not answer well.
+    """
+    alarm = bus.alarms.get(servo, 0)
+    if alarm and bus.settings.protocol == "dynamixel2":  # there its answers say only that there is something
+        register = model.registers["status"]
+        alarm = model.unpack("status", bus.read(servo, register.address, register.size))
+    return model.words(alarm)
+
+
+def _version(bus: Bus, servo: int) -> str:
+    major, minor = bus.read(servo, 0, 2)
+    return f"{major}.{minor}"
+
+
+def _numbers(bus: Bus, servo: int, model: ServoModel, names: Iterable[str]) -> dict[str, int]:
+    return {name: read_number(bus, servo, model, name) for name in names}
+
+
+def read_number(bus: Bus, servo: int, model: ServoModel, name: str) -> int:
+    """What a servo's register holds.
+
+    Raises:
+        DeviceError: it does not answer well.
+    """
+    register = model.registers[name]
+    return model.unpack(name, bus.read(servo, register.address, register.size))

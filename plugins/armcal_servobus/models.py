@@ -1,0 +1,326 @@
+"""What servos have in their registers, by model; from the makers' tables. [FeetechSTS] [Dynamixel1] [Dynamixel2]"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Literal
+
+from armcal_servobus.packets import ProtocolName
+
+_RPM = 2 * math.pi / 60
+
+
+@dataclass(frozen=True)
+class Register:
+    """Where a number stands, and how it is written.
+
+    Attributes:
+        address, size: of its first byte, and bytes.
+        sign_bit: its sign stands apart, in this bit; None: there is none, or it is a two's complement.
+        is_signed: it is a two's complement.
+        unit: what one count is, in SI (V, rad/s, deg C).
+    """
+
+    address: int
+    size: int = 1
+    sign_bit: int | None = None
+    is_signed: bool = False
+    unit: float = 1.0
+
+    def pack(self, value: int, order: Literal["little", "big"]) -> bytes:
+        """As it is written.
+
+        Raises:
+            ValueError: it does not fit.
+        """
+        bits = self.sign_bit if self.sign_bit is not None else 8 * self.size - self.is_signed
+        most = (1 << bits) - 1
+        least = -most if self.sign_bit is not None else -(most + 1) if self.is_signed else 0
+        if not least <= value <= most:
+            raise ValueError(f"found {value}, expected {least} to {most}")
+        if self.sign_bit is not None and value < 0:
+            value = -value | 1 << self.sign_bit
+        return value.to_bytes(self.size, order, signed=self.is_signed)
+
+    def unpack(self, data: bytes, order: Literal["little", "big"]) -> int:
+        """From its bytes."""
+        value = int.from_bytes(data, order, signed=self.is_signed)
+        if self.sign_bit is None:
+            return value
+        magnitude = value & ((1 << self.sign_bit) - 1)
+        return -magnitude if value >> self.sign_bit & 1 else magnitude
+
+
+@dataclass(frozen=True)
+class ServoModel:
+    """A kind of servo.
+
+    Attributes:
+        name: as configurations have it.
+        number: as its register has it.
+        protocol: that it speaks.
+        registers: by armcal's name of what they hold; those that it lacks are not there.
+        polled: the stretches (address, bytes) that hold what changes while it works.
+        alarms: words, by the bit of its alarm.
+        counts: so many are ``turn`` (rad).
+        wraps: whether its encoder goes on over the end of the turn, from the last count to zero.
+        position_mode: what the register of its operating mode holds while it goes to positions.
+        offset_limit: the largest magnitude of its homing offset; 0: it has none.
+        offset_sign: of the offset in the position that it reports: -1 if that is the encoder's less the offset.
+        teeth: of the spline on which its horn sits; 0: not known.
+        order: of the bytes of a number.
+        reads_together: whether it takes part when several are read at once.
+        load: what its register of load counts: a share of its full torque, or a current (A).
+    """
+
+    name: str
+    number: int
+    protocol: ProtocolName
+    registers: Mapping[str, Register]
+    polled: tuple[tuple[int, int], ...]
+    alarms: Mapping[int, str]
+    counts: int = 4096
+    turn: float = 2 * math.pi
+    wraps: bool = True
+    position_mode: int = 0
+    offset_limit: int = 0
+    offset_sign: int = -1
+    teeth: int = 0
+    order: Literal["little", "big"] = "little"
+    reads_together: bool = True
+    load: Literal["share", "current"] = "share"
+
+    @property
+    def step(self) -> float:
+        """The angle of a count (rad)."""
+        return self.turn / self.counts
+
+    def pack(self, name: str, value: int) -> bytes:
+        """A register's bytes."""
+        return self.registers[name].pack(value, self.order)
+
+    def unpack(self, name: str, data: bytes, at: int | None = None) -> int:
+        """A register's number, from bytes that begin at an address, or at the register's own."""
+        register = self.registers[name]
+        first = register.address - (register.address if at is None else at)
+        return register.unpack(data[first : first + register.size], self.order)
+
+    def holds(self, name: str, stretch: tuple[int, int]) -> bool:
+        """Whether a stretch (address, bytes) has all of a register."""
+        register, (first, count) = self.registers.get(name), stretch
+        return register is not None and first <= register.address <= first + count - register.size
+
+    def words(self, alarm: int) -> tuple[str, ...]:
+        """What the bits of an alarm say."""
+        named = tuple(text for bit, text in self.alarms.items() if alarm & bit)
+        unknown = alarm & ~sum(self.alarms)
+        return (*named, f"alarm 0x{unknown:02x}") if unknown else named
+
+
+_FEETECH_ALARMS = MappingProxyType(
+    {0x01: "voltage", 0x02: "angle sensor", 0x04: "overheating", 0x08: "overcurrent", 0x20: "overload"}
+)
+_DYNAMIXEL1_ALARMS = MappingProxyType({0x01: "voltage", 0x02: "angle limit", 0x04: "overheating", 0x20: "overload"})
+_DYNAMIXEL2_ALARMS = MappingProxyType(
+    {0x01: "voltage", 0x02: "angle sensor", 0x04: "overheating", 0x08: "encoder", 0x10: "shock", 0x20: "overload"}
+)
+
+_FEETECH = MappingProxyType(
+    {
+        "firmware": Register(0),
+        "model": Register(3, 2),
+        "id": Register(5),
+        "baud": Register(6),
+        "answers": Register(8),
+        "min": Register(9, 2),
+        "max": Register(11, 2),
+        "max_temperature": Register(13),
+        "max_voltage": Register(14, unit=0.1),
+        "min_voltage": Register(15, unit=0.1),
+        "torque": Register(40),
+        "goal": Register(42, 2),
+        "time": Register(44, 2),
+        "speed": Register(46, 2),
+        "position": Register(56, 2),
+        "load": Register(60, 2, sign_bit=10, unit=0.001),
+        "voltage": Register(62, unit=0.1),
+        "temperature": Register(63),
+        "status": Register(65),
+        "moving": Register(66),
+    }
+)
+_STS = MappingProxyType(
+    {
+        **_FEETECH,
+        "phase": Register(18),
+        "offset": Register(31, 2, sign_bit=11),
+        "mode": Register(33),
+        "acceleration": Register(41, unit=100 * 2 * math.pi / 4096),
+        "goal": Register(42, 2, sign_bit=15),
+        "speed": Register(46, 2, sign_bit=15, unit=2 * math.pi / 4096),
+        "lock": Register(55),
+        "position": Register(56, 2, sign_bit=15),
+    }
+)
+_X = MappingProxyType(
+    {
+        "model": Register(0, 2),
+        "firmware": Register(6),
+        "id": Register(7),
+        "baud": Register(8),
+        "mode": Register(11),
+        "offset": Register(20, 4, is_signed=True),
+        "max_temperature": Register(31),
+        "max_voltage": Register(32, 2, unit=0.1),
+        "min_voltage": Register(34, 2, unit=0.1),
+        "max": Register(48, 4),
+        "min": Register(52, 4),
+        "torque": Register(64),
+        "answers": Register(68),
+        "status": Register(70),
+        "acceleration": Register(108, 4, unit=214.577 * _RPM / 60),
+        "speed": Register(112, 4, unit=0.229 * _RPM),
+        "goal": Register(116, 4, is_signed=True),
+        "moving": Register(122),
+        "load": Register(126, 2, is_signed=True, unit=0.001),
+        "position": Register(132, 4, is_signed=True),
+        "voltage": Register(144, 2, unit=0.1),
+        "temperature": Register(146),
+    }
+)
+_OLD = MappingProxyType(
+    {
+        "model": Register(0, 2),
+        "firmware": Register(2),
+        "id": Register(3),
+        "baud": Register(4),
+        "min": Register(6, 2),
+        "max": Register(8, 2),
+        "max_temperature": Register(11),
+        "min_voltage": Register(12, unit=0.1),
+        "max_voltage": Register(13, unit=0.1),
+        "answers": Register(16),
+        "torque": Register(24),
+        "goal": Register(30, 2),
+        "speed": Register(32, 2, unit=0.111 * _RPM),
+        "position": Register(36, 2),
+        "load": Register(40, 2, sign_bit=10, unit=0.001),
+        "voltage": Register(42, unit=0.1),
+        "temperature": Register(43),
+        "moving": Register(46),
+    }
+)
+
+_STS_SERVO = ServoModel(
+    "sts3215", 777, "feetech", _STS, ((40, 27),), _FEETECH_ALARMS, offset_limit=2047, teeth=25
+)  # fmt: skip
+_SCS_SERVO = ServoModel(
+    "scs0009",
+    1284,
+    "feetech",
+    MappingProxyType({**_FEETECH, "lock": Register(48)}),
+    ((40, 27),),
+    _FEETECH_ALARMS,
+    counts=1024,
+    turn=math.radians(300.0),
+    wraps=False,
+    order="big",
+    reads_together=False,
+)
+_X_SERVO = ServoModel(
+    "xl430",
+    1060,
+    "dynamixel2",
+    _X,
+    ((64, 7), (116, 31)),
+    _DYNAMIXEL2_ALARMS,
+    position_mode=3,
+    offset_limit=1024,
+    offset_sign=1,
+)
+_OLD_SERVO = ServoModel(
+    "ax12",
+    12,
+    "dynamixel1",
+    _OLD,
+    ((24, 23),),
+    _DYNAMIXEL1_ALARMS,
+    counts=1024,
+    turn=math.radians(300.0),
+    wraps=False,
+    reads_together=False,
+)
+_MX = replace(
+    _OLD_SERVO,
+    name="mx28",
+    number=29,
+    counts=4096,
+    turn=2 * math.pi,
+    wraps=True,
+    registers=MappingProxyType(
+        {
+            **_OLD,
+            "speed": Register(32, 2, unit=0.114 * _RPM),
+            "acceleration": Register(73, unit=math.radians(8.583)),
+        }
+    ),
+)
+
+
+def _x(name: str, number: int, current: float = 0.0) -> ServoModel:
+    """An X servo; with the current (A) of a count where it has that in the place of the load."""
+    if not current:
+        return replace(_X_SERVO, name=name, number=number)
+    registers = MappingProxyType({**_X, "load": replace(_X["load"], unit=current)})
+    return replace(_X_SERVO, name=name, number=number, registers=registers, load="current")
+
+
+_ALL = (
+    _STS_SERVO,
+    replace(_STS_SERVO, name="sts3250", number=2825, teeth=0),
+    replace(_STS_SERVO, name="sm8512bl", number=11272, teeth=0),
+    _SCS_SERVO,
+    _x("xl430", 1060),
+    _x("xc430-w150", 1070),
+    _x("xc430-w240", 1080),
+    _x("xl330-m077", 1190, 0.001),
+    _x("xl330-m288", 1200, 0.001),
+    _x("xc330-t181", 1210, 0.001),
+    _x("xc330-t288", 1220, 0.001),
+    _x("xc330-m181", 1230, 0.001),
+    _x("xc330-m288", 1240, 0.001),
+    _x("xm430-w350", 1020, 0.00269),
+    _x("xm430-w210", 1030, 0.00269),
+    _x("xm540-w270", 1120, 0.00269),
+    _x("xm540-w150", 1130, 0.00269),
+    _x("mx28-2", 30),
+    _x("mx64-2", 311, 0.00336),
+    _x("mx106-2", 321, 0.00336),
+    _OLD_SERVO,
+    replace(_OLD_SERVO, name="ax18", number=18),
+    _MX,
+    replace(_MX, name="mx64", number=310),
+    replace(_MX, name="mx106", number=320),
+)
+MODELS: Mapping[str, ServoModel] = MappingProxyType({model.name: model for model in _ALL})
+BASE_MODELS: Mapping[ProtocolName, ServoModel] = MappingProxyType(
+    {"feetech": _STS_SERVO, "dynamixel1": _OLD_SERVO, "dynamixel2": _X_SERVO}
+)
+"""By which servos of a model that is not known are read as far as all of a maker's are alike: model, firmware, id."""
+BAUD_RATES: Mapping[ProtocolName, tuple[int, ...]] = MappingProxyType(
+    {
+        "feetech": (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400),
+        "dynamixel1": (1_000_000, 57_600, 115_200, 200_000, 250_000, 400_000, 500_000, 19_200, 9_600),
+        "dynamixel2": (57_600, 1_000_000, 115_200, 2_000_000, 3_000_000, 4_000_000, 9_600),
+    }
+)
+"""Those that servos can be set to, the likeliest first."""
+
+
+def model_of(protocol: ProtocolName, number: int) -> ServoModel | None:
+    """The model with a number; None: not known."""
+    numbered = (model for model in MODELS.values() if model.protocol == protocol and model.number == number)
+    return next(numbered, None)

@@ -1,0 +1,9 @@
+"""Registration; imports nothing heavy."""
+
+from armcal.hooks import Register, hookimpl
+
+
+@hookimpl
+def armcal_register_devices(register: Register) -> None:
+    """Announce the device."""
+    register("servobus", "armcal_servobus.device:ServoBusDevice", "serial-bus servos: Feetech STS and SCS, Dynamixel")

@@ -1,0 +1,153 @@
+"""The servos of joints, by name: what they read, and goals, torque and speed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from armcal.devices.faults import DeviceError
+
+from armcal_servobus.bus import Bus
+from armcal_servobus.finding import alarms_of, read_number
+from armcal_servobus.joints import ServoJoint
+
+
+@dataclass(frozen=True)
+class ServoReading:
+    """What a servo says while it works.
+
+    Attributes:
+        position, goal: counts, as its registers have them.
+        has_torque: whether it holds.
+        load: share of full torque (-1 to 1), or its current (A) where the model says that.
+        voltage: V.
+        temperature: deg C.
+        alarms: in words.
+    """
+
+    position: int
+    goal: int
+    has_torque: bool
+    load: float
+    voltage: float
+    temperature: float
+    alarms: tuple[str, ...] = ()
+
+
+class Servos:
+    """All of a bus; each call is an exchange or two for all of them."""
+
+    def __init__(self, bus: Bus, joints: Mapping[str, ServoJoint]) -> None:
+        self._bus, self._joints = bus, joints
+        self._goals: dict[str, int] = {}
+
+    def reading(self, joint: str) -> ServoReading:
+        """One servo's; see ``readings``."""
+        return self.readings((joint,))[joint]
+
+    def readings(self, names: Iterable[str] | None = None) -> dict[str, ServoReading]:
+        """Of all joints, or of some.
+
+        Raises:
+            DeviceError: one does not answer, or not well.
+        """
+        joints = [self._joints[name] for name in (self._joints if names is None else names)]
+        values: dict[str, dict[str, int]] = {joint.name: {} for joint in joints}
+        for polled, alike in _by_polled(joints).items():
+            for stretch in polled:
+                together = all(joint.model.reads_together for joint in alike)
+                data = self._bus.read_all([joint.id for joint in alike], *stretch, together=together)
+                for joint in alike:
+                    model = joint.model
+                    names_there = [name for name in model.registers if model.holds(name, stretch)]
+                    values[joint.name] |= {name: model.unpack(name, data[joint.id], stretch[0]) for name in names_there}
+        return {joint.name: self._reading(joint, values[joint.name]) for joint in joints}
+
+    def positions(self) -> dict[str, int]:
+        """Counts of all joints, in one exchange; quicker than ``readings``."""
+        positions: dict[str, int] = {}
+        by_model: dict[tuple[int, int, bool], list[ServoJoint]] = {}
+        for joint in self._joints.values():
+            register = joint.model.registers["position"]
+            by_model.setdefault((register.address, register.size, joint.model.reads_together), []).append(joint)
+        for (address, size, together), alike in by_model.items():
+            data = self._bus.read_all([joint.id for joint in alike], address, size, together=together)
+            positions |= {joint.name: joint.model.unpack("position", data[joint.id]) for joint in alike}
+        return positions
+
+    def set_motion(self, joint: ServoJoint, speed: float, acceleration: float) -> None:
+        """How fast a servo turns by itself at most (rad/s, rad/s^2). Zero would be no limit, so it is never written."""
+        for name, value in (("acceleration", acceleration), ("speed", speed)):
+            if name in joint.model.registers:
+                register = joint.model.registers[name]
+                most = 254 if register.size == 1 else 1023 if joint.model.counts == 1024 else 32767
+                unit = register.unit if register.unit != 1.0 else joint.model.step
+                self._write(joint, name, min(max(round(value / unit), 1), most))
+
+    def hold(self, joint: ServoJoint, count: int) -> None:
+        """Torque on, at a count that is where it stands."""
+        self._write(joint, "goal", count)
+        self._write(joint, "torque", 1)
+        self._write(joint, "goal", count)  # some servos set their goal anew when torque comes on
+        self._goals[joint.name] = count
+
+    def release(self, joint: ServoJoint) -> None:
+        """Torque off, read back.
+
+        Raises:
+            DeviceError: it is still on.
+        """
+        self._goals.pop(joint.name, None)
+        self._write(joint, "torque", 0)
+        if read_number(self._bus, joint.id, joint.model, "torque"):
+            raise DeviceError(
+                f"the torque of {joint.name} (id {joint.id}) did not go off.",
+                where=self._bus.where,
+                hint="Hold the arm and switch the servos' power off.",
+            )
+
+    def command(self, goals: Mapping[str, int]) -> None:
+        """Goals (counts) of several joints, at once for all that have them in the same place."""
+        self._goals |= goals
+        places: dict[tuple[int, int], dict[int, bytes]] = {}
+        for name, goal in goals.items():
+            joint = self._joints[name]
+            register = joint.model.registers["goal"]
+            places.setdefault((register.address, register.size), {})[joint.id] = joint.model.pack("goal", goal)
+        for (address, _), data in places.items():
+            self._bus.write_all(address, data)
+
+    def repeat(self, readings: Mapping[str, ServoReading], powered: Iterable[str]) -> None:
+        """Command once more what did not arrive: a goal for all at once is acknowledged by nobody.
+
+        Raises:
+            DeviceError: a servo does not take its goal.
+        """
+        chosen = set(powered) & set(self._goals)
+        missed = {name: self._goals[name] for name in readings if name in chosen}
+        missed = {name: goal for name, goal in missed.items() if readings[name].goal != goal}
+        for name, goal in missed.items():
+            self._write(self._joints[name], "goal", goal)
+
+    def _write(self, joint: ServoJoint, name: str, value: int) -> None:
+        self._bus.write(joint.id, joint.model.registers[name].address, joint.model.pack(name, value))
+
+    def _reading(self, joint: ServoJoint, values: Mapping[str, int]) -> ServoReading:
+        registers = joint.model.registers
+        return ServoReading(
+            position=values["position"],
+            goal=values["goal"],
+            has_torque=bool(values["torque"]),
+            load=values["load"] * registers["load"].unit,
+            voltage=values["voltage"] * registers["voltage"].unit,
+            temperature=float(values["temperature"]),
+            alarms=alarms_of(self._bus, joint.id, joint.model),
+        )
+
+
+def _by_polled(joints: Iterable[ServoJoint]) -> dict[tuple[tuple[int, int], ...], list[ServoJoint]]:
+    """Joints whose servos are polled alike."""
+    alike: dict[tuple[tuple[int, int], ...], list[ServoJoint]] = {}
+    for joint in joints:
+        alike.setdefault(joint.model.polled, []).append(joint)
+    return alike
