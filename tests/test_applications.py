@@ -14,7 +14,6 @@ APPLICATIONS = {
     "bench": {"acquire", "record", "rehearse", "servo", "simulated-bench"},
     "camera": {"board"},
     "capability": {"acceptance", "capability"},
-    "makers": {"maker"},
     "online": {"control", "mission", "recalibrate", "replay", "watch", "what-if"},
     "serve": {"serve"},
 }
@@ -33,9 +32,10 @@ sys.meta_path.insert(0, Gone())
 every = metadata.entry_points
 metadata.entry_points = lambda **wanted: [p for p in every(**wanted) if not p.value.startswith(gone)]
 sys.argv[0:2] = ["armcal"]
+import click
 from armcal.cli.main import cli, main
 if sys.argv[1:] == ["import-all"]:
-    [cli.get_command(None, name) for name in cli.list_commands(None)]
+    [cli.get_command(click.Context(cli), name) for name in cli.list_commands(None)]
 else:
     main()
 """

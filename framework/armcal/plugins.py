@@ -15,6 +15,7 @@ import pluggy
 
 from armcal import plugin_files
 from armcal.errors import Location, PluginError
+from armcal.extras import extra_of, missing_library
 from armcal.hook_trace import Answer, HookTrace
 from armcal.registration import new_manager, registered, said
 
@@ -45,11 +46,15 @@ class Component:
         module, _, attribute = self.target.partition(":")
         try:
             return getattr(import_module(module), attribute)
+        except ModuleNotFoundError as fault:
+            named = f"the {self.kind} {self.name!r}"
+            raise (missing_library(fault, named) if extra_of(fault.name or "") else self._broken(fault)) from fault
         except (Exception, SystemExit) as fault:  # a plugin may fail in any way; the error names it and the reason
-            raise PluginError(
-                f"the {self.kind} {self.name!r} of the plugin {self.plugin!r} does not load: {said(fault)}.",
-                hint="Repair or update that plugin.",
-            ) from fault
+            raise self._broken(fault) from fault
+
+    def _broken(self, fault: BaseException) -> PluginError:
+        text = f"the {self.kind} {self.name!r} of the plugin {self.plugin!r} does not load: {said(fault)}."
+        return PluginError(text, hint="Repair or update that plugin.")
 
 
 @dataclass(frozen=True)

@@ -259,6 +259,39 @@ def test_a_missing_library_is_named_and_only_hurts_who_asks_for_it(tmp_path: Pat
     assert done.stdout.splitlines() == ["2 True False", "0 False False"], done.stdout + done.stderr
 
 
+def test_a_library_that_is_not_installed_is_named_with_the_extra_that_brings_it(tmp_path: Path) -> None:
+    for name in ("cvxpy", "filterpy"):
+        (tmp_path / f"{name}.py").write_text(f"raise ModuleNotFoundError('gone', name={name!r})\n")
+    script = (
+        "from armcal.cli.main import cli\n"
+        "from armcal.plugins import discover\n"
+        "from click.testing import CliRunner\n"
+        f"done = CliRunner().invoke(cli, ['run', {DEMO!r}, '--out', 'x', '--set', 'estimator.type=cvxpy'])\n"
+        "print(done.exit_code, done.stderr)\n"
+        "try:\n    discover().find('online', 'extended').load()\n"
+        "except Exception as fault:\n    print(fault)\n"
+    )
+    told = forked.run_code(script, path=tmp_path).stdout
+    assert "2 armcal: the estimator 'cvxpy' needs the library cvxpy, which is not installed." in told
+    assert "pip install 'armcal[convex]'" in told and "pip install 'armcal[online]'" in told and "Traceback" not in told
+
+
+def test_a_demonstration_is_copied_out_and_calibrated_and_no_change_to_it_is_lost(tmp_path: Path) -> None:
+    place = tmp_path / "here"
+    done = CliRunner().invoke(cli, ["demo", "--out", str(place)])
+    assert done.exit_code == 0 and "armcal predict" in done.output, done.output
+    assert (place / "results" / "calibration.yaml").exists() and (place / "demo.csv").exists()
+    assert CliRunner().invoke(cli, ["demo", "--out", str(place), "-q"]).exit_code == 0, "again"
+    (place / "demo.yaml").write_text("name: mine\n")
+    again = CliRunner().invoke(cli, ["demo", "--out", str(place)])
+    assert again.exit_code == 2 and "was changed" in again.stderr
+    assert (place / "demo.yaml").read_text() == "name: mine\n"
+    wrong = CliRunner().invoke(cli, ["demo", "kuka"])
+    assert wrong.exit_code == 2 and "lrm_arm" in wrong.stderr
+    shown = CliRunner().invoke(cli, ["demo", "list", "--json"])
+    assert json.loads(shown.stdout)["schema_version"] == 1 and "camera" in json.loads(shown.stdout)["demos"]
+
+
 def test_a_misspelt_command_is_answered_with_the_nearest() -> None:
     ran = armcal("rnu")
     assert ran.exit_code == 2 and "No such command 'rnu'. Did you mean 'run'?" in ran.output

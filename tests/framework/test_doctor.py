@@ -47,8 +47,8 @@ def test_poisoned_libraries_that_armcal_can_do_without_are_warnings(tmp_path: Pa
     assert code == 0
     assert found["main job", "calibrate"]["state"] == "ok"
     assert found["main job", "calibrate"]["off_mm"] < 0.5
-    for subject, cause in (("cvxpy", "poisoned, on two lines"), ("matplotlib", "SystemExit")):
-        finding = found["libraries", subject]
+    for subject, cause in (("convex", "poisoned, on two lines"), ("figures", "SystemExit")):
+        finding = found["extras", subject]
         assert finding["state"] == "warning"
         assert cause in finding["text"] and str(tmp_path) in finding["text"], "it names the file in the way"
         assert finding["hint"]

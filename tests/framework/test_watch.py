@@ -323,8 +323,9 @@ def test_the_present_state_is_printed_once(tmp_path: Path) -> None:
     (tmp_path / "early").mkdir()
     early = CliRunner().invoke(cli, ["watch", str(tmp_path / "early"), "--once"])
     assert early.exit_code == 0 and "Waiting for a recalibration" in early.output
-    nowhere = CliRunner().invoke(cli, ["watch", str(tmp_path / "none"), "--once"])
-    assert nowhere.exit_code == 2 and "there is no such folder" in nowhere.stderr
+    for more in (["--once"], [], ["--terminal"], ["--once", "--wait"]):
+        nowhere = CliRunner().invoke(cli, ["watch", str(tmp_path / "none"), *more])
+        assert nowhere.exit_code == 2 and "there is no such folder" in nowhere.stderr, more
 
 
 def test_what_has_finished_is_not_shown_as_if_it_went_on(tmp_path: Path) -> None:
@@ -381,7 +382,7 @@ def test_the_command_serves_changes_nothing_and_ends_when_asked(tmp_path: Path) 
 
 def test_where_there_is_no_terminal_it_is_a_line_an_event(tmp_path: Path) -> None:
     folder = tmp_path / "dir"
-    command = [sys.executable, "-m", "armcal.cli", "watch", str(folder), "--terminal"]
+    command = [sys.executable, "-m", "armcal.cli", "watch", str(folder), "--terminal", "--wait"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None and process.stdout is not None
     assert "Waiting for a recalibration" in process.stderr.readline()

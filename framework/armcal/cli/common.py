@@ -20,6 +20,7 @@ from armcal.errors import CalibrationWarning, DataError, Location
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.io.parallel import parse_executor
 from armcal.plugins import PluginRegistry, discover
+from armcal.version import JSON_SCHEMA
 
 F = TypeVar("F", bound=Callable[..., Any])
 FILE = click.Path(path_type=Path)
@@ -56,7 +57,7 @@ class Console:
     def result(self, content: Mapping[str, Any]) -> None:
         """The machine-readable result, with --json."""
         if self.json:
-            click.echo(as_json(content))
+            click.echo(as_json({**JSON_SCHEMA, **content}))
 
     def line(self, text: str, style: str = "") -> None:
         """One line of the result, which the terminal may wrap."""

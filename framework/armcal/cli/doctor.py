@@ -10,6 +10,7 @@ import click
 from armcal.doctor.examination import examine, works
 from armcal.doctor.finding import Finding
 from armcal.errors import EXIT_BAD_INPUT
+from armcal.version import JSON_SCHEMA
 
 _MARKS = {"ok": "ok  ", "note": "-   ", "warning": "warn", "fault": "FAIL"}
 _COLOURS = {"ok": "green", "note": None, "warning": "yellow", "fault": "red"}
@@ -28,7 +29,7 @@ def doctor(as_json: bool, quiet: bool, verbose: bool) -> None:
         findings.append(finding)
     healthy = works(findings)
     if as_json:
-        click.echo(json.dumps({"works": healthy, "findings": [f.as_dict() for f in findings]}, indent=2))
+        click.echo(json.dumps({**JSON_SCHEMA, "works": healthy, "findings": [f.as_dict() for f in findings]}, indent=2))
     elif not quiet:
         warnings = sum(finding.state == "warning" for finding in findings)
         text = "Everything works."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +20,7 @@ from armcal.calibration.exporter import (
     request_of,
 )
 from armcal.cli.common import FILE, Console, accept, arm, speaking
+from armcal.cli.completion import component_names
 from armcal.config.options import settings_from
 from armcal.errors import InputError, Location, PluginError
 from armcal.io.file_set import require_new, write_new, write_over
@@ -29,7 +31,14 @@ _NOTHING_MM = 1e-6
 
 @click.command()
 @click.argument("calibration", type=FILE)
-@click.option("--format", "kind", required=True, metavar="NAME", help="The format: c, json, mujoco, ros2, urdf, yaml.")
+@click.option(
+    "--format",
+    "kind",
+    required=True,
+    metavar="NAME",
+    shell_complete=partial(component_names, "exporter"),
+    help="The format; `armcal plugins list` shows the exporters.",
+)
 @click.option("--out", required=True, type=FILE, help="The file to write.")
 @arm
 @click.option("--option", "options", multiple=True, metavar="KEY=VALUE", help="A setting of the format: prefix=lrm.")

@@ -13,11 +13,13 @@ from click.shell_completion import CompletionItem
 
 from armcal.cli.outlet import Outlet, say
 from armcal.errors import EXIT_DONE, EXIT_FAULT, EXIT_INTERRUPTED, ArmcalError
+from armcal.extras import missing_library
 from armcal.plugin_files import use_plugins
 from armcal.plugins import discover
-from armcal.version import __version__
+from armcal.version import JSON_SCHEMA, __version__
 
 COMMANDS = {
+    "demo": ("armcal.cli.demo:demo", "Copy a demonstration's files and calibrate its simulated arm."),
     "new": ("armcal.cli.new:new", "Begin a robot's files, or a plugin of your own."),
     "run": ("armcal.cli.run:run", "Calibrate: load, check, fit, validate, report."),
     "check": ("armcal.cli.check:check", "Everything that can be known before solving."),
@@ -57,11 +59,15 @@ class LazyGroup(click.Group):
         target, _ = COMMANDS.get(cmd_name) or _plugin_commands().get(cmd_name, ("", ""))
         if not target:
             return None
+        if ctx.resilient_parsing:
+            from armcal.cli.completion import options_of
+
+            return options_of(target)
         module, _, attribute = target.partition(":")
         try:
             command: click.Command = getattr(import_module(module), attribute)
         except ImportError as fault:
-            raise _missing(fault) from fault
+            raise missing_library(fault, f"armcal {cmd_name}") from fault
         return command
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -95,8 +101,9 @@ class LazyGroup(click.Group):
             _report(fault)
             ctx.exit(fault.exit_code)
         except ImportError as fault:  # of a library that is imported where it is needed
-            _report(_missing(fault))
-            ctx.exit(EXIT_FAULT)
+            absent = missing_library(fault, f"armcal {ctx.invoked_subcommand}")
+            _report(absent)
+            ctx.exit(absent.exit_code)
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Names and summaries from the table: to import every command for them takes seconds."""
@@ -177,24 +184,10 @@ def _exit_code() -> int:
     return done if isinstance(done, int) else EXIT_DONE
 
 
-def _missing(fault: ImportError) -> ArmcalError:
-    """The refusal where a library is not there, or is broken.
-
-    Raises:
-        ImportError: it is a module of armcal: a fault of ours, not of the installation.
-    """
-    absent = isinstance(fault, ModuleNotFoundError)
-    if (fault.name or ("armcal" if absent else "")).partition(".")[0] == "armcal":
-        raise fault
-    text = f"the library {fault.name} is missing." if absent else f"a library cannot be loaded ({fault})."
-    return ArmcalError(
-        text, hint="Install armcal anew with all it needs: pip install armcal. `armcal doctor` names what is broken."
-    )
-
-
 def _report(fault: ArmcalError) -> None:
     if "--json" in sys.argv:
         import json
 
-        click.echo(json.dumps({"error": {"message": str(fault), "exit_code": fault.exit_code}}, indent=2))
+        error = {"message": str(fault), "exit_code": fault.exit_code}
+        click.echo(json.dumps({**JSON_SCHEMA, "error": error}, indent=2))
     say(f"armcal: {fault}", err=True)

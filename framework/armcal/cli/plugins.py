@@ -11,6 +11,7 @@ import click
 
 from armcal.errors import EXIT_BAD_INPUT, PluginError
 from armcal.plugins import PluginInfo, discover
+from armcal.version import JSON_SCHEMA
 
 if TYPE_CHECKING:
     from armcal.testing.results import CheckResult
@@ -43,7 +44,7 @@ def list_plugins(as_json: bool, quiet: bool, verbose: bool) -> None:
             }
             for plugin in registry.plugins
         ]
-        click.echo(json.dumps({"plugins": content}, indent=2))
+        click.echo(json.dumps({**JSON_SCHEMA, "plugins": content}, indent=2))
     else:
         for plugin in registry.plugins:
             if quiet:
@@ -99,7 +100,7 @@ def check_plugin(name: str | None, as_json: bool, quiet: bool, verbose: bool) ->
         results = [result for plugin in chosen for result in checks_of(plugin, registry)]
         reports.append(_report(text, chosen, results))
     if as_json:
-        click.echo(json.dumps({"plugins": reports} if name is None else reports[0], indent=2))
+        click.echo(json.dumps({**JSON_SCHEMA, **({"plugins": reports} if name is None else reports[0])}, indent=2))
     elif not quiet:
         for report in reports:
             _show(report, verbose)

@@ -42,10 +42,7 @@ LIBRARIES: Mapping[str, Purpose] = MappingProxyType(
         "click": Purpose("click", "the command armcal does not start", needed=True),
         "rich": Purpose("rich.console", "no command but this one runs", needed=True),
         "jinja2": Purpose("jinja2", "no report can be written", needed=True),
-        "cvxpy": Purpose("cvxpy", "no estimator cvxpy, no certified bound of a plan, no cones in recalibrate"),
-        "matplotlib": Purpose("matplotlib.figure", "no figure of a mission"),
         "pyserial": Purpose("serial", "no servo board on a serial port"),
-        "filterpy": Purpose("filterpy.kalman", "armcal recalibrate cannot use its Kalman filters"),
         "typing-extensions": Purpose(
             "typing_extensions", "no application of armcal runs, and some devices do not", needed=True
         ),
@@ -56,6 +53,11 @@ LIBRARIES: Mapping[str, Purpose] = MappingProxyType(
 
 EXTRAS: Mapping[str, str] = MappingProxyType(
     {
+        "online": "armcal recalibrate and mission",
+        "convex": "the estimator cvxpy, certified bounds of a plan for E, cones in armcal recalibrate",
+        "figures": "the figures of armcal mission, capability and acceptance",
+        "lerobot": "LeRobot's data sets",
+        "ros2": "ROS 2 recordings (rosbag2)",
         "camera": "boards found in images, boards to print (armcal board)",
         "i2c": "servo boards on this computer's own I2C bus (link linux_i2c)",
         "mujoco": "checking an export for MuJoCo by MuJoCo itself",
@@ -66,7 +68,16 @@ EXTRAS: Mapping[str, str] = MappingProxyType(
     }
 )
 
-EXTRA_MODULES: Mapping[str, str] = MappingProxyType({"smbus2": "smbus2", "mujoco": "mujoco", "pin": "pinocchio"})
+EXTRA_MODULES: Mapping[str, str] = MappingProxyType(
+    {
+        "cvxpy": "cvxpy",
+        "filterpy": "filterpy.kalman",
+        "matplotlib": "matplotlib.figure",
+        "smbus2": "smbus2",
+        "mujoco": "mujoco",
+        "pin": "pinocchio",
+    }
+)
 """Libraries of extras that are imported to see whether they work; of the others the version is enough."""
 
 
@@ -138,7 +149,7 @@ def extra(name: str, needed: tuple[Requirement, ...], ask: Ask) -> Finding:
         module = EXTRA_MODULES.get(canonicalize_name(requirement.name))
         content = ask("imported", module) if module else {}
         if "fault" in content:
-            text = f"{requirement.name} does not load ({content['fault']}); for {use}"
+            text = f"{requirement.name} does not load{_origin(module or '')} ({content['fault']}); for {use}"
             return Finding("extras", name, "warning", text, f"{_ANEW} '{requirement.name}'.", facts)
     versions = [(r, installed(r.name) or "0") for r in needed]
     old = [f"{r.name} {v} ({r.specifier})" for r, v in versions if not r.specifier.contains(v, prereleases=True)]
@@ -156,12 +167,13 @@ def installed(name: str) -> str | None:
 
 
 def requirements() -> tuple[tuple[Requirement, ...], Mapping[str, tuple[Requirement, ...]]]:
-    """What armcal always needs, and each extra's own; what this list knows where metadata is missing."""
+    """What armcal always needs, and each extra's own (``all`` has none); without metadata, what is listed here."""
     try:
         everything = [Requirement(text) for text in metadata.requires(DISTRIBUTION) or []]
-        names = metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or []
+        names = list(metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or [])
     except metadata.PackageNotFoundError:
         everything, names = [Requirement(name) for name in LIBRARIES], []
     always = tuple(r for r in everything if r.marker is None or r.marker.evaluate({"extra": ""}))
     others = [r for r in everything if r.marker and r not in always]
+    names = [name for name in names if name != "all"]
     return always, {name: tuple(r for r in others if r.marker and r.marker.evaluate({"extra": name})) for name in names}

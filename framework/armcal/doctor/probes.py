@@ -46,6 +46,7 @@ def imported(module: str) -> dict[str, Any]:
 def components() -> dict[str, Any]:
     """Every plugin, with what its registration lacks; and every component imported, with what that lacks."""
     from armcal.errors import PluginError
+    from armcal.extras import extra_of
     from armcal.plugins import discover
 
     registry = discover()
@@ -59,7 +60,9 @@ def components() -> dict[str, Any]:
             except PluginError as fault:
                 cause = fault.__cause__ or fault
                 text = " ".join(f"{type(cause).__name__}: {cause}".split())[:200]
-                broken.append({"kind": component.kind, "name": component.name, "fault": text})
+                absent = isinstance(cause, ModuleNotFoundError) and extra_of(cause.name or "")
+                extra = {"extra": absent} if absent else {}
+                broken.append({"kind": component.kind, "name": component.name, "fault": text, **extra})
         origin = f"{plugin.distribution} {plugin.version}".strip()
         facts = {"name": plugin.name, "module": plugin.module, "distribution": origin, "fault": plugin.fault or None}
         lines.append({**facts, "components": len(own), "broken": broken})

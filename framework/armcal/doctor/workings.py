@@ -7,7 +7,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from armcal.doctor.finding import Finding
-from armcal.doctor.libraries import DISTRIBUTION, Ask
+from armcal.doctor.libraries import DISTRIBUTION, Ask, installed
 
 _CORE = "Install armcal anew: pip install --force-reinstall armcal (or pip install -e . in a checkout)."
 
@@ -39,6 +39,10 @@ def _plugin(facts: Mapping[str, Any]) -> Finding:
         return Finding("plugins", name, "warning", text, "Repair, update or uninstall it.", facts)
     if broken:
         lost = ", ".join(f"{b['kind']} {b['name']}" for b in broken)
+        if all("extra" in b for b in broken):
+            extra = broken[0]["extra"]
+            text = f"{origin} {count} components; not without the extra {extra}: {lost}"
+            return Finding("plugins", name, "note", text, f"If you want that: pip install 'armcal[{extra}]'.", facts)
         text = f"{origin} {len(broken)} of {count} do not load: {lost} ({broken[0]['fault']})"
         return Finding("plugins", name, "warning", text, f"armcal plugins check {name} says more.", facts)
     return Finding("plugins", name, "ok", f"{origin} {count} component{'' if count == 1 else 's'}", detail=facts)
@@ -53,20 +57,20 @@ def solvers(ask: Ask) -> Iterator[Finding]:
         yield Finding("solvers", "IPOPT (in casadi)", "warning", text, hint, content)
     else:
         yield Finding("solvers", "IPOPT (in casadi)", "ok", "solves", detail=content)
-    yield from _convex(ask)
+    if installed("cvxpy"):
+        yield from _convex(ask)
+    if installed("filterpy"):
+        yield _kalman(ask)
+
+
+def _kalman(ask: Ask) -> Finding:
+    """Its filters, as armcal recalibrate uses them."""
     content = ask("kalman")
     if "fault" in content:
-        text = f"does not work ({content['fault']}): armcal recalibrate cannot use ekf or ukf"
-        yield Finding(
-            "solvers",
-            "Kalman filters (filterpy)",
-            "warning",
-            text,
-            "Install it anew: pip install --force-reinstall filterpy.",
-            content,
-        )
-    else:
-        yield Finding("solvers", "Kalman filters (filterpy)", "ok", "work")
+        text = f"does not work ({content['fault']}): armcal recalibrate cannot use its Kalman filters"
+        hint = "Install it anew: pip install --force-reinstall filterpy."
+        return Finding("solvers", "Kalman filters (filterpy)", "warning", text, hint, content)
+    return Finding("solvers", "Kalman filters (filterpy)", "ok", "work")
 
 
 def _convex(ask: Ask) -> Iterator[Finding]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import difflib
+from collections.abc import Callable, Iterator, KeysView, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol, runtime_checkable
@@ -108,8 +109,17 @@ class Interval95:
 
 
 @dataclass(frozen=True)
+class Estimated:
+    """A free number: its value, standard deviation (not a number where undetermined) and 95 % interval; SI, radians."""
+
+    value: float
+    deviation: float
+    interval: Interval95
+
+
+@dataclass(frozen=True)
 class Estimate:
-    """Values, and how sure they are.
+    """Values, and how sure they are; by name of a free number, as a mapping to ``Estimated``.
 
     Attributes:
         parameters: the blocks, with their nominal values.
@@ -148,6 +158,34 @@ class Estimate:
     def names(self) -> tuple[str, ...]:
         """Names of the free canonical entries."""
         return tuple(self.parameters.entry_names[i] for i in self.free_entries)
+
+    def __getitem__(self, name: str) -> Estimated:
+        if name not in self._places:
+            near = ", ".join(difflib.get_close_matches(name, self.names)) or "keys() has them"
+            raise KeyError(f"{name!r} is no free number of this estimate: {near}")
+        i = self._places[name]
+        return Estimated(float(self.free_values[i]), float(self.deviations[i]), self.intervals[i])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._places
+
+    def keys(self) -> KeysView[str]:
+        """Names of the free canonical entries."""
+        return self._places.keys()
+
+    def items(self) -> tuple[tuple[str, Estimated], ...]:
+        """Each free number with its name."""
+        return tuple((name, self[name]) for name in self.names)
+
+    @cached_property
+    def _places(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.names)}
 
     @cached_property
     def free_values(self) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import Any, Literal
 
 import numpy as np
@@ -29,14 +30,15 @@ def bounded(task: Task, solver: BoundSolver = "auto", relaxation: Relaxation | N
 
     ``auto``: cvxpy for up to 2000 candidates and 60 coordinates, beyond them an interior-point method on the
     candidates that matter, certified on all by the equivalence theorem. E is always cvxpy's. O2 and O4 are not
-    concave; E over several draws is not posed. ``relaxation`` is the interior-point answer, where it is known already.
+    concave; E over several draws is not posed. Where the library cvxpy is not installed, ``auto`` does without it.
+    ``relaxation`` is the interior-point answer, where it is known already.
     """
     name = task.criterion.name
     if solver == "none" or name in ("O2", "O4") or (name == "E" and task.candidates.draws > 1):
         return None
     small = task.candidates.count <= AT_ONCE and task.candidates.size <= _MOST_COORDINATES
     can = name in ("D", "A", "E") and task.candidates.draws == 1
-    chosen = name == "E" or solver == "cvxpy" or (solver == "auto" and small)
+    chosen = solver == "cvxpy" or ((name == "E" or (solver == "auto" and small)) and find_spec("cvxpy") is not None)
     if can and chosen and task.count < task.candidates.count * task.limit:
         try:
             return relax(task, by_cvxpy, "cvxpy", max(_AT_ONCE_E if name == "E" else AT_ONCE, 4 * task.count))

@@ -166,7 +166,7 @@ class Experiment:
 
     def provenance(self, dataset: Dataset) -> dict[str, Any]:
         """Where the numbers of a run on these records come from: files, hashes, versions."""
-        packages = ("armcal", "numpy", "scipy", "casadi", "cvxpy")
+        packages = ("armcal", "numpy", "scipy", "casadi")
         return {
             "config": str(self.source.path),
             "config_files": [Path(file).name for file in self.source.files],

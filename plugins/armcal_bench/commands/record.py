@@ -20,6 +20,7 @@ from armcal.devices.line_source import KINDS, STANDARD_INPUT
 from armcal.errors import InputError, Location
 from armcal.io.signals import Signals
 from armcal.run.experiment import Experiment
+from armcal.version import JSON_SCHEMA
 
 from armcal_bench.bench import SECTION, Bench
 from armcal_bench.commands.common import FILE, load, on_bench
@@ -65,7 +66,9 @@ def record_command(
     def show(message: Message) -> None:
         """A JSON line, or a sentence; flushed, so that who reads it knows at once what is safe."""
         if console.json:
-            click.echo(json.dumps({"event": message.kind, **message.content, "sentence": message.sentence}))
+            click.echo(
+                json.dumps({**JSON_SCHEMA, "event": message.kind, **message.content, "sentence": message.sentence})
+            )
         elif not console.quiet:
             say(message.sentence)
 

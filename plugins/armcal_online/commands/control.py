@@ -10,6 +10,7 @@ from typing import Any
 import click
 from armcal.cli.common import Console, speaking
 from armcal.errors import InputError, Location
+from armcal.version import JSON_SCHEMA
 
 from armcal_online.running.control import GOOD, ask, is_running
 
@@ -50,7 +51,7 @@ def control(console: Console, folder: Path, command: str, values: tuple[str, ...
 
 def _show(console: Console, reply: Mapping[str, Any]) -> None:
     if not console.quiet:
-        click.echo(json.dumps(reply, indent=2))
+        click.echo(json.dumps({**JSON_SCHEMA, **reply}, indent=2))
 
 
 def _target(values: tuple[str, ...]) -> int | str:

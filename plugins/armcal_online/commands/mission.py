@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,7 @@ OURS = (BENCH, RECORDS, CALIBRATION, RECALIBRATION, SURPRISE, *TRUTH, *FIGURES)
 @speaking
 def mission(console: Console, config: Path, out: Path, seed: int | None, overrides: tuple[str, ...]) -> None:
     """Simulate the mission of CONFIG, recalibrate over all of it, and judge that against the truth."""
+    import_module("matplotlib")  # if it is missing, the command ends now
     watch = Stopwatch()
     kept = click.get_current_context().with_resource(reserved(out, OURS))
     registry = console.registry()

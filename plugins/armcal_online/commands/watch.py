@@ -12,6 +12,7 @@ import click
 from armcal.cli.console import Screen
 from armcal.cli.outlet import say
 from armcal.errors import InputError, Location
+from armcal.version import JSON_SCHEMA
 
 from armcal_online.watch.feed import Feed
 
@@ -24,15 +25,16 @@ _REFRESH = 1.0
 @click.option("--host", default="127.0.0.1", show_default=True, help="Listen there; beyond this machine with a token.")
 @click.option("--port", type=click.IntRange(0, 65535), default=DEFAULT_PORT, show_default=True, help="0: any free one.")
 @click.option("--terminal", is_flag=True, help="Show it in this terminal; lines where this is none.")
+@click.option("--wait", is_flag=True, help="Wait for a folder that is not there yet.")
 @click.option("--once", is_flag=True, help="Print the present state and end.")
 @click.option("--json", "as_json", is_flag=True, help="With --once: as JSON.")
-def watch(folder: Path, host: str, port: int, terminal: bool, once: bool, as_json: bool) -> None:
+def watch(folder: Path, host: str, port: int, terminal: bool, wait: bool, once: bool, as_json: bool) -> None:
     """Show a recalibration live: a page in the browser, or this terminal. DIR is its folder, which is only read."""
     where, hint = Location(str(folder)), "Give what armcal recalibrate was given as --out"
     if folder.exists() and not folder.is_dir():
         raise InputError("it is a file, expected the folder of a recalibration.", where=where, hint=f"{hint}.")
-    if once and not folder.exists():
-        raise InputError("there is no such folder.", where=where, hint=f"{hint}; without --once it is waited for.")
+    if not folder.exists() and (once or not wait):
+        raise InputError("there is no such folder.", where=where, hint=f"{hint}; with --wait it is waited for.")
     if as_json and not once:
         hint = "Programs follow events.jsonl in the folder itself."
         raise InputError("it is only for --once.", where=Location("--json"), hint=hint)
@@ -41,7 +43,7 @@ def watch(folder: Path, host: str, port: int, terminal: bool, once: bool, as_jso
         while feed.step():
             pass
         if as_json:
-            click.echo(json.dumps(feed.state(), indent=2))
+            click.echo(json.dumps({**JSON_SCHEMA, **feed.state()}, indent=2))
             return
         from armcal_online.watch.terminal import picture
 
@@ -55,8 +57,6 @@ def watch(folder: Path, host: str, port: int, terminal: bool, once: bool, as_jso
             _terminal(Feed(folder), stop)
         else:
             _serve(folder, host, port, stop)
-    except KeyboardInterrupt:
-        click.echo("", err=True)
     finally:
         stop.set()
         signal.signal(signal.SIGTERM, earlier)

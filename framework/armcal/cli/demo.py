@@ -1,0 +1,82 @@
+"""``armcal demo``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from armcal.cli.common import FILE, Console, speaking
+from armcal.errors import InputError, Location
+from armcal.io.file_set import write_new
+from armcal.version import SOURCES
+
+_CONFIG = "demo.yaml"
+
+
+@click.command()
+@click.argument("name", default="lrm_arm")
+@click.option("--out", type=FILE, help="The folder to make [default: armcal-demo-NAME].")
+@speaking
+@click.pass_context
+def demo(ctx: click.Context, console: Console, name: str, out: Path | None) -> None:
+    """Copy a demonstration's files and calibrate its simulated arm.
+
+    NAME is lrm_arm (cheap servos, a tracker), ball (a ball in sockets), camera (a camera and a board), or another
+    that `armcal demo list` shows. The files are yours to change.
+    """
+    demos = {path.parent.name: path.parent for path in sorted(_shipped().glob(f"*/{_CONFIG}"))}
+    if name == "list":
+        console.result({"demos": list(demos)})
+        for known in demos:
+            console.line(known)
+        return
+    if name not in demos:
+        hint = f"The demonstrations are {', '.join(demos)}."
+        raise InputError(f"found {name!r}, expected a demonstration.", where=Location("NAME"), hint=hint)
+    folder = out or Path(f"armcal-demo-{name}")
+    _copy(demos[name], folder)
+    results = folder / "results"
+    console.line(f"the files of {name} are in {folder}; armcal run {folder / _CONFIG} --out {results}")
+    from armcal.cli.run import run  # all of the solver
+
+    options = [name for name, given in zip(("--json", "-q", "-v"), vars(console).values(), strict=True) if given]
+    arguments = [str(folder / _CONFIG), "--out", str(results), *options]
+    with run.make_context("run", arguments, parent=ctx.parent) as running:
+        run.invoke(running)
+    for text in (
+        f"Open {results / 'report.html'} in a browser. Then:",
+        f"  armcal identify {folder / _CONFIG}",
+        f"  armcal predict {results / 'calibration.yaml'} --poses {folder / 'demo.csv'} --out predicted.csv",
+        "  armcal new robot NAME      for an arm of your own",
+    ):
+        console.line(text)
+
+
+def _shipped() -> Path:
+    """Where the demonstrations are: beside the core once it is installed, in a checkout in ``configs``."""
+    installed = SOURCES / "demos"
+    return installed if installed.is_dir() else SOURCES.parents[1] / "configs"
+
+
+def _copy(source: Path, folder: Path) -> None:
+    """Copy what is not there yet; a file that was changed is refused.
+
+    Raises:
+        InputError: a file is there with another content, or cannot be written.
+    """
+    files = {folder / path.relative_to(source): path.read_bytes() for path in source.rglob("*") if path.is_file()}
+    try:
+        missing = {path: content for path, content in files.items() if not _is(path, content)}
+        if changed := next((path for path in missing if path.exists()), None):
+            hint = "Give another --out, or run it with armcal run."
+            raise InputError("it is there and was changed.", where=Location(str(changed)), hint=hint)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_new(missing)
+    except OSError as fault:
+        hint = "Give --out a place that can be written."
+        raise InputError(f"it cannot be written ({fault.strerror}).", where=Location(str(folder)), hint=hint) from fault
+
+
+def _is(path: Path, content: bytes) -> bool:
+    return path.is_file() and path.read_bytes() == content
