@@ -1,0 +1,49 @@
+"""The library ``rosbags``, which knows ROS 2's messages, and the decompressors that come with it."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+from collections.abc import Iterator
+from functools import cache
+from typing import Any
+
+from armcal.errors import PluginError
+
+_PIECE_BYTES = 64 * 1024
+
+
+@cache
+def message_types() -> Any:
+    """What turns the bytes of standard messages into objects: a typestore of ``rosbags``.
+
+    Raises:
+        PluginError: it is not installed.
+    """
+    try:
+        typesys = importlib.import_module("rosbags.typesys")
+    except ImportError as fault:
+        hint = "Run pip install 'armcal[ros2]'."
+        raise PluginError(f"reading recordings of ROS 2 needs rosbags ({fault}).", hint=hint) from fault
+    return typesys.get_typestore(typesys.Stores.LATEST)
+
+
+def decompressed(content: bytes, compression: str) -> bytes:
+    """What was compressed by ``zstd`` or ``lz4``; of content that was cut off or damaged, what comes before."""
+    parts = []
+    with contextlib.suppress(Exception):  # each library has errors of its own
+        for part in _parts(content, compression):
+            parts.append(part)
+    return b"".join(parts)
+
+
+def _parts(content: bytes, compression: str) -> Iterator[bytes]:
+    if compression == "lz4":
+        stream = importlib.import_module("lz4.frame").LZ4FrameDecompressor()
+    else:
+        try:
+            stream = importlib.import_module("compression.zstd").ZstdDecompressor()
+        except ImportError:  # before Python 3.14
+            stream = importlib.import_module("backports.zstd").ZstdDecompressor()
+    for start in range(0, len(content), _PIECE_BYTES):
+        yield stream.decompress(content[start : start + _PIECE_BYTES])

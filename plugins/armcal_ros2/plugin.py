@@ -1,0 +1,15 @@
+"""Registration; imports nothing heavy."""
+
+from armcal.hooks import Register, hookimpl
+
+
+@hookimpl
+def armcal_register_readers(register: Register) -> None:
+    """Announce the reader."""
+    register("rosbag2", "armcal_ros2.reader:Rosbag2Reader", "the rests of an arm in a recording of ROS 2")
+
+
+@hookimpl
+def armcal_register_commands(register: Register) -> None:
+    """Announce the command."""
+    register("bag", "armcal_ros2.bag_command:bag", "Look into a recording of ROS 2, and take images out of it.")

@@ -1,0 +1,289 @@
+"""The reader ``rosbag2``: records from a recording of ROS 2, one a rest of the arm."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, NoReturn
+
+import numpy as np
+from armcal.arm.assembly import Arm
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
+from armcal.base.settings import InputPath, Settings
+from armcal.calibration.rigid_chain import tool_poses
+from armcal.io.plain_files import refuse
+from armcal.measure.checks import check_dataset, layout_of
+from armcal.measure.missing import with_absent
+from armcal.measure.reader import ReadRequest
+from armcal.measure.stillness import deviations_of_mean, judged, mean_pose
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from armcal_ros2.bag import Bag
+from armcal_ros2.clock import estimated_offset
+from armcal_ros2.joints import GUARD_S, JointLog, JointRest, JointsSettings, RestSettings, channels_of
+from armcal_ros2.message import JOINT_STATE, Topic
+from armcal_ros2.samples import MEASURED, TRANSFORMS, MeasuredLog, MeasuredSettings, is_static
+
+_FEWEST_SAMPLES = 4
+_CLOCKS_APART_S = 0.5
+_NAMED = 5
+_FULL_TURN = 2 * np.pi * (1 + 1e-9)
+
+
+class BagSettings(Settings):
+    """Which recording (a folder, or a file .mcap or .db3), and which topics are what.
+
+    ``joints`` is the topic of joint states, needed only where there are several; ``measurements`` maps each measurement
+    to its topic; ``still`` says what a rest is.
+    """
+
+    path: InputPath
+    joints: JointsSettings = Field(default_factory=JointsSettings)
+    measurements: dict[str, MeasuredSettings] = Field(default_factory=dict)
+    still: RestSettings = Field(default_factory=RestSettings)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What a measurement saw in a rest: a mean pose (4 x 4), the deviation of its place (m), or why there is none."""
+
+    pose: Array
+    deviation: float = float("nan")
+    samples: int = 0
+    fault: str = ""
+
+
+class Rosbag2Reader:
+    """The reader ``rosbag2``; ``rows`` and ids number the rests, from 1."""
+
+    Settings: ClassVar[type[BagSettings]] = BagSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {"path": "/no/such/folder/recording"}
+
+    def __init__(self, settings: BagSettings) -> None:
+        self._settings = settings
+        self._digest = hashlib.sha256()
+
+    def read(self, request: ReadRequest) -> Dataset:
+        """The means of all rests that were measured, in SI; the other rests are set aside with their reasons.
+
+        Raises:
+            DataError: there is no such recording, topic, frame or joint, or no rest that was measured.
+            PluginError: rosbags is not there.
+        """
+        s, bag = self._settings, Bag(self._settings.path)
+        unknown = sorted(set(s.measurements) - set(request.measurements))
+        if unknown:
+            have = ", ".join(request.measurements) or "none"
+            self._refuse(f"found measurements.{unknown[0]}, expected one of {have}.", "Correct the name.")
+        self._digest = hashlib.sha256()
+        joints, paths = self._joints(bag, request)
+        remarks = joints.close(str(s.path))
+        self._refuse_degrees(request, joints)
+        rests = joints.rests
+        if not rests:
+            hint = "Let the arm stand at each pose, or give a wider spread_deg or a shorter window_s under still."
+            self._refuse(f"found no rest of at least {s.still.window:g} s in {joints.stamps.topic}.", hint)
+        offsets = {}
+        for name in s.measurements:
+            offsets[name], more = self._offset(name, request, joints, paths.get(name))
+            remarks += more
+        logs = [MeasuredLog(name, own, rests, offsets[name]) for name, own in s.measurements.items()]
+        self._follow(bag, logs)
+        for log in logs:
+            remarks += log.close(str(s.path)) + self._clock_remarks(log, joints)
+        dataset = self._dataset(request, joints, logs, (*bag.remarks, *remarks))
+        dataset = with_absent(dataset, request.channels)
+        return check_dataset(dataset, layout_of(request.channels, dataset, {}, {}, by_line=False))
+
+    def _joints(self, bag: Bag, request: ReadRequest) -> tuple[JointLog, dict[str, MeasuredLog]]:
+        """The first time through: joints, and paths of measurements whose clock offset is to be estimated."""
+        s = self._settings
+        commanded = {name: arm.commanded for name, arm in request.arms.items()}
+        names = channels_of(commanded, s.joints.names)
+        alone = f"{next(iter(commanded))}." if len(commanded) == 1 else ""
+        strange = [name for name in s.joints.names if name not in names and alone + name not in names]
+        if strange:
+            have = ", ".join(name.removeprefix(alone) for name in names)
+            self._refuse(f"found joints.names.{strange[0]}, expected joints of the arm: {have}.", "Correct the name.")
+        slides = [kind == "length" for joints in commanded.values() for kind in joints.values()]
+        log = JointLog(tuple(names.values()), slides, s.joints, s.still)
+        paths = {name: MeasuredLog(name, own) for name, own in s.measurements.items() if own.clock_offset == "estimate"}
+        self._follow(bag, list(paths.values()), log)
+        return log, paths
+
+    def _follow(self, bag: Bag, logs: Sequence[MeasuredLog], joints: JointLog | None = None) -> None:
+        """Once through the recording; each message goes to those that read its topic."""
+        s, seen = self._settings, set[Topic]()
+        tree = {log.settings.topic for log in logs if log.settings.reference is not None}
+
+        def is_read(topic: Topic) -> bool:
+            seen.add(topic)
+            is_joints = joints is not None and topic.type == JOINT_STATE and s.joints.topic in (None, topic.name)
+            is_tree = bool(tree) and topic.type == TRANSFORMS and is_static(topic.name)
+            return is_joints or is_tree or any(topic.name == log.settings.topic for log in logs)
+
+        for (topic, received, data), message in bag.decoded(is_read):
+            if message is None:
+                continue
+            self._digest.update(data or b"")
+            if joints is not None and topic.type == JOINT_STATE:
+                joints.add(topic.name, message, received)
+            for log in logs:
+                if log.settings.topic == topic.name or (log.settings.reference is not None and is_static(topic.name)):
+                    log.add(topic.type, message, received, is_static=is_static(topic.name))
+        self._require(seen, logs)
+
+    def _require(self, seen: set[Topic], logs: Sequence[MeasuredLog]) -> None:
+        """Refuse topics that are not there, or whose messages measure nothing."""
+        types = {topic.name: topic.type for topic in seen}
+        for log in logs:
+            topic, types_read = (
+                log.settings.topic,
+                (TRANSFORMS,) if log.settings.reference is not None else MEASURED[:-1],
+            )
+            if types.get(topic) not in types_read:
+                have = ", ".join(name for name, own in sorted(types.items()) if own in MEASURED) or "none"
+                kind = f"the type {types[topic]}" if topic in types else "no such topic"
+                expected = ", ".join(name.rpartition("/")[2] for name in types_read)
+                hint = f"Topics that measure are {have}."
+                if types.get(topic) == TRANSFORMS:
+                    hint = "Give reference and frame: the pose of frame in reference is read."
+                self._refuse(f"found {kind} for {log.instance} ({topic}), expected {expected}.", hint)
+
+    def _offset(
+        self, name: str, request: ReadRequest, joints: JointLog, seen: MeasuredLog | None
+    ) -> tuple[float, list[str]]:
+        """How far a measurement's clock is ahead (s), with what is known of it."""
+        offset = self._settings.measurements[name].clock_offset
+        if seen is None or offset != "estimate":
+            assert not isinstance(offset, str)
+            return offset, []
+        seen.close(str(self._settings.path))
+        arm = request.arms[request.measurements[name].arms[0]]
+        tool = _tool_of(arm, list(request.arms.values()).index(arm), request.arms)
+        guess = joints.stamps.delay - seen.stamps.delay
+        estimate = estimated_offset(joints.rests, joints.path(), seen.path(), tool, guess)
+        if isinstance(estimate, str):
+            hint = f"State it, measurements: {{{name}: {{clock_offset_ms: 0}}}}, and let rests be longer than it."
+            self._refuse(f"the clock offset of {name} cannot be estimated: {estimate}.", hint)
+        width, count = 1000 * estimate.half_width, estimate.motions
+        text = f"the clock of {name} is {1000 * estimate.seconds:.2f} +- {width:.2f} ms ahead of that of the joints"
+        return estimate.seconds, [f"{text} (95 %, from {count} motions)."]
+
+    def _clock_remarks(self, log: MeasuredLog, joints: JointLog) -> list[str]:
+        apart = joints.stamps.delay - log.stamps.delay
+        stated = self._settings.measurements[log.instance].clock_offset
+        if isinstance(stated, str) or not abs(apart - stated) > _CLOCKS_APART_S:
+            return []
+        text = f"stamps of {log.settings.topic} are about {apart:.3g} s ahead of those of {joints.stamps.topic}"
+        return [f"{text}, by the times of receipt. Set clock_offset: estimate for {log.instance}."]
+
+    def _dataset(
+        self, request: ReadRequest, joints: JointLog, logs: Sequence[MeasuredLog], remarks: Sequence[str]
+    ) -> Dataset:
+        """A record a rest."""
+        rests, count = joints.rests, len(joints.rests)
+        names = _joint_channels(request)
+        means = np.array([rest.means for rest in rests]).T
+        sides = np.array([joints.approach(rest.end) for rest in rests]).T
+        channels = dict(zip(names, means, strict=True))
+        channels |= {name.replace(".", ".approach.", 1): own for name, own in zip(names, sides, strict=True)}
+        channels["time"] = np.array([(rest.begin + rest.end) / 2 for rest in rests])
+        seen = {log.instance: [self._seen(log, i, rest) for i, rest in enumerate(rests)] for log in logs}
+        extra = {"rest_s": tuple(f"{rest.end - rest.begin:.3f}" for rest in rests)}
+        for name, own in seen.items():
+            channels |= self._measured(name, request, own)
+            extra[f"{name}_samples"] = tuple(str(one.samples) for one in own)
+            extra[f"{name}_scatter_mm"] = tuple(f"{1000 * one.deviation:.4f}" for one in own)
+        faulty = {}
+        for i, rest in enumerate(rests):
+            faults = [f"{name}: {own[i].fault}" for name, own in seen.items() if own[i].fault]
+            if rest.end - rest.begin < self._settings.still.window:
+                faulty[i] = f"too short: {rest.end - rest.begin:.2f} s, at least {self._settings.still.window:g} s"
+            elif faults and len(faults) == len(seen):
+                faulty[i] = "; ".join(faults)
+        ids, place = tuple(f"rest{i + 1}" for i in range(count)), str(self._settings.path)
+        text = f"{count - len(faulty)} of {count} rests are records"
+        if faulty:
+            listed = "; ".join(f"{ids[i]}: {reason}" for i, reason in list(faulty.items())[:_NAMED])
+            text += f"; left out: {listed}" + (f"; and {len(faulty) - _NAMED} more" if len(faulty) > _NAMED else "")
+        if len(faulty) == count:
+            self._refuse(f"{text}.", " ".join(remarks) or "Let the arm stand where it is measured.")
+        warnings = tuple(f"{place}: {remark}" for remark in (*remarks, f"{text}."))
+        digest = self._digest.hexdigest()
+        dataset = Dataset(ids, channels, extra, tuple(range(1, count + 1)), place, digest, warnings=warnings)
+        return dataset.without(faulty)
+
+    def _seen(self, log: MeasuredLog, place: int, rest: JointRest) -> _Seen:
+        """What a measurement saw in a rest once the arm had settled."""
+        s, nothing = self._settings.still, np.full((4, 4), np.nan)
+        rows = log.samples(place)
+        at = rows[:, 0] - log.offset
+        rows = rows[(at >= rest.begin + s.settle) & (at <= rest.end - GUARD_S)]
+        if len(rows) < _FEWEST_SAMPLES:
+            fault = f"no measurement ({len(rows)} samples, at least {_FEWEST_SAMPLES})"
+            return _Seen(nothing, samples=len(rows), fault=fault)
+        poses = np.tile(np.eye(4), (len(rows), 1, 1))
+        poses[:, :3, 3] = rows[:, 1:4]
+        is_point = bool(np.isnan(rows[0, 4]))
+        poses[:, :3, :3] = np.nan if is_point else Rotation.from_quat(rows[:, 4:]).as_matrix()
+        stillness = judged(poses, s.drift)
+        if stillness.why_not:
+            return _Seen(nothing, samples=len(rows), fault=stillness.why_not)
+        kept = poses[stillness.kept]
+        mean = mean_pose(kept)
+        return _Seen(mean, float(np.linalg.norm(deviations_of_mean(kept, mean)[:3])), len(kept))
+
+    def _measured(self, name: str, request: ReadRequest, seen: Sequence[_Seen]) -> dict[str, Array]:
+        """The channels of a measurement, NaN where it saw nothing.
+
+        Raises:
+            DataError: it reads what no pose has, or orientations of points.
+        """
+        poses = np.array([one.pose for one in seen])
+        values = {axis: poses[:, i, 3] for i, axis in enumerate("xyz")}
+        turned = np.isfinite(poses[:, 0, 0])
+        quaternions = np.full((len(poses), 4), np.nan)
+        if turned.any():
+            quaternions[turned] = Rotation.from_matrix(poses[turned, :3, :3]).as_quat()
+            quaternions[quaternions[:, 3] < 0] *= -1
+        values |= {axis: quaternions[:, i] for i, axis in enumerate(("qx", "qy", "qz", "qw"))}
+        needed = [channel.name for channel in request.measurements[name].channels()]
+        lacking = [own for own in needed if own not in values]
+        if lacking:
+            hint = "Take images out with armcal bag images, or give another measurement."
+            self._refuse(f"{name} reads {lacking[0]}, which a message of a pose does not hold.", hint)
+        if "qw" in needed and not turned.any() and np.isfinite(values["x"]).any():
+            topic = self._settings.measurements[name].topic
+            self._refuse(f"{name} reads orientations, and {topic} has points.", "Set type: tip_position.")
+        return {f"{name}.{own}": values[own] for own in needed}
+
+    def _refuse_degrees(self, request: ReadRequest, joints: JointLog) -> None:
+        """Angles beyond one turn of joints that do not turn on and on."""
+        turning = {w.channel for w in request.channels if w.dimension == "angle" and not w.is_endless}
+        for name, largest in zip(_joint_channels(request), joints.largest, strict=True):
+            if name in turning and largest > _FULL_TURN:
+                hint = "If these are degrees, set joints: {unit: deg}; if not, record angles within one turn."
+                self._refuse(f"{name} stands at {largest:.6g} rad, more than one turn (2 pi rad).", hint)
+
+    def _refuse(self, message: str, hint: str) -> NoReturn:
+        refuse(self._settings.path, message, hint)
+
+
+def _joint_channels(request: ReadRequest) -> list[str]:
+    return [f"{name}.{joint}" for name, arm in request.arms.items() for joint in arm.commanded]
+
+
+def _tool_of(arm: Arm, number: int, arms: Mapping[str, Arm]) -> Callable[[Array], Array]:
+    """The place of the nominal tool (N x 3, m) at the joints of all arms (N x joints)."""
+    first = sum(len(own.commanded) for own in list(arms.values())[:number])
+    chain = arm.nominal_chain
+
+    def places(joints: Array) -> Array:
+        commands = arm.joint_commands([*joints[:, first : first + len(arm.commanded)].T])
+        return tool_poses(chain, np.stack(commands, axis=1))[:, :3, 3]
+
+    return places
