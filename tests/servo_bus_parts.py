@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import termios
+
 import numpy as np
 from armcal_simulation.bus_motor import BusMotor, BusMotorSettings
 from armcal_simulation.bus_registers import TABLES
@@ -76,3 +78,10 @@ def packet(protocol: str, number: int, code: int, params: bytes) -> bytes:
         if remainder >> bit & 1:
             remainder ^= 0x18005 << (bit - 16)
     return whole + remainder.to_bytes(2, "little")
+
+
+def at_baud(port: int) -> None:
+    """Set an open pty to the rate of the servos."""
+    settings = termios.tcgetattr(port)
+    settings[4] = settings[5] = termios.B1000000
+    termios.tcsetattr(port, termios.TCSANOW, settings)

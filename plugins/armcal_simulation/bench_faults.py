@@ -13,8 +13,9 @@ from pydantic import Field, ValidationError
 Count = Annotated[int, Field(ge=0, le=1_000_000)]
 Seconds = Annotated[float, Field(ge=0)]
 Kind = Literal[
-    "drop", "duplicate", "reorder", "flip", "split",
+    "drop", "duplicate", "reorder", "flip", "split", "late",
     "unplug", "replug", "reset", "brown_out", "nack", "stuck",
+    "disconnect", "connect", "jam", "free", "heat",
     "lost", "silent", "frozen", "skew", "seen",
 ]  # fmt: skip
 
@@ -31,6 +32,7 @@ class FaultRequest(Settings):
         unit: serial faults: whole frames, or single bytes.
         byte: ``nack``: the index in the data; -1 is the address.
         seconds: ``stuck``: for so long.
+        joint: ``disconnect`` to ``heat``, and ``brown_out``, of smart servos: whose; all by default.
         body: ``lost`` and ``seen``: which; all by default.
         counter: ``frozen``: what the frame counter does.
         ppm: ``skew``: how much the tracker's clock gains.
@@ -44,6 +46,7 @@ class FaultRequest(Settings):
     unit: Literal["frames", "bytes"] = "frames"
     byte: Annotated[int, Field(ge=-1, le=240)] = -1
     seconds: Seconds = 0.05
+    joint: str | None = None
     body: str | None = None
     counter: Literal["rising", "same"] = "rising"
     ppm: float = 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 from armcal.arm.assembly import Arm
 from armcal.arm.joints import unknown_joint
@@ -27,6 +27,15 @@ from armcal_simulation.servo_model import JointServo, ServoJointSettings
 
 ALL = "all"
 """In the place of a joint's name: settings of all joints, beneath each joint's own."""
+
+
+_JointSettings = TypeVar("_JointSettings", bound=ServoJointSettings)
+
+
+def merged(joints: Mapping[str, _JointSettings], joint: str, made: type[_JointSettings]) -> _JointSettings:
+    """A joint's own settings above those of all."""
+    stated = [joints[name] for name in (ALL, joint) if name in joints]
+    return made.si(**{key: getattr(settings, key) for settings in stated for key in settings.model_fields_set})
 
 
 class BenchTrackerSettings(DTrackSenderSettings):
@@ -78,9 +87,7 @@ class ServoBenchSettings(BenchTruthSettings):
 
     def servo_of(self, joint: str) -> ServoJointSettings:
         """What kind of servo drives a joint: its own settings above those of all."""
-        stated = [self.joints[name] for name in (ALL, joint) if name in self.joints]
-        merged = {key: getattr(settings, key) for settings in stated for key in settings.model_fields_set}
-        return ServoJointSettings.si(**merged)
+        return merged(self.joints, joint, ServoJointSettings)
 
 
 def true_servos(settings: ServoBenchSettings, arm: Arm) -> ServoFile:

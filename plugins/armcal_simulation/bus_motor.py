@@ -77,7 +77,7 @@ class BusMotor(JointServo):
         """
         if not self.powered:
             return 0.0
-        low, high = self.settings.travel
+        low, high = self.stops
         beyond = (self.setpoint or 0.0) - min(max(self.setpoint or 0.0, low), high)
         if abs(beyond) > self._compliance * self.settings.stall:
             return math.copysign(self.torque_share, beyond)
@@ -107,15 +107,21 @@ class BusMotor(JointServo):
 
     @override
     def advance(self, seconds: float, torque: float) -> bool:
-        self.torque = torque
+        self.torque, side = torque, self.approach
         if self.setpoint is not None:
+            before = self.setpoint
             self._follow(seconds)
             self._aim()
-        return super().advance(seconds, torque)
+            if self.setpoint != before:
+                side = 1 if self.setpoint > before else -1
+        moved = super().advance(seconds, torque)
+        if self.setpoint is not None:
+            self.approach = side  # what its load turns it by is no motion of its own
+        return moved
 
     def _aim(self) -> None:
         """Where the shaft is drawn to: the set point, less what the load makes it stand off."""
-        low, high = self.settings.travel
+        low, high = self.stops
         aim = None if self.setpoint is None else self.setpoint + self._compliance * self.torque
         self.target = None if aim is None else min(max(aim, low), high)
 

@@ -81,8 +81,13 @@ class BusServo:
         """The present position (counts), neither rounded nor noisy."""
         raw = self._zero + self._direction * self.motor.shaft / self.table.count
         if self._protocol == "feetech":
-            return (raw - self.get("homing_offset")) % self.table.counts
-        return raw % self.table.counts + self.get("homing_offset") if "homing_offset" in self.table.by_name else raw
+            return (raw - self.offset) % self.table.counts
+        return raw % self.table.counts + self.offset if self._protocol == "dynamixel2" else raw
+
+    @property
+    def offset(self) -> int:
+        """The homing offset; 0 where there is none."""
+        return self.get("homing_offset") if "homing_offset" in self.table.by_name else 0
 
     def get(self, name: str) -> int:
         """A register's value."""

@@ -15,3 +15,4 @@ def armcal_register_simulators(register: Register) -> None:
 def armcal_register_benches(register: Register) -> None:
     """Announce the simulated benches."""
     register("servo_bench", "armcal_simulation.servo_bench:ServoBench", "a servo board at a pty, an arm, a tracker")
+    register("bus_bench", "armcal_simulation.bus_bench:BusBench", "smart servos on a bus at a pty, an arm, a tracker")

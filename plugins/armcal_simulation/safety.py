@@ -22,6 +22,8 @@ _TICK_S = 0.02
 _AT_ONCE = 512
 _AT_REST_S = 1.0
 _NO_TIME = -1e9
+_FOUND_RAD = 0.02
+"""A first pulse that turns its joint by less takes it up where it stands: beyond a limit, that is nobody's offence."""
 
 
 class SafetySettings(Settings):
@@ -29,8 +31,9 @@ class SafetySettings(Settings):
 
     The commanded speed over ``window`` may be above ``rate_deg_per_s`` by a twentieth and one count. Joint limits and
     clearances are the plan's, less what a host cannot know of the true tables. Pulses are those that the true servo
-    file's servos bear, less what a host cannot know of the true oscillator. Two joints whose pulses begin within
-    ``together`` were not energised one at a time.
+    file's servos bear, less what a host cannot know of the true oscillator. A joint that is taken up where it stands,
+    beyond a limit or too near to something, may stay there and come back, and go no further. Two joints whose pulses
+    begin within ``together`` were not energised one at a time.
     """
 
     rate_deg_per_s: Positive = 20.0
@@ -75,8 +78,10 @@ class Safety:
         self._logged: set[tuple[str, str]] = set()
         self._worst: dict[str, tuple[float, dict[str, Any]]] = {}
         self._dropped: dict[str, float] = {}
-        self._moved = False
-        self._poses: list[tuple[float, list[float]]] = []
+        self._moved = self._taken_up = False
+        self._beyond: dict[str, float] = {}
+        self._inherited = 0.0
+        self._poses: list[tuple[float, bool, list[float]]] = []
 
     def committed(self, joint: str, commit: Commit, period: float, torque: float) -> None:
         """A change at a joint's pin, while its servo carried a torque (N m)."""
@@ -95,6 +100,9 @@ class Safety:
                 self._offend("energised_together", joint, now, now - last, settings.together)
             self._first_pulse, jump = (now, joint), angle - servo.angle
             self._dropped.pop(joint, None)
+            self._beyond.pop(joint, None)
+            if abs(jump) < _FOUND_RAD:
+                self._beyond[joint], self._taken_up = angle, True
             self._weigh("first_pulse", joint, abs(jump), value=jump)
             self._note("first_pulse", joint, now, jump)
         else:
@@ -107,6 +115,10 @@ class Safety:
         )
         for kind, value, bounds, slack in judged:
             low, high = bounds.get(joint, (-np.inf, np.inf))
+            if kind == "limits" and joint in self._beyond:
+                if low <= value <= high:
+                    del self._beyond[joint]
+                low, high = min(low, self._beyond.get(joint, low)), max(high, self._beyond.get(joint, high))
             if not low - slack <= value <= high + slack:
                 self._offend(kind, joint, now, value, low - slack if value < low else high + slack)
         self._moved = True
@@ -123,7 +135,8 @@ class Safety:
             return
         self._moved = False
         if len(self._commanded) == len(self._servos):
-            self._poses.append((now, [self._commanded[joint] for joint in self._servos]))
+            self._poses.append((now, self._taken_up, [self._commanded[joint] for joint in self._servos]))
+            self._taken_up = False
             if len(self._poses) >= _AT_ONCE:
                 self.judge_clearance()
 
@@ -132,11 +145,13 @@ class Safety:
         check, poses = self._bounds.clearance, self._poses
         if check is None or not poses:
             return
-        margins = check(np.array([angles for _, angles in poses]).T).margins.min(axis=0)
+        margins = check(np.array([angles for _, _, angles in poses]).T).margins.min(axis=0)
         self._poses = []
-        for (now, _), margin in zip(poses, margins, strict=True):
-            if margin < -self._settings.clearance_slack:
-                self._offend("clearance", "", now, float(margin), -self._settings.clearance_slack)
+        for (now, taken_up, _), margin in zip(poses, margins.tolist(), strict=True):
+            self._inherited = min(0.0, margin) if taken_up else max(self._inherited, min(0.0, margin))
+            limit = self._inherited - self._settings.clearance_slack
+            if margin < limit:
+                self._offend("clearance", "", now, margin, limit)
 
     def summary(self) -> dict[str, Any]:
         """Both counters, and the worst of each kind: its joint, and its value and limit as in the log.

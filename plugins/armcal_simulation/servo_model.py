@@ -65,6 +65,7 @@ class JointServo:
         angle: of its horn (rad).
         target: where it is sent (rad), within its stops; None while it is not powered.
         approach: the sign of its last motion; 0 before the first.
+        stops: where it can turn no further (rad).
         failed: it has burnt out, and holds nothing.
 
     Args:
@@ -74,6 +75,7 @@ class JointServo:
     def __init__(self, settings: ServoJointSettings, angle: float) -> None:
         self.settings, self.angle, self.approach, self.failed = settings, angle, 0, False
         self.target: float | None = None
+        self.stops = settings.travel
         self._horn, self._slipped, self._creep = angle, 0.0, math.radians(settings.creep_deg_per_min) / 60.0
         self._gear = angle  # where the gear stands, without its backlash (rad)
         self._driving = False
@@ -93,7 +95,7 @@ class JointServo:
         if self.holds(torque):
             error = abs((self.target or 0.0) - self._gear)
             return error <= _NEAR or not (self._driving or error > self.settings.dead_band)
-        low, high = self.settings.travel
+        low, high = self.stops
         at_stop = self._gear >= high - _NEAR if torque > 0 else self._gear <= low + _NEAR
         return at_stop or abs(torque) <= self.settings.friction
 
@@ -111,7 +113,7 @@ class JointServo:
             self._drive(seconds, torque)
         else:
             step = self._fall_speed * seconds
-            low, high = self.settings.travel
+            low, high = self.stops
             self._gear = min(max(before + (step if torque > 0 else -step), low), high)
         moved = self._gear - before
         if moved:
@@ -160,7 +162,7 @@ class ServoModel(JointServo):
 
     def set_pulse(self, pulse: float | None) -> None:
         """Other pulses (s), or none."""
-        low, high = self.settings.travel
+        low, high = self.stops
         self.target = None if pulse is None else min(max(self.angle_of(pulse), low), high)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from armcal.cli.main import cli
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal.run.plan_clearance import clearance_check
+from armcal.run.plan_poses import JointSpace, spread
 from click.testing import CliRunner, Result
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
@@ -151,6 +153,18 @@ def test_by_torque_servos_stay_cooler_and_the_poses_are_the_same(tmp_path: Path)
     assert set(plans["travel"]["ids"]) == set(plans["torque"]["ids"]) == set(plans["none"]["ids"])
     assert plans["torque"]["visit"]["peak_squared_torque"] < plans["travel"]["visit"]["peak_squared_torque"]
     assert plans["travel"]["visit"]["travel_s"] <= plans["torque"]["visit"]["travel_s"]
+
+
+def test_poses_are_drawn_until_enough_keep_a_clearance_that_few_keep() -> None:
+    experiment = Experiment.load(PLAN)
+    plan, space = experiment.settings.plan, JointSpace.of(experiment)
+    assert plan is not None
+
+    def one_in_ten(poses: np.ndarray) -> SimpleNamespace:
+        return SimpleNamespace(allowed=poses[0] > np.deg2rad(80))
+
+    pool = spread(plan.model_copy(update={"count": 1500}), space, np.deg2rad([[-100, 100]] * 6), one_in_ten)  # type: ignore[arg-type]
+    assert len(pool.dataset) == 1500
 
 
 @pytest.mark.parametrize("kind", ["grid", "continuous"])

@@ -213,7 +213,7 @@ def spread(settings: PlanSettings, space: JointSpace, limits: Array, check: Clea
         allowed = np.ones(poses.shape[1], dtype=bool) if check is None else check(poses).allowed
         kept_poses.append(poses[:, allowed])
         kept, tried = kept + int(allowed.sum()), tried + poses.shape[1]
-        drawn = sequence.random_base2(_POWER)
+        drawn = sequence.random(2**_POWER)
     left_out = {"too little clearance": tried - kept} if tried > kept else {}
     if not kept:
         raise ProblemError(f"none of {tried} poses keeps its clearance.", hint="Check plan.clearance.")

@@ -24,31 +24,45 @@ _FALLEN_IN_S = 5.0
 _LONGEST_SOCKET_PATH = 107
 
 
-def overrides_for(folder: Path) -> tuple[str, ...]:
-    """The overrides that make a configuration work with the simulated bench in a folder."""
+def overrides_for(folder: Path, part: str = "link") -> tuple[str, ...]:
+    """The overrides that make a configuration work with the simulated bench in a folder.
+
+    ``part``: of the bench, which has the serial port: see ``part_with_port``.
+    """
     there = folder.absolute()
-    return (f"bench.clock={{simulated: {there / CLOCK}}}", f"bench.link.port={there / BOARD}")
+    return (f"bench.clock={{simulated: {there / CLOCK}}}", f"bench.{part}.port={there / BOARD}")
+
+
+def part_with_port(experiment: Experiment) -> str:
+    """``link``, or ``device`` for one that needs no link.
+
+    Raises:
+        ConfigError: there is no bench.
+    """
+    settings = Bench.of(experiment).settings
+    return "device" if settings.link is None and settings.device is not None else "link"
 
 
 def port_instead_of_adapter(experiment: Experiment) -> tuple[str, ...]:
-    """Further overrides if its link names an adapter: simulated ones have no serial number.
+    """Further overrides if its port is named by an adapter: simulated ones have no serial number.
 
     Raises:
         ConfigError: its link has no serial port, or there is no bench.
     """
-    link = Bench.of(experiment).settings.link or {}
+    part = part_with_port(experiment)
+    stated: dict[str, Any] = getattr(Bench.of(experiment).settings, part) or {}
     try:
-        component = experiment.registry.find("link", str(link.get("type")))
+        component = experiment.registry.find(part, str(stated.get("type")))
     except PluginError:
         return ()  # whoever builds it says so, and where
     settings = getattr(component.load(), "Settings", None)
     if "port" not in getattr(settings, "model_fields", ("port",)):
         raise ConfigError(
-            f"found the link {component.name}, expected one with a serial port: simulated boards have nothing else.",
-            where=experiment.source.where((SECTION, "link")),
+            f"found the {part} {component.name}, expected one with a serial port: simulated boards have nothing else.",
+            where=experiment.source.where((SECTION, part)),
             hint=f"Rehearse with the link of the simulated firmware: --set {SECTION}.link='{{type: framed}}'.",
         )
-    return (f"{SECTION}.link.serial_number=null",) if "serial_number" in link else ()
+    return (f"{SECTION}.{part}.serial_number=null",) if "serial_number" in stated else ()
 
 
 @contextmanager

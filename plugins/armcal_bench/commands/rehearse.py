@@ -18,6 +18,7 @@ from armcal_bench.acquisition.preparation import prepare
 from armcal_bench.acquisition.rehearsal import (
     make_bench_folder,
     overrides_for,
+    part_with_port,
     port_instead_of_adapter,
     simulated_bench,
     truth,
@@ -47,7 +48,7 @@ def rehearse(console: Console, config: Path, plan: Path, out: Path, overrides: t
     """Do what armcal acquire does, against the simulated bench of CONFIG, and say what its arm came to bear."""
     bench = out / BENCH
     stated = load(console, config, overrides)
-    simulated = (*overrides, *overrides_for(bench), *port_instead_of_adapter(stated))
+    simulated = (*overrides, *overrides_for(bench, part_with_port(stated)), *port_instead_of_adapter(stated))
     prepared = prepare(Experiment.load(config, simulated, registry=stated.registry), plan)
     check_folder(out, OURS)
     if not console.json:

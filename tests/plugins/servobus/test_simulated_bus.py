@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import os
 import select
-import termios
 from pathlib import Path
 
 import numpy as np
 import pytest
+from armcal_simulation.bus_packets import crc16
 from armcal_simulation.serial_line import SerialLine
-from servo_bus_parts import BAUD, BusOnDesk, packet
+from servo_bus_parts import BAUD, BusOnDesk, at_baud, packet
 
 UNLOCK = ("lock", 0)
 
@@ -36,8 +36,6 @@ def test_published_packets_are_answered_as_documented(model: str, asked: str, an
 
 def test_a_dynamixel_answers_with_the_crc_of_the_e_manual() -> None:
     body = bytes.fromhex("FF FF FD 00 01 07 00 55 00 06 04 26")
-    from armcal_simulation.bus_packets import crc16
-
     assert crc16(body).to_bytes(2, "little") == bytes.fromhex("65 5D")
 
 
@@ -252,9 +250,7 @@ def test_on_a_pty_packets_are_lost_damaged_and_late_and_the_baud_rate_is_the_hos
     line = SerialLine(tmp_path / "bus", desk.bus.split, np.random.default_rng(1))
     line.plug_in()
     host = os.open(tmp_path / "bus", os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-    settings = termios.tcgetattr(host)
-    settings[4] = settings[5] = termios.B1000000
-    termios.tcsetattr(host, termios.TCSANOW, settings)
+    at_baud(host)
     assert line.baud == BAUD
 
     def heard(number: int) -> bytes:

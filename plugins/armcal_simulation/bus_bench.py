@@ -1,0 +1,242 @@
+"""The simulated bench ``bus_bench``: smart servos on a bus at a pty, an arm that they carry, and a tracker."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from armcal.arm.joints import unknown_joint
+from armcal.devices.simulated import BenchRequest
+from armcal.errors import ConfigError
+from armcal.testing import EXAMPLE_TRUTH
+from pydantic import Field, field_validator, model_validator
+
+from armcal_simulation import bench_parts
+from armcal_simulation.bench_faults import FaultRequest
+from armcal_simulation.bench_parts import ALL, BenchTruthSettings, merged
+from armcal_simulation.bench_world import BenchWorld, serve_world
+from armcal_simulation.bus_motor import BusMotor, BusMotorSettings
+from armcal_simulation.bus_registers import SPLINE_TEETH, TABLES, ServoTable
+from armcal_simulation.bus_servo import BusServo
+from armcal_simulation.pca9685_model import Commit
+from armcal_simulation.servo_bus import ServoBus
+
+_TURN = 2 * math.pi
+_BURNING = 0.95
+
+
+class BusJointSettings(BusMotorSettings):
+    """One servo as it truly is: what a host may believe of it stands under ``bench.device``.
+
+    ``zero_count`` is what it reads at the joint's zero, with its ``homing_offset`` and its horn on the right tooth;
+    ``horn_teeth`` says by how many teeth it is not. ``limits`` are its position limits (counts), none by default.
+    """
+
+    id: Annotated[int, Field(ge=0, le=252)] = 1
+    model: str = "sts3215"
+    baud: int | None = None
+    zero_count: float = 2048
+    direction: Literal[1, -1] = 1
+    homing_offset: int = 0
+    horn_teeth: int = 0
+    limits: tuple[int, int] | None = None
+
+    @field_validator("model")
+    @classmethod
+    def _known(cls, model: str) -> str:
+        if model not in TABLES:
+            raise ValueError(f"found {model!r}, expected one of {', '.join(TABLES)}")
+        return model
+
+    @property
+    def table(self) -> ServoTable:
+        """Its registers."""
+        return TABLES[self.model]
+
+
+class BusBenchSettings(BenchTruthSettings):
+    """The truth of a bench with smart servos; ``joints`` has them by joint, and what ``all`` have in common.
+
+    ``baud`` is that of the servos, ``echo`` whether the adapter hears itself. ``supply_V`` sags by ``supply_ohm``.
+    """
+
+    baud: int = 1_000_000
+    echo: bool = False
+    supply_V: Annotated[float, Field(gt=0)] = 7.4
+    supply_ohm: Annotated[float, Field(ge=0)] = 0.1
+    joints: dict[str, BusJointSettings]
+
+    @model_validator(mode="after")
+    def _one_protocol(self) -> BusBenchSettings:
+        stated = {self.servo_of(joint).table.protocol for joint in self.joints if joint != ALL}
+        if len(stated) > 1:
+            raise ValueError(f"found servos of {' and '.join(sorted(stated))}, expected one protocol: it is one bus")
+        return self
+
+    def servo_of(self, joint: str) -> BusJointSettings:
+        """A joint's servo."""
+        return merged(self.joints, joint, BusJointSettings)
+
+    def baud_code(self, servo: BusJointSettings) -> int:
+        """What stands in a servo's baud register.
+
+        Raises:
+            ConfigError: the model has no such rate.
+        """
+        baud = servo.baud or self.baud
+        for code, rate in servo.table.bauds.items():
+            if rate == baud:
+                return code
+        rates = ", ".join(map(str, servo.table.bauds.values()))
+        raise ConfigError(f"bench.simulator: found {baud} baud, expected one of {rates} for {servo.model}.")
+
+
+@dataclass(frozen=True)
+class _BusJoint:
+    servo: BusServo
+    motor: BusMotor
+
+
+class BusElectronics:
+    """Servos on their bus: the electronics of a ``bus_bench``. Motors are judged by the set points they follow."""
+
+    def __init__(self, world: BenchWorld, bus: ServoBus, joints: Mapping[str, _BusJoint]) -> None:
+        self.split = bus.split
+        self._world, self._bus, self._joints = world, bus, dict(joints)
+        self._setpoints: dict[str, float | None] = dict.fromkeys(joints)
+        for joint, part in joints.items():
+            part.servo.heat = lambda heat=world.physics.heat[joint]: heat.winding  # type: ignore[misc]
+
+    def boot(self) -> None:
+        """See ``Electronics``."""
+        self._bus.boot()
+        self.moved()
+
+    def receive(self, data: bytes) -> None:
+        """See ``Electronics``."""
+        self._bus.receive(data)
+        self.moved()
+        self._world.physics.commands_changed()
+
+    def next_event(self) -> float:
+        """See ``Electronics``."""
+        return self._bus.next_event()
+
+    def run_timers(self) -> None:
+        """See ``Electronics``."""
+        self._bus.run_timers()
+        self.moved()
+        self._world.physics.commands_changed()
+
+    def moved(self) -> None:
+        """Judge what the motors were sent to since the last look."""
+        for joint, part in self._joints.items():
+            before, now = self._setpoints[joint], part.motor.setpoint
+            if before != now:
+                self._setpoints[joint] = now
+                commit = Commit(self._world.now, part.servo.id, before, now)
+                self._world.safety.committed(joint, commit, _TURN, self._world.physics.torques[joint])
+
+    def fail(self, fault: FaultRequest) -> None:
+        """See ``Electronics``."""
+        for joint, part in self._joints.items():
+            if fault.joint not in (None, joint):
+                continue
+            if fault.kind in ("brown_out", "reset"):
+                part.servo.power_cycle()
+            elif fault.kind == "disconnect":
+                self._bus.absent.add(part.servo)
+            elif fault.kind == "connect":
+                self._bus.absent.discard(part.servo)
+            elif fault.kind == "jam":
+                part.motor.stops = (part.motor.shaft, part.motor.shaft)
+            elif fault.kind == "free":
+                part.motor.stops = part.motor.settings.travel
+            elif fault.kind == "heat":
+                self._world.physics.heat[joint].winding = _BURNING
+        self.moved()
+        self._world.physics.commands_changed()
+
+    def state(self) -> dict[str, Any]:
+        """See ``Electronics``."""
+        servos = {
+            joint: {
+                "id": part.servo.id,
+                "position": part.servo.exact_position,
+                "homing_offset": part.servo.offset,
+                "status": part.servo.status(),
+                "connected": part.servo not in self._bus.absent,
+                "shaft_rad": part.motor.shaft,
+            }
+            for joint, part in self._joints.items()
+        }
+        return {"bus": servos, "volts": self._bus.volts()}
+
+
+class BusBench:
+    """The simulated bench ``bus_bench``; time and determinism are those of ``servo_bench``."""
+
+    Settings: ClassVar[type[BusBenchSettings]] = BusBenchSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {
+        "truth": str(EXAMPLE_TRUTH),
+        "joints": {"all": {"backlash_deg": 0.6}, "q1": {"id": 1}, "q2": {"id": 2, "zero_count": 2100}},
+        "tracker": {"port": 5000, "noise_mm": 0.05},
+        "seed": 1,
+    }
+
+    def __init__(self, settings: BusBenchSettings) -> None:
+        self._settings = settings
+
+    def serve(self, request: BenchRequest) -> None:
+        """See ``armcal.devices.simulated.SimulatedBench``.
+
+        Raises:
+            ConfigError: the settings do not fit the experiment.
+            InputError: the folder cannot be used.
+        """
+        serve_world(bus_world(self._settings, request), request.folder)
+
+
+def bus_world(settings: BusBenchSettings, request: BenchRequest) -> BenchWorld:
+    """A bench of smart servos.
+
+    Raises:
+        ConfigError: the settings do not fit the experiment.
+    """
+    tracked = bench_parts.tracked_arm(settings, request.experiment)
+    names = list(tracked.arm.commanded)
+    if fault := unknown_joint([joint for joint in (*settings.joints, *settings.start) if joint != ALL], names):
+        raise ConfigError(f"bench.simulator: {fault}.")
+    if missing := sorted(set(names) - set(settings.joints)):
+        raise ConfigError(f"bench.simulator: found no servo for {', '.join(missing)}.", hint="Give each joint its id.")
+    random = np.random.default_rng([settings.seed, 2])
+    joints = {joint: _bus_joint(settings, joint, random) for joint in names}
+
+    def electronics(world: BenchWorld) -> BusElectronics:
+        supply = settings.supply_V, settings.supply_ohm
+        servos = [part.servo for part in joints.values()]
+        bus = ServoBus(world.clock, servos, world.send, world.baud, random, echo=settings.echo, supply=supply)
+        return BusElectronics(world, bus, joints)
+
+    motors = {joint: part.motor for joint, part in joints.items()}
+    bounds = bench_parts.bounds(request.experiment, {})
+    return BenchWorld(settings, tracked, motors, bounds, request.folder, electronics)
+
+
+def _bus_joint(settings: BusBenchSettings, joint: str, random: np.random.Generator) -> _BusJoint:
+    """A servo with its EEPROM, and its motor, which stands where the arm is put at the start."""
+    stated = settings.servo_of(joint)
+    table = stated.table
+    eeprom = {"id": stated.id, "baud": settings.baud_code(stated)}
+    if "homing_offset" in table.by_name:
+        eeprom["homing_offset"] = stated.homing_offset
+    if stated.limits is not None:
+        eeprom |= dict(zip(("min_position", "max_position"), stated.limits, strict=True))
+    sign = -1 if table.protocol == "dynamixel2" else 1
+    teeth = stated.direction * stated.horn_teeth * _TURN / SPLINE_TEETH / table.count
+    zero = stated.zero_count + sign * stated.homing_offset + teeth
+    motor = BusMotor(stated, settings.start.get(joint, 0.0))
+    return _BusJoint(BusServo(table, motor, zero, stated.direction, random, eeprom), motor)
