@@ -14,6 +14,7 @@ APPLICATIONS = {
     "bench": {"acquire", "record", "rehearse", "servo", "simulated-bench"},
     "camera": {"board"},
     "capability": {"acceptance", "capability"},
+    "lerobot": {"lerobot"},
     "online": {"control", "mission", "recalibrate", "replay", "watch", "what-if"},
     "ros2": {"bag"},
     "serve": {"serve"},

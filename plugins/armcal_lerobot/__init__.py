@@ -1,0 +1,1 @@
+"""LeRobot: motor calibration files, recorded data sets, and what both say of an arm."""

@@ -1,0 +1,177 @@
+"""LeRobot's motor calibration JSON: read and checked, and written with all that did not change as it was."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NoReturn
+
+from armcal.errors import DataError, Location
+from armcal.io.file_set import write_new, write_over
+from armcal.io.plain_files import input_bytes, text_of
+
+from armcal_lerobot.motors import GRIPPER, LARGEST_OFFSET, LAST_COUNT, Motor, remount
+
+_MAX_BYTES = 1 << 20
+_FIELDS = tuple(field.name for field in fields(Motor) if field.name != "name")
+_LARGEST_ID = 252
+_NARROW_DEG, _BESIDE_DEG = 40.0, 20.0
+_EXPECTED = "a key a motor, each with " + ", ".join(_FIELDS)
+_CALIBRATE = "Run lerobot-calibrate again"
+
+
+@dataclass(frozen=True)
+class MotorFile:
+    """A calibration file: where it is, its text, its motors by name in the file's order."""
+
+    path: Path
+    text: str
+    motors: Mapping[str, Motor]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is unusual and can be used, a sentence each."""
+        return tuple(text for motor in self.motors.values() for text in _notes(motor))
+
+    def with_motors(self, motors: Mapping[str, Motor]) -> str:
+        """The text with these motors' numbers in place of the old ones, all else as it was."""
+        text = self.text
+        for name, new in motors.items():
+            old = self.motors[name]
+            for field in _FIELDS:
+                if getattr(new, field) != getattr(old, field):
+                    text = _replaced(text, name, field, getattr(new, field))
+        expected = {**self.motors, **motors}
+        content = {name: {field: getattr(motor, field) for field in _FIELDS} for name, motor in expected.items()}
+        # Names may be written with escapes: then the whole file is written anew, laid out as LeRobot does.
+        return text if json.loads(text) == content else json.dumps(content, indent=4)
+
+    def write(self, motors: Mapping[str, Motor]) -> Path:
+        """Write new numbers over the file; its old content is kept beside it, under the name that is given back.
+
+        Raises:
+            InputError: a file cannot be written; then all is as it was.
+        """
+        stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
+        kept = self.path.with_name(f"{self.path.stem}.before-{stamp}{self.path.suffix}")
+        write_new({kept: self.text.encode()})
+        write_over({self.path: self.with_motors(motors).encode()})
+        return kept
+
+
+def read_motors(path: Path) -> MotorFile:
+    """A calibration file.
+
+    Raises:
+        DataError: it is no such file, or a number in it is one that a servo cannot have; with motor and field.
+    """
+    text = text_of(input_bytes(path, _MAX_BYTES, "a LeRobot calibration file (JSON)"), path, "Save it as UTF-8 text.")
+    try:
+        content = json.loads(text, object_pairs_hook=lambda pairs: _unique(path, pairs))
+    except (json.JSONDecodeError, RecursionError) as fault:
+        where = Location(str(path), line=getattr(fault, "lineno", None))
+        hint = "Take the file that lerobot-calibrate wrote, whole."
+        raise DataError(f"it is not JSON ({getattr(fault, 'msg', fault)}).", where=where, hint=hint) from fault
+    if not isinstance(content, dict) or not content:
+        _refuse(path, "", f"found {_kind(content)}, expected {_EXPECTED}.", "Give LeRobot's calibration file.")
+    motors = {name: _motor(path, name, entry) for name, entry in content.items()}
+    _require_own_ids(path, motors)
+    return MotorFile(path, text, motors)
+
+
+def _motor(path: Path, name: str, entry: Any) -> Motor:
+    if not isinstance(entry, dict):
+        _refuse(path, name, f"found {_kind(entry)}, expected {', '.join(_FIELDS)}.", "Give LeRobot's calibration file.")
+    for field in _FIELDS:
+        if field not in entry:
+            _refuse(path, f"{name}.{field}", "found nothing, expected a whole number.", f"{_CALIBRATE}.")
+        if type(entry[field]) is not int:
+            shown = json.dumps(entry[field])[:40]
+            _refuse(path, f"{name}.{field}", f"found {shown}, expected a whole number.", "Write it without a fraction.")
+    beyond = [key for key in entry if key not in _FIELDS]
+    if beyond:
+        _refuse(path, f"{name}.{beyond[0]}", f"found another field, expected {', '.join(_FIELDS)}.", "Remove it.")
+    motor = Motor(name, **{field: entry[field] for field in _FIELDS})
+    _require_possible(path, motor)
+    return motor
+
+
+def _require_possible(path: Path, motor: Motor) -> None:
+    name = motor.name
+    if not 0 <= motor.id <= _LARGEST_ID:
+        _refuse(path, f"{name}.id", f"found {motor.id}, expected 0 to {_LARGEST_ID}.", "Correct it.")
+    if motor.drive_mode not in (0, 1):
+        text = f"found {motor.drive_mode}, expected 0 (as mounted) or 1 (inverted)."
+        _refuse(path, f"{name}.drive_mode", text, "Write 0, as LeRobot does.")
+    if abs(motor.homing_offset) > LARGEST_OFFSET:
+        text = f"found {motor.homing_offset}, expected -{LARGEST_OFFSET} to {LARGEST_OFFSET}: a servo stores a sign and"
+        _refuse(path, f"{name}.homing_offset", f"{text} 11 bits.", remount(motor.homing_offset))
+    for field in ("range_min", "range_max"):
+        count = getattr(motor, field)
+        if not 0 <= count <= LAST_COUNT:
+            text = f"found {count}, expected 0 to {LAST_COUNT}: the encoder passed its end as the range was recorded."
+            hint = f"{_CALIBRATE}, with the joint in the middle of its range when it asks for that."
+            _refuse(path, f"{name}.{field}", text, hint)
+    if motor.range_min >= motor.range_max:
+        text = f"found {motor.range_max}, expected more than range_min ({motor.range_min})."
+        _refuse(path, f"{name}.range_max", text, f"{_CALIBRATE}, and move the joint from end to end.")
+
+
+def _require_own_ids(path: Path, motors: Mapping[str, Motor]) -> None:
+    owners: dict[int, str] = {}
+    for name, motor in motors.items():
+        other = owners.setdefault(motor.id, name)
+        if other != name:
+            text = f"found {motor.id}, which {other} has too; expected an id of its own."
+            _refuse(
+                path, f"{name}.id", text, "Give each servo its own id (lerobot-setup-motors), and correct the file."
+            )
+
+
+def _notes(motor: Motor) -> list[str]:
+    notes, name = [], motor.name
+    if motor.drive_mode:
+        notes.append(
+            f"{name} has drive_mode 1: LeRobot inverts it in percent and not in degrees, so that the joint turns the "
+            "other way as soon as use_degrees changes."
+        )
+    if name != GRIPPER and not motor.turns_freely and 2 * motor.half_range_deg < _NARROW_DEG:
+        notes.append(
+            f"{name} has a range of {2 * motor.half_range_deg:.1f} deg: it was hardly moved while the range was "
+            "recorded, and its zero, the middle of the range, is wrong with it."
+        )
+    beside = (motor.middle - LAST_COUNT / 2) * 360 / LAST_COUNT
+    if name != GRIPPER and abs(beside) > _BESIDE_DEG:
+        notes.append(
+            f"{name} was {abs(beside):.0f} deg from the middle of its range when its homing was set: its zero is the "
+            "middle of the recorded range, not that pose."
+        )
+    return notes
+
+
+def _replaced(text: str, motor: str, field: str, value: int) -> str:
+    """The text with one number replaced; a motor's object holds numbers alone, so that it ends at the first brace."""
+    entry = re.compile(re.escape(json.dumps(motor)) + r"\s*:\s*\{[^{}]*\}")
+    number = re.compile(rf'("{field}"\s*:\s*)-?\d+')
+    return entry.sub(lambda part: number.sub(rf"\g<1>{value}", part[0], count=1), text, count=1)
+
+
+def _unique(path: Path, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    names = [name for name, _ in pairs]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        _refuse(path, twice, "found this key twice, expected it once.", "Remove one of them.")
+    return dict(pairs)
+
+
+def _kind(value: Any) -> str:
+    kinds = {dict: "an empty object", list: "a list", str: "text", bool: "true or false", type(None): "null"}
+    return kinds.get(type(value), "a number")
+
+
+def _refuse(path: Path, field: str, message: str, hint: str) -> NoReturn:
+    raise DataError(message, where=Location(str(path), field=field or None), hint=hint)

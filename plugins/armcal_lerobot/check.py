@@ -1,0 +1,195 @@
+"""What a calibration file says of an arm, as numbers, tables and sections of a configuration."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.cli.common import Console
+from armcal.cli.console import columned
+from armcal.errors import InputError, Location
+
+from armcal_lerobot.calibration_file import MotorFile
+from armcal_lerobot.comparison import poses_of
+from armcal_lerobot.gripper import Gripper, wiring_of
+from armcal_lerobot.motion import read_motion, require_motors
+from armcal_lerobot.motors import GRIPPER, Motor, Units, teeth_of, zero_shift_deg
+from armcal_lerobot.recordings import open_recording
+from armcal_lerobot.zeros import Zero
+
+_MOST_UNSWEPT_DEG = 6.0
+_LEAST_SHIFT_DEG = 0.2
+_PRIOR_DEG = 3.0
+
+
+def check_content(
+    file: MotorFile, other: MotorFile | None, gripper: Gripper | None, folder: Path | None, units: Units
+) -> dict[str, Any]:
+    """All that is known of a file, of two, and of the gripper.
+
+    Raises:
+        InputError: motors are missing, or a data set is refused.
+    """
+    if other is not None:
+        require_motors(other, list(file.motors))
+    content: dict[str, Any] = {"notes": [*file.notes, *_unswept(file, gripper)], "motors": {}}
+    for name, motor in file.motors.items():
+        content["motors"][name] = {**asdict(motor), "range_deg": 2 * motor.half_range_deg}
+    if other is not None:
+        content["notes"] += [f"{other.path.name}: {text}" for text in other.notes]
+        for name, motor in file.motors.items():
+            apart = zero_shift_deg(motor, other.motors[name])
+            content["motors"][name] |= {"zero_moved_deg": apart, "teeth": teeth_of(apart)}
+    if gripper is None:
+        return content
+    angles = gripper.poses(file.motors)
+    if folder is not None:
+        angles = poses_of(read_motion(open_recording(folder), units, file), gripper)
+    content["poses"] = "of the data set" if folder else "drawn from the ranges of the file"
+    for joint, cost in gripper.per_degree(angles).items():
+        content["motors"][gripper.motor_of(joint)[0]]["mm_per_deg"] = asdict(cost)
+    if other is not None:
+        alone, together = gripper.shifted(angles, _moved(file, other, gripper, angles, units))
+        for joint, cost in alone.items():
+            content["motors"][gripper.motor_of(joint)[0]]["moved_mm"] = asdict(cost)
+        content["moved_mm"] = asdict(together)
+    return content
+
+
+def show_check(console: Console, content: Mapping[str, Any]) -> None:
+    """A row a motor, and the sum of it."""
+    motors, has_mm, has_two = content["motors"], "poses" in content, "zero_moved_deg" in _first(content["motors"])
+    columns = ["motor", "range, deg", *(() if has_two else ("id", "offset"))]
+    columns += ["mm per deg"] if has_mm else []
+    columns += ["moved, deg"] if has_two else []
+    columns += ["moved, mm"] if has_mm and has_two else []
+    table = columned("What zeros cost at the gripper" if has_mm else "Motors", columns)
+    for name, motor in motors.items():
+        row = [name, f"{motor['range_deg']:.1f}"]
+        row += [] if has_two else [str(motor["id"]), str(motor["homing_offset"])]
+        row += [_pair(motor.get("mm_per_deg"))] if has_mm else []
+        row += [f"{motor['zero_moved_deg']:+.2f}"] if has_two else []
+        row += [_pair(motor.get("moved_mm"))] if has_mm and has_two else []
+        table.add_row(*row)
+    console.out.print(table)
+    if has_mm:
+        console.line(f"mm at the gripper: in a typical pose, and at most; poses {content['poses']}")
+    for name, motor in motors.items():
+        if motor.get("teeth"):
+            teeth = "one tooth" if abs(motor["teeth"]) == 1 else f"{abs(motor['teeth'])} teeth"
+            console.line(f"{name}: {motor['zero_moved_deg']:+.1f} deg are {teeth} of a horn (14.4 deg each).")
+    if has_two and has_mm:
+        typical, most = content["moved_mm"]["typical_mm"], content["moved_mm"]["largest_mm"]
+        console.line(
+            f"At the same command the gripper stands {typical:.1f} mm elsewhere in a typical pose, {most:.1f} mm at "
+            "most, if no horn was remounted between the files."
+        )
+    elif has_two and any(abs(motor["zero_moved_deg"]) > _LEAST_SHIFT_DEG for motor in motors.values()):
+        console.line("Give --arm CONFIG to see what that is in mm at the gripper.")
+
+
+def sections(file: MotorFile, gripper: Gripper | None, model: str) -> str:
+    """Sections of a configuration: the joints of a servo bus, the limits of a plan, zeros and priors of a servo map."""
+    arm = gripper.name if gripper else "arm"
+    turned = [(joint, *gripper.motor_of(joint)) for joint in gripper.joints] if gripper else _same_names(file)
+    lines = [f"# From {file.path.name}, LeRobot's motor calibration.", "bench:", "  device:", "    joints:"]
+    limits, values, priors = [], [], []
+    for number, (joint, name, sense) in enumerate(turned, start=1):
+        motor = file.motors[name]
+        low, high = (f"{end:.1f}" for end in motor.limits)
+        direction = "direction: -1, " if sense < 0 else ""
+        servo = f"id: {motor.id}, model: {model}, zero_count: {round(motor.middle)}"
+        lines.append(f"      {arm}.{joint}: {{{servo}, {direction}range_deg: [{low}, {high}]}}")
+        limits.append(f"    {joint}: [{low} deg, {high} deg]")
+        ends = gripper.limits[joint] if gripper else None
+        middle = math.degrees(sum(ends)) / 2 if ends and not motor.turns_freely else 0.0
+        unswept = abs(math.degrees(ends[1] - ends[0]) - 2 * motor.half_range_deg) / 2 if ends else 0.0
+        if abs(middle) > 0.05:
+            values.append(f"    {arm}.zeros.offset{number}: {middle:.1f} deg")
+        priors.append(f"    {arm}.zeros.offset{number}: {max(_PRIOR_DEG, unswept):.1f} deg")
+    lines += ["plan:", "  limits:", *limits]
+    lines += ["# With an effect {type: servo_map, gains: one} called zeros:", "parameters:"]
+    lines += ["  values:           # LeRobot's zero is the middle of the range", *values] if values else []
+    return "\n".join([*lines, "  priors:", *priors, ""])
+
+
+def wired_zeros(zeros: Mapping[str, Zero], file: MotorFile, joints: Sequence[str]) -> dict[str, tuple[Zero, int]]:
+    """Each motor's zero, with the sense of its joint.
+
+    Raises:
+        InputError: a joint has no motor in the file.
+    """
+    wiring = {follows.joint: (motor, follows.sense) for motor, follows in wiring_of(joints).items()}
+    wired = {}
+    for joint, zero in zeros.items():
+        motor, sense = wiring.get(joint, (joint, 1))
+        if motor not in file.motors:
+            text = f"found no motor for the joint {joint}; the motors are {', '.join(file.motors)}."
+            hint = f"Say which one turns it: --joint MOTOR={joint}."
+            raise InputError(text, where=Location(str(file.path)), hint=hint)
+        wired[motor] = (zero, sense)
+    return wired
+
+
+def show_zeros(
+    console: Console, file: MotorFile, changed: Mapping[str, Motor], wired: Mapping[str, tuple[Zero, int]]
+) -> None:
+    """A row a motor: its zero, and the numbers of the file before and after."""
+    table = columned(
+        "What changes in the file", ("motor", "zero, deg", "sd", "homing_offset", "range_min", "range_max")
+    )
+    for name, motor in changed.items():
+        old, zero = file.motors[name], wired[name][0]
+        cells = [
+            f"{getattr(old, field)} -> {getattr(motor, field)}" for field in ("homing_offset", "range_min", "range_max")
+        ]
+        table.add_row(name, f"{zero.degrees:+.2f}", f"{zero.sd_deg:.2f}", *cells)
+    console.out.print(table)
+
+
+def _unswept(file: MotorFile, gripper: Gripper | None) -> list[str]:
+    """Ranges that are another than the arm's own: the zero, their middle, is as wrong as half of the difference."""
+    notes: list[str] = []
+    if gripper is None:
+        return notes
+    for joint in gripper.joints:
+        name, ends = gripper.motor_of(joint)[0], gripper.limits[joint]
+        motor = file.motors[name]
+        if ends is None or motor.turns_freely:
+            continue
+        whole = math.degrees(ends[1] - ends[0])
+        missing = whole - 2 * motor.half_range_deg
+        if abs(missing) > _MOST_UNSWEPT_DEG:
+            notes.append(
+                f"{name} has a range of {2 * motor.half_range_deg:.0f} deg, and the joint {joint} one of {whole:.0f} "
+                f"deg: if an end was not reached while it was recorded, its zero is off by {abs(missing) / 2:.0f} deg."
+            )
+    return notes
+
+
+def _moved(file: MotorFile, other: MotorFile, gripper: Gripper, angles: Array, units: Units) -> dict[str, Array]:
+    """By motor, how far it stands elsewhere (N; deg) by the other file at the commands of these poses (n x N; rad)."""
+    moved = {}
+    for index, joint in enumerate(gripper.joints):
+        name, sense = gripper.motor_of(joint)
+        one, two = file.motors[name], other.motors[name]
+        stretched = two.degrees_in(units) / one.degrees_in(units) - 1
+        moved[name] = zero_shift_deg(one, two) + stretched * sense * np.degrees(angles[index])
+    return moved
+
+
+def _same_names(file: MotorFile) -> list[tuple[str, str, int]]:
+    return [(name, name, 1) for name in file.motors if name != GRIPPER]
+
+
+def _first(motors: Mapping[str, Any]) -> Mapping[str, Any]:
+    return next(iter(motors.values()))
+
+
+def _pair(cost: Mapping[str, float] | None) -> str:
+    return "-" if cost is None else f"{cost['typical_mm']:.1f}, {cost['largest_mm']:.1f}"

@@ -1,0 +1,176 @@
+"""``armcal lerobot``: what motor calibration files and data sets say of an arm, and calibrated zeros back into them."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+from armcal.cli.common import FILE, Console, command_line, speaking
+from armcal.errors import InputError
+
+from armcal_lerobot.calibration_file import read_motors
+
+_JOINT_HELP = "Which joint a motor turns, where names differ; =-JOINT where it turns the other way."
+
+
+@click.group()
+def lerobot() -> None:
+    """LeRobot's motor calibration files and recorded data sets: checked, compared, and zeros written back."""
+
+
+def _of_arm(command: Any) -> Any:
+    """The options that say which arm, and how its motors are called."""
+    config = click.option("--arm", "config", type=FILE, help="The arm's configuration or calibration: gives mm.")
+    name = click.option("--arm-name", metavar="NAME", help="Which arm, where there are several.")
+    joint = click.option("--joint", "joints", multiple=True, metavar="MOTOR=JOINT", help=_JOINT_HELP)
+    return config(name(joint(command)))
+
+
+_UNITS = click.option(
+    "--units",
+    type=click.Choice(["degrees", "percent"]),
+    default="degrees",
+    show_default=True,
+    help="Of a data set's numbers, as use_degrees was when it was recorded.",
+)
+
+
+@lerobot.command()
+@click.argument("calibration", type=FILE)
+@click.argument("other", type=FILE, required=False)
+@click.option("--data", "folder", type=FILE, help="A data set whose poses count [default: the files' ranges].")
+@_UNITS
+@_of_arm
+@speaking
+def check(console: Console, calibration: Path, other: Path | None, folder: Path | None, **given: Any) -> None:
+    """Check a calibration file, and say what its zeros cost at the gripper.
+
+    With OTHER (yesterday's file and today's) also how far the same command moves each joint, and the gripper.
+    """
+    from armcal_lerobot.check import check_content, show_check
+
+    file, second = read_motors(calibration), read_motors(other) if other else None
+    gripper = _gripper(console, list(file.motors), **given)
+    content = check_content(file, second, gripper, folder, given["units"])
+    console.result(content)
+    for note in content["notes"]:
+        console.warn(note)
+    show_check(console, content)
+
+
+@lerobot.command()
+@click.argument("calibration", type=FILE)
+@click.option("--model", default="sts3215", show_default=True, help="Of the servos.")
+@_of_arm
+@speaking
+def joints(console: Console, calibration: Path, model: str, **given: Any) -> None:
+    """Print a calibration file as sections of an armcal configuration: joints of the bus, limits, zeros and priors."""
+    from armcal_lerobot.check import sections
+
+    file = read_motors(calibration)
+    gripper = _gripper(console, list(file.motors), **given)
+    text = sections(file, gripper, model)
+    console.result({"text": text})
+    if not console.json:
+        click.echo(text, nl=False)
+
+
+@lerobot.command()
+@click.argument("calibrated", metavar="CALIBRATION_YAML", type=FILE)
+@click.argument("calibration", metavar="LEROBOT_JSON", type=FILE)
+@click.option("--arm-name", metavar="NAME", help="Which arm, where there are several.")
+@click.option("--joint", "joints", multiple=True, metavar="MOTOR=JOINT", help=_JOINT_HELP)
+@click.option("--yes", is_flag=True, help="Write without a question.")
+@speaking
+def zeros(console: Console, calibrated: Path, calibration: Path, arm_name: str | None, yes: bool, **given: Any) -> None:
+    """Write the zeros of a calibrated arm into LeRobot's calibration file, after showing what changes.
+
+    The records must have been taken with this very file. Its old content is kept beside it.
+    """
+    from armcal_lerobot.check import show_zeros, wired_zeros
+    from armcal_lerobot.zeros import rezeroed, zeros_of
+
+    file = read_motors(calibration)
+    known, left = zeros_of(calibrated, arm_name, console.registry())
+    wired = wired_zeros(known, file, given["joints"])
+    changed = {name: motor for name, motor in rezeroed(file, wired).items() if motor != file.motors[name]}
+    for joint, reason in left.items():
+        console.warn(f"{joint} keeps its zero: {reason}")
+    show_zeros(console, file, changed, wired)
+    content = {"changed": {name: asdict(motor) for name, motor in changed.items()}, "kept": left}
+    if not changed:
+        console.result({**content, "written": False})
+        console.line("no zero moves by a count: nothing was written")
+        return
+    if not (yes or _agreed(calibration)):
+        console.result({**content, "written": False})
+        console.line("nothing was written")
+        return
+    before = file.write(changed)
+    console.result({**content, "written": True, "before": str(before)})
+    console.line(f"written: {calibration}; the old file: {before}")
+    console.line(
+        "LeRobot notices at the next connect that file and motors differ: press ENTER there to take the file. Then set "
+        "the zeros in the configuration to 0, and record anew: old data sets have the old zeros."
+    )
+
+
+@lerobot.command()
+@click.argument("dataset", type=FILE)
+@click.argument("second", metavar="[DATASET2]", type=FILE, required=False)
+@click.option("--calibration", type=FILE, help="The follower's calibration file: turns percent into degrees.")
+@click.option("--out", type=FILE, help="A page to write (HTML).")
+@_UNITS
+@_of_arm
+@speaking
+def compare(console: Console, dataset: Path, second: Path | None, out: Path | None, **given: Any) -> None:
+    """How a follower follows its commands in recorded data, joint by joint, with intervals; or two arms' data sets."""
+    from armcal_lerobot.motion import read_motion
+    from armcal_lerobot.recordings import open_recording
+    from armcal_lerobot.tracking_report import compare_content, page, show_compare
+
+    units, calibration = given["units"], given.pop("calibration")
+    file = read_motors(calibration) if calibration else None
+    read = partial(read_motion, units=units, file=file)
+    motions = [read(open_recording(folder)) for folder in (dataset, second) if folder]
+    if len(motions) == 2 and set(motions[0].motors) != set(motions[1].motors):
+        raise InputError(
+            f"found the motors {', '.join(motions[1].motors)} in {second}, expected {', '.join(motions[0].motors)}.",
+            hint="Compare data sets of arms with the same motors.",
+        )
+    gripper = _gripper(console, list(motions[0].motors), **given)
+    if gripper and units == "percent" and file is None:
+        raise InputError("found numbers in percent, expected degrees for mm.", hint="Give --calibration FILE as well.")
+    content = {"data": [str(folder) for folder in (dataset, second) if folder], **compare_content(motions, gripper)}
+    console.result(content)
+    show_compare(console, content)
+    if out is not None:
+        from armcal.io.file_set import write_over
+
+        write_over({out: page(content, command_line()).encode()})
+        console.line(f"page: {out}")
+
+
+def _gripper(console: Console, motors: list[str], **given: Any) -> Any:
+    """The arm, if one was given, whose motors are there; None without."""
+    if given["config"] is None:
+        if given["joints"] or given["arm_name"]:
+            raise InputError("found --joint or --arm-name without --arm.", hint="Give --arm CONFIG.")
+        return None
+    from armcal_lerobot.gripper import Gripper, wiring_of
+
+    gripper = Gripper(given["config"], given["arm_name"], wiring_of(given["joints"]), console.registry())
+    gripper.require(motors)
+    return gripper
+
+
+def _agreed(path: Path) -> bool:
+    if not sys.stdin.isatty():
+        raise InputError(
+            f"there is no terminal to ask whether {path} may be written; nothing was written.", hint="Give --yes."
+        )
+    return click.confirm(f"Write {path}?", err=True)

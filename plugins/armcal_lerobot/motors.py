@@ -1,0 +1,92 @@
+"""A servo as LeRobot's calibration has it, and how its counts become degrees or percent there.
+
+The servo reports ``Present_Position``: its encoder's count minus its homing offset, which is stored as a sign and 11
+bits. In degrees LeRobot's zero is the middle of the range, and 4095 counts are 360 degrees; in percent the range is
+-100 to 100 (of a gripper 0 to 100).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+Units = Literal["degrees", "percent"]
+
+LAST_COUNT = 4095
+COUNTS_A_TURN = 4096
+LARGEST_OFFSET = 2047
+DEGREES_A_COUNT = 360 / LAST_COUNT
+"""As LeRobot has it; a count of the encoder itself is 360 / 4096 deg."""
+TOOTH_DEG = 14.4
+"""A horn of 25 teeth, remounted one tooth further."""
+GRIPPER = "gripper"
+
+
+@dataclass(frozen=True)
+class Motor:
+    """One motor of a calibration file; offset and range in counts, the range as the servo reports it."""
+
+    name: str
+    id: int
+    drive_mode: int
+    homing_offset: int
+    range_min: int
+    range_max: int
+
+    @property
+    def middle(self) -> float:
+        """Of the range (counts, as the servo reports it): zero in degrees."""
+        return (self.range_min + self.range_max) / 2
+
+    @property
+    def zero_count(self) -> float:
+        """Where the encoder itself stands at zero degrees (counts)."""
+        return self.homing_offset + self.middle
+
+    @property
+    def half_range_deg(self) -> float:
+        """Degrees from the middle to either end."""
+        return (self.range_max - self.range_min) / 2 * DEGREES_A_COUNT
+
+    @property
+    def turns_freely(self) -> bool:
+        """Whether the range is the whole turn, as LeRobot writes for wrist_roll."""
+        return self.range_min == 0 and self.range_max == LAST_COUNT
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Degrees at both ends of the range."""
+        return -self.half_range_deg, self.half_range_deg
+
+    def degrees_in(self, units: Units) -> float:
+        """Degrees of one unit of a data set that was recorded with this file."""
+        if units == "degrees":
+            return 1.0
+        sign = -1.0 if self.drive_mode else 1.0  # LeRobot inverts percent by the drive mode, and never degrees
+        return sign * self.half_range_deg / 100
+
+
+def zero_shift_deg(one: Motor, two: Motor) -> float:
+    """How far the joint stands from where ``one`` put it, at the same command in degrees by ``two`` (-180 to 180)."""
+    counts = two.zero_count - one.zero_count
+    return math.remainder(counts, COUNTS_A_TURN) * 360 / COUNTS_A_TURN
+
+
+def teeth_of(degrees: float, within_deg: float = 2.0) -> int:
+    """By how many teeth of the horn an angle is explained; 0 for none, or where it is no whole number of them."""
+    teeth = round(degrees / TOOTH_DEG)
+    return teeth if teeth and abs(degrees - teeth * TOOTH_DEG) <= within_deg else 0
+
+
+def remount(offset: float) -> str:
+    """What to do about a homing offset (counts) that the servo cannot store."""
+    degrees = offset * 360 / COUNTS_A_TURN
+    teeth = max(1, round(abs(degrees) / TOOTH_DEG))
+    other = round(offset - math.copysign(COUNTS_A_TURN, offset))
+    within = f" (within one turn of the encoder the same angle is {other})" if abs(other) <= LARGEST_OFFSET else ""
+    return (
+        f"Switch the arm's power off and on, and calibrate again{within}; or take the horn off, turn it by {teeth} "
+        f"{'tooth' if teeth == 1 else 'teeth'} ({TOOTH_DEG:g} deg each) towards the middle of the encoder, and then "
+        "calibrate again."
+    )

@@ -1,0 +1,295 @@
+"""LeRobot's data sets, v2.1 (a parquet file an episode) and v3 (many episodes a file), read a batch at a time."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.errors import DataError, Location, PluginError
+from armcal.io.plain_files import input_bytes, text_of
+from numpy.typing import NDArray
+
+STATE, ACTION = "observation.state", "action"
+_NUMBERS = ("timestamp", "episode_index", "frame_index")
+_VECTOR_TYPES = ("float32", "float64", "int64", "int32")
+_MAX_META = 64 << 20
+_ROWS_AT_ONCE = 4096
+_EPISODE_FILE = re.compile(r"episode_(\d+)\.parquet")
+_KNOWN = ("v2.0", "v2.1", "v3.")
+_RECORD_AGAIN = "Take the file again from where it was recorded."
+
+
+def parquet() -> Any:
+    """The module ``pyarrow.parquet``.
+
+    Raises:
+        PluginError: pyarrow is not installed.
+    """
+    try:
+        return importlib.import_module("pyarrow.parquet")
+    except ImportError as fault:
+        hint = "Run pip install 'armcal[lerobot]'."
+        raise PluginError(f"reading LeRobot's data sets needs pyarrow ({fault}).", hint=hint) from fault
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Some frames in a row: their file, episode (N), frame in it (N), time (N, s), vectors (N x size) by feature."""
+
+    file: Path
+    episode: NDArray[np.int64]
+    frame: NDArray[np.int64]
+    time: Array
+    vectors: Mapping[str, Array]
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def chosen(self, which: Any) -> Frames:
+        """Those of a slice or an index."""
+        vectors = {name: values[which] for name, values in self.vectors.items()}
+        return Frames(self.file, self.episode[which], self.frame[which], self.time[which], vectors)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A data set on disk.
+
+    Attributes:
+        folder: with ``meta`` and ``data``.
+        version: as stated, such as v2.1.
+        fps: frames a second.
+        frames: how many ``meta/info.json`` states.
+        names: of the numbers of each vector feature, such as the motors.
+        files: parquet files in their order.
+        lengths: frames by episode, as far as the meta data state them.
+    """
+
+    folder: Path
+    version: str
+    fps: float
+    frames: int
+    names: Mapping[str, tuple[str, ...]]
+    files: tuple[Path, ...]
+    lengths: Mapping[int, int] = field(default_factory=dict)
+
+    @cached_property
+    def motors(self) -> tuple[str, ...]:
+        """The motors of the state, which those of the action must be too.
+
+        Raises:
+            DataError: the two differ.
+        """
+        state, action = (tuple(motor_name(name) for name in self.names[part]) for part in (STATE, ACTION))
+        if state != action:
+            text = f"found {', '.join(action)} in {ACTION} and {', '.join(state)} in {STATE}, expected the same motors."
+            raise DataError(
+                text, where=_info(self.folder), hint="Only joint actions can be compared with joint states."
+            )
+        return state
+
+    def read(self, features: Sequence[str]) -> Iterator[Frames]:
+        """All frames, at most 4096 at a time, none of two files.
+
+        Raises:
+            DataError: a file is damaged or cut off, a column is missing, or a vector has another length.
+        """
+        counted: dict[int, int] = {}
+        for file in self.files:
+            for frames in _read(file, features, {name: len(self.names[name]) for name in features}):
+                episodes, counts = np.unique(frames.episode, return_counts=True)
+                for episode, count in zip(episodes.tolist(), counts.tolist(), strict=True):
+                    counted[episode] = counted.get(episode, 0) + count
+                yield frames
+        for episode, length in self.lengths.items():
+            if counted.get(episode, 0) != length:
+                text = (
+                    f"found {counted.get(episode, 0)} frames of episode {episode}, expected {length} (its meta data)."
+                )
+                raise DataError(text, where=Location(str(self.folder / "data")), hint=_RECORD_AGAIN)
+
+
+def open_recording(folder: Path) -> Recording:
+    """A data set's meta data and files.
+
+    Raises:
+        DataError: it is no data set of LeRobot, of a version that is not known, or files are missing.
+        PluginError: pyarrow is not installed.
+    """
+    where = _info(folder)
+    info = _json(Path(str(where.file)))
+    version = str(info.get("codebase_version", ""))
+    if not version.startswith(_KNOWN):
+        text = f"found codebase_version {version[:20]!r}, expected v2.1 or v3.0."
+        raise DataError(text, where=where, hint="Convert it with LeRobot's own scripts.")
+    fps, frames = (info.get(key) for key in ("fps", "total_frames"))
+    if not isinstance(fps, int | float) or not 0 < fps <= 10_000 or not isinstance(frames, int):
+        hint = "Take it whole from where it was recorded."
+        raise DataError("found no fps and total_frames, expected numbers.", where=where, hint=hint)
+    names = _vector_names(info, where)
+    files = tuple(sorted((folder / "data").glob("chunk-*/*.parquet")))
+    if not files:
+        text = "found no file data/chunk-*/*.parquet."
+        raise DataError(text, where=Location(str(folder)), hint="Give the folder that holds meta and data.")
+    is_early = version.startswith("v2")
+    lengths = _lengths_of_lines(folder) if is_early else _lengths_of_tables(folder)
+    if is_early:
+        _require_files(folder, files, lengths)
+    return Recording(folder, version, float(fps), frames, names, files, lengths)
+
+
+def motor_name(name: str) -> str:
+    """A motor by the name of its number: ``shoulder_pan.pos`` and ``main_shoulder_pan`` are shoulder_pan."""
+    return name.removesuffix(".pos").removeprefix("main_")
+
+
+def _vector_names(info: Mapping[str, Any], where: Location) -> dict[str, tuple[str, ...]]:
+    features = info.get("features")
+    if not isinstance(features, dict):
+        raise DataError("found no features.", where=where, hint="Take it whole from where it was recorded.")
+    names = {}
+    for feature, about in features.items():
+        shape = about.get("shape") if isinstance(about, dict) else None
+        if about.get("dtype") not in _VECTOR_TYPES or not isinstance(shape, list) or len(shape) != 1:
+            continue
+        stated = about.get("names")
+        listed = next(iter(stated.values()), None) if isinstance(stated, dict) else stated
+        listed = listed if isinstance(listed, list) and len(listed) == shape[0] else range(shape[0])
+        names[feature] = tuple(map(str, listed))
+    for feature in (STATE, ACTION):
+        if feature not in names:
+            shown = ", ".join(features) or "none"
+            raise DataError(
+                f"found no feature {feature}, expected it as a vector of numbers; found {shown[:200]}.",
+                where=where,
+                hint="Only data sets of arms whose joints were recorded can be used.",
+            )
+    return names
+
+
+def _lengths_of_lines(folder: Path) -> dict[int, int]:
+    path = folder / "meta" / "episodes.jsonl"
+    lengths: dict[int, int] = {}
+    lines = text_of(input_bytes(path, _MAX_META, "a list of episodes"), path, "Save it as UTF-8.").splitlines()
+    for number, line in enumerate(lines, start=1):
+        try:
+            entry = json.loads(line) if line.strip() else None
+            if entry is not None:
+                lengths[int(entry["episode_index"])] = int(entry["length"])
+        except (ValueError, KeyError, TypeError) as fault:
+            text = "found a line without episode_index and length."
+            raise DataError(text, where=Location(str(path), line=number), hint=_RECORD_AGAIN) from fault
+    return lengths
+
+
+def _lengths_of_tables(folder: Path) -> dict[int, int]:
+    lengths: dict[int, int] = {}
+    for path in sorted((folder / "meta" / "episodes").glob("chunk-*/*.parquet")):
+        for batch in _batches(path, ("episode_index", "length")):
+            columns = (batch.column(name).to_pylist() for name in ("episode_index", "length"))
+            lengths.update(zip(*columns, strict=True))
+    return lengths
+
+
+def _require_files(folder: Path, files: Sequence[Path], lengths: Mapping[int, int]) -> None:
+    there = {int(match[1]) for file in files if (match := _EPISODE_FILE.fullmatch(file.name))}
+    missing = [episode for episode in lengths if episode not in there]
+    if missing:
+        shown = ", ".join(f"episode_{episode:06d}.parquet" for episode in missing[:3])
+        more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+        text = f"found no file {shown}{more}, expected one for each line of meta/episodes.jsonl."
+        raise DataError(text, where=Location(str(folder / "data")), hint=_RECORD_AGAIN)
+
+
+def _read(file: Path, features: Sequence[str], sizes: Mapping[str, int]) -> Iterator[Frames]:
+    done = 0
+    for batch in _batches(file, (*_NUMBERS, *features)):
+        numbers = {name: _numbers(batch.column(name), file, name, done) for name in _NUMBERS}
+        vectors = {name: _vectors(batch.column(name), file, name, sizes[name], done) for name in features}
+        done += batch.num_rows
+        if batch.num_rows:
+            episode, frame = (numbers[name].astype(np.int64) for name in _NUMBERS[1:])
+            yield Frames(file, episode, frame, numbers["timestamp"], vectors)
+
+
+def _batches(file: Path, columns: Sequence[str]) -> Iterator[Any]:
+    with _damage_named(file), parquet().ParquetFile(file, memory_map=True) as table:
+        there = table.schema_arrow.names
+        for column in columns:
+            if column not in there:
+                hint = "Record the data set again, or take out this file."
+                _refuse(file, column, f"found no column {column}; found {', '.join(there)[:200]}.", hint)
+        yield from table.iter_batches(batch_size=_ROWS_AT_ONCE, columns=list(columns), use_threads=False)
+
+
+@contextmanager
+def _damage_named(file: Path) -> Iterator[None]:
+    """What the library raises of a damaged file, as a DataError with the file."""
+    try:
+        yield
+    except (OSError, ValueError, KeyError) as fault:  # pyarrow's own errors derive from these
+        text = f"it is damaged or cut off ({str(fault).splitlines()[0][:120] if str(fault) else type(fault).__name__})."
+        raise DataError(text, where=Location(str(file)), hint=_RECORD_AGAIN) from fault
+
+
+def _numbers(column: Any, file: Path, name: str, done: int) -> Array:
+    values = column.to_numpy(zero_copy_only=False)
+    if values.dtype.kind not in "fiu":
+        _refuse(file, name, f"found {column.type}, expected numbers.", _RECORD_AGAIN)
+    _require_finite(np.asarray(values, dtype=float), file, name, done)
+    return np.asarray(values, dtype=float)
+
+
+def _vectors(column: Any, file: Path, name: str, size: int, done: int) -> Array:
+    """A column of lists (N x size)."""
+    if column.null_count:
+        row = int(np.argmax(column.is_null().to_numpy(zero_copy_only=False)))
+        _refuse(file, name, "found nothing, expected a vector.", _RECORD_AGAIN, done + row + 1)
+    if size == 1 and not hasattr(column, "flatten"):
+        return _numbers(column, file, name, done)[:, None]
+    if not hasattr(column.type, "value_type"):
+        _refuse(file, name, f"found {column.type}, expected a list of {size} numbers.", _RECORD_AGAIN)
+    lengths = np.asarray(column.value_lengths().to_numpy(zero_copy_only=False), dtype=float)
+    wrong = np.flatnonzero(lengths != size)
+    if len(wrong):
+        text = f"found {lengths[wrong[0]]:.0f} numbers, expected {size} as in meta/info.json."
+        _refuse(file, name, text, _RECORD_AGAIN, done + int(wrong[0]) + 1)
+    values = np.asarray(column.flatten().to_numpy(zero_copy_only=False), dtype=float).reshape(-1, size)
+    _require_finite(values, file, name, done)
+    return values
+
+
+def _require_finite(values: Array, file: Path, name: str, done: int) -> None:
+    bad = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+    if bad.any():
+        text = "found a number that is not finite."
+        _refuse(file, name, text, "Leave that episode out.", done + int(np.argmax(bad)) + 1)
+
+
+def _json(path: Path) -> dict[str, Any]:
+    text = text_of(input_bytes(path, _MAX_META, "a LeRobot data set's meta/info.json"), path, "Save it as UTF-8 text.")
+    try:
+        content = json.loads(text)
+    except (json.JSONDecodeError, RecursionError) as fault:
+        where = Location(str(path), line=getattr(fault, "lineno", None))
+        raise DataError(f"it is not JSON ({getattr(fault, 'msg', fault)}).", where=where, hint=_RECORD_AGAIN) from fault
+    if not isinstance(content, dict):
+        raise DataError("found no object.", where=Location(str(path)), hint=_RECORD_AGAIN)
+    return content
+
+
+def _info(folder: Path) -> Location:
+    return Location(str(folder / "meta" / "info.json"))
+
+
+def _refuse(file: Path, column: str, message: str, hint: str, row: int | None = None) -> NoReturn:
+    raise DataError(message, where=Location(str(file), field=column, row=row), hint=hint)

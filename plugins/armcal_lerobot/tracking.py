@@ -1,0 +1,303 @@
+"""How a joint follows its command: delay, gain, offset, backlash and what a load does, each with a 95 % interval.
+
+The delay comes from frames in motion, the rest from slow ones: y = a + g p(u, b) + c T, with the command u (delayed),
+what play p of the width b leaves of it, and gravity's torque T about the joint; the slope of p by b is the side on
+which the play rests. Neighbouring frames share their errors, so intervals are by whole stretches of motion: a sandwich
+covariance by clusters [Liang1986].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from armcal.base.domains import Array
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from armcal_lerobot.motion import Motion, Stretch
+
+Torque = Callable[[Array], Array]
+"""Gravity about the joints of the motors (N x motors; N m) for commands (N x motors); NaN for a motor without joint."""
+REVERSAL = 0.35
+"""deg or %: a command that comes back by less has not reversed; a servo's count is 0.09 deg."""
+SETTLED = 3.0
+"""deg or %: after so much travel from a reversal any play is taken up."""
+SLOW_A_SECOND, FAST_A_SECOND = 8.0, 10.0
+_CLUSTER_S = 3.0
+_EARLIEST_S, _LATEST_S, _FINEST = -0.4, 0.6, 0.25
+_FEWEST_CLUSTERS, _FEWEST_SIDES = 6, 3
+_LEAST_SPAN = 3.0
+_LEAST_TORQUE = 0.02
+_LEAST_GAIN = 0.1
+_STEPS = 3
+_SETTLES_S = 0.5
+"""After a fast motion, until a servo that lags has arrived."""
+_THIRD_OF_A_COUNT, _FINEST_GAIN = 0.03, 0.0005
+_CONFIDENCE = 0.975
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A number and its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def times(self, factor: float) -> Figure:
+        """In another unit."""
+        ends = sorted((self.low * factor, self.high * factor))
+        return Figure(self.value * factor, *ends)
+
+    def plus(self, number: float) -> Figure:
+        """Moved by a number that is known."""
+        return Figure(self.value + number, self.low + number, self.high + number)
+
+    def no_finer(self, half: float) -> Figure:
+        """With an interval of at least so much either way."""
+        return Figure(self.value, min(self.low, self.value - half), max(self.high, self.value + half))
+
+    def minus(self, other: Figure) -> Figure:
+        """The difference of two independent numbers."""
+        half = float(np.hypot(self.high - self.low, other.high - other.low)) / 2
+        middle = self.value - other.value
+        return Figure(middle, middle - half, middle + half)
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """How one motor's state follows its command; None where the data cannot say, and ``doubts`` say why.
+
+    Attributes:
+        motor: its name.
+        unit: deg, or % where degrees are not known.
+        span: of the command, without its outermost hundredths.
+        delay_s: state behind command; below zero the command follows the state.
+        gain: state over command, at rest.
+        offset: of the state at rest, in the middle of the motion.
+        backlash: by how much the command has to come back before the state does.
+        load: per N m of gravity about the joint.
+        load_most: the largest error by gravity in these poses.
+        doubts: sentences.
+    """
+
+    motor: str
+    unit: str
+    span: float
+    delay_s: Figure | None = None
+    gain: Figure | None = None
+    offset: Figure | None = None
+    backlash: Figure | None = None
+    load: Figure | None = None
+    load_most: float | None = None
+    doubts: tuple[str, ...] = ()
+
+
+def trackings(motion: Motion, torque: Torque | None = None) -> tuple[Tracking, ...]:
+    """Every motor's."""
+    return tuple(_tracking(motion, index, torque) for index in range(len(motion.motors)))
+
+
+def delayed(values: Array, frames: float) -> Array:
+    """Values (N) so many frames later; NaN where they are not known."""
+    at = np.arange(len(values)) - frames
+    return np.asarray(np.interp(at, np.arange(len(values)), values, left=np.nan, right=np.nan))
+
+
+def sides(command: Array) -> tuple[Array, Array]:
+    """Which way a command moved last (N; -1, 1, or 0 before its first motion), and how far since it reversed."""
+    side, way = np.zeros(len(command)), np.zeros(len(command))
+    now, turned, extreme = 0.0, command[0], command[0]
+    for i, value in enumerate(command.tolist()):
+        if now == 0.0:
+            if abs(value - turned) > REVERSAL:
+                now, extreme = (1.0 if value > turned else -1.0), value
+        elif (value - extreme) * now > 0:
+            extreme = value
+        elif abs(value - extreme) > REVERSAL:
+            now, turned, extreme = -now, extreme, value
+        side[i], way[i] = now, abs(extreme - turned)
+    return side, way
+
+
+def played(command: Array, width: float) -> Array:
+    """What follows a command (N) through play of a width: it stays until the command has taken the play up."""
+    values, now, half = np.empty(len(command)), float(command[0]), width / 2
+    for i, value in enumerate(command.tolist()):
+        now = min(max(now, value - half), value + half)
+        values[i] = now
+    return values
+
+
+def _tracking(motion: Motion, index: int, torque: Torque | None) -> Tracking:
+    commands = np.concatenate([stretch.commanded[:, index] for stretch in motion.stretches])
+    low, high = np.percentile(commands, [1, 99])
+    known = Tracking(motion.motors[index], motion.units[index], float(high - low))
+    if known.span < _LEAST_SPAN:
+        text = f"it moved by {known.span:.1f} {known.unit} only: nothing but its offset can be known"
+        known = replace(known, doubts=(text,))
+    else:
+        delay, doubt = _delay(motion, index)
+        known = replace(known, delay_s=delay, doubts=(doubt,) if doubt else ())
+    return _at_rest(motion, index, known, torque)
+
+
+def _delay(motion: Motion, index: int) -> tuple[Figure | None, str]:
+    """From frames in motion: the delay that leaves least, then one step of Gauss and Newton for its interval."""
+    pairs = [(stretch.commanded[:, index], stretch.reached[:, index]) for stretch in motion.stretches]
+    fps = motion.fps
+    grid = np.arange(_EARLIEST_S * fps, _LATEST_S * fps + _FINEST, _FINEST)
+    speeds = [np.gradient(command) * fps for command, _ in pairs]
+    moving = [_widened(np.abs(speed) > FAST_A_SECOND, round(_LATEST_S * fps)) for speed in speeds]
+    if sum(int(mask.sum()) for mask in moving) < 3 * fps:
+        return None, "it hardly moves fast: its delay cannot be known"
+    best = min(grid, key=lambda frames: _left(pairs, moving, frames))
+    rows, y, cluster = [], [], []
+    for number, ((command, state), speed, mask) in enumerate(zip(pairs, speeds, moving, strict=True)):
+        late, rate = delayed(command, best), delayed(speed, best)
+        side, way = sides(np.where(np.isfinite(late), late, command[0] if best > 0 else command[-1]))
+        keep = mask & np.isfinite(late) & (way > SETTLED)  # backlash looks like a delay where motion has one speed
+        rows.append(np.column_stack([np.ones(keep.sum()), late[keep], -rate[keep], -side[keep]]))
+        y.append(state[keep])
+        cluster.append(_clusters(number, np.flatnonzero(keep), _CLUSTER_S * fps))
+    fit = _fit(np.concatenate(rows), np.concatenate(y), np.concatenate(cluster))
+    if fit is None:
+        return None, "too few motions: its delay cannot be known"
+    gain, seconds = fit[1].value, fit[2]
+    if abs(gain) < _LEAST_GAIN:
+        return None, "its state does not follow its command"
+    late_s = seconds.times(1 / gain)
+    if best in (grid[0], grid[-1]):
+        return None, f"its delay is beyond {best / fps:+.1f} s"
+    return late_s.plus(best / fps).no_finer(_FINEST / fps / 2), ""
+
+
+def _left(pairs: Sequence[tuple[Array, Array]], moving: Sequence[NDArray[np.bool_]], frames: float) -> float:
+    """What a line leaves of the states at a delay, over all stretches."""
+    late, state = [], []
+    for (command, reached), mask in zip(pairs, moving, strict=True):
+        shifted = delayed(command, frames)
+        keep = mask & np.isfinite(shifted)
+        late.append(shifted[keep])
+        state.append(reached[keep])
+    x, y = np.concatenate(late), np.concatenate(state)
+    if len(x) < 3 or not np.ptp(x):
+        return np.inf
+    slope, level = np.polyfit(x, y, 1)
+    return float(np.mean((y - slope * x - level) ** 2))
+
+
+def _at_rest(motion: Motion, index: int, known: Tracking, torque: Torque | None) -> Tracking:
+    """Gain, offset, backlash and load from slow frames; the backlash by steps of Gauss and Newton."""
+    width = 0.0
+    for _ in range(_STEPS):
+        estimate = _one_step(motion, index, known, torque, width)
+        if estimate.backlash is None:
+            break
+        width = max(estimate.backlash.value, 0.0)
+    return estimate
+
+
+def _one_step(motion: Motion, index: int, known: Tracking, torque: Torque | None, width: float) -> Tracking:
+    """The linear fit about one width of the play."""
+    delay = (known.delay_s.value if known.delay_s else 0.0) * motion.fps
+    rows = _slow_rows(motion, index, delay, width, torque)
+    if rows is None:
+        return replace(known, doubts=(*known.doubts, "it hardly stands or moves slowly: only its delay can be known"))
+    command, state, speed, side, load, cluster = rows
+    doubts, middle = list(known.doubts), float(command.mean())
+    columns = {"offset": np.ones(len(command))}
+    if known.span >= _LEAST_SPAN and np.ptp(command) >= _LEAST_SPAN:
+        columns |= {"gain": command - middle, "speed": speed}
+        visits = [len(np.unique(cluster[side == one])) for one in (-1, 1)]
+        if min(visits) >= _FEWEST_SIDES:
+            columns["backlash"] = -side / 2
+        else:
+            doubts.append(f"it comes to rest {visits[1]} times from below and {visits[0]} from above: no backlash")
+    if np.isfinite(load).all() and np.ptp(load) > _LEAST_TORQUE and "gain" in columns:
+        columns["load"] = load - load.mean()
+    elif np.isfinite(load).all():
+        doubts.append("gravity about it hardly changes in these poses")
+    target = state - (middle if "gain" in columns else command)
+    fit = _fit(np.column_stack(list(columns.values())), target, cluster)
+    if fit is None:
+        return replace(known, doubts=(*doubts, "too few separate rests for intervals: record more episodes"))
+    figures = dict(zip(columns, fit, strict=True))
+    gain, load_figure, backlash = figures.get("gain"), figures.get("load"), figures.get("backlash")
+    if backlash is not None and gain is not None and abs(gain.value) > _LEAST_GAIN:
+        backlash = backlash.times(1 / gain.value).plus(width).no_finer(_THIRD_OF_A_COUNT)
+    gain = gain.no_finer(_FINEST_GAIN) if gain else None
+    most = abs(load_figure.value) * float(np.abs(load).max()) if load_figure else None
+    known = replace(known, gain=gain, offset=figures["offset"], backlash=backlash, load=load_figure)
+    return replace(known, load_most=most, doubts=tuple(doubts))
+
+
+def _slow_rows(
+    motion: Motion, index: int, delay: float, width: float, torque: Torque | None
+) -> tuple[Array, Array, Array, Array, Array, NDArray[np.int64]] | None:
+    """Command through the play, state, speed, side, torque and cluster of slow frames whose play is taken up."""
+    parts: list[tuple[Array, ...]] = []
+    for number, stretch in enumerate(motion.stretches):
+        parts.append(_slow_part(motion, stretch, number, index, delay, width, torque))
+    command, state, speed, side, load, cluster = (np.concatenate(column) for column in zip(*parts, strict=True))
+    if len(np.unique(cluster)) < 2:
+        return None
+    return command, state, speed, side, load, cluster.astype(np.int64)
+
+
+def _slow_part(
+    motion: Motion, stretch: Stretch, number: int, index: int, delay: float, width: float, torque: Torque | None
+) -> tuple[Array, ...]:
+    late = np.column_stack([delayed(column, delay) for column in stretch.commanded.T])
+    known = np.flatnonzero(np.isfinite(late).all(axis=1))
+    if len(known) < 3:
+        return tuple(np.zeros(0) for _ in range(6))
+    late = late[known]
+    command, state = late[:, index], stretch.reached[known, index]
+    speed = np.gradient(command) * motion.fps
+    quick = np.abs(speed) > SLOW_A_SECOND
+    for frames in range(1, round(_SETTLES_S * motion.fps) + 1):
+        quick[frames:] |= np.abs(speed[:-frames]) > SLOW_A_SECOND
+    side, way = sides(command)
+    # A motor that never left its place has no side, and its offset counts all the same.
+    keep = ~quick & ((way > SETTLED) if np.ptp(command) > REVERSAL else np.ones(len(command), dtype=bool))
+    load = torque(late[keep])[:, index] if torque else np.full(int(keep.sum()), np.nan)
+    turns = np.cumsum(np.abs(np.diff(side, prepend=side[0])) > 0)
+    blocks = np.arange(len(command)) // max(1, round(_CLUSTER_S * motion.fps))
+    cluster = (number * 10**10 + turns * 10**5 + blocks)[keep]
+    return played(command, width)[keep], state[keep], speed[keep], side[keep], load, cluster.astype(float)
+
+
+def _widened(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
+    """A mask (N) that also holds for so many neighbours."""
+    return (
+        np.convolve(mask, np.ones(2 * by + 1), mode="same")[: len(mask)] > 0.5
+        if len(mask) > 2 * by
+        else mask | mask.any()
+    )
+
+
+def _clusters(number: int, frames: NDArray[np.intp], length: float) -> NDArray[np.int64]:
+    return (number * 1_000_000 + frames // max(1, round(length))).astype(np.int64)
+
+
+def _fit(rows: Array, y: Array, cluster: NDArray[np.int64]) -> list[Figure] | None:
+    """Least squares with intervals by clusters of frames; None where clusters are few or a column says nothing."""
+    groups, place = np.unique(cluster, return_inverse=True)
+    count, size = len(groups), rows.shape[1]
+    scale = np.linalg.norm(rows, axis=0)
+    if count < max(_FEWEST_CLUSTERS, size + 2) or not scale.all():
+        return None
+    scaled = rows / scale
+    if np.linalg.matrix_rank(scaled, tol=1e-6) < size:
+        return None
+    solution = np.linalg.lstsq(scaled, y, rcond=None)[0]
+    scores = np.zeros((count, size))
+    np.add.at(scores, place, scaled * (y - scaled @ solution)[:, None])
+    inverse = np.linalg.inv(scaled.T @ scaled)
+    covariance = inverse @ (scores.T @ scores) @ inverse * count / (count - 1) * len(y) / max(1, len(y) - size)
+    half = student.ppf(_CONFIDENCE, count - size) * np.sqrt(np.diag(covariance)) / scale
+    values = solution / scale
+    return [Figure(float(v), float(v - h), float(v + h)) for v, h in zip(values, half, strict=True)]

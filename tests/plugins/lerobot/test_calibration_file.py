@@ -1,0 +1,116 @@
+"""LeRobot's motor calibration: what a servo cannot have is named, and what did not change stays to the byte."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+from armcal.errors import DataError, InputError
+from armcal_lerobot.calibration_file import read_motors
+from armcal_lerobot.motors import Motor, teeth_of, zero_shift_deg
+from armcal_lerobot.zeros import Zero, rezeroed
+
+from tests.plugins.lerobot.planted import motor_entries, write_motors
+
+BAD = [
+    ({"elbow_flex": {"homing_offset": 2114}}, "elbow_flex.homing_offset", "13 teeth"),
+    ({"elbow_flex": {"homing_offset": -2048}}, "elbow_flex.homing_offset", "11 bits"),
+    ({"wrist_flex": {"range_max": 4368}}, "wrist_flex.range_max", "passed its end"),
+    ({"wrist_flex": {"range_min": -3}}, "wrist_flex.range_min", "expected 0 to 4095"),
+    ({"wrist_flex": {"range_min": 3185}}, "wrist_flex.range_max", "more than range_min"),
+    ({"gripper": {"id": 2}}, "gripper.id", "shoulder_lift has too"),
+    ({"gripper": {"id": 253}}, "gripper.id", "expected 0 to 252"),
+    ({"shoulder_pan": {"drive_mode": 2}}, "shoulder_pan.drive_mode", "inverted"),
+    ({"shoulder_pan": {"id": True}}, "shoulder_pan.id", "whole number"),
+    ({"shoulder_pan": {"range_min": 10.5}}, "shoulder_pan.range_min", "found 10.5"),
+    ({"shoulder_pan": {"speed": 3}}, "shoulder_pan.speed", "another field"),
+]
+
+
+@pytest.mark.parametrize(("changed", "field", "text"), BAD)
+def test_what_a_servo_cannot_have_is_named(tmp_path: Path, changed: dict, field: str, text: str) -> None:
+    with pytest.raises(DataError) as refused:
+        read_motors(write_motors(tmp_path / "arm.json", **changed))
+    assert refused.value.where is not None and refused.value.where.field == field
+    assert text in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"a": 3}', '{"a": {}}', '{"a": {"id": 1}, "a": {}}', "{", "[" * 9000]
+)
+def test_what_is_no_calibration_file_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "arm.json"
+    path.write_text(text)
+    with pytest.raises(DataError, match=r"arm\.json"):
+        read_motors(path)
+
+
+def test_largest_offsets_are_taken(tmp_path: Path) -> None:
+    path = write_motors(tmp_path / "arm.json", gripper={"homing_offset": 2047}, elbow_flex={"homing_offset": -2047})
+    assert read_motors(path).motors["gripper"].homing_offset == 2047
+
+
+@pytest.mark.parametrize(
+    "layout", [{"indent": 4}, {"indent": 1}, {"separators": (",", ":")}, {"indent": 4, "sort_keys": True}]
+)
+def test_what_did_not_change_stays_to_the_byte(tmp_path: Path, layout: dict) -> None:
+    path, text = tmp_path / "arm.json", json.dumps(motor_entries(), **layout) + "\n"
+    path.write_text(text)
+    file = read_motors(path)
+    assert file.with_motors(file.motors) == text
+    moved = rezeroed(file, {"elbow_flex": (Zero(-90 * 360 / 4095, 0.1), 1)})
+    kept = file.write(moved)
+    assert kept.read_text() == text
+    changed = json.loads(path.read_text())
+    assert changed["elbow_flex"] == {
+        **json.loads(text)["elbow_flex"],
+        "homing_offset": 40,
+        "range_min": 1000,
+        "range_max": 3095,
+    }
+    assert {**changed, "elbow_flex": 0} == {**json.loads(text), "elbow_flex": 0}
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+def test_a_new_zero_brings_the_joint_where_the_command_says(tmp_path: Path, sense: int) -> None:
+    """By LeRobot's own rules: degrees = (count - offset - middle of the range) * 360 / 4095."""
+    file, zero = read_motors(write_motors(tmp_path / "arm.json")), 6.3
+    old, new = (
+        file.motors["shoulder_lift"],
+        rezeroed(file, {"shoulder_lift": (Zero(zero, 0.1), sense)})["shoulder_lift"],
+    )
+
+    def degrees(motor: Motor, count: float) -> float:
+        return (count - motor.homing_offset - (motor.range_min + motor.range_max) / 2) * 360 / 4095
+
+    for count in (1300, 1898, 2500):
+        true_joint = sense * degrees(old, count) + zero  # what the servo map of the calibration says
+        assert sense * degrees(new, count) == pytest.approx(true_joint, abs=0.05)
+    for end in ("range_min", "range_max"):  # the joint goes nowhere that it was not let go before
+        at = getattr(new, end) + new.homing_offset
+        assert old.range_min + old.homing_offset <= at <= old.range_max + old.homing_offset
+
+
+def test_a_zero_that_a_servo_cannot_store_is_refused_with_the_mend(tmp_path: Path) -> None:
+    file = read_motors(write_motors(tmp_path / "arm.json", elbow_flex={"homing_offset": 2000}))
+    with pytest.raises(InputError, match=r"would be 2114.*turn it by 13 teeth \(14.4 deg each\)"):
+        rezeroed(file, {"elbow_flex": (Zero(-114 * 360 / 4095, 0.1), 1)})
+    with pytest.raises(InputError, match="more than half of the range"):
+        rezeroed(file, {"shoulder_lift": (Zero(-110.0, 0.1), 1)})
+
+
+def test_odd_values_are_named(tmp_path: Path) -> None:
+    odd = {"elbow_flex": {"range_min": 1900, "range_max": 2200}, "wrist_flex": {"drive_mode": 1, "range_min": 1500}}
+    notes = " ".join(read_motors(write_motors(tmp_path / "arm.json", **odd)).notes)
+    assert "elbow_flex has a range of 26.4 deg" in notes and "wrist_flex has drive_mode 1" in notes
+    assert "wrist_flex was 26 deg from the middle" in notes and "shoulder" not in notes
+
+
+def test_zeros_of_two_files() -> None:
+    one = Motor("q", 1, 0, 2000, 900, 3100)
+    assert zero_shift_deg(one, Motor("q", 1, 0, 2000 + 164, 900, 3100)) == pytest.approx(164 * 360 / 4096)
+    assert zero_shift_deg(one, Motor("q", 1, 0, 2000 - 4096, 900, 3100)) == pytest.approx(0)
+    assert [teeth_of(x) for x in (14.6, -29.0, 7.0, 2.0, 43.0)] == [1, -2, 0, 0, 3]
+    assert math.isclose(one.half_range_deg, 1100 * 360 / 4095)

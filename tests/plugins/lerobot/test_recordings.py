@@ -1,0 +1,152 @@
+"""LeRobot's data sets, v2.1 and v3: the same numbers from both, and every damage named with its file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from armcal.errors import DataError, PluginError
+
+pytest.importorskip("pyarrow")
+import pyarrow as pa
+import pyarrow.parquet as pq
+from armcal_lerobot.motion import read_motion
+from armcal_lerobot.recordings import ACTION, STATE, Recording, open_recording
+
+from tests.plugins.lerobot.planted import MOTORS, episodes, write_dataset
+
+VERSIONS = ("v2.1", "v3.0")
+
+
+@pytest.fixture(params=VERSIONS)
+def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    return write_dataset(tmp_path / "data_set", episodes({}, count=3, frames=60), request.param)
+
+
+def files(folder: Path) -> list[Path]:
+    return sorted((folder / "data").rglob("*.parquet"))
+
+
+def rewritten(path: Path, **columns: object) -> None:
+    table = pq.read_table(path)
+    for name, values in columns.items():
+        place = table.schema.get_field_index(name)
+        table = table.remove_column(place) if values is None else table.set_column(place, name, values)
+    pq.write_table(table, path)
+
+
+def all_of(recording: Recording) -> list:
+    return list(recording.read((ACTION, STATE)))
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_numbers_are_those_that_were_recorded(tmp_path: Path, version: str) -> None:
+    made = episodes({}, count=3, frames=5000)
+    recording = open_recording(write_dataset(tmp_path / "set", made, version))
+    assert recording.motors == MOTORS and recording.fps == 30
+    read = all_of(recording)
+    assert max(map(len, read)) <= 4096
+    for feature, place in ((ACTION, 0), (STATE, 1)):
+        values = np.concatenate([frames.vectors[feature] for frames in read])
+        np.testing.assert_allclose(values, np.concatenate([episode[place] for episode in made]), atol=1e-4)
+    assert np.concatenate([frames.episode for frames in read]).tolist() == np.repeat([0, 1, 2], 5000).tolist()
+
+
+def test_a_file_that_was_cut_off_is_named(folder: Path) -> None:
+    path = files(folder)[-1]
+    path.write_bytes(path.read_bytes()[:-300])
+    with pytest.raises(DataError, match=rf"{path.name}: it is damaged or cut off"):
+        all_of(open_recording(folder))
+
+
+def test_a_file_damaged_inside_is_named(folder: Path) -> None:
+    path = files(folder)[0]
+    content = bytearray(path.read_bytes())
+    content[4:200] = bytes(196)
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=path.name):
+        all_of(open_recording(folder))
+
+
+def test_a_missing_column_is_named(folder: Path) -> None:
+    rewritten(files(folder)[0], **{STATE: None})
+    with pytest.raises(DataError, match=rf"{files(folder)[0].name}.*found no column {STATE}"):
+        all_of(open_recording(folder))
+
+
+def test_vectors_of_another_length_are_named_with_their_row(folder: Path) -> None:
+    path = files(folder)[0]
+    rows = pq.read_table(path).num_rows
+    rewritten(path, action=pa.array([[0.0] * (6 if row != 7 else 5) for row in range(rows)]))
+    with pytest.raises(DataError, match=rf"{path.name}, row 8, action: found 5 numbers, expected 6"):
+        all_of(open_recording(folder))
+
+
+def test_numbers_that_are_none_are_named(folder: Path) -> None:
+    path = files(folder)[0]
+    rows = pq.read_table(path).num_rows
+    for values in ([[0.0] * 6] * (rows - 1) + [[float("nan")] * 6], [[0.0] * 6] * (rows - 1) + [None]):
+        rewritten(path, action=pa.array(values))
+        with pytest.raises(DataError, match=rf"row {rows}, action"):
+            all_of(open_recording(folder))
+    rewritten(path, action=pa.array(["x"] * rows))
+    with pytest.raises(DataError, match="expected a list of 6 numbers"):
+        all_of(open_recording(folder))
+
+
+def test_episodes_shorter_than_their_meta_data_are_named(folder: Path) -> None:
+    path = files(folder)[0]
+    pq.write_table(pq.read_table(path).slice(0, 50), path)
+    with pytest.raises(DataError, match=r"found 50 frames of episode 0, expected 60"):
+        all_of(open_recording(folder))
+
+
+def test_a_missing_episode_is_named(tmp_path: Path) -> None:
+    folder = write_dataset(tmp_path / "set", episodes({}, count=3, frames=60))
+    files(folder)[1].unlink()
+    with pytest.raises(DataError, match=r"found no file episode_000001\.parquet"):
+        open_recording(folder)
+
+
+@pytest.mark.parametrize(
+    ("changed", "text"),
+    [
+        ({"codebase_version": "v1.6"}, "expected v2.1 or v3.0"),
+        ({"fps": "30"}, "no fps"),
+        ({"features": []}, "no features"),
+        ({"features": {"action": {"dtype": "float32", "shape": [6]}}}, "found no feature observation.state"),
+    ],
+)
+def test_meta_data_that_cannot_be_used_are_refused(folder: Path, changed: dict, text: str) -> None:
+    path = folder / "meta" / "info.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changed}))
+    with pytest.raises(DataError, match=text):
+        open_recording(folder)
+    path.write_text("{")
+    with pytest.raises(DataError, match="it is not JSON"):
+        open_recording(folder)
+
+
+def test_actions_of_other_motors_are_refused(folder: Path) -> None:
+    path = folder / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    info["features"]["action"]["names"] = ["x", "y", "z", "roll", "pitch", "yaw"]
+    path.write_text(json.dumps(info))
+    with pytest.raises(DataError, match="expected the same motors"):
+        read_motion(open_recording(folder), "degrees", None)
+
+
+def test_without_pyarrow_one_sentence(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow.parquet", None)
+    with pytest.raises(PluginError, match=r"needs pyarrow.*pip install 'armcal\[lerobot\]'"):
+        all_of(open_recording(folder))
+
+
+def test_large_data_sets_are_thinned_by_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("armcal_lerobot.motion.MOST_FRAMES", 200)
+    folder = write_dataset(tmp_path / "set", episodes({}, count=6, frames=100), "v3.0")
+    motion = read_motion(open_recording(folder), "degrees", None)
+    assert (motion.frames, motion.of) == (200, 600)
+    assert [stretch.episode for stretch in motion.stretches] == [0, 3]

@@ -1,0 +1,195 @@
+"""Leader and follower: what was planted in recorded data is found within its interval, and doubt is stated."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pyarrow")
+from armcal.plugins import discover
+from armcal_lerobot.comparison import findings_of, gripper_error, shift_findings, shifts
+from armcal_lerobot.gripper import Gripper
+from armcal_lerobot.motion import Motion, read_motion
+from armcal_lerobot.recordings import open_recording
+from armcal_lerobot.tracking import Tracking, trackings
+from armcal_lerobot.tracking_report import compare_content, page
+
+from tests.plugins.lerobot.planted import MOTORS, Planted, episodes, write_dataset
+
+ARM = Path(__file__).parents[3] / "configs" / "so101" / "arm.yaml"
+PLANTED = {
+    "shoulder_pan": Planted(offset=0.5),
+    "shoulder_lift": Planted(offset=-2.0, gain=0.98, backlash=1.0, delay=0.15),
+    "elbow_flex": Planted(offset=1.2, gain=1.02, backlash=2.0, delay=0.05),
+    "wrist_flex": Planted(backlash=0.4, delay=0.2),
+    "wrist_roll": Planted(gain=-1.0, backlash=0.5),
+}
+
+
+def motion_of(folder: Path, made: list, version: str = "v2.1") -> Motion:
+    return read_motion(open_recording(write_dataset(folder, made, version)), "degrees", None)
+
+
+def by_motor(motion: Motion) -> Mapping[str, Tracking]:
+    return {t.motor: t for t in trackings(motion)}
+
+
+@pytest.fixture(scope="module")
+def planted_motion(tmp_path_factory: pytest.TempPathFactory) -> Motion:
+    return motion_of(tmp_path_factory.mktemp("data") / "planted", episodes(PLANTED, count=5, frames=800))
+
+
+@pytest.fixture(scope="module")
+def gripper() -> Gripper:
+    return Gripper(ARM, None, {}, discover())
+
+
+@pytest.mark.parametrize("motor", PLANTED)
+def test_what_was_planted_is_found_within_its_interval(planted_motion: Motion, motor: str) -> None:
+    found, true = by_motor(planted_motion)[motor], PLANTED[motor]
+    assert found.delay_s and found.gain and found.offset and found.backlash and not found.doubts
+    assert found.delay_s.low <= true.delay <= found.delay_s.high
+    assert found.delay_s.high - found.delay_s.low < 0.03
+    assert found.backlash.low <= true.backlash <= found.backlash.high
+    assert found.backlash.high - found.backlash.low < 0.12
+    assert abs(found.gain.value - true.gain) < 3 * (found.gain.high - found.gain.low)
+    assert found.gain.high - found.gain.low < 0.004
+    middle = np.mean([np.mean(stretch.commanded[:, MOTORS.index(motor)]) for stretch in planted_motion.stretches])
+    assert found.offset.value == pytest.approx(true.offset + (true.gain - 1) * middle, abs=0.1 + abs(true.gain - 1))
+
+
+@pytest.mark.slow
+def test_intervals_cover_what_was_planted(tmp_path: Path) -> None:
+    """40 data sets, 95 % intervals of delay, gain and backlash of five motors: at least 90 % cover."""
+    covered = []
+    for seed in range(40):
+        for t in trackings(motion_of(tmp_path / str(seed), episodes(PLANTED, count=6, frames=900, seed=seed))):
+            true = PLANTED.get(t.motor, Planted())
+            for figure, value in ((t.delay_s, true.delay), (t.gain, true.gain), (t.backlash, true.backlash)):
+                assert figure is not None
+                covered.append(figure.low <= value <= figure.high)
+    assert np.mean(covered) > 0.9
+
+
+def test_a_follower_that_lags_like_a_spring_and_damper_has_no_backlash(tmp_path: Path) -> None:
+    """A first-order lag, which is no pure delay, must not be taken for play."""
+    made = []
+    for action, _ in episodes({}, count=5, frames=800):
+        state = action.copy()
+        for k in range(1, len(state)):
+            state[k] = state[k - 1] + (action[k] - state[k - 1]) * (1 - np.exp(-1 / 30 / 0.12))
+        made.append((action, state))
+    for t in by_motor(motion_of(tmp_path / "set", made)).values():
+        assert t.backlash and t.delay_s
+        assert abs(t.backlash.value) < 0.1 and 0.06 < t.delay_s.value < 0.14
+
+
+def test_sag_under_gravity_is_found_per_newton_metre(tmp_path: Path, gripper: Gripper) -> None:
+    made, compliance = [], {"shoulder_lift": 2.4, "elbow_flex": 3.9}
+    for action, _ in episodes({}, count=5, frames=800):
+        efforts = gripper.efforts(gripper.angles({name: action[:, i] for i, name in enumerate(MOTORS)}))
+        state = action.copy()
+        for name, degrees in compliance.items():
+            state[:, MOTORS.index(name)] += degrees * efforts[gripper.joints.index(name)]
+        made.append((action, state))
+    content = compare_content([motion_of(tmp_path / "set", made)], gripper)
+    motors = content["sets"][0]["motors"]
+    for name, degrees in compliance.items():
+        assert motors[name]["load"]["value"] == pytest.approx(degrees, rel=0.05)
+    assert motors["shoulder_lift"]["load_most"] > 1.0
+    assert "gravity about it hardly changes" in motors["shoulder_pan"]["doubts"][0]
+
+
+def test_exchanged_leader_and_follower_are_named(tmp_path: Path) -> None:
+    made = [(state, action) for action, state in episodes({}, count=4, frames=600)]
+    findings = findings_of(trackings(motion_of(tmp_path / "set", made)))
+    assert re.search(r"exchanged: the commands follow the states, by (9\d|10\d|11\d) ms, in 6 of 6", findings[0])
+
+
+def test_faults_of_a_motor_are_named(tmp_path: Path) -> None:
+    planted = {"elbow_flex": Planted(offset=-28.8), "wrist_roll": Planted(gain=-1.0), "wrist_flex": Planted(gain=0.8)}
+    findings = findings_of(trackings(motion_of(tmp_path / "set", episodes(planted, count=4, frames=600))))
+    assert len(findings) == 3
+    assert "elbow_flex stands -28.8 deg from its command: a horn that sits 2 teeth" in findings[0]
+    assert "wrist_flex moves 0.800 times as far" in findings[1] and "wrist_roll is inverted" in findings[2]
+
+
+def test_a_healthy_follower_has_no_findings(tmp_path: Path) -> None:
+    assert not findings_of(trackings(motion_of(tmp_path / "set", episodes({}, count=4, frames=600))))
+
+
+def test_doubt_is_stated(tmp_path: Path) -> None:
+    """A motor that stands still, one that only ever rises, one that never moves fast."""
+    random, made = np.random.default_rng(3), []
+    for _ in range(4):
+        action = np.zeros((600, 6))
+        action[:, 1] = np.linspace(0, 50, 600)
+        action[:, 2] = 20 * np.sin(np.linspace(0, 6, 600))
+        made.append((action, action + random.normal(0, 0.05, action.shape)))
+    motors = by_motor(motion_of(tmp_path / "set", made))
+    assert "nothing but its offset" in motors["shoulder_pan"].doubts[0] and motors["shoulder_pan"].gain is None
+    assert motors["shoulder_pan"].offset is not None
+    assert motors["shoulder_lift"].backlash is None and "no backlash" in " ".join(motors["shoulder_lift"].doubts)
+    assert motors["elbow_flex"].delay_s is None and "hardly moves fast" in motors["elbow_flex"].doubts[0]
+
+
+def test_one_short_episode_gives_doubt_and_no_number(tmp_path: Path) -> None:
+    for t in by_motor(motion_of(tmp_path / "set", episodes(PLANTED, count=1, frames=40))).values():
+        assert t.backlash is None and t.gain is None and t.doubts
+
+
+def moved(made: list, motor: str, offset: float, factor: float = 1.0) -> list:
+    """The same arm at rest elsewhere, in what it sends and what it reads."""
+    place, random, others = MOTORS.index(motor), np.random.default_rng(5), []
+    for action, state in made:
+        pair = []
+        for values in (action.copy(), state.copy()):
+            values[:, place] = factor * (values[:, place] + 20) + offset + random.normal(0, 0.2)
+            pair.append(values)
+        others.append(tuple(pair))
+    return others
+
+
+@pytest.mark.parametrize(
+    ("offset", "factor", "text"),
+    [
+        (14.4, 1, "elbow_flex begins .14.. deg elsewhere: a horn that sits one tooth"),
+        (6.0, 1, r"elbow_flex begins \+(5.9|6.0|6.1) deg elsewhere: its zero differs"),
+        (0, -1, "elbow_flex is inverted in one of them"),
+    ],
+)
+def test_two_data_sets_name_a_zero_that_moved(tmp_path: Path, offset: float, factor: float, text: str) -> None:
+    one = motion_of(tmp_path / "one", moved(episodes({}, count=6, frames=90, seed=1), "elbow_flex", 0.0))
+    two = motion_of(
+        tmp_path / "two", moved(episodes({}, count=6, frames=90, seed=2), "elbow_flex", offset, factor), "v3"
+    )
+    findings = shift_findings(shifts(one, two), one, two)
+    assert len(findings) == 1 and re.search(text.replace(".14..", r"\+14\.\d"), findings[0]), findings
+
+
+def test_mm_at_the_gripper(tmp_path: Path, gripper: Gripper) -> None:
+    """2 deg of the pan alone move the gripper by its distance from the pan's axis."""
+    made = []
+    for action, _ in episodes({}, count=4, frames=300):
+        state = action.copy()
+        state[:, 0] += 2.0
+        made.append((action, state))
+    motion = motion_of(tmp_path / "set", made)
+    error = gripper_error(motion, trackings(motion), gripper)
+    angles = gripper.angles({name: made[0][0][:, i] for i, name in enumerate(MOTORS)})
+    radius = np.linalg.norm(gripper.positions(angles)[:2], axis=0)
+    assert error.at_rest and error.at_rest.largest_mm < 1000 * np.radians(2.0) * 0.39
+    assert error.moving.typical_mm == pytest.approx(1000 * np.radians(2.0) * np.median(radius), rel=0.2)
+
+
+def test_the_page_stands_alone(planted_motion: Motion, gripper: Gripper) -> None:
+    content = {"data": ["a<b"], **compare_content([planted_motion], gripper)}
+    html = page(content, "armcal lerobot compare")
+    assert "a&lt;b" in html and "wrist_roll is inverted" in html and "<script" not in html
+    assert not re.search(r'(src|href)="(?!data:)', html)
+    json.dumps(content)
