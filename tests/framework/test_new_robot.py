@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import yaml
 from armcal.calibration.calibration import Calibration
+from armcal.calibration.convert_check import difference, load_source
 from armcal.cli.main import cli
 from armcal.cli.robot_questions import direction, place
 from armcal.errors import InputError
@@ -215,6 +216,22 @@ def test_a_scara_slides_in_either_convention(convention: str, here: Path) -> Non
     assert "no_deg" in read and "q3_mm" in read
     text = (here / "scara" / "README.md").read_text(encoding="utf-8")
     assert "masses" not in text and "assumed" not in text
+
+
+def test_an_so101_begins_as_the_arm_of_the_shipped_configurations(here: Path) -> None:
+    ran = new_robot("so101", "--up", "z", "--json")
+    assert ran.exit_code == 0 and json.loads(ran.stdout)["works"], ran.output
+    ours, shipped = (
+        load_source(path, None, REGISTRY) for path in (here / "so101" / "arm.yaml", ROOT / "configs/so101/arm.yaml")
+    )
+    assert [joint.name for joint in ours.chain.joints] == [joint.name for joint in shipped.chain.joints]
+    off = difference(ours.chain, shipped.chain)
+    assert max(off.position_m, off.angle_rad) < 1e-12
+    weights = [
+        {link["mass_g"]: link["com_mm"] for link in yaml.safe_load(path.read_text())["arms"]["arm"]["links"].values()}
+        for path in (here / "so101" / "arm.yaml", ROOT / "configs" / "so101" / "arm.yaml")
+    ]
+    assert weights[0] == weights[1]
 
 
 def test_a_urdf_gives_limits_and_masses(here: Path) -> None:

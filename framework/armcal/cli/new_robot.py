@@ -11,6 +11,7 @@ from armcal.cli.outlet import say
 from armcal.cli.robot_questions import ask_rows, ask_up, direction, place
 from armcal.errors import EXIT_FAULT, EXIT_NOT_CONVERGED, ConfigError
 from armcal.plugins import PluginRegistry
+from armcal.scaffold import dh_table
 from armcal.scaffold.dh_table import read_rows
 from armcal.scaffold.naming import robot_name
 from armcal.scaffold.robot import Convention, Robot, robot_of_rows
@@ -19,6 +20,8 @@ from armcal.scaffold.trial import try_out
 from armcal.scaffold.urdf_source import robot_of_urdf
 
 CONVENTIONS: dict[str, Convention] = {"standard": "standard", "modified": "craig"}
+SKELETONS = {path.stem: path for path in sorted(Path(dh_table.__file__).with_name("skeletons").glob("*.csv"))}
+"""Rows of arms that many people have, in round numbers, by the name that begins one."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,8 @@ def begin(console: Console, name: str, source: Source, folder: Path) -> None:
     for text in trial.result.warnings:
         console.warn(text)
     console.line(f"{robot.name}: {len(robot.joints)} joints, {len(made.choice.kept)} free parameters, in {made.folder}")
+    if robot.name in SKELETONS and not (source.dh or source.urdf):
+        console.line(f"{robot.name} is a skeleton of round numbers: correct arm.yaml, or begin with --urdf FILE")
     assumed = [joint.name for joint in robot.joints if joint.assumed]
     if assumed:
         console.line(f"limits were assumed for {', '.join(assumed)}: correct them in plan.yaml before the arm moves")
@@ -85,6 +90,8 @@ def _robot(name: str, source: Source, registry: PluginRegistry) -> Robot:
         raise ConfigError("found --convention without --dh.", hint="Give --dh FILE, or leave it out.")
     if source.urdf:
         return robot_of_urdf(name, source.urdf, source.tip, registry)
+    if not source.dh and name in SKELETONS:
+        return robot_of_rows(name, "standard", read_rows(SKELETONS[name]))
     if not source.dh:
         return robot_of_rows(name, *ask_rows(CONVENTIONS))
     if source.convention is None:
