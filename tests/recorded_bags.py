@@ -135,12 +135,12 @@ class Tour:
         return sent
 
 
-def made_tour(folder: Path, rests: int = 30, joint_hz: float = 100.0, seen_hz: float = 60.0) -> Tour:
+def made_tour(folder: Path, rests: int = 30, joint_hz: float = 100.0, seen_hz: float = 60.0, seed: int = 5) -> Tour:
     """A tour through random poses: 0.9 s of rest, then motions of 0.6 to 1.2 s; the true arm is that of ``TRUTH``."""
     (folder / "truth.yaml").write_text("".join(f"{name}: {value}\n" for name, value in TRUTH.items()))
     config = folder / "arm.yaml"
     config.write_text(CONFIG)
-    random = np.random.default_rng(5)
+    random = np.random.default_rng(seed)
     poses = random.uniform(-1.3, 1.3, (rests, len(NAMES)))
     begins = BEGIN_S + np.concatenate([[0.0], np.cumsum(0.9 + random.uniform(0.6, 1.2, rests - 1))])
     ends = begins + 0.9
@@ -156,7 +156,7 @@ def made_tour(folder: Path, rests: int = 30, joint_hz: float = 100.0, seen_hz: f
     times = np.arange(BEGIN_S, ends[-1], 1 / joint_hz)
     joints = joints_at(times) + random.normal(0.0, 2e-5, (len(times), len(NAMES)))
     seen_at = np.arange(BEGIN_S + 0.0021, ends[-1], 1 / seen_hz)
-    experiment = Experiment.load(config)
+    experiment = Experiment.load(config, (f"simulation.seed={seed}",))
     seen = simulated(experiment, joints_at(seen_at))
     exact = Dataset(tuple(map(str, range(rests))), dict(zip(CHANNELS, poses.T, strict=True)))
     request = replace(experiment.simulation_request, poses=exact)

@@ -98,13 +98,13 @@ def estimated_offset(
 
 def _combined(offsets: Array) -> ClockOffset | str:
     """The mean of those that are not far off, with its interval."""
-    offsets = offsets[np.isfinite(offsets)]
+    motions, offsets = len(offsets), offsets[np.isfinite(offsets)]
     if len(offsets):
         away = np.abs(offsets - np.median(offsets))
         offsets = offsets[away <= _FAR * max(1.4826 * float(np.median(away)), 1e-4)]
     count = len(offsets)
-    if count < _FEWEST_MOTIONS:
-        return f"{count} motions agree, at least {_FEWEST_MOTIONS} needed"
+    if count < max(_FEWEST_MOTIONS, motions / 2):
+        return f"motions disagree: {count} of {motions} have about the same offset"
     half_width = float(stats.t.ppf(0.975, count - 1) * offsets.std(ddof=1) / np.sqrt(count))
     if half_width > _WIDEST_S:
         return f"motions disagree: {1000 * offsets.mean():.0f} +- {1000 * half_width:.0f} ms"

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
-from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.settings import InputPath, Settings
@@ -162,8 +161,7 @@ class Rosbag2Reader:
             assert not isinstance(offset, str)
             return offset, []
         seen.close(str(self._settings.path))
-        arm = request.arms[request.measurements[name].arms[0]]
-        tool = _tool_of(arm, list(request.arms.values()).index(arm), request.arms)
+        tool = _target_of(request, name)
         guess = joints.stamps.delay - seen.stamps.delay
         estimate = estimated_offset(joints.rests, joints.path(), seen.path(), tool, guess)
         if isinstance(estimate, str):
@@ -277,13 +275,17 @@ def _joint_channels(request: ReadRequest) -> list[str]:
     return [f"{name}.{joint}" for name, arm in request.arms.items() for joint in arm.commanded]
 
 
-def _tool_of(arm: Arm, number: int, arms: Mapping[str, Arm]) -> Callable[[Array], Array]:
-    """The place of the nominal tool (N x 3, m) at the joints of all arms (N x joints)."""
-    first = sum(len(own.commanded) for own in list(arms.values())[:number])
-    chain = arm.nominal_chain
+def _target_of(request: ReadRequest, name: str) -> Callable[[Array], Array]:
+    """The place of a measurement's target on the nominal arm (N x 3, m) at the joints of all arms (N x joints)."""
+    measurement = request.measurements[name]
+    arm = request.arms[measurement.arms[0]]
+    channels = _joint_channels(request)
+    own = [channels.index(f"{measurement.arms[0]}.{joint}") for joint in arm.commanded]
+    stated = {block.name: block.nominal[0] for block in measurement.parameters() if len(block.nominal) == 1}
+    target = np.array([stated.get(f"target_{axis}", 0.0) for axis in "xyz"])
 
     def places(joints: Array) -> Array:
-        commands = arm.joint_commands([*joints[:, first : first + len(arm.commanded)].T])
-        return tool_poses(chain, np.stack(commands, axis=1))[:, :3, 3]
+        poses = tool_poses(arm.nominal_chain, np.stack(arm.joint_commands([*joints[:, own].T]), axis=1))
+        return poses[:, :3, 3] + poses[:, :3, :3] @ target
 
     return places
