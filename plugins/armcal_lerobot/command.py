@@ -13,6 +13,7 @@ from armcal.cli.common import FILE, Console, command_line, speaking
 from armcal.errors import InputError
 
 from armcal_lerobot.calibration_file import read_motors
+from armcal_lerobot.motors import Units
 
 _JOINT_HELP = "Which joint a motor turns, where names differ; =-JOINT where it turns the other way."
 
@@ -153,6 +154,39 @@ def compare(console: Console, dataset: Path, second: Path | None, out: Path | No
 
         write_over({out: page(content, command_line()).encode()})
         console.line(f"page: {out}")
+
+
+@lerobot.command()
+@click.argument("dataset", type=FILE)
+@click.option("--out", type=FILE, required=True, help="The CSV file to write, a row a rest.")
+@click.option("--window-s", type=float, default=0.5, show_default=True, help="How long no motor moves.")
+@click.option("--spread-deg", type=float, default=0.5, show_default=True, help="By more than this.")
+@click.option(
+    "--angles", type=click.Choice(["state", "action"]), default="state", show_default=True, help="Which ones."
+)
+@click.option(
+    "--camera", metavar="FEATURE", help="A camera whose images at rest are written, as observation.images.wrist."
+)
+@click.option("--images", type=FILE, help="The folder for them.")
+@click.option("--calibration", type=FILE, help="The follower's calibration file: turns percent into degrees.")
+@click.option("--joint", "joints", multiple=True, metavar="MOTOR=JOINT", help=_JOINT_HELP)
+@_UNITS
+@speaking
+def rests(console: Console, dataset: Path, out: Path, calibration: Path | None, units: Units, **given: Any) -> None:
+    """Write where an arm stood at rest in a data set, as records to calibrate from, and a camera's images of it."""
+    from armcal_lerobot.gripper import wiring_of
+    from armcal_lerobot.recordings import open_recording
+    from armcal_lerobot.rest_records import records_of, write_images, write_records
+
+    if (given["camera"] is None) != (given["images"] is None):
+        raise InputError("found one of --camera and --images, expected both.", hint="Give both, or none.")
+    file, recording = read_motors(calibration) if calibration else None, open_recording(dataset)
+    records = records_of(recording, units, file, given["angles"], given["window_s"], given["spread_deg"])
+    if given["camera"] is not None:
+        write_images(recording, given["camera"], records, given["images"])
+    write_records(out, recording.motors, records, wiring_of(given["joints"]), given["camera"] is not None)
+    console.result({"rests": len(records), "out": str(out), "images": str(given["images"] or "")})
+    console.line(f"{len(records)} rests: {out}" + (f", images in {given['images']}" if given["images"] else ""))
 
 
 def _gripper(console: Console, motors: list[str], **given: Any) -> Any:

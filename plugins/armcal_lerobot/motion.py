@@ -78,7 +78,7 @@ def read_motion(recording: Recording, units: Units, file: MotorFile | None) -> M
         InputError: the calibration lacks a motor.
     """
     motors = recording.motors
-    factors, shown = zip(*(_factor(name, units, file) for name in motors), strict=True)
+    factors, shown = zip(*(unit_of(name, units, file) for name in motors), strict=True)
     step = max(1, math.ceil(recording.frames / MOST_FRAMES))
     stretches, taken = [], 0
     columns: list[tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]] = []
@@ -115,7 +115,7 @@ def require_motors(file: MotorFile, motors: Sequence[str]) -> None:
         )
 
 
-def _factor(name: str, units: Units, file: MotorFile | None) -> tuple[float, str]:
+def unit_of(name: str, units: Units, file: MotorFile | None) -> tuple[float, str]:
     """What turns a motor's numbers into degrees, and the unit that they then have."""
     if name == GRIPPER or (units == "percent" and file is None):
         return 1.0, "%"

@@ -97,6 +97,36 @@ class Recording:
             )
         return state
 
+    def video(self, camera: str, episode: int) -> tuple[Path, int]:
+        """A camera's video of an episode, and the frame in it at which the episode begins.
+
+        Raises:
+            DataError: there is no such video.
+        """
+        videos = self.folder / "videos"
+        if self.version.startswith("v2"):
+            there = sorted(videos.glob(f"chunk-*/{camera}/episode_{episode:06d}.mp4"))
+            path, first = (there[0] if there else videos / camera), 0
+        else:
+            path, first = self._part_of_video(camera, episode)
+        if not path.is_file():
+            shown = ", ".join(sorted({str(file.parent.relative_to(videos)) for file in videos.rglob("*.mp4")}))
+            text = f"found no video of {camera}, episode {episode}; found {shown[:200] or 'none'}."
+            raise DataError(text, where=Location(str(path)), hint="Name a camera of the data set, or take its videos.")
+        return path, first
+
+    def _part_of_video(self, camera: str, episode: int) -> tuple[Path, int]:
+        """Of v3, where a file holds many episodes."""
+        columns = tuple(f"videos/{camera}/{name}" for name in ("chunk_index", "file_index", "from_timestamp"))
+        for path in sorted((self.folder / "meta" / "episodes").glob("chunk-*/*.parquet")):
+            for batch in _batches(path, ("episode_index", *columns)):
+                episodes = batch.column("episode_index").to_pylist()
+                if episode in episodes:
+                    chunk, file, start = (batch.column(name)[episodes.index(episode)].as_py() for name in columns)
+                    place = self.folder / "videos" / camera / f"chunk-{int(chunk):03d}" / f"file-{int(file):03d}.mp4"
+                    return place, round(float(start) * self.fps)
+        return self.folder / "videos" / camera, 0
+
     def read(self, features: Sequence[str]) -> Iterator[Frames]:
         """All frames, at most 4096 at a time, none of two files.
 

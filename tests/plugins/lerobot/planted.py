@@ -105,7 +105,10 @@ def write_dataset(
                 pq.write_table(pa.concat_tables(some), data / f"file-{number:03d}.parquet")
         place = folder / "meta" / "episodes" / "chunk-000"
         place.mkdir(parents=True)
+        starts = [sum(lengths[:i]) / FPS for i in range(len(lengths))]
+        video = {"chunk_index": [0] * len(lengths), "file_index": [0] * len(lengths), "from_timestamp": starts}
         about = {"episode_index": list(range(len(lengths))), "length": lengths}
+        about |= {f"videos/observation.images.front/{name}": values for name, values in video.items()}
         pq.write_table(pa.table(about), place / "file-000.parquet")
     feature: dict[str, Any] = {"dtype": "float32", "shape": [len(motors)], "names": [f"{m}.pos" for m in motors]}
     info = {

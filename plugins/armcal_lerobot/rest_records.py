@@ -1,0 +1,152 @@
+"""Where an arm stood at rest in a data set, as records to calibrate from, and a camera's images of these moments."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.errors import DataError, InputError, Location, PluginError
+from armcal.io.file_set import write_over
+from armcal.measure.rests import StillSettings, rests
+
+from armcal_lerobot.calibration_file import MotorFile
+from armcal_lerobot.gripper import Follows
+from armcal_lerobot.motion import unit_of
+from armcal_lerobot.motors import GRIPPER, Units
+from armcal_lerobot.recordings import ACTION, STATE, Frames, Recording
+from armcal_lerobot.tracking import sides
+
+_DEG = np.pi / 180
+
+
+@dataclass(frozen=True)
+class RestRecord:
+    """A rest: its episode, its middle frame, the motors' mean angles (deg) and the sides they came from (-1, 0, 1)."""
+
+    episode: int
+    frame: int
+    degrees: Array
+    approach: Array
+
+    @property
+    def name(self) -> str:
+        """Its id, and its image's name without the ending."""
+        return f"e{self.episode:06d}_f{self.frame:06d}"
+
+
+def records_of(
+    recording: Recording,
+    units: Units,
+    file: MotorFile | None,
+    angles: Literal["state", "action"],
+    window_s: float,
+    spread_deg: float,
+) -> list[RestRecord]:
+    """All rests of all episodes, in order.
+
+    Raises:
+        DataError: the data set is damaged, or no rest is in it.
+        InputError: percent without a calibration file, or no length of time.
+    """
+    if not (window_s > 0 and spread_deg > 0):
+        raise InputError("found a window or spread of zero or less.", hint="Give --window-s and --spread-deg above 0.")
+    if units == "percent" and file is None:
+        raise InputError("found numbers in percent, expected degrees.", hint="Give --calibration FILE as well.")
+    factors = np.array([unit_of(name, units, file)[0] for name in recording.motors])
+    still = StillSettings.si(window=window_s, spread=spread_deg * _DEG)
+    records = []
+    for frames in _episodes(recording):
+        shown = frames.vectors[STATE if angles == "state" else ACTION] * factors
+        moved = np.column_stack([sides(column)[0] for column in (frames.vectors[ACTION] * factors).T])
+        turning = [i for i, name in enumerate(recording.motors) if name != GRIPPER]
+        for rest in rests(shown.T[turning] * _DEG, [], frames.time, still):
+            part, middle = slice(rest.start, rest.stop), (rest.start + rest.stop) // 2
+            records.append(
+                RestRecord(
+                    int(frames.episode[0]), int(frames.frame[middle]), shown[part].mean(axis=0), moved[rest.stop - 1]
+                )
+            )
+    if not records:
+        text = f"found no {window_s:g} s in which no motor moved by more than {spread_deg:g} deg."
+        raise DataError(text, where=Location(str(recording.folder)), hint="Give another --window-s or --spread-deg.")
+    return records
+
+
+def write_records(
+    out: Path, motors: Sequence[str], records: Sequence[RestRecord], wiring: Mapping[str, Follows], has_images: bool
+) -> None:
+    """Write a CSV: pose_id, angles and approaches of every joint but the gripper's, and the image's name."""
+    turned = [(i, wiring.get(name, Follows(name))) for i, name in enumerate(motors) if name != GRIPPER]
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    names = [name for _, follows in turned for name in (f"{follows.joint}_deg", f"approach_{follows.joint}")]
+    writer.writerow(["pose_id", *names, *(["image"] if has_images else [])])
+    for record in records:
+        cells = [
+            text
+            for i, follows in turned
+            for text in (f"{follows.sense * record.degrees[i]:.4f}", f"{follows.sense * record.approach[i]:.0f}")
+        ]
+        writer.writerow([record.name, *cells, *([f"{record.name}.png"] if has_images else [])])
+    write_over({out: stream.getvalue().encode()})
+
+
+def write_images(recording: Recording, camera: str, records: Sequence[RestRecord], folder: Path) -> None:
+    """Write a camera's image of each rest as PNG.
+
+    Raises:
+        DataError: a video is missing, or ends before a rest.
+        PluginError: OpenCV is not installed.
+    """
+    try:
+        cv2: Any = importlib.import_module("cv2")
+    except ImportError as fault:
+        hint = "Run pip install 'armcal[camera]'."
+        raise PluginError(f"reading videos needs OpenCV ({fault}).", hint=hint) from fault
+    by_video: dict[Path, list[tuple[int, RestRecord]]] = {}
+    for record in records:
+        path, first = recording.video(camera, record.episode)
+        by_video.setdefault(path, []).append((first + record.frame, record))
+    folder.mkdir(parents=True, exist_ok=True)
+    for path, places in by_video.items():
+        capture, at = cv2.VideoCapture(str(path)), 0
+        try:
+            for place, record in sorted(places, key=lambda pair: pair[0]):
+                while at < place and capture.grab():
+                    at += 1
+                there, image = capture.read()
+                if not there:
+                    text = f"it ends or is damaged before frame {place}, expected an image there."
+                    raise DataError(text, where=Location(str(path)), hint="Take the video again, whole.")
+                at += 1
+                write_over({folder / f"{record.name}.png": cv2.imencode(".png", image)[1].tobytes()})
+        finally:
+            capture.release()
+
+
+def _episodes(recording: Recording) -> Iterator[Frames]:
+    """The frames of one episode after another; only one is held at a time."""
+    held: list[Frames] = []
+    for frames in recording.read((ACTION, STATE)):
+        edges = np.flatnonzero(np.diff(frames.episode)) + 1
+        for start, end in zip([0, *edges], [*edges, len(frames)], strict=True):
+            part = frames.chosen(slice(start, end))
+            if held and held[0].episode[0] != part.episode[0]:
+                yield _joined(held)
+                held = []
+            held.append(part)
+    if held:
+        yield _joined(held)
+
+
+def _joined(parts: Sequence[Frames]) -> Frames:
+    episode, frame, time = (np.concatenate([getattr(p, name) for p in parts]) for name in ("episode", "frame", "time"))
+    vectors = {name: np.concatenate([p.vectors[name] for p in parts]) for name in parts[0].vectors}
+    return Frames(parts[0].file, episode, frame, time, vectors)
