@@ -15,6 +15,7 @@ APPLICATIONS = {
     "camera": {"board"},
     "capability": {"acceptance", "capability"},
     "lerobot": {"lerobot"},
+    "makers": {"maker"},
     "online": {"control", "mission", "recalibrate", "replay", "watch", "what-if"},
     "ros2": {"bag"},
     "serve": {"serve"},

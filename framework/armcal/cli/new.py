@@ -53,6 +53,8 @@ def new_plugin(console: Console, name: str, kind: str, package: bool, out: Path 
 @click.option(
     "--target", metavar="X,Y,Z", help="Where the target sits in the tool's frame, in mm or as 2 cm [default: found]."
 )
+@click.option("--prior-mm", type=float, help="How far lengths may be off the file (standard deviation) [default: 10].")
+@click.option("--prior-deg", type=float, help="The same of angles [default: 2].")
 @click.option("--out", type=FILE, help="The folder to make [default: NAME].")
 @speaking
 def new_robot(console: Console, name: str, out: Path | None, **source: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from armcal.plugins import PluginRegistry
 from armcal.scaffold import dh_table
 from armcal.scaffold.dh_table import read_rows
 from armcal.scaffold.naming import robot_name
-from armcal.scaffold.robot import Convention, Robot, robot_of_rows
+from armcal.scaffold.robot import WIDTHS, Convention, Robot, Unit, robot_of_rows
 from armcal.scaffold.robot_files import write_robot
 from armcal.scaffold.trial import try_out
 from armcal.scaffold.urdf_source import robot_of_urdf
@@ -34,6 +35,8 @@ class Source:
     tip: str | None
     up: str | None
     target: str | None
+    prior_mm: float | None
+    prior_deg: float | None
 
 
 def begin(console: Console, name: str, source: Source, folder: Path) -> None:
@@ -44,7 +47,7 @@ def begin(console: Console, name: str, source: Source, folder: Path) -> None:
     if up is None and robot.has_masses and sys.stdin.isatty():  # gravity bends the arm, and somebody is there to ask
         up = ask_up()
     robot = replace(robot, up=direction(up) if up else robot.up, target=place(target) if target else robot.target)
-    made = write_robot(robot, folder, registry)
+    made = write_robot(replace(robot, widths=_widths(source)), folder, registry)
     with console.progress() as progress:
         trial = try_out(made, registry, command_line(), progress)
     content = {
@@ -79,6 +82,17 @@ def begin(console: Console, name: str, source: Source, folder: Path) -> None:
     if trial.fault:
         say(f"armcal: {made.folder}: the calibration of simulated records failed: {trial.fault}.", err=True)
         sys.exit(EXIT_FAULT if trial.result.estimate.verdict.converged else EXIT_NOT_CONVERGED)
+
+
+def _widths(source: Source) -> dict[Unit, float]:
+    """Of the priors."""
+    given: dict[Unit, float | None] = {"mm": source.prior_mm, "deg": source.prior_deg}
+    widths = {**WIDTHS, **{unit: width for unit, width in given.items() if width is not None}}
+    for unit, width in widths.items():
+        if not 0 < width < math.inf:
+            hint = f"Give how far the robot may well be off its file (standard deviation, {unit})."
+            raise ConfigError(f"found --prior-{unit} {width:g}, expected more than 0.", hint=hint)
+    return widths
 
 
 def _robot(name: str, source: Source, registry: PluginRegistry) -> Robot:

@@ -10,6 +10,7 @@ from typing import Literal
 
 Convention = Literal["standard", "craig"]
 Range = tuple[float, float]
+Unit = Literal["mm", "deg"]
 
 FEWEST_JOINTS, MOST_JOINTS = 2, 20
 ASSUMED_TURN: Range = (-math.radians(120), math.radians(120))
@@ -17,6 +18,7 @@ ASSUMED_TRAVEL: Range = (0.0, 0.2)
 """Limits (rad, m) of joints of which none are stated."""
 MOST = MappingProxyType({"angle": 4 * math.pi, "length": 100.0, "mass": 1e5})
 """Sizes (rad, m, kg) beyond which a number is in another unit than it says."""
+WIDTHS: Mapping[Unit, float] = MappingProxyType({"mm": 10.0, "deg": 2.0})
 _PARALLEL = 0.02
 
 
@@ -61,7 +63,8 @@ class Robot:
         joints: those that are commanded, from the base to the tip.
         has_masses: whether gravity loads it, as far as is known.
         preferred: globs of parameters to keep free where the data lets one choose, the first matter most.
-        priors: of parameters by glob, with units.
+        priors: globs of parameters that have one, each with the unit of its width.
+        widths: how far such parameters may be off the drawing (standard deviation), by unit.
         convention: of the rows.
         rows: empty for a URDF.
         urdf: the file's content.
@@ -75,7 +78,8 @@ class Robot:
     joints: tuple[RobotJoint, ...]
     has_masses: bool
     preferred: tuple[tuple[str, ...], ...]
-    priors: Mapping[str, str] = field(default_factory=dict)
+    priors: Mapping[str, Unit] = field(default_factory=dict)
+    widths: Mapping[Unit, float] = field(default_factory=lambda: WIDTHS)
     convention: Convention = "standard"
     rows: tuple[Row, ...] = ()
     urdf: bytes = b""
@@ -106,13 +110,13 @@ def robot_of_rows(name: str, convention: Convention, rows: tuple[Row, ...]) -> R
     """
     rows = with_tilts(convention, rows)
     of_rows = (("arm.mdh.theta*",), ("arm.mdh.a[0-9]*", "arm.mdh.d[0-9]*"), ("arm.mdh.alpha*", "arm.mdh.*_ry"))
-    priors = {
-        "arm.mdh.theta*": "2 deg",
-        "arm.mdh.alpha*": "2 deg",
-        "arm.mdh.after*_ry": "2 deg",
-        "arm.mdh.before*_ry": "2 deg",
-        "arm.mdh.a[0-9]*": "10 mm",
-        "arm.mdh.d[0-9]*": "10 mm",
+    priors: dict[str, Unit] = {
+        "arm.mdh.theta*": "deg",
+        "arm.mdh.alpha*": "deg",
+        "arm.mdh.after*_ry": "deg",
+        "arm.mdh.before*_ry": "deg",
+        "arm.mdh.a[0-9]*": "mm",
+        "arm.mdh.d[0-9]*": "mm",
     }
     return Robot(
         name=name,

@@ -83,7 +83,7 @@ def _fill(place: Path, robot: Robot, registry: PluginRegistry) -> FreeChoice:
     weight_N = GRAVITY_M_S2 * sum(block.nominal[0] for block in masses)
     reach = _reach(experiment, robot)
     target = {} if robot.target else {name: share * reach for name, share in truth.UNSTATED_TARGET.items()}
-    true = truth.made_up(parameters, weight_N * reach, target)
+    true = truth.made_up(parameters, weight_N * reach, target, robot.widths)
     _write(place, robot, nothing, truth.as_text(parameters, true))
     experiment = Experiment.load(place / SIMULATED, registry=registry)
     dataset = experiment.simulator().simulate(experiment.simulation_request)
@@ -118,7 +118,8 @@ def _choose_free(experiment: Experiment, robot: Robot, target: Mapping[str, floa
 
 
 def _write(place: Path, robot: Robot, choice: FreeChoice, true: Mapping[str, str]) -> None:
-    priors = {glob: sd for glob, sd in robot.priors.items() if fnmatch.filter(choice.kept, glob)}
+    held = {glob: unit for glob, unit in robot.priors.items() if fnmatch.filter(choice.kept, glob)}
+    priors = {glob: f"{number(robot.widths[unit])} {unit}" for glob, unit in held.items()}
     context: dict[str, Any] = {
         "robot": robot,
         "name": robot.name,

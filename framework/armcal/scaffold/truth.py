@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -11,6 +12,7 @@ from armcal.base.domains import Array, Rotation
 from armcal.base.parameters import Parameters
 from armcal.base.units import to_unit
 from armcal.scaffold.rendering import number
+from armcal.scaffold.robot import Unit
 
 SEED = 1
 LENGTH_SD_M, ANGLE_SD_RAD = 0.001, 0.003
@@ -36,15 +38,19 @@ def candidates(parameters: Parameters) -> tuple[str, ...]:
     )
 
 
-def made_up(parameters: Parameters, load_Nm: float, target: Mapping[str, float]) -> dict[str, float]:
+def made_up(
+    parameters: Parameters, load_Nm: float, target: Mapping[str, float], widths: Mapping[Unit, float]
+) -> dict[str, float]:
     """True values (SI) of every candidate that is one number; a rotation stays as it was stated.
 
     Args:
         parameters: of the robot, with their nominal values.
         load_Nm: the moment of its whole weight at its full reach; 0 if its masses are not known.
         target: how far parameters of the target are off beside that (m).
+        widths: of the priors, by unit: errors are no larger.
     """
     random = np.random.default_rng(SEED)
+    deviations = {"m": min(LENGTH_SD_M, 1e-3 * widths["mm"]), "rad": min(ANGLE_SD_RAD, math.radians(widths["deg"]))}
     names = [name for name in candidates(parameters) if parameters[name].size == 1]
     values = {}
     for name in names:
@@ -53,8 +59,7 @@ def made_up(parameters: Parameters, load_Nm: float, target: Mapping[str, float])
             drawn = float(random.uniform(*_SPRING))
             error = drawn * SAG_RAD / (0.5 * load_Nm) if load_Nm > 0 else 0.0
         else:
-            deviation = LENGTH_SD_M if block.unit == "m" else ANGLE_SD_RAD
-            error = deviation * float(np.clip(random.normal(), -_MOST_SD, _MOST_SD))
+            error = deviations[block.unit] * float(np.clip(random.normal(), -_MOST_SD, _MOST_SD))
         values[name] = float(block.nominal[0]) + error + target.get(name, 0.0)
     return values
 

@@ -13,7 +13,7 @@ from armcal.calibration.rigid_chain import numeric_chain
 from armcal.errors import ConfigError, DataError, Location
 from armcal.plugins import PluginRegistry
 from armcal.scaffold.naming import check_joint_names
-from armcal.scaffold.robot import ASSUMED_TRAVEL, ASSUMED_TURN, FEWEST_JOINTS, MOST_JOINTS, Robot, RobotJoint
+from armcal.scaffold.robot import ASSUMED_TRAVEL, ASSUMED_TURN, FEWEST_JOINTS, MOST_JOINTS, Robot, RobotJoint, Unit
 
 _MOST_TRAVEL_RAD = 3.2
 """A turning joint need not be measured over more than one turn."""
@@ -43,10 +43,10 @@ def robot_of_urdf(name: str, path: Path, tip: str | None, registry: PluginRegist
             hint="Name the link at the arm's end: --tip LINK.",
         )
     check_joint_names([joint.name for joint in joints], [where] * len(joints))
-    priors = {}  # how far joints may be off the URDF; where the arm stands before the tracker has none
+    priors: dict[str, Unit] = {}  # how far joints may be off the URDF; where the arm stands before the tracker has none
     for joint in joints:
-        priors[f"arm.urdf.{joint.name}_[xyz]"] = "10 mm"
-        priors[f"arm.urdf.{joint.name}_[rpy][oia]*"] = "2 deg"
+        priors[f"arm.urdf.{joint.name}_[xyz]"] = "mm"
+        priors[f"arm.urdf.{joint.name}_[rpy][oia]*"] = "deg"
     moving = tuple(f"arm.urdf.{joint.name}_*" for joint in joints)
     # Without a placement of its own the tracker's frame would end up in the first joint, and with it in every export.
     placed = ((f"arm.{PLACEMENT}_*",), ("tracker.target_*",))

@@ -1,0 +1,194 @@
+"""The exporters ``ur_calibration`` and ``xarm_kinematics``: calibrated arms in the files of their makers' drivers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import casadi as ca
+import numpy as np
+import yaml
+from armcal.arm.model import Chain, forward
+from armcal.base.domains import Array
+from armcal.base.settings import Settings
+from armcal.calibration.exporter import Exported, ExportRequest, changed_numbers, random_commands
+from armcal.calibration.rigid_chain import (
+    RigidJoint,
+    largest_difference,
+    numeric_chain,
+    require_plain_axes,
+    rigid_chain,
+)
+from armcal.errors import ConfigError, ProblemError
+
+from armcal_makers.formats import FARTHEST_M, FARTHEST_RAD, HASH, read_text
+from armcal_makers.frames import KEYS, at_zero, between, differences, placed, six_of, tips
+from armcal_makers.nominal import UR, XARM, Family, Nominal, nominal_arms
+
+TOLERANCE = 1e-9
+"""m and rad."""
+_NOTHING = 1e-7
+
+
+class XarmSettings(Settings):
+    """Which arm it is (``xarm6``); the nearest one unless given."""
+
+    robot: str | None = None
+
+
+class UrSettings(XarmSettings):
+    """Which arm it is (``ur5e``), and the hash of the robot's own calibration (``calib_...``).
+
+    A calibration whose URDF ``armcal maker`` wrote knows the hash.
+    """
+
+    hash: str | None = None
+
+
+class XarmExporter:
+    """``kinematics:``, and six numbers of each joint: the file that ``kinematics_suffix`` names."""
+
+    Settings: ClassVar[type[XarmSettings]] = XarmSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {}
+    family: ClassVar[Family] = XARM
+
+    def __init__(self, settings: Any) -> None:
+        self._settings = settings
+
+    def export(self, request: ExportRequest) -> Exported:
+        """The YAML, read again and compared in 1,000 poses.
+
+        Raises:
+            ConfigError: it is no arm of this maker, or its hash is not known.
+            ProblemError: a joint has a pitch, or what was written is not the calibrated arm.
+        """
+        chain = _chain(request)
+        axes, flange = _at_zero(chain, self.family)
+        nominal = self._nominal(axes)
+        drawn = at_zero(nominal.frames)
+        shifted, turned = differences(flange[None], drawn[-1:])
+        near = shifted[0] <= FARTHEST_M and turned[0] <= FARTHEST_RAD
+        zero = placed(axes, flange if near else drawn[-1], drawn)
+        frames = between(zero)
+        rows = {
+            key: dict(zip(KEYS, six_of(frame), strict=True)) for key, frame in zip(nominal.keys, frames, strict=True)
+        }
+        content = {"kinematics": {**rows, **self._more(request)}}
+        text = yaml.safe_dump(content, sort_keys=False).encode()
+        left = np.linalg.solve(zero[-1], flange)
+        written = read_text(text.decode(), Path(request.out or "kinematics.yaml"), nominal.name)
+        _compare(request, chain, self.family, written.frames, left)
+        return Exported(text, changed_numbers(request), tuple(request.arm.effects), remarks=_of_tool(left))
+
+    def _more(self, request: ExportRequest) -> Mapping[str, str]:
+        return {}
+
+    def _nominal(self, axes: Array) -> Nominal:
+        """The arm that is meant: by its name, or the one whose links are nearest."""
+        arms = {name: arm for name, arm in nominal_arms().items() if arm.family is self.family}
+        robot = self._settings.robot
+        if robot is not None and robot not in arms:
+            raise ConfigError(f"the arm {robot!r} is not known.", hint=f"The arms are {', '.join(arms)}.")
+        fitting = {}
+        for name, arm in arms.items():
+            if len(arm.frames) == len(axes) and robot in (None, name):
+                drawn = at_zero(arm.frames)
+                shifts, turns = differences(placed(axes, drawn[-1], drawn), drawn)
+                if turns.max() <= FARTHEST_RAD:
+                    fitting[name] = float(shifts.max())
+        nearest = min(fitting, key=lambda name: fitting[name], default="")
+        if not nearest or fitting[nearest] > FARTHEST_M:
+            far = f": its links are {1000 * fitting[nearest]:.3g} mm off {nearest}" if nearest else ""
+            raise ConfigError(
+                f"the arm is none of {', '.join(arms) if robot is None else robot}{far}.",
+                hint="Export it as a URDF: armcal export --format urdf, or armcal convert --to urdf.",
+            )
+        return arms[nearest]
+
+
+class UrExporter(XarmExporter):
+    """``kinematics:``, six numbers of each link and a hash: the ``kinematics_params_file`` of the UR driver."""
+
+    Settings: ClassVar[type[XarmSettings]] = UrSettings
+    family: ClassVar[Family] = UR
+
+    def _more(self, request: ExportRequest) -> Mapping[str, str]:
+        text = str(request.description.get("model", {}).get("text", ""))
+        known = HASH.search(text)
+        own = self._settings.hash or (known.group() if known else "")
+        if not HASH.fullmatch(own):
+            raise ConfigError(
+                f"found {own!r}, expected the hash of the robot's own calibration." if own else "found no hash.",
+                hint="Give --option hash=calib_..., as the robot's own kinematics YAML has it.",
+            )
+        return {"hash": own}
+
+
+def _chain(request: ExportRequest) -> Chain:
+    scope = f"{request.name}.{request.arm.model_name}."
+    values = {n.removeprefix(scope): v for n, v in request.values.items() if n.startswith(scope)}
+    return numeric_chain(request.arm.model, values)
+
+
+def _flange_poses(chain: Chain, family: Family, commands: Array) -> tuple[Array, Array]:
+    """The maker's base (4x4), and its flange at commands (N x n; rad) in it (N x 4 x 4).
+
+    They are links of the maker's own URDF; of another model the base of its first row, and its tool.
+    """
+    symbols = ca.SX.sym("commands", len(chain.joints))
+    frames = forward(chain, [joint.offset + symbols[i] for i, joint in enumerate(chain.joints)], {})
+    start, end = chain.frames.get(family.base), chain.frames.get(family.flange)
+    base = frames.named[family.base] if start is not None and start.joint == 0 else chain.base_T_mount
+    at_end = end is not None and end.joint == len(chain.joints)
+    flange = frames.named[family.flange] if at_end else frames.base_T_tool
+    stacked = ca.horzcat(*[ca.vec(ca.densify(ca.SX(part.matrix()).T)) for part in (base, flange)])
+    function = ca.Function("ends", [symbols], [stacked[:, 0], stacked[:, 1]], {"cse": True}).map(len(commands))
+    base_T_bases, base_T_flange = (np.asarray(part.full()).T.reshape(-1, 4, 4) for part in function(commands.T))
+    return base_T_bases[0], np.linalg.solve(base_T_bases, base_T_flange)
+
+
+def _at_zero(chain: Chain, family: Family) -> tuple[Array, Array]:
+    """Frames with z along the joints' axes (n x 4 x 4), and the flange (4x4), at zero angles in the maker's base."""
+    arm = rigid_chain(chain)
+    require_plain_axes(arm, family.format)
+    wrong = [joint.name for joint in arm.joints if joint.slides or joint.mimic is not None]
+    if wrong:
+        raise ConfigError(f"{', '.join(wrong)} slides or follows another joint.", hint="Export it as a URDF.")
+    base, flange = _flange_poses(chain, family, np.zeros((1, len(chain.joints))))
+    return np.array([np.linalg.solve(base, _along_z(joint)) for joint in arm.joints]), flange[0]
+
+
+def _along_z(joint: RigidJoint) -> Array:
+    """The joint's frame with z along its axis (4x4)."""
+    frame, z = np.array(joint.base_T_joint), joint.direction
+    if np.abs(joint.axis - (0, 0, 1)).max() > 1e-12:
+        x = frame[:3, int(np.argmin(np.abs(joint.axis)))]
+        x = x - z * (z @ x)
+        x = x / np.linalg.norm(x)
+        frame[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+    return frame
+
+
+def _compare(request: ExportRequest, chain: Chain, family: Family, frames: Array, left: Array) -> None:
+    """What was written, and the tool on it, in random poses within the limits."""
+    commands = random_commands(request.arm).T
+    apart, turned = largest_difference(_flange_poses(chain, family, commands)[1], tips(frames, commands) @ left)
+    if not (apart <= TOLERANCE and turned <= 10 * TOLERANCE):
+        raise ProblemError(
+            f"what would be written is {apart:.3g} m and {turned:.3g} rad off the calibrated arm, "
+            f"expected {TOLERANCE:g} at most.",
+            hint="Nothing was written. Please report this with the calibration.",
+        )
+
+
+def _of_tool(left: Array) -> tuple[str, ...]:
+    """Where the tool is on the flange, if it is not there."""
+    x, y, z, *angles = six_of(left)
+    if max(map(abs, (x, y, z, *angles))) <= _NOTHING:
+        return ()
+    roll, pitch, yaw = np.degrees(angles)
+    return (
+        f"the arm's tool is not at the flange of the file: give it to the robot as a tool (TCP) of x {1000 * x:.3f}, "
+        f"y {1000 * y:.3f}, z {1000 * z:.3f} mm, roll {roll:.4f}, pitch {pitch:.4f}, yaw {yaw:.4f} deg",
+    )

@@ -1,0 +1,197 @@
+"""Makers' calibration files: the kinematics YAML of ur_calibration and xarm_ros2, and a UR's own calibration.conf."""
+
+from __future__ import annotations
+
+import configparser
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.io.plain_files import input_bytes, refuse, text_of
+
+from armcal_makers.frames import KEYS, at_zero, between, dh_frames, placed, pose, tips
+from armcal_makers.nodes import AGAIN, Scalar, Section, read_section
+from armcal_makers.nominal import UR, Nominal, nominal_arms, ur_rows
+
+MAX_BYTES = 1 << 18
+FARTHEST_M, FARTHEST_RAD = 0.03, math.radians(5)
+"""Frames of a calibrated arm further off the nominal ones are of another arm, or in other units."""
+_LONGEST_M = 3.0
+_WIDEST = 2 * math.pi + 1e-6
+_STEEPEST = 0.1
+"""rad: axes that should be square or parallel are never further off."""
+_CONF = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
+HASH = re.compile(r"calib_\d+")
+
+
+@dataclass(frozen=True)
+class MakersArm:
+    """An arm as its maker measured it.
+
+    Attributes:
+        nominal: the arm that it is one of.
+        frames: parent_T_joint (n x 4 x 4).
+        source: what kind of file said so.
+        hash: by which the maker's driver knows the calibration (``calib_...``); empty where the file has none.
+        moving_axes: the frames, if roll, pitch and yaw are about the moving axes; None where there is one reading.
+    """
+
+    nominal: Nominal
+    frames: Array
+    source: str
+    hash: str = ""
+    moving_axes: Array | None = None
+
+    def other_order_m(self, commands: Array) -> float | None:
+        """How far the flange moves at commands (N x n; rad), at most, between both readings of roll, pitch and yaw.
+
+        ur_calibration computes them about the moving axes, and a URDF takes them about the fixed ones.
+        """
+        if self.moving_axes is None:
+            return None
+        apart = tips(self.frames, commands)[:, :3, 3] - tips(self.moving_axes, commands)[:, :3, 3]
+        return float(np.linalg.norm(apart, axis=1).max())
+
+
+def read_maker(path: Path, robot: str | None = None) -> MakersArm:
+    """An arm from a maker's file.
+
+    Args:
+        path: of the file.
+        robot: which arm it is (``ur5e``); needed for calibration.conf, which holds only what differs from the nominal
+            arm. Elsewhere the nearest arm, and a stated one is checked.
+
+    Raises:
+        DataError: what was found, what was expected, the line, and what to do.
+    """
+    text = text_of(input_bytes(path, MAX_BYTES, "a maker's calibration"), path, "Save the file as UTF-8.")
+    return read_text(text, path, robot)
+
+
+def read_text(text: str, path: Path, robot: str | None = None) -> MakersArm:
+    """As ``read_maker``, of the content of a file; ``path`` names it in messages."""
+    arms = nominal_arms()
+    if robot is not None and robot not in arms:
+        refuse(path, f"the arm {robot!r} is not known.", f"The arms are {', '.join(arms)}.")
+    if re.search(r"^\s*\[", text, re.MULTILINE):
+        return _of_conf(text, path, robot, arms)
+    return _of_yaml(read_section(text, path), path, robot, arms)
+
+
+def _of_yaml(root: Section, path: Path, robot: str | None, arms: dict[str, Nominal]) -> MakersArm:
+    kinematics = root.section("kinematics")
+    keys = [key for key, entry in kinematics.entries.items() if isinstance(entry, Section)]
+    known = [arm for arm in arms.values() if set(arm.keys) == set(keys)]
+    if not known:
+        expected = f"{', '.join(arms['ur5e'].keys)} (UR), or joint1 to joint5, joint6 or joint7 (xArm)"
+        kinematics.place.refuse(f"found the joints {', '.join(keys)[:200] or 'none'}, expected {expected}.", AGAIN)
+    rows = [_six(kinematics.section(key)) for key in known[0].keys]
+    frames = np.array([pose(row) for row in rows])
+    nominal = _chosen(path, robot, {arm.name: frames for arm in known}, arms)
+    if nominal.family is not UR:
+        return MakersArm(nominal, frames, nominal.family.format)
+    moving = np.array([pose(row, "XYZ") for row in rows])
+    return MakersArm(nominal, frames, UR.format, _hash(kinematics), moving)
+
+
+def _six(section: Section) -> list[float]:
+    numbers = section.numbers(KEYS)
+    for key, value, most, unit in zip(KEYS, numbers, 3 * [_LONGEST_M] + 3 * [_WIDEST], "mmm" + 3 * "r", strict=True):
+        if abs(value) > most:
+            if unit == "m":
+                section.place.refuse(
+                    f"found {key} {value:g}, expected metres of an arm's link.", "Divide millimetres by 1000."
+                )
+            section.place.refuse(
+                f"found {key} {value:g}, expected radians: it looks like degrees.", "Convert it to radians."
+            )
+    return numbers
+
+
+def _hash(kinematics: Section) -> str:
+    entry = kinematics.entries.get("hash")
+    if not (isinstance(entry, Scalar) and HASH.fullmatch(entry.text)):
+        text = repr(entry.text[:40]) if isinstance(entry, Scalar) else "no hash"
+        hint = "Without it the driver cannot tell whose calibration it is. Extract the file from the robot again."
+        kinematics.place.refuse(f"found {text}, expected hash: calib_ and a number.", hint)
+    return entry.text
+
+
+def _chosen(path: Path, robot: str | None, candidates: Mapping[str, Array], arms: Mapping[str, Nominal]) -> Nominal:
+    """The stated arm, or the nearest of those that the file may be of, each with its frames.
+
+    Raises:
+        DataError: the frames are not near to it.
+    """
+    off = {name: arms[name].off(frames) for name, frames in candidates.items()}
+    name = robot or min(off, key=lambda candidate: off[candidate])
+    shift, turn = off.get(name, (math.inf, math.inf))
+    if shift <= FARTHEST_M and turn <= FARTHEST_RAD:
+        return arms[name]
+    nearest = min(off, key=lambda candidate: off[candidate])
+    apart = (
+        "it has other joints" if math.isinf(shift) else f"{1000 * shift:.3g} mm and {math.degrees(turn):.2g} deg off"
+    )
+    hint = "It fits no arm that armcal knows: check units (m, rad), or give armcal the arm's own URDF."
+    if off[nearest][0] <= FARTHEST_M:
+        near_mm = 1000 * off[nearest][0]
+        hint = f"It fits {nearest}, {near_mm:.2g} mm off: give --robot {nearest}, or check whose file it is."
+    limits = f"{1000 * FARTHEST_M:g} mm and {math.degrees(FARTHEST_RAD):g} deg"
+    refuse(path, f"it is not a calibration of {name}: {apart}, expected {limits} at most.", hint)
+
+
+def _of_conf(text: str, path: Path, robot: str | None, arms: dict[str, Nominal]) -> MakersArm:
+    """Deltas of standard Denavit-Hartenberg rows, added to the nominal ones, and moved back to the links."""
+    deltas = _deltas(text, path)
+    choices = {name: arm for name, arm in arms.items() if arm.family is UR}
+    if robot is None or robot not in choices:
+        reason = "it holds only differences from a nominal arm" if robot is None else f"found {robot}"
+        refuse(path, f"{reason}, expected a UR.", f"Give --robot, one of {', '.join(choices)}.")
+    fitted = {name: _with(deltas, arm) for name, arm in choices.items()}
+    return MakersArm(_chosen(path, robot, fitted, arms), fitted[robot], "ur_controller")
+
+
+def _with(deltas: dict[str, Array], nominal: Nominal) -> Array:
+    theta, a, d, alpha = (row + deltas[name] for row, name in zip(ur_rows(nominal.name), _CONF, strict=True))
+    zero = at_zero(dh_frames(theta, a, d, alpha))
+    return between(placed(zero, zero[-1], at_zero(nominal.frames)))
+
+
+def _deltas(text: str, path: Path) -> dict[str, Array]:
+    parser = configparser.ConfigParser(strict=False, interpolation=None, inline_comment_prefixes=("#", ";"))
+    try:
+        parser.read_string(text)
+    except configparser.Error as fault:
+        line = getattr(fault, "lineno", None)
+        refuse(path, f"it cannot be read ({type(fault).__name__}).", "Copy the file from the robot again.", line)
+    if not parser.has_section("mounting"):
+        sections = ", ".join(parser.sections())
+        refuse(path, f"found the sections {sections}, expected [mounting].", "Give calibration.conf of a UR.")
+    mounting = parser["mounting"]
+    status = mounting.get("calibration_status", "2").strip()
+    if status != "2":
+        hint = "The robot was never calibrated, or not to its end: use the nominal arm."
+        refuse(path, f"found calibration_status = {status}, expected 2.", hint, column="calibration_status")
+    deltas = {key: _six_numbers(mounting.get(key, ""), path, key) for key in _CONF}
+    steepest = np.abs(deltas["delta_alpha"]).max()
+    if steepest > _STEEPEST:
+        hint = "Convert degrees to radians."
+        refuse(path, f"found {steepest:g}, expected at most {_STEEPEST} rad.", hint, column="delta_alpha")
+    if deltas["delta_a"][5] or deltas["delta_alpha"][5]:
+        refuse(path, "found a or alpha behind the last joint, expected 0.", "Copy the file from the robot again.")
+    return deltas
+
+
+def _six_numbers(text: str, path: Path, key: str) -> Array:
+    cells = [cell.strip() for cell in text.strip().removeprefix("[").removesuffix("]").split(",")]
+    try:
+        numbers = np.array([float(cell) for cell in cells])
+    except ValueError:
+        numbers = np.array([math.nan])
+    if numbers.shape != (6,) or not np.isfinite(numbers).all():
+        refuse(path, f"found {text[:60] or 'nothing'!r}, expected [six numbers].", "Copy the file again.", column=key)
+    return numbers

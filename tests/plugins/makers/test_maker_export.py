@@ -1,0 +1,184 @@
+"""Calibrated arms written as their makers' files: read back they are the same arm in 1,000 poses."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from armcal.calibration.exporter import request_of
+from armcal.cli.main import cli
+from armcal.errors import ConfigError
+from armcal_makers.export import UrExporter, UrSettings, XarmExporter, XarmSettings
+from armcal_makers.nominal import ur_rows
+from click.testing import CliRunner
+
+from tests.made_calibrations import made_calibration
+from tests.plugins.makers.maker_files import UR5E_YAML, XARM6_YAML, dh_tip, poses, yaml_tip
+
+KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
+HASH = "calib_14698139022496758595"
+
+
+def armcal(*arguments):
+    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+
+
+def rows_of(content):
+    """The six numbers of each joint, in order."""
+    entries = yaml.safe_load(content)["kinematics"]
+    return [[float(entry[key]) for key in KEYS] for entry in entries.values() if isinstance(entry, dict)]
+
+
+def tips_of(content, q):
+    return np.array([yaml_tip(rows_of(content), angles) for angles in q])
+
+
+def made(folder, model, **more):
+    """A calibration of an arm, every number of which moved by up to 2 mm and 20 mrad."""
+    config = {"arms": {"arm": {"model": model, **more}}, "measurements": {"t": {"type": "tip_position", "noise_mm": 1}}}
+    (folder / "arm.yaml").write_text(yaml.safe_dump(config))
+    return request_of(made_calibration(folder / "arm.yaml"), None)
+
+
+def ur_mdh(robot, **more):
+    rows = [
+        {"theta_deg": float(np.degrees(t)), "a_m": float(a), "d_m": float(d), "alpha_deg": float(np.degrees(alpha))}
+        for t, a, d, alpha in zip(*ur_rows(robot), strict=True)
+    ]
+    return {"type": "mdh", "convention": "standard", "rows": rows, **more}
+
+
+def of_maker(folder, text, name):
+    """The section ``model`` of a maker's file."""
+    (folder / "k.yaml").write_text(text)
+    ran = armcal("maker", folder / "k.yaml", "--out", folder / name)
+    assert ran.exit_code == 0, ran.output
+    return {"type": "urdf", "path": name}
+
+
+@pytest.mark.parametrize(
+    ("exporter", "text"), [(UrExporter(UrSettings()), UR5E_YAML), (XarmExporter(XarmSettings()), XARM6_YAML)]
+)
+def test_a_makers_file_comes_back_number_by_number(tmp_path, exporter, text):
+    request = made(tmp_path, of_maker(tmp_path, text, "arm.urdf"))
+    nominal = {block.name: np.array(block.nominal) for block in request.arm.parameters()}
+    exported = exporter.export(replace(request, values=nominal))
+    q = poses()
+    assert np.abs(tips_of(exported.content, q) - tips_of(text, q)).max() < 1e-13
+    for here, there in zip(rows_of(exported.content), rows_of(text), strict=True):
+        assert here[:3] == pytest.approx(there[:3], abs=1e-12)
+    assert (exported.changed, exported.left_out, exported.remarks) == (0, (), ())
+    assert yaml.safe_load(exported.content)["kinematics"].get("hash") == (HASH if text is UR5E_YAML else None)
+
+
+@pytest.mark.parametrize("robot", ["ur3", "ur10", "ur16e"])
+def test_a_calibrated_table_of_rows_is_written_for_the_driver(tmp_path, robot):
+    request = made(tmp_path, ur_mdh(robot))
+    scope = "arm.mdh."
+    rows = [[request.values[f"{scope}{name}{i}"][0] for i in range(1, 7)] for name in ("theta", "a", "d", "alpha")]
+    exported, q = UrExporter(UrSettings(hash=HASH)).export(request), poses()
+    calibrated = np.array([dh_tip(rows, angles) for angles in q])
+    written = tips_of(exported.content, q)
+    flange_T_tool = np.linalg.solve(written, calibrated)  # a and alpha of the last row lie behind the last joint
+    assert np.abs(flange_T_tool - flange_T_tool[0]).max() < 1e-12
+    assert np.abs(flange_T_tool[0] - np.eye(4)).max() < 0.03 and "TCP" in exported.remarks[0]
+    assert exported.changed == 24
+    nominal = [np.linalg.norm(dh_tip(ur_rows(robot), a)[:3, 3] - t[:3, 3]) for a, t in zip(q, calibrated, strict=True)]
+    assert max(nominal) > 0.003  # it is no copy of the nominal arm
+
+
+def test_without_a_tool_behind_the_flange_nothing_is_left_over(tmp_path):
+    request = made(tmp_path, ur_mdh("ur10", base=[{"x_mm": 1500}, {"rz_deg": 40}]))
+    values = {**request.values, "arm.mdh.a6": np.zeros(1), "arm.mdh.alpha6": np.zeros(1)}
+    exported = UrExporter(UrSettings(hash=HASH)).export(replace(request, values=values))
+    assert exported.remarks == ()  # and where the arm stands is not in the file
+    assert np.linalg.norm(rows_of(exported.content)[0][:2]) < 1e-12
+
+
+def full_urdf():
+    """A UR5e as ur_description has it: half a turn on its base link, a gripper behind its flange."""
+    from armcal_makers.nominal import nominal_arms
+
+    arm = nominal_arms()["ur5e"]
+    links = ["base_link_inertia", "a", "b", "c", "d", "e", "wrist_3_link"]
+    joints = [("base_link", "base_link_inertia", "0 0 0", "0 0 3.141592653589793", "half", "fixed")]
+    from armcal_makers.frames import six_of
+
+    for name, frame, parent, child in zip(arm.joints, arm.frames, links[:-1], links[1:], strict=True):
+        six = [repr(x) for x in six_of(frame)]
+        joints.append((parent, child, " ".join(six[:3]), " ".join(six[3:]), name, "revolute"))
+    joints.append(("wrist_3_link", "gripper", "0 0.01 0.15", "0 0 0.3", "grip", "fixed"))
+    lines = ['<robot name="cell">', *(f'<link name="{link}"/>' for link in ["base_link", *links, "gripper"])]
+    for parent, child, xyz, rpy, name, kind in joints:
+        limit = '<limit lower="-6.28" upper="6.28" effort="1" velocity="1"/>' if kind == "revolute" else ""
+        lines.append(
+            f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+            f'<origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="0 0 1"/>{limit}</joint>'
+        )
+    return "\n".join([*lines, "</robot>"])
+
+
+def test_of_the_makers_own_urdf_the_arm_alone_is_written(tmp_path):
+    (tmp_path / "cell.urdf").write_text(full_urdf())
+    request = made(tmp_path, {"type": "urdf", "path": "cell.urdf"})
+    nominal = {block.name: np.array(block.nominal) for block in request.arm.parameters()}
+    exported = UrExporter(UrSettings(hash=HASH)).export(replace(request, values=nominal))
+    q = poses()
+    wanted = np.array([dh_tip(ur_rows("ur5e"), angles) for angles in q])
+    assert np.abs(tips_of(exported.content, q) - wanted).max() < 1e-12
+    assert exported.remarks == ()
+
+
+def test_effects_are_named(tmp_path):
+    model = of_maker(tmp_path, UR5E_YAML, "arm.urdf")
+    effects = {"zero": {"type": "gear_error"}}
+    exported = UrExporter(UrSettings()).export(made(tmp_path, model, effects=effects))
+    assert exported.left_out == ("zero",)
+
+
+@pytest.mark.parametrize(
+    ("exporter", "robot", "message"),
+    [
+        (UrExporter(UrSettings()), "ur5", "no hash"),
+        (UrExporter(UrSettings(hash="1")), "ur5", "expected the hash"),
+        (UrExporter(UrSettings(hash=HASH, robot="ur9")), "ur5", "is not known"),
+        (UrExporter(UrSettings(hash=HASH, robot="ur10")), "ur5", "mm off ur10"),
+        (XarmExporter(XarmSettings()), "ur5", "none of xarm5"),
+    ],
+)
+def test_other_arms_are_refused(tmp_path, exporter, robot, message):
+    with pytest.raises(ConfigError, match=message):
+        exporter.export(made(tmp_path, ur_mdh(robot)))
+
+
+def test_a_joint_that_slides_is_refused(tmp_path):
+    model = ur_mdh("ur5")
+    model["rows"][2]["kind"] = "prismatic"
+    with pytest.raises(ConfigError, match="slides"):
+        UrExporter(UrSettings(hash=HASH)).export(made(tmp_path, model))
+
+
+def test_a_file_to_a_robot_and_back(tmp_path):
+    """Read, made a robot with narrow priors, calibrated on simulated records, written, read."""
+    of_maker(tmp_path, UR5E_YAML, "arm.urdf")
+    folder = tmp_path / "r"
+    widths = ("--prior-mm", "0.5", "--prior-deg", "0.05")
+    ran = armcal("new", "robot", "r", "--urdf", tmp_path / "arm.urdf", "--out", folder, *widths)
+    assert ran.exit_code == 0, ran.output
+    priors = yaml.safe_load((folder / "calibrate.yaml").read_text())["parameters"]["priors"]
+    assert set(priors.values()) == {"0.5 mm", "0.05 deg"}
+    calibration, out = folder / "runs" / "simulated" / "calibration.yaml", tmp_path / "new.yaml"
+    ran = armcal("export", calibration, "--format", "ur_calibration", "--out", out)
+    assert ran.exit_code == 0, ran.output
+    said = json.loads(armcal("maker", out, "--json").stdout)
+    assert (said["robot"], said["hash"]) == ("ur5e", HASH)
+    assert said["largest_mm"] > 2
+
+
+def test_a_prior_of_no_width_is_refused(tmp_path):
+    of_maker(tmp_path, UR5E_YAML, "arm.urdf")
+    ran = armcal("new", "robot", "r", "--urdf", tmp_path / "arm.urdf", "--out", tmp_path / "r", "--prior-mm", "0")
+    assert (ran.exit_code, "--prior-mm 0" in ran.stderr, (tmp_path / "r").exists()) == (2, True, False)
