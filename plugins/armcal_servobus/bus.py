@@ -20,6 +20,8 @@ _BITS = 10
 _ECHO_ID = 0xFD
 """Nobody's: what comes back when it is asked is an echo."""
 _NOBODY = frozenset((-1,))
+_NOISE = 4
+"""So many bytes that mean nothing are more than an adapter makes that turns its direction."""
 
 
 class BusSettings(SerialPortSettings):
@@ -73,11 +75,9 @@ class Bus:
                 f"the port cannot be set to {self.settings.baud} baud ({fault}).", where=self.where, hint=hint
             ) from fault
         self._echoes, self._is_clean = False, True
-        if self._framing.echo_is_an_answer:
-            place = self._framing.place(0, 1)
-            packet = self._framing.encoded(_ECHO_ID, Instruction.READ, place)
-            self._send(packet)
-            self._echoes = self._heard(self.settings.reply, len(packet)).startswith(packet)
+        packet = self._framing.encoded(_ECHO_ID, Instruction.READ, self._framing.place(0, 1))
+        self._send(packet)
+        self._echoes = self._heard(self.settings.reply, len(packet)).startswith(packet)
         return number
 
     def set_baud(self, baud: int) -> None:
@@ -244,6 +244,7 @@ class Bus:
         """
         answers: list[Status] = []
         missing, rest, damaged, echo = set(servos), b"", 0, len(packet) if self._echoes else 0
+        noise = 0
         until = time.monotonic() + wait_s
         while missing and (left := until - time.monotonic()) > 0 and not (damaged and len(servos) == 1):
             rest += self._port.read(left)
@@ -255,10 +256,11 @@ class Bus:
                     break
                 rest, echo = rest[echo:], 0
             received = self._framing.received(rest)
+            noise += 0 if received.answers or received.damaged else len(rest) - len(received.rest)
             answers += received.answers
             damaged, rest = damaged + received.damaged, received.rest
             missing -= {answer.id for answer in received.answers if is_it(answer)}
-        damaged += bool(rest and missing)
+        damaged += bool(missing and (rest or noise >= _NOISE))
         self._is_clean = not missing and not rest
         self.alarms |= {answer.id: answer.alarm for answer in answers}
         self.counts["damaged"] += damaged

@@ -14,6 +14,7 @@ from armcal_servobus.finding import looked_at, present, read_number
 from armcal_servobus.joints import ServoJoint
 
 _READINGS = 2
+_SILENT_MEND = "Look at its plug and its power; armcal bus find shows who answers, and at which baud rate."
 _SEVERAL_TURNS = 0x10
 """Of a Feetech servo's phase: it reports angles of several turns."""
 _ROUNDED = 2
@@ -71,68 +72,73 @@ def read_eeprom(bus: Bus, joint: ServoJoint) -> Eeprom:
     )
 
 
-def checked(bus: Bus, joints: Mapping[str, ServoJoint]) -> dict[str, Eeprom]:
+@dataclass(frozen=True)
+class Examination:
+    """A bus beside its configuration.
+
+    Attributes:
+        eeproms: by joint, of servos that are the configured ones.
+        mistakes: all that is not as configured.
+        silent: joints whose servos do not answer.
+        strangers: ids that answer and that no joint has; looked for only where somebody is silent.
+    """
+
+    eeproms: Mapping[str, Eeprom]
+    mistakes: tuple[Mistake, ...]
+    silent: tuple[str, ...]
+    strangers: tuple[int, ...]
+
+
+def checked(bus: Bus, joints: Mapping[str, ServoJoint]) -> Mapping[str, Eeprom]:
     """The EEPROMs of all joints' servos, by joint, where all is as configured.
 
     Raises:
         DeviceLostError: no servo answers at all.
         DeviceRefusedError: something is not as configured; every fault is named.
     """
-    eeproms, mistakes = examined(bus, joints)
-    if not mistakes:
-        return eeproms
-    if len(joints) == sum(mistake.what == _SILENT for mistake in mistakes):
-        others = ", ".join(map(str, present(bus)))
-        raise DeviceLostError(
-            f"no servo answers at {bus.settings.baud} baud" + (f" but the ids {others}." if others else "."),
-            where=bus.where,
-            hint="Look at the servos' power and the plug; armcal bus find shows who answers, and at which baud rate.",
-        )
-    listed = "; ".join(f"{mistake.joint} {mistake.what}" for mistake in mistakes)
-    hints = " ".join(dict.fromkeys(mistake.mend for mistake in mistakes))
+    examination = examined(bus, joints)
+    if len(examination.silent) == len(joints) and not examination.strangers:
+        raise DeviceLostError(f"no servo answers at {bus.settings.baud} baud.", where=bus.where, hint=_SILENT_MEND)
+    if not examination.mistakes:
+        return examination.eeproms
+    listed = "; ".join(f"{mistake.joint} {mistake.what}" for mistake in examination.mistakes)
+    hints = " ".join(dict.fromkeys(mistake.mend for mistake in examination.mistakes))
     raise DeviceRefusedError(f"found servos that are not as configured: {listed}.", where=bus.where, hint=hints)
 
 
-_SILENT = "does not answer"
-
-
-def examined(bus: Bus, joints: Mapping[str, ServoJoint]) -> tuple[dict[str, Eeprom], list[Mistake]]:
+def examined(bus: Bus, joints: Mapping[str, ServoJoint]) -> Examination:
     """What all servos hold, and all that is not as configured."""
+    silent = tuple(name for name, joint in joints.items() if not bus.ping(joint.id))
+    known = {joint.id for joint in joints.values()}
+    strangers = tuple(servo for servo in present(bus) if servo not in known) if silent else ()
     eeproms: dict[str, Eeprom] = {}
     mistakes: list[Mistake] = []
     for name, joint in joints.items():
         label = f"{name} (id {joint.id})"
-        if not bus.ping(joint.id):
-            mistakes.append(Mistake(label, _SILENT, _missing(bus, joints, joint)))
-            continue
-        servo = looked_at(bus, joint.id, _READINGS)
-        if servo.is_doubled:
-            mistakes.append(
-                Mistake(
-                    label,
-                    f"answers damaged or twice ({servo.damaged} times)",
-                    f"Two servos may have the id {joint.id}: unplug all but one, and give it another id.",
-                )
-            )
-            continue
-        if servo.model is None or servo.model.name != joint.model.name:
-            other = servo.model.name if servo.model else f"a model of number {servo.number}"
-            mend = f"Set model, or plug in the {joint.model.name}; ids may be exchanged."
-            mistakes.append(Mistake(label, f"is {other}, expected {joint.model.name}", mend))
-            continue
-        eeproms[name] = read_eeprom(bus, joint)
-        mistakes += _mistakes(label, joint, eeproms[name])
-    return eeproms, mistakes
+        if name in silent:
+            listed = ", ".join(map(str, strangers))
+            mend = f"Found the id {listed}, which no joint has: is that the servo? Then give it the id {joint.id}."
+            mistakes.append(Mistake(label, "does not answer", mend if strangers else _SILENT_MEND))
+        elif (mistake := _wrong_servo(bus, label, joint)) is not None:
+            mistakes.append(mistake)
+        else:
+            eeproms[name] = read_eeprom(bus, joint)
+            mistakes += _mistakes(label, joint, eeproms[name])
+    return Examination(eeproms, tuple(mistakes), silent, strangers)
 
 
-def _missing(bus: Bus, joints: Mapping[str, ServoJoint], joint: ServoJoint) -> str:
-    """What to do about a servo that does not answer."""
-    known = {other.id for other in joints.values()}
-    strangers = [str(servo) for servo in present(bus) if servo not in known]
-    if strangers:
-        listed = ", ".join(strangers)
-        return f"Found the id {listed}, which no joint has: is that servo meant? Then give it the id {joint.id}."
-    return "Look at its plug and its power; armcal bus find shows who answers, and at which baud rate."
+def _wrong_servo(bus: Bus, label: str, joint: ServoJoint) -> Mistake | None:
+    """Two servos with one id, or another model."""
+    servo = looked_at(bus, joint.id, _READINGS)
+    if servo.is_doubled:
+        what = f"answers damaged or twice ({servo.damaged} times)"
+        mend = f"Two servos may have the id {joint.id}: unplug all but one, and give it another id."
+        return Mistake(label, what, mend)
+    if servo.model is not None and servo.model.name == joint.model.name:
+        return None
+    other = servo.model.name if servo.model else f"a model of number {servo.number}"
+    mend = f"Set model, or plug in the {joint.model.name}; ids may be exchanged."
+    return Mistake(label, f"is {other}, expected {joint.model.name}", mend)
 
 
 def _mistakes(label: str, joint: ServoJoint, eeprom: Eeprom) -> list[Mistake]:

@@ -14,7 +14,7 @@ from armcal_servobus.packets import BROADCAST
 _FIRST_IDS = range(31)
 """Asked one by one at each baud rate, where nothing else is said; beyond that only those that answer to all."""
 _BROADCAST_S = 0.25
-_ONE_S = 0.015
+_ONE_S = 0.03
 _AGAIN = 4
 """So often a servo is read: two with one id do not always collide. So many damaged answers are no chance."""
 

@@ -11,6 +11,8 @@ from typing import Literal
 from armcal_servobus.packets import ProtocolName
 
 _RPM = 2 * math.pi / 60
+_OLD_TURN = math.radians(300.0) * 1024 / 1023
+"""Servos with potentiometers: count 0 is at 0 degrees and count 1023 at 300."""
 
 
 @dataclass(frozen=True)
@@ -225,13 +227,13 @@ _SCS_SERVO = ServoModel(
     ((40, 27),),
     _FEETECH_ALARMS,
     counts=1024,
-    turn=math.radians(300.0),
+    turn=_OLD_TURN,
     wraps=False,
     order="big",
     reads_together=False,
 )
 _X_SERVO = ServoModel(
-    "xl430",
+    "xl430-w250",
     1060,
     "dynamixel2",
     _X,
@@ -249,7 +251,7 @@ _OLD_SERVO = ServoModel(
     ((24, 23),),
     _DYNAMIXEL1_ALARMS,
     counts=1024,
-    turn=math.radians(300.0),
+    turn=_OLD_TURN,
     wraps=False,
     reads_together=False,
 )
@@ -283,7 +285,7 @@ _ALL = (
     replace(_STS_SERVO, name="sts3250", number=2825, teeth=0),
     replace(_STS_SERVO, name="sm8512bl", number=11272, teeth=0),
     _SCS_SERVO,
-    _x("xl430", 1060),
+    _X_SERVO,
     _x("xc430-w150", 1070),
     _x("xc430-w240", 1080),
     _x("xl330-m077", 1190, 0.001),

@@ -70,11 +70,9 @@ class Framing(Protocol):
 
     Attributes:
         overhead: bytes of an answer beside its data.
-        echo_is_an_answer: an instruction that an adapter sends back may be taken for an answer.
     """
 
     overhead: int
-    echo_is_an_answer: bool
 
     def encoded(self, servo: int, instruction: Instruction, parameters: bytes = b"") -> bytes:
         """A whole instruction."""
@@ -93,7 +91,6 @@ class LegacyFraming(Framing):
     """Feetech's and Dynamixel's first: two bytes FF, a length, and the inverted sum of all after the header."""
 
     overhead = 6
-    echo_is_an_answer = True
 
     def __init__(self, refusals: Mapping[int, str]) -> None:
         self._refusals = refusals
@@ -140,7 +137,6 @@ class Framing2(Framing):
     """Dynamixel's second: FF FF FD 00, a length of two bytes, stuffing, and a CRC of 16 bits."""
 
     overhead = 11
-    echo_is_an_answer = False
 
     @override
     def encoded(self, servo: int, instruction: Instruction, parameters: bytes = b"") -> bytes:

@@ -67,7 +67,7 @@ def test_an_offset_beyond_the_register_is_refused_with_what_to_do():
     with pytest.raises(ValueError, match=r"remount its horn by 6 teeth"):
         check_offset(MODELS["sts3215"], -3000)
     with pytest.raises(ValueError, match=r"-1024 to 1024.*remount its horn by 26 deg or more"):
-        check_offset(MODELS["xl430"], 1320)
+        check_offset(MODELS["xl430-w250"], 1320)
     with pytest.raises(ValueError, match="has none"):
         check_offset(MODELS["ax12"], 1)
 
@@ -78,7 +78,7 @@ def test_an_offset_beyond_the_register_is_refused_with_what_to_do():
         ({"offset": 2500}, "remount its horn by 3 teeth"),
         ({"model": "sts9999"}, "expected one of sts3215"),
         ({"range_deg": [10, -10]}, "does not rise"),
-        ({"model": "xl430"}, "set protocol: dynamixel2"),
+        ({"model": "xl430-w250"}, "set protocol: dynamixel2"),
         ({"id": 253}, "less than or equal to 252"),
         ({"direction": 0}, "1 or -1"),
     ],

@@ -121,7 +121,7 @@ def test_sign_and_magnitude(value):
 @pytest.mark.parametrize(
     ("register", "value"),
     [(MODELS["sts3215"].registers["offset"], 2048), (MODELS["sts3215"].registers["offset"], -2048), (Register(0), 256),
-     (Register(0, 2), -1), (MODELS["xl430"].registers["goal"], 1 << 31)],
+     (Register(0, 2), -1), (MODELS["xl430-w250"].registers["goal"], 1 << 31)],
 )  # fmt: skip
 def test_what_does_not_fit_a_register_is_refused(register, value):
     with pytest.raises(ValueError, match="expected"):

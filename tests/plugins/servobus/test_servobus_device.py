@@ -33,7 +33,7 @@ class Bench:
 
 def device(fake: FakeBus, changes: dict[str, object] | None = None, **settings: object) -> ServoBusDevice:
     is_x = fake.protocol == 2
-    servo = {"model": "xl430" if is_x else "sts3215", "range_deg": [-100, 100]}
+    servo = {"model": "xl430-w250" if is_x else "sts3215", "range_deg": [-100, 100]}
     joints = {"arm.q1": {"id": 1, **servo, **(changes or {})}, "arm.q2": {"id": 2, "direction": -1, **servo}}
     whole = {"port": fake.path, "reply_ms": 20, "joints": joints, **settings}
     if is_x:
