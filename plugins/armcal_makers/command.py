@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -12,36 +15,95 @@ from armcal.calibration.exporter import POSES
 from armcal.calibration.rigid_chain import turn_between
 from armcal.cli.common import FILE, Console, spare_inputs, speaking
 from armcal.cli.console import columned
-from armcal.errors import InputError
+from armcal.errors import ConfigError, InputError
 from armcal.io.file_set import write_new, write_over
 from armcal.io.plain_files import check_output
 
-from armcal_makers.formats import MakersArm, read_maker
+from armcal_makers.formats import MakersArm, read_maker, text_in
 from armcal_makers.frames import differences, rigid, tips
+from armcal_makers.nodes import read_section
+from armcal_makers.offsets import Baked, bake
 
 _SEED = 1
 _SAME_M = 1e-5
 """Two readings of a file that are nearer than this are not worth a warning."""
+_OTHER_ORDER = (
+    "roll, pitch and yaw are read as a URDF, and so ROS, reads them. ur_calibration computes them in the other order: "
+    "so read, the flange is up to {:.3f} mm elsewhere. calibration.conf has one reading."
+)
 
 
 @click.command()
 @click.argument("file", type=FILE)
 @click.option("--robot", metavar="NAME", help="Which arm it is: ur5e, xarm6 [default: the nearest].")
+@click.option("--urdf", type=FILE, help="The URDF that offsets of robot_calibration belong to.")
+@click.option("--tip", metavar="LINK", help="The URDF's link at the arm's end, where there are several.")
 @click.option("--out", type=FILE, help="The URDF to write.")
 @click.option("--force", is_flag=True, help="Overwrite a file that is there.")
 @speaking
-def maker(console: Console, file: Path, robot: str | None, out: Path | None, force: bool) -> None:
+def maker(
+    console: Console,
+    file: Path,
+    robot: str | None,
+    urdf: Path | None,
+    tip: str | None,
+    out: Path | None,
+    force: bool,
+) -> None:
     """Compare a maker's calibration with the nominal arm, and write it as a URDF for `armcal new robot --urdf`.
 
-    FILE is the kinematics YAML of ur_calibration or xarm_ros2, or calibration.conf of a UR's controller.
+    FILE is the kinematics YAML of ur_calibration or xarm_ros2, calibration.conf of a UR's controller, or, with --urdf,
+    the offsets that robot_calibration found.
     """
     if out is not None:
-        spare_inputs(out, file)
+        spare_inputs(out, file, urdf)
         check_output(out, InputError)
-    arm = read_maker(file, robot)
+    if urdf is None:
+        if tip is not None:
+            raise ConfigError("found --tip without --urdf.", hint="Give --urdf FILE, or leave it out.")
+        arm = read_maker(file, robot)
+        comparison, content = _of_arm(arm), _urdf(arm).encode()
+    else:
+        if robot is not None:
+            raise ConfigError("found --robot with --urdf.", hint="Leave one of them out.")
+        baked = bake(read_section(text_in(file), file), urdf, tip, console.registry())
+        comparison, content = _of_offsets(baked, urdf), baked.content
     if out is not None:
-        (write_over if force else write_new)({out: _urdf(arm).encode()})
-    _show(console, arm, out)
+        (write_over if force else write_new)({out: content})
+    _show(console, comparison, out)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What is shown: whose calibration, against what, flanges of both (2 x N x 4 x 4), joints' shifts (m, rad)."""
+
+    title: str
+    nominal: str
+    tools: Array
+    joints: Mapping[str, tuple[float, float]]
+    facts: Mapping[str, Any]
+    warnings: tuple[str, ...] = ()
+
+
+def _of_arm(arm: MakersArm) -> Comparison:
+    nominal = arm.nominal
+    commands = np.random.default_rng(_SEED).uniform(-np.pi, np.pi, (POSES, len(arm.frames)))
+    tools = np.array([tips(nominal.frames, commands), tips(arm.frames, commands)])
+    parts = zip(*differences(arm.frames, nominal.frames), strict=True)
+    other = arm.other_order_m(commands)
+    warnings = () if other is None or other <= _SAME_M else (_OTHER_ORDER.format(1000 * other),)
+    facts = {"robot": nominal.name, "source": arm.source, "hash": arm.hash}
+    title = f"{nominal.name} as its maker calibrated it, {arm.source} {arm.hash}".rstrip()
+    joints = dict(zip(nominal.joints, parts, strict=True))
+    shown_mm = {"other_order_mm": None if other is None else 1000 * other}
+    return Comparison(title, f"the nominal {nominal.name}", tools, joints, {**facts, **shown_mm}, warnings)
+
+
+def _of_offsets(baked: Baked, urdf: Path) -> Comparison:
+    unused = f"offsets of what is not between the root and the tip are left out: {', '.join(baked.unused)}."
+    warnings = (unused,) if baked.unused else ()
+    facts = {"source": "robot_calibration", "unused": list(baked.unused)}
+    return Comparison(f"{urdf.name} with its offsets", urdf.name, baked.tools, baked.joints, facts, warnings)
 
 
 def _urdf(arm: MakersArm) -> str:
@@ -51,48 +113,28 @@ def _urdf(arm: MakersArm) -> str:
     return note + urdf_text(chain, arm.nominal.name)
 
 
-def _show(console: Console, arm: MakersArm, out: Path | None) -> None:
-    nominal, commands = arm.nominal, _commands(arm)
-    there, here = tips(arm.frames, commands), tips(nominal.frames, commands)
-    apart = 1000 * np.linalg.norm(there[:, :3, 3] - here[:, :3, 3], axis=1)
-    turned = np.degrees(np.linalg.norm(turn_between(here[:, :3, :3], there[:, :3, :3]), axis=1))
+def _show(console: Console, comparison: Comparison, out: Path | None) -> None:
+    before, now = comparison.tools
+    apart = 1000 * np.linalg.norm(now[:, :3, 3] - before[:, :3, 3], axis=1)
+    turned = np.degrees(np.linalg.norm(turn_between(before[:, :3, :3], now[:, :3, :3]), axis=1))
+    sizes = {"median_mm": np.median(apart), "largest_mm": apart.max(), "largest_deg": turned.max()}
     joints = {
         name: {"shift_mm": 1000 * float(shift), "turn_deg": float(np.degrees(turn))}
-        for name, shift, turn in zip(nominal.joints, *differences(arm.frames, nominal.frames), strict=True)
+        for name, (shift, turn) in comparison.joints.items()
     }
-    other = arm.other_order_m(commands)
-    content = {
-        "robot": nominal.name,
-        "source": arm.source,
-        "hash": arm.hash,
-        "poses": POSES,
-        "median_mm": float(np.median(apart)),
-        "largest_mm": float(apart.max()),
-        "largest_deg": float(turned.max()),
-        "joints": joints,
-        "other_order_mm": None if other is None else 1000 * other,
-        "out": None if out is None else str(out),
-    }
-    console.result(content)
-    console.line(f"{nominal.name} as its maker calibrated it, {arm.source} {arm.hash}".rstrip())
+    numbers = {name: float(size) for name, size in sizes.items()}
+    file = None if out is None else str(out)
+    console.result({**comparison.facts, "poses": len(apart), **numbers, "joints": joints, "out": file})
+    console.line(comparison.title)
     console.line(
-        f"flange against the nominal {nominal.name} in {POSES} random poses: median {content['median_mm']:.3f} mm, "
-        f"at most {content['largest_mm']:.3f} mm and {content['largest_deg']:.3f} deg"
+        f"tool against {comparison.nominal} in {len(apart)} random poses: median {numbers['median_mm']:.3f} mm, "
+        f"at most {numbers['largest_mm']:.3f} mm and {numbers['largest_deg']:.3f} deg"
     )
-    table = columned("Each joint against the nominal arm", ["joint", "shift, mm", "turn, deg"])
+    table = columned("Each joint, on the one before it", ["joint", "shift, mm", "turn, deg"])
     for name, part in joints.items():
         table.add_row(name, f"{part['shift_mm']:.3f}", f"{part['turn_deg']:.4f}")
     console.out.print(table)
-    if other is not None and other > _SAME_M:
-        console.warn(
-            "roll, pitch and yaw are read as a URDF, and so ROS, reads them. ur_calibration computes them in the other "
-            f"order: so read, the flange is up to {1000 * other:.3f} mm elsewhere. calibration.conf has one reading."
-        )
+    for warning in comparison.warnings:
+        console.warn(warning)
     if out is not None:
         console.line(f"written: {out}; next: armcal new robot NAME --urdf {out}")
-
-
-def _commands(arm: MakersArm) -> Array:
-    """Angles up to half a turn to either side (N x n; rad)."""
-    random = np.random.default_rng(_SEED)
-    return random.uniform(-np.pi, np.pi, (POSES, len(arm.frames)))

@@ -22,7 +22,7 @@ from armcal.calibration.rigid_chain import (
 )
 from armcal.errors import ConfigError, ProblemError
 
-from armcal_makers.formats import FARTHEST_M, FARTHEST_RAD, HASH, read_text
+from armcal_makers.formats import FARTHEST_M, FARTHEST_RAD, HASH, MARK, read_text
 from armcal_makers.frames import KEYS, at_zero, between, differences, placed, six_of, tips
 from armcal_makers.nominal import UR, XARM, Family, Nominal, nominal_arms
 
@@ -75,7 +75,8 @@ class XarmExporter:
             key: dict(zip(KEYS, six_of(frame), strict=True)) for key, frame in zip(nominal.keys, frames, strict=True)
         }
         content = {"kinematics": {**rows, **self._more(request)}}
-        text = yaml.safe_dump(content, sort_keys=False).encode()
+        head = f"{MARK}: {nominal.name}; roll, pitch and yaw are about the fixed axes, as in a URDF.\n"
+        text = (head + yaml.safe_dump(content, sort_keys=False)).encode()
         left = np.linalg.solve(zero[-1], flange)
         written = read_text(text.decode(), Path(request.out or "kinematics.yaml"), nominal.name)
         _compare(request, chain, self.family, written.frames, left)

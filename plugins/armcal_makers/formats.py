@@ -6,7 +6,7 @@ import configparser
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,8 @@ from armcal_makers.nodes import AGAIN, Scalar, Section, read_section
 from armcal_makers.nominal import UR, Nominal, nominal_arms, ur_rows
 
 MAX_BYTES = 1 << 18
+MARK = "# Calibrated by armcal"
+"""How files begin that armcal wrote, in which there is no doubt about the order of angles."""
 FARTHEST_M, FARTHEST_RAD = 0.03, math.radians(5)
 """Frames of a calibrated arm further off the nominal ones are of another arm, or in other units."""
 _LONGEST_M = 3.0
@@ -68,8 +70,16 @@ def read_maker(path: Path, robot: str | None = None) -> MakersArm:
     Raises:
         DataError: what was found, what was expected, the line, and what to do.
     """
-    text = text_of(input_bytes(path, MAX_BYTES, "a maker's calibration"), path, "Save the file as UTF-8.")
-    return read_text(text, path, robot)
+    return read_text(text_in(path), path, robot)
+
+
+def text_in(path: Path) -> str:
+    """The text of a maker's file.
+
+    Raises:
+        DataError: it cannot be read, or is not UTF-8.
+    """
+    return text_of(input_bytes(path, MAX_BYTES, "a maker's calibration"), path, "Save the file as UTF-8.")
 
 
 def read_text(text: str, path: Path, robot: str | None = None) -> MakersArm:
@@ -79,7 +89,12 @@ def read_text(text: str, path: Path, robot: str | None = None) -> MakersArm:
         refuse(path, f"the arm {robot!r} is not known.", f"The arms are {', '.join(arms)}.")
     if re.search(r"^\s*\[", text, re.MULTILINE):
         return _of_conf(text, path, robot, arms)
-    return _of_yaml(read_section(text, path), path, robot, arms)
+    root = read_section(text, path)
+    if "kinematics" not in root.entries and all(isinstance(entry, Scalar) for entry in root.entries.values()):
+        hint = "Offsets of robot_calibration need the --urdf that they belong to; else check which file this is."
+        root.refuse("found numbers alone, expected kinematics:.", hint)
+    arm = _of_yaml(root, path, robot, arms)
+    return replace(arm, moving_axes=None) if text.startswith(MARK) else arm
 
 
 def _of_yaml(root: Section, path: Path, robot: str | None, arms: dict[str, Nominal]) -> MakersArm:
@@ -88,7 +103,7 @@ def _of_yaml(root: Section, path: Path, robot: str | None, arms: dict[str, Nomin
     known = [arm for arm in arms.values() if set(arm.keys) == set(keys)]
     if not known:
         expected = f"{', '.join(arms['ur5e'].keys)} (UR), or joint1 to joint5, joint6 or joint7 (xArm)"
-        kinematics.place.refuse(f"found the joints {', '.join(keys)[:200] or 'none'}, expected {expected}.", AGAIN)
+        kinematics.refuse(f"found the joints {', '.join(keys)[:200] or 'none'}, expected {expected}.", AGAIN)
     rows = [_six(kinematics.section(key)) for key in known[0].keys]
     frames = np.array([pose(row) for row in rows])
     nominal = _chosen(path, robot, {arm.name: frames for arm in known}, arms)
@@ -103,12 +118,10 @@ def _six(section: Section) -> list[float]:
     for key, value, most, unit in zip(KEYS, numbers, 3 * [_LONGEST_M] + 3 * [_WIDEST], "mmm" + 3 * "r", strict=True):
         if abs(value) > most:
             if unit == "m":
-                section.place.refuse(
+                section.refuse(
                     f"found {key} {value:g}, expected metres of an arm's link.", "Divide millimetres by 1000."
                 )
-            section.place.refuse(
-                f"found {key} {value:g}, expected radians: it looks like degrees.", "Convert it to radians."
-            )
+            section.refuse(f"found {key} {value:g}, expected radians: it looks like degrees.", "Convert it to radians.")
     return numbers
 
 
@@ -117,7 +130,7 @@ def _hash(kinematics: Section) -> str:
     if not (isinstance(entry, Scalar) and HASH.fullmatch(entry.text)):
         text = repr(entry.text[:40]) if isinstance(entry, Scalar) else "no hash"
         hint = "Without it the driver cannot tell whose calibration it is. Extract the file from the robot again."
-        kinematics.place.refuse(f"found {text}, expected hash: calib_ and a number.", hint)
+        kinematics.refuse(f"found {text}, expected hash: calib_ and a number.", hint)
     return entry.text
 
 

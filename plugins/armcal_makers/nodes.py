@@ -17,24 +17,23 @@ AGAIN = "Extract the file from the robot again."
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where something stands: its file, line and field."""
+class Node:
+    """Something in a file: where it stands."""
 
     path: Path
     line: int
-    field: str = ""
+    field: str
 
-    def refuse(self, message: str, hint: str) -> NoReturn:
+    def refuse(self, message: str, hint: str = AGAIN) -> NoReturn:
         """Raise a DataError here."""
         refuse(self.path, message, hint, self.line, self.field or None)
 
 
 @dataclass(frozen=True)
-class Scalar:
-    """A text of the file."""
+class Scalar(Node):
+    """A text."""
 
     text: str
-    place: Place
 
     @property
     def number(self) -> float:
@@ -48,16 +47,20 @@ class Scalar:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            self.place.refuse(f"found {self.text[:40]!r}, expected a number.", AGAIN)
+            self.refuse(f"found {self.text[:40]!r}, expected a number.")
         return value
 
 
 @dataclass(frozen=True)
-class Section:
+class Section(Node):
     """Keys with what they hold."""
 
     entries: Mapping[str, Section | Scalar]
-    place: Place
+
+    @property
+    def number(self) -> float:
+        """None: keys stand where a number should; raises DataError."""
+        self.refuse("found keys, expected a number.")
 
     def section(self, key: str) -> Section:
         """The section under a key.
@@ -68,7 +71,7 @@ class Section:
         entry = self.entries.get(key)
         if not isinstance(entry, Section):
             keys = ", ".join(list(self.entries)[:12]) or "nothing"
-            self.place.refuse(f"found {keys}, expected {key}: and numbers under it.", "Check which file this is.")
+            self.refuse(f"found {keys}, expected {key}: and numbers under it.", "Check which file this is.")
         return entry
 
     def numbers(self, keys: tuple[str, ...]) -> list[float]:
@@ -79,12 +82,8 @@ class Section:
         """
         if set(self.entries) != set(keys):
             own = ", ".join(self.entries) or "nothing"
-            self.place.refuse(f"found {own}, expected {', '.join(keys)}.", AGAIN)
-        scalars = [self.entries[key] for key in keys]
-        for scalar in scalars:
-            if isinstance(scalar, Section):
-                scalar.place.refuse("found keys, expected a number.", AGAIN)
-        return [scalar.number for scalar in scalars if isinstance(scalar, Scalar)]
+            self.refuse(f"found {own}, expected {', '.join(keys)}.")
+        return [self.entries[key].number for key in keys]
 
 
 def read_section(text: str, path: Path) -> Section:
@@ -107,17 +106,16 @@ def read_section(text: str, path: Path) -> Section:
 
 
 def _section(node: yaml.MappingNode, path: Path, field: str, depth: int) -> Section:
-    place = Place(path, node.start_mark.line + 1, field)
     entries: dict[str, Section | Scalar] = {}
     for key, value in node.value:
         name = str(key.value)
-        here = Place(path, key.start_mark.line + 1, f"{field}.{name}".lstrip("."))
+        here = Node(path, key.start_mark.line + 1, f"{field}.{name}".lstrip("."))
         if name in entries:
             here.refuse("found this key a second time.", "Remove one of them.")
         if isinstance(value, yaml.MappingNode) and depth < DEEPEST:
             entries[name] = _section(value, path, here.field, depth + 1)
         elif isinstance(value, yaml.ScalarNode):
-            entries[name] = Scalar(value.value, here)
+            entries[name] = Scalar(here.path, here.line, here.field, value.value)
         else:
             here.refuse("found a list or deeper keys, expected a number.", "Check which file this is.")
-    return Section(entries, place)
+    return Section(path, node.start_mark.line + 1, field, entries)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -27,13 +28,7 @@ def robot_of_urdf(name: str, path: Path, tip: str | None, registry: PluginRegist
         PluginError: no plugin reads URDFs.
     """
     where = Location(str(path))
-    made = registry.find("model", "urdf").load()
-    try:
-        model = made(made.Settings.model_validate({"path": str(path), **({"tip": tip} if tip else {})}))
-    except ValidationError as fault:
-        text = "; ".join(str(error["msg"]).removeprefix("Value error, ") for error in fault.errors(include_url=False))
-        hint = "Correct the URDF, or choose --tip LINK."
-        raise ConfigError(f"{text}.", where=where, hint=hint) from fault
+    model = urdf_model(path, tip, registry)
     chain = numeric_chain(model, nominal_values(model))
     joints = tuple(_joint(joint, where) for joint in chain.joints if joint.mimic is None)
     if not FEWEST_JOINTS <= len(joints) <= MOST_JOINTS:
@@ -60,6 +55,22 @@ def robot_of_urdf(name: str, path: Path, tip: str | None, registry: PluginRegist
         urdf_file=f"{name}.urdf",
         tip=model.settings.tip,
     )
+
+
+def urdf_model(path: Path, tip: str | None, registry: PluginRegistry) -> Any:
+    """The arm model of a URDF; ``tip`` names its last link where the file leaves a choice.
+
+    Raises:
+        ConfigError: the file is refused.
+        PluginError: no plugin reads URDFs.
+    """
+    made = registry.find("model", "urdf").load()
+    try:
+        return made(made.Settings.model_validate({"path": str(path), **({"tip": tip} if tip else {})}))
+    except ValidationError as fault:
+        text = "; ".join(str(error["msg"]).removeprefix("Value error, ") for error in fault.errors(include_url=False))
+        hint = "Correct the URDF, or choose --tip LINK."
+        raise ConfigError(f"{text}.", where=Location(str(path)), hint=hint) from fault
 
 
 def _joint(joint: Joint, where: Location) -> RobotJoint:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,9 @@ from tests.made_calibrations import made_calibration
 from tests.plugins.makers.maker_files import UR5E_YAML, XARM6_YAML, dh_tip, poses, yaml_tip
 
 KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
+ROOT = Path(__file__).resolve().parents[3]
+UR10 = ROOT.parent / "shared" / "data" / "ur10_leica" / "random_poses.csv"
+PAGE = ROOT / "docs" / "pose_residual.md"
 HASH = "calib_14698139022496758595"
 
 
@@ -176,6 +180,30 @@ def test_a_file_to_a_robot_and_back(tmp_path):
     said = json.loads(armcal("maker", out, "--json").stdout)
     assert (said["robot"], said["hash"]) == ("ur5e", HASH)
     assert said["largest_mm"] > 2
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not UR10.exists(), reason="measured data that are not published here")
+def test_a_measured_ur10_is_written_for_its_driver(tmp_path):
+    """A quarter of its random poses: the file is the calibrated arm, which is nearer than the nominal one."""
+    text = next(part for part in PAGE.read_text().split("```") if "random_poses.csv" in part).partition("\n")[2]
+    (tmp_path / "run.yaml").write_text(text.replace("    residual: {type: gaussian_process}\n", ""))
+    lines = UR10.read_text().splitlines(keepends=True)
+    (tmp_path / "random_poses.csv").write_text("".join([lines[0], *lines[1::4]]))
+    calibration, out = tmp_path / "out" / "calibration.yaml", tmp_path / "ur10.yaml"
+    assert armcal("run", tmp_path / "run.yaml", "--out", tmp_path / "out", "-q").exit_code == 0
+    ran = armcal("export", calibration, "--format", "ur_calibration", "--option", f"hash={HASH}", "--out", out)
+    assert ran.exit_code == 0, ran.output
+    values = {e["name"]: e["value"] for e in yaml.safe_load(calibration.read_text())["parameters"]}
+    rows = [[values[f"arm.mdh.{name}{i}"] for i in range(1, 7)] for name in ("theta", "a", "d", "alpha")]
+    q = poses()
+    written, calibrated = tips_of(out.read_bytes(), q), np.array([dh_tip(rows, angles) for angles in q])
+    flange_T_tool = np.linalg.solve(written, calibrated)
+    assert np.abs(flange_T_tool - flange_T_tool[0]).max() < 1e-10
+    said = json.loads(armcal("maker", out, "--json").stdout)
+    assert said["robot"] == "ur10" and 0.5 < said["median_mm"] < 5
+    quality = json.loads((tmp_path / "out" / "metrics.json").read_text())["error_mm"]
+    assert quality["calibrated"]["holdout"]["mean"] < 0.7 * quality["nominal"]["holdout"]["mean"]
 
 
 def test_a_prior_of_no_width_is_refused(tmp_path):
