@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 from armcal.base.config_text import resolve_path
@@ -47,46 +48,82 @@ def tags_in(family: str) -> int:
     return int(match[2])
 
 
+@dataclass(frozen=True)
+class Layout:
+    """What is printed of a board.
+
+    Attributes:
+        points: where its points are (P x 3, m, in the board's frame; z = 0).
+        extent: width and height of what is printed, without a margin (m).
+        step: the distance of neighbouring points (m).
+        reach: how far around a point nothing is printed but the edges that cross there (m).
+        tag_family: the family of its tags; empty if it has none.
+        tag_ids: the ids of its tags, in their order on the board.
+    """
+
+    points: Array
+    extent: tuple[float, float]
+    step: float
+    reach: float
+    tag_family: str = ""
+    tag_ids: range = range(0)
+
+
 class Board(Settings):
-    """What all boards have; the kinds derive from it."""
+    """What all boards have; the kinds derive from it, and say how they are printed."""
 
     kind: ClassVar[str]
     """What one of them is called."""
 
     @property
-    def points(self) -> Array:
-        """Where its points are (P x 3, m, in the board's frame; z = 0)."""
+    def layout(self) -> Layout:
+        """What is printed."""
         raise NotImplementedError
+
+    @model_validator(mode="after")
+    def _with_enough_tags(self) -> Self:
+        """Its family has all its ids."""
+        family, ids = self.tag_family, self.tag_ids
+        known = tags_in(family) if family else 0
+        if ids.stop > known:
+            up_to = f"ids up to {ids.stop - 1}"
+            raise ValueError(f"found {up_to}, expected at most {known - 1} in {family}: take a larger family")
+        return self
+
+    @property
+    def points(self) -> Array:
+        """Where its points are (P x 3, m)."""
+        return self.layout.points
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Width and height of what is printed, without a margin (m)."""
-        raise NotImplementedError
+        """Width and height of what is printed (m)."""
+        return self.layout.extent
+
+    @property
+    def step(self) -> float:
+        """The distance of neighbouring points (m)."""
+        return self.layout.step
+
+    @property
+    def reach(self) -> float:
+        """How far around a point there are only the edges that cross there (m)."""
+        return self.layout.reach
 
     @property
     def tag_family(self) -> str:
         """The family of its tags; empty if it has none."""
-        return ""
+        return self.layout.tag_family
 
     @property
     def tag_ids(self) -> range:
-        """The ids of its tags, in their order on the board."""
-        return range(0)
+        """The ids of its tags."""
+        return self.layout.tag_ids
 
     @property
     def tag_corners(self) -> Array:
         """Each tag's upper left, upper right, lower right and lower left corner as printed (T x 4 x 3, m)."""
         return self.points.reshape(-1, 4, 3)
-
-    @property
-    def reach(self) -> float:
-        """How far around a point nothing is printed but the edges that cross there (m)."""
-        raise NotImplementedError
-
-    @property
-    def step(self) -> float:
-        """The distance of neighbouring points (m)."""
-        raise NotImplementedError
 
 
 class Chessboard(Board):
@@ -104,24 +141,10 @@ class Chessboard(Board):
     square: _Size
 
     @property
-    def points(self) -> Array:
+    def layout(self) -> Layout:
         """The inner corners, row by row from the origin."""
-        return _grid(self.columns, self.rows, self.square)
-
-    @property
-    @override
-    def extent(self) -> tuple[float, float]:
-        return (self.columns + 1) * self.square, (self.rows + 1) * self.square
-
-    @property
-    @override
-    def step(self) -> float:
-        return self.square
-
-    @property
-    @override
-    def reach(self) -> float:
-        return 0.7 * self.square
+        extent = (self.columns + 1) * self.square, (self.rows + 1) * self.square
+        return Layout(_grid(self.columns, self.rows, self.square), extent, self.square, 0.7 * self.square)
 
 
 class Charuco(Board):
@@ -142,31 +165,23 @@ class Charuco(Board):
     legacy: bool = False
 
     @model_validator(mode="after")
-    def _fits(self) -> Charuco:
+    def _fits(self) -> Self:
         if self.marker >= self.square:
             sizes = f"marker {1000 * self.marker:g} mm and square {1000 * self.square:g} mm"
             raise ValueError(f"found {sizes}, expected the marker to be smaller")
-        return _with_enough_tags(self)
+        return self
 
     @property
-    def points(self) -> Array:
+    def layout(self) -> Layout:
         """The inner corners, row by row from the origin."""
-        return _grid(self.columns - 1, self.rows - 1, self.square)
-
-    @property
-    @override
-    def extent(self) -> tuple[float, float]:
-        return self.columns * self.square, self.rows * self.square
-
-    @property
-    @override
-    def step(self) -> float:
-        return self.square
-
-    @property
-    @override
-    def reach(self) -> float:
-        return min(0.7 * self.square, 0.65 * (self.square - self.marker))
+        return Layout(
+            points=_grid(self.columns - 1, self.rows - 1, self.square),
+            extent=(self.columns * self.square, self.rows * self.square),
+            step=self.square,
+            reach=min(0.7 * self.square, 0.65 * (self.square - self.marker)),
+            tag_family=self.dictionary,
+            tag_ids=range(self.first_id, self.first_id + self.columns * self.rows // 2),
+        )
 
     @property
     @override
@@ -175,16 +190,6 @@ class Charuco(Board):
         white = [(i, j) for j in range(self.rows) for i in range(self.columns) if (i + j) % 2 != is_swapped]
         middles = self.square * (np.array([(i, j, 0.5) for i, j in white]) - 0.5)
         return np.asarray(middles[:, None] + self.marker * np.array(_DOWNWARDS))
-
-    @property
-    @override
-    def tag_family(self) -> str:
-        return self.dictionary
-
-    @property
-    @override
-    def tag_ids(self) -> range:
-        return range(self.first_id, self.first_id + self.columns * self.rows // 2)
 
 
 class Aprilgrid(Board):
@@ -204,41 +209,19 @@ class Aprilgrid(Board):
     first_id: _Id = 0
     border_bits: Literal[1, 2] = 1
 
-    @model_validator(mode="after")
-    def _fits(self) -> Aprilgrid:
-        return _with_enough_tags(self)
-
     @property
-    def points(self) -> Array:
+    def layout(self) -> Layout:
         """Each tag's corners, the tags row by row: upper left, upper right, lower right, lower left."""
-        origins = _grid(self.columns, self.rows, self.tag + self.spacing)
-        return np.asarray((origins[:, None] + self.tag * np.array(_UPWARDS)).reshape(-1, 3))
-
-    @property
-    @override
-    def extent(self) -> tuple[float, float]:
-        width, height = (n * (self.tag + self.spacing) - self.spacing for n in (self.columns, self.rows))
-        return width, height
-
-    @property
-    @override
-    def step(self) -> float:
-        return self.tag
-
-    @property
-    @override
-    def reach(self) -> float:
-        return min(_tag_reach(self.tag, self.family, self.border_bits), 0.7 * self.spacing)
-
-    @property
-    @override
-    def tag_family(self) -> str:
-        return self.family
-
-    @property
-    @override
-    def tag_ids(self) -> range:
-        return range(self.first_id, self.first_id + self.columns * self.rows)
+        pitch = self.tag + self.spacing
+        origins = _grid(self.columns, self.rows, pitch)
+        return Layout(
+            points=np.asarray((origins[:, None] + self.tag * np.array(_UPWARDS)).reshape(-1, 3)),
+            extent=(self.columns * pitch - self.spacing, self.rows * pitch - self.spacing),
+            step=self.tag,
+            reach=min(_tag_reach(self.tag, self.family, self.border_bits), 0.7 * self.spacing),
+            tag_family=self.family,
+            tag_ids=range(self.first_id, self.first_id + self.columns * self.rows),
+        )
 
 
 class Tag(Board):
@@ -254,39 +237,12 @@ class Tag(Board):
     family: str = "36h11"
     border_bits: Literal[1, 2] = 1
 
-    @model_validator(mode="after")
-    def _fits(self) -> Tag:
-        return _with_enough_tags(self)
-
     @property
-    def points(self) -> Array:
+    def layout(self) -> Layout:
         """The corners: upper left, upper right, lower right, lower left."""
-        return self.tag * np.array(_DOWNWARDS)
-
-    @property
-    @override
-    def extent(self) -> tuple[float, float]:
-        return self.tag, self.tag
-
-    @property
-    @override
-    def step(self) -> float:
-        return self.tag
-
-    @property
-    @override
-    def reach(self) -> float:
-        return _tag_reach(self.tag, self.family, self.border_bits)
-
-    @property
-    @override
-    def tag_family(self) -> str:
-        return self.family
-
-    @property
-    @override
-    def tag_ids(self) -> range:
-        return range(self.id, self.id + 1)
+        reach = _tag_reach(self.tag, self.family, self.border_bits)
+        corners, ids = self.tag * np.array(_DOWNWARDS), range(self.id, self.id + 1)
+        return Layout(corners, (self.tag, self.tag), self.tag, reach, self.family, ids)
 
 
 _DOWNWARDS = ((-0.5, -0.5, 0.0), (0.5, -0.5, 0.0), (0.5, 0.5, 0.0), (-0.5, 0.5, 0.0))
@@ -300,7 +256,8 @@ def _grid(columns: int, rows: int, step: float) -> Array:
 
 
 def tag_modules(family: str, border_bits: int = 1) -> int:
-    """Black and white cells along a tag's edge, its border included."""
+    """Black and white cells along a tag's edge, its border included; ValueError for a family that there is not."""
+    tags_in(family)
     match = _DICTIONARY.fullmatch(family)
     inner = int(match[1]) if match else math.isqrt(int(family.split("h")[0]))
     return inner + 2 * border_bits
@@ -309,15 +266,6 @@ def tag_modules(family: str, border_bits: int = 1) -> int:
 def _tag_reach(tag: float, family: str, border_bits: int) -> float:
     """Within its border a tag's corner has nothing else around it."""
     return 1.3 * tag * border_bits / tag_modules(family, border_bits)
-
-
-def _with_enough_tags(board: Any) -> Any:
-    """The board, whose family has all its ids."""
-    known = tags_in(board.tag_family)
-    if board.tag_ids.stop > known:
-        ids = f"ids up to {board.tag_ids.stop - 1}"
-        raise ValueError(f"found {ids}, expected at most {known - 1} in {board.tag_family}: take a larger family")
-    return board
 
 
 def or_file(read: Callable[[Path], Settings]) -> BeforeValidator:

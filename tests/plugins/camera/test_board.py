@@ -56,6 +56,7 @@ def test_a_board_may_stand_in_a_file_of_its_own(tmp_path: Path, settings: dict[s
     [
         (CHARUCO | {"marker_mm": 31}, "expected the marker to be smaller"),
         (CHARUCO | {"dictionary": "DICT_5X5_50", "first_id": 40}, "ids up to 56, expected at most 49"),
+        (APRILGRID | {"family": "big"}, "found the family 'big', expected one of 16h5"),
         (APRILGRID | {"family": "36h12"}, "found the family '36h12', expected one of 16h5"),
         (CHESSBOARD | {"columns": 2}, "greater than or equal to 3"),
         ({"type": "chessboard", "columns": 9, "rows": 6, "square": 25}, "square_mm: 25"),
