@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -50,12 +50,14 @@ class FirstMotion:
     Attributes:
         free: joints that hang free and get their first pulses.
         powered: joints that have pulses.
+        measured: joints that hang free too, and whose servos know where: they do not jump.
         hazards: of the motion, the worst of each kind.
     """
 
     free: tuple[str, ...]
     powered: tuple[str, ...]
     hazards: tuple[Hazard, ...]
+    measured: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,18 +78,27 @@ class HazardJudge:
     torques: Torques
     rest: Array
 
-    def first_motion(self, standing: Mapping[str, float], first: Mapping[str, float], *, releases: bool) -> FirstMotion:
+    def first_motion(
+        self,
+        standing: Mapping[str, float],
+        first: Mapping[str, float],
+        *,
+        releases: bool,
+        measured: Collection[str] = (),
+    ) -> FirstMotion:
         """A run's start and its end.
 
         Args:
             standing: the angles (rad) of the joints that have pulses.
             first: the angles that the others' first pulses ask for, where that is not where the arm rests.
             releases: whether servos are let go where the arm rests.
+            measured: joints whose servos know where they stand.
         """
-        free = tuple(joint for joint in self.moved if joint not in standing)
+        free = tuple(joint for joint in self.moved if joint not in standing and joint not in measured)
         hazards = [self._jump(free, first), self._outside(standing), self._drop() if releases else None]
         powered = tuple(joint for joint in self.moved if joint in standing)
-        return FirstMotion(free, powered, tuple(hazard for hazard in hazards if hazard is not None))
+        known = tuple(joint for joint in self.moved if joint not in standing and joint in measured)
+        return FirstMotion(free, powered, tuple(hazard for hazard in hazards if hazard is not None), known)
 
     def _jump(self, free: Sequence[str], first: Mapping[str, float]) -> Hazard | None:
         """A limp joint hangs anywhere: at an end of its range, or as it falls from where the arm rests."""

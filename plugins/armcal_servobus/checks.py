@@ -43,11 +43,12 @@ class Eeprom:
 
 @dataclass(frozen=True)
 class Mistake:
-    """Something about a servo that is not as configured, and what to do."""
+    """Something about a servo that is not as configured, and what to do. ``of_motion``: only one that moves minds."""
 
     joint: str
     what: str
     mend: str
+    of_motion: bool = False
 
 
 def read_eeprom(bus: Bus, joint: ServoJoint) -> Eeprom:
@@ -89,8 +90,11 @@ class Examination:
     strangers: tuple[int, ...]
 
 
-def checked(bus: Bus, joints: Mapping[str, ServoJoint]) -> Mapping[str, Eeprom]:
+def checked(bus: Bus, joints: Mapping[str, ServoJoint], *, moves: bool = True) -> Mapping[str, Eeprom]:
     """The EEPROMs of all joints' servos, by joint, where all is as configured.
+
+    Args:
+        moves: whether they are to move.
 
     Raises:
         DeviceLostError: no servo answers at all.
@@ -99,10 +103,11 @@ def checked(bus: Bus, joints: Mapping[str, ServoJoint]) -> Mapping[str, Eeprom]:
     examination = examined(bus, joints)
     if len(examination.silent) == len(joints) and not examination.strangers:
         raise DeviceLostError(f"no servo answers at {bus.settings.baud} baud.", where=bus.where, hint=_SILENT_MEND)
-    if not examination.mistakes:
+    mistakes = [mistake for mistake in examination.mistakes if moves or not mistake.of_motion]
+    if not mistakes:
         return examination.eeproms
-    listed = "; ".join(f"{mistake.joint} {mistake.what}" for mistake in examination.mistakes)
-    hints = " ".join(dict.fromkeys(mistake.mend for mistake in examination.mistakes))
+    listed = "; ".join(f"{mistake.joint} {mistake.what}" for mistake in mistakes)
+    hints = " ".join(dict.fromkeys(mistake.mend for mistake in mistakes))
     raise DeviceRefusedError(f"found servos that are not as configured: {listed}.", where=bus.where, hint=hints)
 
 
@@ -150,7 +155,7 @@ def _mistakes(label: str, joint: ServoJoint, eeprom: Eeprom) -> list[Mistake]:
         mistakes.append(Mistake(label, what, "Write it with armcal bus home, or correct offset."))
     if eeprom.mode != model.position_mode:
         what = f"is in operating mode {eeprom.mode}, expected {model.position_mode} (positions)"
-        mistakes.append(Mistake(label, what, "Set its mode with the maker's program."))
+        mistakes.append(Mistake(label, what, "Set its mode with the maker's program.", True))
     if eeprom.phase & _SEVERAL_TURNS:
         what = "reports angles of several turns (bit 4 of its phase, register 18)"
         mistakes.append(Mistake(label, what, "Clear that bit: armcal bus home does so."))
@@ -159,7 +164,7 @@ def _mistakes(label: str, joint: ServoJoint, eeprom: Eeprom) -> list[Mistake]:
         what = f"stops at counts {eeprom.limits[0]} and {eeprom.limits[1]}, and its range is {low} to {high}"
         ends = sorted(math.degrees(joint.angle(limit)) for limit in eeprom.limits)
         mend = f"Narrow range_deg of {joint.name} to [{ends[0]:.1f}, {ends[1]:.1f}], or widen the limits in the servo."
-        mistakes.append(Mistake(label, what, mend))
+        mistakes.append(Mistake(label, what, mend, True))
     return mistakes
 
 

@@ -7,3 +7,9 @@ from armcal.hooks import Register, hookimpl
 def armcal_register_devices(register: Register) -> None:
     """Announce the device."""
     register("servobus", "armcal_servobus.device:ServoBusDevice", "serial-bus servos: Feetech STS and SCS, Dynamixel")
+
+
+@hookimpl
+def armcal_register_joint_streams(register: Register) -> None:
+    """Announce the joint stream."""
+    register("servobus", "armcal_servobus.stream:ServoBusStream", "serial-bus servos of an arm guided by hand")

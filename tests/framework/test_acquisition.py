@@ -297,3 +297,26 @@ def test_a_lost_device_while_asked_to_stop_is_held() -> None:
     run.clock.at += [(12.0, lambda: setattr(run.device, "gone", True)), (14.0, lambda: setattr(run, "asked", True))]
     assert run.run() == "held"
     assert isinstance(DeviceLostError("x"), DeviceError)
+
+
+class MeasuringFake(FakeDevice):
+    """Its servos know where they stand: 0.4 rad at first, then a little off from where they were commanded to be."""
+
+    def measured(self) -> dict[str, float]:
+        return {joint: self.running.get(joint, 0.39) + 0.01 for joint in self.joint_names}
+
+    def energise(self, joint: str, angle: float) -> None:
+        assert angle == pytest.approx(0.4), f"{joint} jumps"
+        super().energise(joint, angle)
+
+
+@pytest.mark.parametrize("chosen", ["commanded", "measured"])
+def test_servos_that_know_where_they_stand_do_not_jump_and_are_measured(chosen) -> None:
+    clock = FakeClock()
+    run = Run(AcquisitionSettings.si(angles=chosen), device=MeasuringFake(clock), clock=clock)
+    assert run.run() == "done"
+    records = [content for kind, content in run.log.entries if kind == "measured"]
+    other, offset = ("commanded", 0.01) if chosen == "measured" else ("measured", 0.0)
+    for record, pose in zip(records, POSES, strict=True):
+        assert list(record["standing"].values()) == pytest.approx(pose + offset, abs=1e-9)
+        assert list(record[other].values()) == pytest.approx(pose + 0.01 - offset, abs=1e-9)

@@ -145,7 +145,7 @@ def _expect_damage_counted(source: Any, take: Callable[[Any], Any], path: Path) 
 def _settings_to_feed(subject: Subject, path: Path) -> Mapping[str, Any]:
     """Settings with a free port, or with a file to which the checks append."""
     example, fields = dict(subject.example), type(subject.settings).model_fields
-    if example.get("port") is not None:
+    if isinstance(example.get("port"), int):  # not that of a serial line
         return {**example, "port": 0, **({"host": "127.0.0.1"} if "host" in fields else {})}
     for name in ("path", "source"):
         if name in fields:

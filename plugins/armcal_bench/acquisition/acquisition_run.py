@@ -188,7 +188,7 @@ class AcquisitionRun:
             "frames": settled.frames,
             "rejected": settled.rejected,
             "temperature": self._settings.temperature,
-            "standing": self._drive.standing(),
+            **self._standing(),
             "approach": dict(zip(drive.angles, drive.approach.tolist(), strict=True)),
         }
         doubt = self._arrival.doubt(pose, settled.base_T_target, self.known) if self._arrival else ""
@@ -204,6 +204,13 @@ class AcquisitionRun:
         self._astray = 0
         self.evidence.succeeded(pose)
         self._keep(pose, record)
+
+    def _standing(self) -> dict[str, dict[str, float]]:
+        """``standing``: the joint angles (rad) that the dataset has; the others, where there are any, by their name."""
+        commanded, measured = self._drive.standing(), self._drive.measured()
+        if self._settings.angles == "measured":
+            return {"standing": measured, "commanded": commanded}
+        return {"standing": commanded, **({"measured": measured} if measured else {})}
 
     def _check_frame(self) -> None:
         """Refuse other units or another frame than expected; poses that seemed astray in it are kept as measured.

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 from armcal.base.domains import Array
 from armcal.devices.clock import Clock
-from armcal.devices.device import JointDevice
+from armcal.devices.device import JointDevice, MeasuringDevice
 from armcal.devices.faults import DeviceError, DeviceRefusedError
 
 from armcal_bench.acquisition.heat import HeatModel, ThermalState, Torques
@@ -134,10 +134,10 @@ class Drive(Motion):
 
         Args:
             known: the angles (rad) that were commanded last before this run, where they were written down; other
-                joints get the angle at which they park.
+                joints get the angle at which they park. What the device measures goes before both.
         """
         last = self.angles if self._is_energised else {**self.angles, **known}
-        self.take_over({**last, **self.device.state().angles})
+        self.take_over({**last, **self.measured(), **self.device.state().angles})
         self._is_energised = True
         # Should the host fall silent from now on: stay, for joints that hang free make every path unknown.
         self.device.guard([self.angles], self._rate, self.settings.silence)
@@ -164,6 +164,10 @@ class Drive(Motion):
                     hint="Look at the board's power and bus, and whether another program uses it.",
                 )
         return commanded
+
+    def measured(self) -> dict[str, float]:
+        """Where the joints stand (rad), by servos that know; empty for others."""
+        return self.device.measured() if isinstance(self.device, MeasuringDevice) else {}
 
     def go(self, path: Sequence[Array], may_move: MayMove) -> None:
         """Along a path that begins where the arm is: straight lines in joint space, all joints in proportion.

@@ -13,7 +13,7 @@ from armcal.arm.joints import joint_limits, unknown_joint
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.calibration.rigid_chain import tool_poses
-from armcal.devices.device import JointDevice
+from armcal.devices.device import JointDevice, MeasuringDevice
 from armcal.devices.faults import DeviceRefusedError
 from armcal.errors import ConfigError, DataError, Location
 from armcal.run.experiment import Experiment
@@ -70,6 +70,7 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
     """
     bench = Bench.of(experiment)
     settings, arm, device = bench.settings.acquisition, bench.arm, bench.device()
+    _check_measures(experiment, settings, device)
     space = JointSpace.of(experiment)
     commands = commands_of(read_poses(experiment, plan), space)
     limits = run_limits(experiment, settings, arm)
@@ -102,6 +103,15 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
     arrival = Arrival(_rigid_poses(arm, poses), settings.arrival)
     sag = SagJudge(device.joint_names, partial(_rigid_poses, arm), torques)
     return Prepared(bench, device, commands, scheduler, arrival, sag, judge)
+
+
+def _check_measures(experiment: Experiment, settings: AcquisitionSettings, device: JointDevice) -> None:
+    if settings.angles == "measured" and not isinstance(device, MeasuringDevice):
+        raise ConfigError(
+            "found measured, but this device does not know where its servos stand.",
+            where=experiment.source.where((*_AT, "angles")),
+            hint="Leave angles out: the commanded angles are written.",
+        )
 
 
 def _check_clear(planner: PathPlanner, poses: Array, plan: Path, commands: Dataset) -> None:

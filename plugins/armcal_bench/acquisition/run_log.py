@@ -156,6 +156,12 @@ def dataset_of(experiment: Experiment, progress: Progress, digests: Mapping[str,
     for joint in records[0]["standing"] if records else ():
         channels[f"{arm}.{joint}"] = np.array([r["standing"][joint] for r in records])
         channels[f"{arm}.approach.{joint}"] = np.array([float(r["approach"][joint]) for r in records])
+    beside = {
+        f"{kind}_{joint}_deg": tuple(f"{np.rad2deg(r[kind][joint]):.4f}" for r in records)
+        for kind in ("commanded", "measured")
+        if records and all(kind in r for r in records)
+        for joint in records[0][kind]
+    }
     poses = np.full((len(records), len(_POSITION) + len(_QUATERNION)), np.nan)
     for pose, record in zip(poses, records, strict=True):
         pose[:3] = record["position"]
@@ -172,6 +178,7 @@ def dataset_of(experiment: Experiment, progress: Progress, digests: Mapping[str,
     extra = {
         "mean_sd_mm": tuple(f"{1000 * max(r['deviation']):.4f}" for r in records),
         "frames": tuple(str(r["frames"]) for r in records),
+        **beside,
         **{name: (digest,) * len(records) for name, digest in digests.items()},
     }
     return Dataset(tuple(progress.measured), channels, extra, source="acquired")

@@ -179,7 +179,8 @@ def _prepared_run(
     if progress.thermal_state:  # the warmth that an earlier part of the run has left
         drive.thermal_state.go_on(progress.thermal_state, progress.angles, clock.wall() - progress.at)
     angles = device.state().angles
-    start = prepared.judge.first_motion(angles, progress.angles, releases=settings.at_end == "release")
+    releases, measured = settings.at_end == "release", drive.measured()
+    start = prepared.judge.first_motion(angles, progress.angles, releases=releases, measured=measured)
     if angles:  # no signs of life reach the board while somebody thinks: joints that hold are to stay where they are
         device.guard([angles], float(np.deg2rad(settings.rate_deg_per_s)), settings.silence)
     before = options.asked_to_end()

@@ -63,7 +63,8 @@ class AcquisitionSettings(Settings):
     ``order`` is the plan's, or ``cool``: the next pose is then the one that the servos can best bear. The board waits
     for ``silence`` of the host before it parks the arm by itself, where its link can. At the end the arm parks, and its
     servos are let go one by one, or hold. Joints get their first pulses one by one, ``between_joints`` apart.
-    ``temperature`` is that of the room, where it is known; it is written with the data.
+    ``temperature`` is that of the room, where it is known; it is written with the data. ``angles`` are those that the
+    dataset has: as commanded, or as servos that know where they stand have measured them; the others stand beside them.
     """
 
     rate_deg_per_s: Annotated[float, Field(gt=0, le=180)] = 20.0
@@ -80,4 +81,5 @@ class AcquisitionSettings(Settings):
     at_end: Literal["release", "hold"] = "release"
     between_joints: Duration = 0.5
     temperature: Temperature | None = None
+    angles: Literal["commanded", "measured"] = "commanded"
     seed: Annotated[int, Field(ge=0)] = 0

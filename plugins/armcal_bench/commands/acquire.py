@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 import numpy as np
 from armcal.cli.common import Console
+from armcal.devices.device import MeasuringDevice
 from armcal.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_FAULT, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
 from armcal.io.signals import Signals
 
@@ -144,8 +145,10 @@ def show_outcome(console: Console, outcome: Outcome, config: Path, out: Path) ->
 
 def _show_dry_run(console: Console, prepared: Prepared, forecast: ScheduleForecast) -> None:
     """What a run would take, and what is dangerous in it, as far as that is known without a device."""
-    hazards = prepared.judge.first_motion({}, {}, releases=prepared.settings.at_end == "release").hazards
     joints, unchecked = prepared.device.joint_names, ""
+    measured = joints if isinstance(prepared.device, MeasuringDevice) else ()
+    releases = prepared.settings.at_end == "release"
+    hazards = prepared.judge.first_motion({}, {}, releases=releases, measured=measured).hazards
     try:
         check_wiring(prepared.bench, joints)
     except InputError as fault:

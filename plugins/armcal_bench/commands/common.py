@@ -49,8 +49,8 @@ def ask(motion: FirstMotion) -> bool:
     Raises:
         InputError: there is no terminal to ask at.
     """
-    named = ", ".join(motion.free or motion.powered)
-    pulses = "get no pulses yet" if motion.free else "have pulses"
+    named = ", ".join(motion.free or motion.measured or motion.powered)
+    pulses = "get no pulses yet" if motion.free else "hang free" if motion.measured else "have pulses"
     if not sys.stdin.isatty():
         raise InputError(
             f"{named} {pulses}, and there is no terminal to ask whether the arm may be moved; nothing was moved.",
