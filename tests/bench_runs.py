@@ -54,11 +54,13 @@ class BenchRun:
     Attributes:
         folder: of everything.
         sets: overrides beside those that a simulated bench needs.
+        part: of the bench, which has the serial port.
     """
 
     folder: Path
     sets: tuple[str, ...] = ()
     config: Path = CONFIG
+    part: str = "link"
     experiment: Experiment = field(init=False)
     plan: Path = field(init=False)
 
@@ -68,7 +70,7 @@ class BenchRun:
         ports = (f"bench.tracker.port={port}", f"bench.simulator.tracker.port={port}")
         if self.config == CONFIG:  # it holds the arm at the end; these runs see the servos let go unless they say so
             ports = (*ports, "bench.acquisition.at_end=release")
-        self.experiment = Experiment.load(self.config, (*ports, *self.sets, *overrides_for(self.bench)))
+        self.experiment = Experiment.load(self.config, (*ports, *self.sets, *overrides_for(self.bench, self.part)))
         self.plan = write_plan(self.folder / "plan.csv")
 
     @property

@@ -77,6 +77,8 @@ class ServoBusDevice(JointDevice, MeasuringDevice):
             readings = self._servos.readings()
             self._health.check(readings, clock.now())
             self._powered = {joint for joint, reading in readings.items() if reading.has_torque}
+            for joint in self._ordered_powered:  # one that has started anew may hold, and knows no limit
+                self._servos.set_motion(self._joints[joint], self._speed, self._acceleration)
             self._is_open = True
         except BaseException:
             self.close()

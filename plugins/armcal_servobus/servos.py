@@ -11,6 +11,9 @@ from armcal_servobus.bus import Bus
 from armcal_servobus.finding import alarms_of, read_number
 from armcal_servobus.joints import ServoJoint
 
+_TIME_BYTES = 2
+"""Between goal and speed some have a time to be taken, which is zero here: the speed holds."""
+
 
 @dataclass(frozen=True)
 class ServoReading:
@@ -40,6 +43,7 @@ class Servos:
     def __init__(self, bus: Bus, joints: Mapping[str, ServoJoint]) -> None:
         self._bus, self._joints = bus, joints
         self._goals: dict[str, int] = {}
+        self._speeds: dict[str, int] = {}
 
     def reading(self, joint: str) -> ServoReading:
         """One servo's; see ``readings``."""
@@ -82,7 +86,10 @@ class Servos:
                 register = joint.model.registers[name]
                 most = 254 if register.size == 1 else 1023 if joint.model.counts == 1024 else 32767
                 unit = register.unit if register.unit != 1.0 else joint.model.step
-                self._write(joint, name, min(max(round(value / unit), 1), most))
+                number = min(max(round(value / unit), 1), most)
+                self._write(joint, name, number)
+                if name == "speed":
+                    self._speeds[joint.name] = number
 
     def hold(self, joint: ServoJoint, count: int) -> None:
         """Torque on, at a count that is where it stands."""
@@ -111,11 +118,10 @@ class Servos:
         self._goals |= goals
         places: dict[tuple[int, int], dict[int, bytes]] = {}
         for name, goal in goals.items():
-            joint = self._joints[name]
-            register = joint.model.registers["goal"]
-            places.setdefault((register.address, register.size), {})[joint.id] = joint.model.pack("goal", goal)
-        for (address, _), data in places.items():
-            self._bus.write_all(address, data)
+            address, data = self._with_speed(self._joints[name], goal)
+            places.setdefault((address, len(data)), {})[self._joints[name].id] = data
+        for (address, _), by_id in places.items():
+            self._bus.write_all(address, by_id)
 
     def repeat(self, readings: Mapping[str, ServoReading], powered: Iterable[str]) -> None:
         """Command once more what did not arrive: a goal for all at once is acknowledged by nobody.
@@ -127,7 +133,19 @@ class Servos:
         missed = {name: self._goals[name] for name in readings if name in chosen}
         missed = {name: goal for name, goal in missed.items() if readings[name].goal != goal}
         for name, goal in missed.items():
-            self._write(self._joints[name], "goal", goal)
+            self._bus.write(self._joints[name].id, *self._with_speed(self._joints[name], goal))
+
+    def _with_speed(self, joint: ServoJoint, goal: int) -> tuple[int, bytes]:
+        """The address and the bytes that set a goal, and the speed in the same go where its register is at hand.
+
+        A servo that started anew has forgotten its speed, and some switch their torque on with the next goal.
+        """
+        model = joint.model
+        first, speed, data = model.registers["goal"], model.registers.get("speed"), model.pack("goal", goal)
+        between = -1 if speed is None else speed.address - first.address - first.size
+        if joint.name not in self._speeds or not 0 <= between <= _TIME_BYTES:
+            return first.address, data
+        return first.address, data + bytes(between) + model.pack("speed", self._speeds[joint.name])
 
     def _write(self, joint: ServoJoint, name: str, value: int) -> None:
         self._bus.write(joint.id, joint.model.registers[name].address, joint.model.pack(name, value))

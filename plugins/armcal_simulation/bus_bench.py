@@ -22,6 +22,7 @@ from armcal_simulation.bus_motor import BusMotor, BusMotorSettings
 from armcal_simulation.bus_registers import SPLINE_TEETH, TABLES, ServoTable
 from armcal_simulation.bus_servo import BusServo
 from armcal_simulation.pca9685_model import Commit
+from armcal_simulation.safety import SafetySettings
 from armcal_simulation.servo_bus import ServoBus
 
 _TURN = 2 * math.pi
@@ -61,6 +62,7 @@ class BusBenchSettings(BenchTruthSettings):
     """The truth of a bench with smart servos; ``joints`` has them by joint, and what ``all`` have in common.
 
     ``baud`` is that of the servos, ``echo`` whether the adapter hears itself. ``supply_V`` sags by ``supply_ohm``.
+    Servos that are switched on together are no offence, for they stay where they stand.
     """
 
     baud: int = 1_000_000
@@ -68,6 +70,7 @@ class BusBenchSettings(BenchTruthSettings):
     supply_V: Annotated[float, Field(gt=0)] = 7.4
     supply_ohm: Annotated[float, Field(ge=0)] = 0.1
     joints: dict[str, BusJointSettings]
+    safety: SafetySettings = Field(default_factory=lambda: SafetySettings.si(together=0.0))
 
     @model_validator(mode="after")
     def _one_protocol(self) -> BusBenchSettings:

@@ -24,7 +24,7 @@ from servo_bus_parts import at_baud, packet
 
 CONFIG = Path(__file__).resolve().parents[3] / "configs" / "so101" / "bench.yaml"
 PAN, LIFT, ELBOW = 1, 2, 3
-GOAL, SPEED, TORQUE = 42, 46, 40
+GOAL, SPEED = 42, 46
 
 
 class Host:
@@ -103,10 +103,14 @@ def test_a_goal_far_away_without_a_speed_limit_is_an_offence(host: Host) -> None
     assert host.run(1.0)["offences"]["speed"] > 0
 
 
-def test_servos_that_are_switched_on_together_are_an_offence(host: Host) -> None:
-    data = b"".join(bytes((number, 1)) for number in range(1, 6))
-    host.ask(packet("feetech", 0xFE, 0x83, bytes((TORQUE, 1)) + data))
-    assert host.run(0.5)["offences"]["energised_together"] == 4
+def test_servos_that_are_switched_on_together_stay_where_they_stand(host: Host) -> None:
+    before = host.run(0.1)["joints"]
+    for number in range(1, 6):
+        host.write(number, GOAL, host.position(number))
+    state = host.run(0.5)
+    assert state["offences"] == {}
+    for joint, entry in state["joints"].items():
+        assert abs(entry["angle_rad"] - before[joint]["angle_rad"]) < math.radians(0.3)
 
 
 def test_beyond_a_limit_and_too_near_are_offences(host: Host) -> None:
