@@ -19,10 +19,10 @@ from armcal.errors import ConfigError, InputError
 from armcal.io.file_set import write_new, write_over
 from armcal.io.plain_files import check_output
 
-from armcal_makers.formats import MakersArm, read_maker, text_in
+from armcal_makers.formats import MakersArm, has_offsets, read_text, text_in
 from armcal_makers.frames import differences, rigid, tips
 from armcal_makers.nodes import read_section
-from armcal_makers.offsets import Baked, bake
+from armcal_makers.origins import OwnUrdf, Placed
 
 _SEED = 1
 _SAME_M = 1e-5
@@ -36,7 +36,7 @@ _OTHER_ORDER = (
 @click.command()
 @click.argument("file", type=FILE)
 @click.option("--robot", metavar="NAME", help="Which arm it is: ur5e, xarm6 [default: the nearest].")
-@click.option("--urdf", type=FILE, help="The URDF that offsets of robot_calibration belong to.")
+@click.option("--urdf", type=FILE, help="The robot's own URDF, to put the calibration in.")
 @click.option("--tip", metavar="LINK", help="The URDF's link at the arm's end, where there are several.")
 @click.option("--out", type=FILE, help="The URDF to write.")
 @click.option("--force", is_flag=True, help="Overwrite a file that is there.")
@@ -52,22 +52,24 @@ def maker(
 ) -> None:
     """Compare a maker's calibration with the nominal arm, and write it as a URDF for `armcal new robot --urdf`.
 
-    FILE is the kinematics YAML of ur_calibration or xarm_ros2, calibration.conf of a UR's controller, or, with --urdf,
-    the offsets that robot_calibration found.
+    FILE is the kinematics YAML of ur_calibration or xarm_ros2, calibration.conf of a UR's controller, or the offsets
+    that robot_calibration found. With --urdf masses, limits and all else of the robot's own URDF stay.
     """
     if out is not None:
         spare_inputs(out, file, urdf)
         check_output(out, InputError)
-    if urdf is None:
-        if tip is not None:
-            raise ConfigError("found --tip without --urdf.", hint="Give --urdf FILE, or leave it out.")
-        arm = read_maker(file, robot)
-        comparison, content = _of_arm(arm), _urdf(arm).encode()
-    else:
+    if urdf is None and tip is not None:
+        raise ConfigError("found --tip without --urdf.", hint="Give --urdf FILE, or leave it out.")
+    text = text_in(file)
+    own = None if urdf is None else OwnUrdf.read(urdf, tip, console.registry())
+    if own is not None and has_offsets(text, file):
         if robot is not None:
-            raise ConfigError("found --robot with --urdf.", hint="Leave one of them out.")
-        baked = bake(read_section(text_in(file), file), urdf, tip, console.registry())
-        comparison, content = _of_offsets(baked, urdf), baked.content
+            raise ConfigError("found --robot, and offsets of a URDF's own joints.", hint="Leave --robot out.")
+        comparison, content = _of_offsets(own.with_offsets(read_section(text, file)), own)
+    else:
+        arm = read_text(text, file, robot)
+        placed = None if own is None else own.with_frames(dict(zip(arm.nominal.joints, arm.frames, strict=True)), file)
+        comparison, content = _of_arm(arm), _urdf(arm, placed)
     if out is not None:
         (write_over if force else write_new)({out: content})
     _show(console, comparison, out)
@@ -99,18 +101,21 @@ def _of_arm(arm: MakersArm) -> Comparison:
     return Comparison(title, f"the nominal {nominal.name}", tools, joints, {**facts, **shown_mm}, warnings)
 
 
-def _of_offsets(baked: Baked, urdf: Path) -> Comparison:
-    unused = f"offsets of what is not between the root and the tip are left out: {', '.join(baked.unused)}."
-    warnings = (unused,) if baked.unused else ()
-    facts = {"source": "robot_calibration", "unused": list(baked.unused)}
-    return Comparison(f"{urdf.name} with its offsets", urdf.name, baked.tools, baked.joints, facts, warnings)
+def _of_offsets(placed: Placed, own: OwnUrdf) -> tuple[Comparison, bytes]:
+    unused = f"offsets of what is not between the root and the tip are left out: {', '.join(placed.unused)}."
+    facts = {"source": "robot_calibration", "unused": list(placed.unused)}
+    title, warnings = f"{own.path.name} with its offsets", (unused,) if placed.unused else ()
+    return Comparison(title, own.path.name, placed.tools, placed.joints, facts, warnings), placed.content
 
 
-def _urdf(arm: MakersArm) -> str:
-    """One link a joint, without masses; the hash of the calibration stands in a comment, where exporters find it."""
-    chain = rigid(arm.frames, arm.nominal.joints, arm.nominal.family.limits)
+def _urdf(arm: MakersArm, placed: Placed | None) -> bytes:
+    """The robot's own URDF, or one link a joint; the calibration's hash in a comment, where exporters find it."""
     note = f"<!-- {arm.nominal.name}, from {arm.source}{f', {arm.hash}' if arm.hash else ''} -->\n"
-    return note + urdf_text(chain, arm.nominal.name)
+    if placed is None:
+        chain = rigid(arm.frames, arm.nominal.joints, arm.nominal.family.limits)
+        return (note + urdf_text(chain, arm.nominal.name)).encode()
+    in_ascii = placed.content.lstrip().startswith(b"<")  # of other encodings the comment is left out
+    return placed.content + note.encode() if in_ascii else placed.content
 
 
 def _show(console: Console, comparison: Comparison, out: Path | None) -> None:

@@ -22,9 +22,9 @@ from armcal.calibration.rigid_chain import (
 )
 from armcal.errors import ConfigError, ProblemError
 
-from armcal_makers.formats import FARTHEST_M, FARTHEST_RAD, HASH, MARK, read_text
+from armcal_makers.formats import HASH, MARK, read_text
 from armcal_makers.frames import KEYS, at_zero, between, differences, placed, six_of, tips
-from armcal_makers.nominal import UR, XARM, Family, Nominal, nominal_arms
+from armcal_makers.nominal import FARTHEST_M, FARTHEST_RAD, UR, XARM, Family, Nominal, nearest, nominal_arms
 
 TOLERANCE = 1e-9
 """m and rad."""
@@ -70,11 +70,8 @@ class XarmExporter:
         shifted, turned = differences(flange[None], drawn[-1:])
         near = shifted[0] <= FARTHEST_M and turned[0] <= FARTHEST_RAD
         zero = placed(axes, flange if near else drawn[-1], drawn)
-        frames = between(zero)
-        rows = {
-            key: dict(zip(KEYS, six_of(frame), strict=True)) for key, frame in zip(nominal.keys, frames, strict=True)
-        }
-        content = {"kinematics": {**rows, **self._more(request)}}
+        sixes = (dict(zip(KEYS, six_of(frame), strict=True)) for frame in between(zero))
+        content = {"kinematics": {**dict(zip(nominal.keys, sixes, strict=True)), **self._more(request)}}
         head = f"{MARK}: {nominal.name}; roll, pitch and yaw are about the fixed axes, as in a URDF.\n"
         text = (head + yaml.safe_dump(content, sort_keys=False)).encode()
         left = np.linalg.solve(zero[-1], flange)
@@ -87,25 +84,12 @@ class XarmExporter:
 
     def _nominal(self, axes: Array) -> Nominal:
         """The arm that is meant: by its name, or the one whose links are nearest."""
-        arms = {name: arm for name, arm in nominal_arms().items() if arm.family is self.family}
-        robot = self._settings.robot
-        if robot is not None and robot not in arms:
-            raise ConfigError(f"the arm {robot!r} is not known.", hint=f"The arms are {', '.join(arms)}.")
-        fitting = {}
-        for name, arm in arms.items():
-            if len(arm.frames) == len(axes) and robot in (None, name):
+        candidates = {}
+        for name, arm in nominal_arms().items():
+            if arm.family is self.family and len(arm.frames) == len(axes):
                 drawn = at_zero(arm.frames)
-                shifts, turns = differences(placed(axes, drawn[-1], drawn), drawn)
-                if turns.max() <= FARTHEST_RAD:
-                    fitting[name] = float(shifts.max())
-        nearest = min(fitting, key=lambda name: fitting[name], default="")
-        if not nearest or fitting[nearest] > FARTHEST_M:
-            far = f": its links are {1000 * fitting[nearest]:.3g} mm off {nearest}" if nearest else ""
-            raise ConfigError(
-                f"the arm is none of {', '.join(arms) if robot is None else robot}{far}.",
-                hint="Export it as a URDF: armcal export --format urdf, or armcal convert --to urdf.",
-            )
-        return arms[nearest]
+                candidates[name] = between(placed(axes, drawn[-1], drawn))
+        return nearest(candidates, self._settings.robot)
 
 
 class UrExporter(XarmExporter):

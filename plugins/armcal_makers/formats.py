@@ -5,27 +5,26 @@ from __future__ import annotations
 import configparser
 import math
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from armcal.base.domains import Array
+from armcal.errors import Location
 from armcal.io.plain_files import input_bytes, refuse, text_of
 
 from armcal_makers.frames import KEYS, at_zero, between, dh_frames, placed, pose, tips
 from armcal_makers.nodes import AGAIN, Scalar, Section, read_section
-from armcal_makers.nominal import UR, Nominal, nominal_arms, ur_rows
+from armcal_makers.nominal import UR, Nominal, nearest, nominal_arms, ur_rows
 
 MAX_BYTES = 1 << 18
 MARK = "# Calibrated by armcal"
 """How files begin that armcal wrote, in which there is no doubt about the order of angles."""
-FARTHEST_M, FARTHEST_RAD = 0.03, math.radians(5)
-"""Frames of a calibrated arm further off the nominal ones are of another arm, or in other units."""
 _LONGEST_M = 3.0
 _WIDEST = 2 * math.pi + 1e-6
 _STEEPEST = 0.1
 """rad: axes that should be square or parallel are never further off."""
+_SECTION = re.compile(r"^\s*\[", re.MULTILINE)
 _CONF = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
 HASH = re.compile(r"calib_\d+")
 
@@ -85,16 +84,21 @@ def text_in(path: Path) -> str:
 def read_text(text: str, path: Path, robot: str | None = None) -> MakersArm:
     """As ``read_maker``, of the content of a file; ``path`` names it in messages."""
     arms = nominal_arms()
-    if robot is not None and robot not in arms:
-        refuse(path, f"the arm {robot!r} is not known.", f"The arms are {', '.join(arms)}.")
-    if re.search(r"^\s*\[", text, re.MULTILINE):
+    if _SECTION.search(text):
         return _of_conf(text, path, robot, arms)
-    root = read_section(text, path)
-    if "kinematics" not in root.entries and all(isinstance(entry, Scalar) for entry in root.entries.values()):
+    if has_offsets(text, path):
         hint = "Offsets of robot_calibration need the --urdf that they belong to; else check which file this is."
-        root.refuse("found numbers alone, expected kinematics:.", hint)
-    arm = _of_yaml(root, path, robot, arms)
+        refuse(path, "found numbers alone, expected kinematics:.", hint)
+    arm = _of_yaml(read_section(text, path), path, robot, arms)
     return replace(arm, moving_axes=None) if text.startswith(MARK) else arm
+
+
+def has_offsets(text: str, path: Path) -> bool:
+    """Whether a file has numbers alone, as robot_calibration writes its offsets."""
+    if _SECTION.search(text):
+        return False
+    root = read_section(text, path)
+    return "kinematics" not in root.entries and all(isinstance(entry, Scalar) for entry in root.entries.values())
 
 
 def _of_yaml(root: Section, path: Path, robot: str | None, arms: dict[str, Nominal]) -> MakersArm:
@@ -106,7 +110,7 @@ def _of_yaml(root: Section, path: Path, robot: str | None, arms: dict[str, Nomin
         kinematics.refuse(f"found the joints {', '.join(keys)[:200] or 'none'}, expected {expected}.", AGAIN)
     rows = [_six(kinematics.section(key)) for key in known[0].keys]
     frames = np.array([pose(row) for row in rows])
-    nominal = _chosen(path, robot, {arm.name: frames for arm in known}, arms)
+    nominal = nearest({arm.name: frames for arm in known}, robot, Location(str(path)))
     if nominal.family is not UR:
         return MakersArm(nominal, frames, nominal.family.format)
     moving = np.array([pose(row, "XYZ") for row in rows])
@@ -115,12 +119,10 @@ def _of_yaml(root: Section, path: Path, robot: str | None, arms: dict[str, Nomin
 
 def _six(section: Section) -> list[float]:
     numbers = section.numbers(KEYS)
-    for key, value, most, unit in zip(KEYS, numbers, 3 * [_LONGEST_M] + 3 * [_WIDEST], "mmm" + 3 * "r", strict=True):
-        if abs(value) > most:
-            if unit == "m":
-                section.refuse(
-                    f"found {key} {value:g}, expected metres of an arm's link.", "Divide millimetres by 1000."
-                )
+    for key, value in zip(KEYS, numbers, strict=True):
+        if key in "xyz" and abs(value) > _LONGEST_M:
+            section.refuse(f"found {key} {value:g}, expected metres of a link.", "Divide millimetres by 1000.")
+        if abs(value) > _WIDEST:
             section.refuse(f"found {key} {value:g}, expected radians: it looks like degrees.", "Convert it to radians.")
     return numbers
 
@@ -134,29 +136,6 @@ def _hash(kinematics: Section) -> str:
     return entry.text
 
 
-def _chosen(path: Path, robot: str | None, candidates: Mapping[str, Array], arms: Mapping[str, Nominal]) -> Nominal:
-    """The stated arm, or the nearest of those that the file may be of, each with its frames.
-
-    Raises:
-        DataError: the frames are not near to it.
-    """
-    off = {name: arms[name].off(frames) for name, frames in candidates.items()}
-    name = robot or min(off, key=lambda candidate: off[candidate])
-    shift, turn = off.get(name, (math.inf, math.inf))
-    if shift <= FARTHEST_M and turn <= FARTHEST_RAD:
-        return arms[name]
-    nearest = min(off, key=lambda candidate: off[candidate])
-    apart = (
-        "it has other joints" if math.isinf(shift) else f"{1000 * shift:.3g} mm and {math.degrees(turn):.2g} deg off"
-    )
-    hint = "It fits no arm that armcal knows: check units (m, rad), or give armcal the arm's own URDF."
-    if off[nearest][0] <= FARTHEST_M:
-        near_mm = 1000 * off[nearest][0]
-        hint = f"It fits {nearest}, {near_mm:.2g} mm off: give --robot {nearest}, or check whose file it is."
-    limits = f"{1000 * FARTHEST_M:g} mm and {math.degrees(FARTHEST_RAD):g} deg"
-    refuse(path, f"it is not a calibration of {name}: {apart}, expected {limits} at most.", hint)
-
-
 def _of_conf(text: str, path: Path, robot: str | None, arms: dict[str, Nominal]) -> MakersArm:
     """Deltas of standard Denavit-Hartenberg rows, added to the nominal ones, and moved back to the links."""
     deltas = _deltas(text, path)
@@ -165,7 +144,7 @@ def _of_conf(text: str, path: Path, robot: str | None, arms: dict[str, Nominal])
         reason = "it holds only differences from a nominal arm" if robot is None else f"found {robot}"
         refuse(path, f"{reason}, expected a UR.", f"Give --robot, one of {', '.join(choices)}.")
     fitted = {name: _with(deltas, arm) for name, arm in choices.items()}
-    return MakersArm(_chosen(path, robot, fitted, arms), fitted[robot], "ur_controller")
+    return MakersArm(nearest(fitted, robot, Location(str(path))), fitted[robot], "ur_controller")
 
 
 def _with(deltas: dict[str, Array], nominal: Nominal) -> Array:

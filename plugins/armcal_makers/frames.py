@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 _NEAR_M, _NEAR_RAD = 0.02, 0.1
 """A frame as near to its nominal one stays where it is; another is shifted along its axis, and turned about it."""
+_ALONG = 0.9
+"""Cosine to an axis beyond which a direction says too little of what is across it."""
 
 
 def pose(six: Sequence[float], order: str = "xyz") -> Array:
@@ -82,7 +84,8 @@ def placed(axes: Array, flange: Array, nominal: Array) -> Array:
 def _on_axis(own: Array, drawn: Array) -> Array:
     """The frame with the z axis of one, nearest to another (4x4 each)."""
     z, point = own[:3, 2], own[:3, 3]
-    x = drawn[:3, 0] - z * (z @ drawn[:3, 0])
+    towards = drawn[:3, 0] if abs(z @ drawn[:3, 0]) < _ALONG else own[:3, 0]
+    x = towards - z * (z @ towards)
     x = x / np.linalg.norm(x)
     frame = np.eye(4)
     frame[:3, :3] = np.column_stack([x, np.cross(z, x), z])

@@ -9,6 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 from armcal.base.domains import Array
+from armcal.errors import DataError, Location
 
 from armcal_makers.frames import at_zero, dh_frames, differences, pose
 
@@ -72,6 +73,8 @@ _XARM: Mapping[str, tuple[tuple[float, ...], ...]] = MappingProxyType(
         ),
     }
 )
+FARTHEST_M, FARTHEST_RAD = 0.03, math.radians(5)
+"""Frames of a calibrated arm further off the nominal ones are of another arm, or in other units."""
 _UR_JOINTS = ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", *(f"wrist_{i}_joint" for i in (1, 2, 3)))
 _UR_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 
@@ -132,6 +135,34 @@ def nominal_arms() -> dict[str, Nominal]:
         joints = tuple(f"joint{i}" for i in range(1, len(rows) + 1))
         arms.append(Nominal(name, XARM, joints, joints, np.array([pose(row) for row in rows])))
     return {arm.name: arm for arm in arms}
+
+
+def nearest(candidates: Mapping[str, Array], robot: str | None, where: Location | None = None) -> Nominal:
+    """The stated arm, or the nearest of those that frames may be of.
+
+    Args:
+        candidates: parent_T_joint (n x 4 x 4) of each arm that it may be, by name.
+        robot: the stated arm.
+        where: the frames were read.
+
+    Raises:
+        DataError: the arm is not known, or the frames are not near to it.
+    """
+    arms = nominal_arms()
+    if robot is not None and robot not in arms:
+        raise DataError(f"the arm {robot!r} is not known.", where=where, hint=f"The arms are {', '.join(arms)}.")
+    off = {name: arms[name].off(frames) for name, frames in candidates.items()}
+    best = min(off, key=lambda candidate: off[candidate], default="any arm that is known")
+    name, none = robot or best, (math.inf, math.inf)
+    shift, turn = off.get(name, none)
+    if shift <= FARTHEST_M and turn <= FARTHEST_RAD:
+        return arms[name]
+    hint = "It fits no arm that armcal knows: check units (m, rad), or use a URDF of the arm itself."
+    if best in off and off[best][0] <= FARTHEST_M and off[best][1] <= FARTHEST_RAD:
+        hint = f"It fits {best}, {1000 * off[best][0]:.2g} mm off: name that one, or check whose calibration it is."
+    apart = f"{1000 * shift:.3g} mm and {math.degrees(turn):.2g} deg off" if shift < math.inf else "it has other joints"
+    limits = f"{1000 * FARTHEST_M:g} mm and {math.degrees(FARTHEST_RAD):g} deg"
+    raise DataError(f"it is not a calibration of {name}: {apart}, expected {limits} at most.", where=where, hint=hint)
 
 
 def ur_rows(name: str) -> tuple[Array, Array, Array, Array]:

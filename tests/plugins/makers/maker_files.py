@@ -7,7 +7,11 @@ those of three UR10 in the tests of ur_calibration.
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ElementTree
+
 import numpy as np
+from armcal_makers.frames import six_of
+from armcal_makers.nominal import nominal_arms
 
 UR5_CONF = """[mounting]
 ## calibration_status: 2 == Linearised
@@ -235,3 +239,30 @@ def yaml_tip(rows, q, urdf=True):
 
 def poses(count=1000, joints=6):
     return np.random.default_rng(7).uniform(-np.pi, np.pi, (count, joints))
+
+
+def full_urdf():
+    """A UR5e as ur_description has it: half a turn on its base link, a gripper behind its flange."""
+    arm = nominal_arms()["ur5e"]
+    links = ["base_link_inertia", "a", "b", "c", "d", "e", "wrist_3_link"]
+    joints = [("base_link", "base_link_inertia", "0 0 0", "0 0 3.141592653589793", "half", "fixed")]
+    for name, frame, parent, child in zip(arm.joints, arm.frames, links[:-1], links[1:], strict=True):
+        six = [repr(x) for x in six_of(frame)]
+        joints.append((parent, child, " ".join(six[:3]), " ".join(six[3:]), name, "revolute"))
+    joints.append(("wrist_3_link", "gripper", "0 0.01 0.15", "0 0 0.3", "grip", "fixed"))
+    lines = ['<robot name="cell">', *(f'<link name="{link}"/>' for link in ["base_link", *links, "gripper"])]
+    for parent, child, xyz, rpy, name, kind in joints:
+        limit = '<limit lower="-6.28" upper="6.28" effort="1" velocity="1"/>' if kind == "revolute" else ""
+        lines.append(
+            f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+            f'<origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="0 0 1"/>{limit}</joint>'
+        )
+    return "\n".join([*lines, "</robot>"])
+
+
+def without_origins(text):
+    """All of a URDF but the origins of its joints."""
+    root = ElementTree.fromstring(text)
+    for joint in root.iter("joint"):
+        joint.find("origin").attrib.clear()
+    return ElementTree.tostring(root)

@@ -11,13 +11,13 @@ import pytest
 import yaml
 from armcal.calibration.exporter import request_of
 from armcal.cli.main import cli
-from armcal.errors import ConfigError
+from armcal.errors import ConfigError, InputError
 from armcal_makers.export import UrExporter, UrSettings, XarmExporter, XarmSettings
 from armcal_makers.nominal import ur_rows
 from click.testing import CliRunner
 
 from tests.made_calibrations import made_calibration
-from tests.plugins.makers.maker_files import UR5E_YAML, XARM6_YAML, dh_tip, poses, yaml_tip
+from tests.plugins.makers.maker_files import UR5E_YAML, XARM6_YAML, dh_tip, full_urdf, poses, without_origins, yaml_tip
 
 KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 ROOT = Path(__file__).resolve().parents[3]
@@ -102,29 +102,6 @@ def test_without_a_tool_behind_the_flange_nothing_is_left_over(tmp_path):
     assert np.linalg.norm(rows_of(exported.content)[0][:2]) < 1e-12
 
 
-def full_urdf():
-    """A UR5e as ur_description has it: half a turn on its base link, a gripper behind its flange."""
-    from armcal_makers.nominal import nominal_arms
-
-    arm = nominal_arms()["ur5e"]
-    links = ["base_link_inertia", "a", "b", "c", "d", "e", "wrist_3_link"]
-    joints = [("base_link", "base_link_inertia", "0 0 0", "0 0 3.141592653589793", "half", "fixed")]
-    from armcal_makers.frames import six_of
-
-    for name, frame, parent, child in zip(arm.joints, arm.frames, links[:-1], links[1:], strict=True):
-        six = [repr(x) for x in six_of(frame)]
-        joints.append((parent, child, " ".join(six[:3]), " ".join(six[3:]), name, "revolute"))
-    joints.append(("wrist_3_link", "gripper", "0 0.01 0.15", "0 0 0.3", "grip", "fixed"))
-    lines = ['<robot name="cell">', *(f'<link name="{link}"/>' for link in ["base_link", *links, "gripper"])]
-    for parent, child, xyz, rpy, name, kind in joints:
-        limit = '<limit lower="-6.28" upper="6.28" effort="1" velocity="1"/>' if kind == "revolute" else ""
-        lines.append(
-            f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-            f'<origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="0 0 1"/>{limit}</joint>'
-        )
-    return "\n".join([*lines, "</robot>"])
-
-
 def test_of_the_makers_own_urdf_the_arm_alone_is_written(tmp_path):
     (tmp_path / "cell.urdf").write_text(full_urdf())
     request = made(tmp_path, {"type": "urdf", "path": "cell.urdf"})
@@ -134,6 +111,34 @@ def test_of_the_makers_own_urdf_the_arm_alone_is_written(tmp_path):
     wanted = np.array([dh_tip(ur_rows("ur5e"), angles) for angles in q])
     assert np.abs(tips_of(exported.content, q) - wanted).max() < 1e-12
     assert exported.remarks == ()
+
+
+def test_a_makers_file_goes_into_its_own_urdf_and_back(tmp_path):
+    """Only origins change; tool, limits and what stands around the arm stay, and the hash is known again."""
+    (tmp_path / "cell.urdf").write_text(full_urdf())
+    (tmp_path / "k.yaml").write_text(UR5E_YAML)
+    arguments = ("maker", tmp_path / "k.yaml", "--urdf", tmp_path / "cell.urdf", "--tip")
+    assert armcal(*arguments, "base_link_inertia", "--out", tmp_path / "new.urdf").exit_code == 2
+    ran = armcal(*arguments, "gripper", "--out", tmp_path / "new.urdf")
+    assert ran.exit_code == 0, ran.output
+    assert without_origins((tmp_path / "new.urdf").read_text()) == without_origins(full_urdf())
+    request = made(tmp_path, {"type": "urdf", "path": "new.urdf"})
+    nominal = {block.name: np.array(block.nominal) for block in request.arm.parameters()}
+    content = UrExporter(UrSettings()).export(replace(request, values=nominal)).content
+    q = poses()
+    assert np.abs(tips_of(content, q) - tips_of(UR5E_YAML, q)).max() < 1e-12
+    assert yaml.safe_load(content)["kinematics"]["hash"] == HASH
+
+
+def test_a_urdf_without_the_makers_joints_is_refused(tmp_path):
+    (tmp_path / "cell.urdf").write_text(full_urdf())
+    (tmp_path / "k.yaml").write_text(XARM6_YAML)
+    ran = armcal("maker", tmp_path / "k.yaml", "--urdf", tmp_path / "cell.urdf", "--out", tmp_path / "new.urdf")
+    assert (ran.exit_code, "cell.urdf has no joint1" in ran.stderr, (tmp_path / "new.urdf").exists()) == (
+        2,
+        True,
+        False,
+    )
 
 
 def test_effects_are_named(tmp_path):
@@ -149,13 +154,22 @@ def test_effects_are_named(tmp_path):
         (UrExporter(UrSettings()), "ur5", "no hash"),
         (UrExporter(UrSettings(hash="1")), "ur5", "expected the hash"),
         (UrExporter(UrSettings(hash=HASH, robot="ur9")), "ur5", "is not known"),
-        (UrExporter(UrSettings(hash=HASH, robot="ur10")), "ur5", "mm off ur10"),
-        (XarmExporter(XarmSettings()), "ur5", "none of xarm5"),
+        (UrExporter(UrSettings(hash=HASH, robot="ur10")), "ur5", "not a calibration of ur10.*It fits ur5"),
+        (XarmExporter(XarmSettings()), "ur5", "not a calibration of"),
     ],
 )
 def test_other_arms_are_refused(tmp_path, exporter, robot, message):
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(InputError, match=message):
         exporter.export(made(tmp_path, ur_mdh(robot)))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("alpha", [0, 90, 180])
+def test_an_arm_of_six_other_joints_is_refused(tmp_path, alpha):
+    model = ur_mdh("ur5", base=[{"ry_deg": alpha}])
+    model["rows"] = [{**row, "alpha_deg": alpha} for row in model["rows"]]
+    with pytest.raises(InputError, match="not a calibration of"):
+        UrExporter(UrSettings(hash=HASH)).export(made(tmp_path, model))
 
 
 def test_a_joint_that_slides_is_refused(tmp_path):

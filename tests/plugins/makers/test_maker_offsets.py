@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
 from tests.made_calibrations import made_calibration
-from tests.plugins.makers.maker_files import poses, shift, turn, yaml_tip
+from tests.plugins.makers.maker_files import poses, shift, turn, without_origins, yaml_tip
 
 ORIGINS = {
     "mount": ((0.1, 0, 0.2), (0, 0.3, 0)),
@@ -101,7 +100,7 @@ def test_offsets_of_others_are_listed(tmp_path):
         ({"camera_fx": 0.1}, "none of a joint"),
         ({"pan": 2.5}, "looks like mm or degrees"),
         ({"pan": "high"}, "expected a number"),
-        ({"pan": "{x: 1}"}, "expected a number"),
+        ({"pan": "{x: 1}"}, "found pan, expected kinematics"),
         ({}, "no keys"),
     ],
 )
@@ -143,14 +142,6 @@ def panda_urdf():
             f'<dynamics damping="1.0"/></joint>\n'
         )
     return text + "</robot>\n"
-
-
-def without_origins(text):
-    """All of a URDF but the origins of its joints."""
-    root = ElementTree.fromstring(text)
-    for joint in root.iter("joint"):
-        joint.find("origin").attrib.clear()
-    return ElementTree.tostring(root)
 
 
 def test_a_frankas_urdf_comes_back_with_limits_and_inertials_and_its_calibrated_arm(tmp_path):
