@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 import yaml
@@ -39,5 +40,34 @@ def info(console: Console, path: Path) -> None:
     for remark in content.remarks:
         console.warn(remark)
     if data:
-        console.line("A data section for a configuration:")
-        console.out.print(yaml.safe_dump({"data": data}, sort_keys=False, default_flow_style=None), soft_wrap=True)
+        _show_data(console, data)
+
+
+@bag.command()
+@click.argument("path", type=FILE)
+@click.option("--out", required=True, type=FILE, help="The folder for images, joints.csv and camera_info.yaml.")
+@click.option("--topic", metavar="NAME", help="Of the images, where there are several.")
+@click.option("--joints", metavar="NAME", help="Of the joint states, where there are several.")
+@click.option("--clock-offset-ms", default=0.0, help="How far the camera's clock is ahead of that of the joints.")
+@speaking
+def images(
+    console: Console, path: Path, out: Path, topic: str | None, joints: str | None, clock_offset_ms: float
+) -> None:
+    """Take one image of each rest out of the recording PATH, for the reader images."""
+    from armcal_ros2.images import extract
+
+    extracted = extract(Bag(path), out, topic, joints, clock_offset_ms / 1000)
+    data: dict[str, Any] = {"type": "images", "folder": str(out), "poses": str(out / "joints.csv")}
+    console.result({"images": list(extracted.images), "files": [str(file) for file in extracted.files], "data": data})
+    console.line(f"{len(extracted.images)} images written: {out}")
+    for remark in extracted.remarks:
+        console.warn(remark)
+    if not set(extracted.joints) <= {f"q{i}" for i in range(1, len(extracted.joints) + 1)}:
+        names = {f"q{i}_rad": f"{name}_rad" for i, name in enumerate(extracted.joints, start=1)}
+        data["poses"] = {"type": "csv", "path": str(out / "joints.csv"), "columns": names}
+    _show_data(console, data)
+
+
+def _show_data(console: Console, data: dict[str, Any]) -> None:
+    console.line("A data section for a configuration:")
+    console.out.print(yaml.safe_dump({"data": data}, sort_keys=False, default_flow_style=None), soft_wrap=True)

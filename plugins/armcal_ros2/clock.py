@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 from armcal.base.domains import Array
-from scipy import stats
+from scipy.special import stdtrit
 
 from armcal_ros2.joints import JointRest
 
@@ -105,7 +105,7 @@ def _combined(offsets: Array) -> ClockOffset | str:
     count = len(offsets)
     if count < max(_FEWEST_MOTIONS, motions / 2):
         return f"motions disagree: {count} of {motions} have about the same offset"
-    half_width = float(stats.t.ppf(0.975, count - 1) * offsets.std(ddof=1) / np.sqrt(count))
+    half_width = float(stdtrit(count - 1, 0.975) * offsets.std(ddof=1) / np.sqrt(count))
     if half_width > _WIDEST_S:
         return f"motions disagree: {1000 * offsets.mean():.0f} +- {1000 * half_width:.0f} ms"
     return ClockOffset(float(offsets.mean()), half_width, count)

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 MAX_BYTES = 1 << 44
 JOINT_STATE = "sensor_msgs/msg/JointState"
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
 
 class Topic(NamedTuple):

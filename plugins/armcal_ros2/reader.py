@@ -286,6 +286,6 @@ def _target_of(request: ReadRequest, name: str) -> Callable[[Array], Array]:
 
     def places(joints: Array) -> Array:
         poses = tool_poses(arm.nominal_chain, np.stack(arm.joint_commands([*joints[:, own].T]), axis=1))
-        return poses[:, :3, 3] + poses[:, :3, :3] @ target
+        return np.asarray(poses[:, :3, 3] + poses[:, :3, :3] @ target)
 
     return places

@@ -13,7 +13,6 @@ from armcal_ros2.joints import JointLog, JointsSettings, RestSettings
 from armcal_ros2.message import JOINT_STATE
 from armcal_ros2.samples import MEASURED, TRANSFORMS
 
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _MOST_FRAMES = 200
 
 
