@@ -1,0 +1,93 @@
+"""The exporter ``ros2-node``: a file for those who have ROS 2, between its topics and armcal's sockets."""
+
+from __future__ import annotations
+
+import ast
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+from armcal.base.settings import Settings
+from armcal.calibration.exporter import Exported, ExportRequest
+from armcal.errors import ConfigError, ProblemError
+from pydantic import Field
+
+_TEMPLATE = Path(__file__).with_name("templates") / "node.py.in"
+_CHANNELS = {"tip_position": False, "tip_pose": True}
+Port = Annotated[int, Field(ge=1, le=65535)]
+
+
+class NodeSettings(Settings):
+    """Which measurement feeds the recalibration (the only one unless said), and the ports of both programs."""
+
+    measurement: str | None = None
+    recalibrate_port: Port = 5005
+    serve_port: Port = 5006
+
+
+class Ros2NodeExporter:
+    """One Python file; it holds names alone, and asks a served calibration for the rest."""
+
+    Settings: ClassVar[type[NodeSettings]] = NodeSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {}
+    holds_residual = True
+
+    def __init__(self, settings: NodeSettings) -> None:
+        self._settings = settings
+
+    def export(self, request: ExportRequest) -> Exported:
+        """The file, parsed again and its names compared.
+
+        Raises:
+            ConfigError: no measurement gives positions or poses of the tip, or several do and none is named.
+            ProblemError: it does not read back.
+        """
+        s = self._settings
+        name, is_pose = self._measurement(request)
+        joints = list(request.arm.commanded)
+        sliding = [joint for joint, kind in request.arm.commanded.items() if kind == "length"]
+        kind = "PoseStamped" if is_pose else "PointStamped"
+        constants = {"ARM": request.name, "CALIBRATION": request.digest, "JOINTS": joints, "SLIDING": sliding}
+        constants |= {"MEASUREMENT": name, "IS_POSE": is_pose}
+        words = {
+            "ARM": _comment(request.name),
+            "EXPERIMENT": _comment(request.origin.experiment),
+            "ARM_TEXT": json.dumps(request.name),
+            "DIGEST": json.dumps(request.digest),
+            "JOINTS": json.dumps(joints),
+            "SLIDING": json.dumps(sliding),
+            "MEASUREMENT": json.dumps(name),
+            "IS_POSE": str(is_pose),
+            "MEASURED_TYPE": f"geometry_msgs/{kind}",
+            "MEASURED_CLASS": kind,
+            "MEASURED_IMPORT": kind if is_pose else f"{kind}, PoseStamped",
+            "RECALIBRATE_PORT": str(s.recalibrate_port),
+            "SERVE_PORT": str(s.serve_port),
+        }
+        text = _TEMPLATE.read_text(encoding="utf-8")
+        for word, content in words.items():
+            text = text.replace(f"@{word}@", content)
+        assigned = (node for node in ast.parse(text).body if isinstance(node, ast.Assign))
+        read = {ast.unparse(node.targets[0]): node.value for node in assigned}
+        if any(ast.literal_eval(read[constant]) != value for constant, value in constants.items()):
+            raise ProblemError("the names do not read back as they were written.", hint="Rename the joints.")
+        remarks = (f"run armcal recalibrate with --from udp:{s.recalibrate_port} beside it",)
+        return Exported(text.encode(), 0, remarks=remarks)
+
+    def _measurement(self, request: ExportRequest) -> tuple[str, bool]:
+        """The measurement's name, and whether it reads orientations."""
+        own = {name: str(i.settings.get("type")) for name, i in request.instruments.items()}
+        usable = {name: _CHANNELS[kind] for name, kind in own.items() if kind in _CHANNELS}
+        chosen = self._settings.measurement or (next(iter(usable)) if len(usable) == 1 else None)
+        if chosen is None or chosen not in usable:
+            listed = ", ".join(f"{name} ({kind})" for name, kind in own.items()) or "none"
+            text = f"found the measurements {listed}, expected {self._settings.measurement or 'one'} "
+            hint = f"Give --option measurement=NAME: {', '.join(usable)}." if usable else "A node feeds tip positions."
+            raise ConfigError(f"{text}of type tip_position or tip_pose.", hint=hint)
+        return chosen, usable[chosen]
+
+
+def _comment(text: str) -> str:
+    """What may stand in a docstring."""
+    return "".join(c if c.isprintable() and c not in '"\\' else " " for c in text)[:80]
