@@ -229,7 +229,7 @@ def test_an_so101_begins_as_the_arm_of_the_shipped_configurations(here: Path) ->
     assert max(off.position_m, off.angle_rad) < 1e-12
     weights = [
         {link["mass_g"]: link["com_mm"] for link in yaml.safe_load(path.read_text())["arms"]["arm"]["links"].values()}
-        for path in (here / "so101" / "arm.yaml", ROOT / "configs" / "so101" / "arm.yaml")
+        for path in (here / "so101" / "arm.yaml", ROOT / "configs" / "so101" / "skeleton.yaml")
     ]
     assert weights[0] == weights[1]
 

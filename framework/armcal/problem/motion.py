@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from armcal.arm.loading import LOAD_CHANNELS, SiteLoads, site_loads
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem
 
 ORDER_CHANNELS = ("sequence", "time")
@@ -100,7 +101,8 @@ def _by_load(problem: Problem, values: Array, records: Sequence[FactorRecords], 
     def slopes(of: Dataset) -> tuple[Array, ...]:
         here = zip(other.records(of), records, strict=True)
         at_rest = [replace(factor_records, state=before.state.copy()) for factor_records, before in here]
-        return other.channel_slopes(values, at_rest, LOAD_CHANNELS[:4])
+        whole = other.channel_slopes(values, at_rest, LOAD_CHANNELS[:4])
+        return tuple(map(_of_points, problem.kernels, other.kernels, whole))
 
     g = np.array([acting[f"gravity_{axis}"] for axis in "xyz"])
     ways = np.stack([np.cross(axis, g, axisb=0, axisc=0) for axis in np.eye(3)] + [g], axis=1)
@@ -112,3 +114,11 @@ def _by_load(problem: Problem, values: Array, records: Sequence[FactorRecords], 
         shifted = slopes(replace(loaded, channels=moved))
         hung.append([(own[:, 3:] - at) / _STEP_M for own, at in zip(shifted, hung[0], strict=True)])
     return tuple(np.concatenate(own, axis=1) for own in zip(pulled, *hung, strict=True))
+
+
+def _of_points(kernel: Kernel, whole: Kernel, slopes: Array) -> Array:
+    """The rows of slopes by a kernel of all points that belong to the points of another, which may have few of them."""
+    if kernel.factor.points is None:
+        return slopes
+    every = {channel: row for row, channel in enumerate(whole.factor.output_channels)}
+    return slopes[[every[channel] for channel in kernel.factor.output_channels]]

@@ -78,7 +78,7 @@ def test_sections_are_a_configuration(tmp_path: Path) -> None:
     joint = sections["bench"]["device"]["joints"]["arm.elbow_flex"]
     assert joint == {"id": 3, "model": "sts3215", "zero_count": 2092, "direction": -1, "range_deg": [-96.0, 96.0]}
     assert sections["plan"]["limits"]["shoulder_pan"] == ["-100.0 deg", "100.0 deg"]
-    for name in ("arm.yaml", "demo.csv", "truth.yaml"):
+    for name in ("skeleton.yaml", "arm.yaml"):
         (tmp_path / name).write_bytes((CONFIGS / name).read_bytes())
     path, parameters = tmp_path / "plan.yaml", {**sections["parameters"], "free": ["arm.zeros.offset*"]}
     path.write_text("extends: arm.yaml\n" + yaml.safe_dump({"parameters": parameters, "plan": sections["plan"]}))
@@ -117,7 +117,7 @@ def test_calibrated_zeros_go_back_into_the_file(tmp_path: Path, calibrated: Path
     assert path.read_text() == text and len(list(tmp_path.iterdir())) == 1
     content = json_of("zeros", calibrated, path, "--yes")
     assert content["written"] and Path(content["before"]).read_text() == text
-    truth = yaml.safe_load((CONFIGS / "truth.yaml").read_text())
+    truth = yaml.safe_load((CONFIGS / "arm_truth.yaml").read_text())
     before, after = json.loads(text), json.loads(path.read_text())
     for number, motor in enumerate(list(before)[:5], start=1):
         true = float(truth[f"arm.zeros.offset{number}"].split()[0])
