@@ -16,6 +16,7 @@ APPLICATIONS = {
     "capability": {"acceptance", "capability"},
     "lerobot": {"lerobot"},
     "makers": {"maker"},
+    "servobus": {"bus"},
     "online": {"control", "mission", "recalibrate", "replay", "watch", "what-if"},
     "ros2": {"bag"},
     "serve": {"serve"},

@@ -15,7 +15,7 @@ from armcal_servobus.joints import ServoJoint
 
 _READINGS = 2
 _SILENT_MEND = "Look at its plug and its power; armcal bus find shows who answers, and at which baud rate."
-_SEVERAL_TURNS = 0x10
+SEVERAL_TURNS = 0x10
 """Of a Feetech servo's phase: it reports angles of several turns."""
 _ROUNDED = 2
 """Counts: limits in a servo may be so much narrower than a range that was rounded."""
@@ -156,7 +156,7 @@ def _mistakes(label: str, joint: ServoJoint, eeprom: Eeprom) -> list[Mistake]:
     if eeprom.mode != model.position_mode:
         what = f"is in operating mode {eeprom.mode}, expected {model.position_mode} (positions)"
         mistakes.append(Mistake(label, what, "Set its mode with the maker's program.", True))
-    if eeprom.phase & _SEVERAL_TURNS:
+    if eeprom.phase & SEVERAL_TURNS:
         what = "reports angles of several turns (bit 4 of its phase, register 18)"
         mistakes.append(Mistake(label, what, "Clear that bit: armcal bus home does so."))
     low, high = joint.count_range

@@ -1,0 +1,83 @@
+"""``armcal bus``: find servos on a serial bus, check them against a configuration, set their homing offsets."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+from armcal.cli.common import Console
+from armcal.cli.console import columned
+from armcal.errors import EXIT_BAD_INPUT, InputError
+
+from armcal_servobus.checks import examined
+from armcal_servobus.configured import on_config, opened
+from armcal_servobus.find_command import find_command
+from armcal_servobus.home_command import home_command
+from armcal_servobus.homing import turned
+from armcal_servobus.servos import Servos
+
+
+@click.group()
+def bus() -> None:
+    """Serial-bus servos: find them, check them, set their homing offsets."""
+
+
+@click.command("check")
+@on_config
+def check_command(console: Console, config: Path, overrides: tuple[str, ...]) -> None:
+    """Compare the servos with CONFIG: ids, models, offsets, limits, voltage. Nothing is written to them."""
+    with opened(config, overrides) as (wires, joints):
+        examination = examined(wires, joints)
+        there = {name: joints[name] for name in joints if name in examination.eeproms}
+        readings = Servos(wires, there).readings()
+    rows: list[dict[str, Any]] = []
+    for name, joint in there.items():
+        reading, eeprom = readings[name], examination.eeproms[name]
+        angle = math.degrees(joint.angle(joint.unwrapped(reading.position)))
+        rows.append({"joint": name, "id": joint.id, "angle_deg": round(angle, 2), "count": reading.position})
+        rows[-1] |= {"offset": eeprom.offset, "limits": list(eeprom.limits), "voltage_V": round(reading.voltage, 2)}
+        rows[-1] |= {"temperature_C": reading.temperature, "torque": reading.has_torque, "alarms": list(reading.alarms)}
+    mistakes = [{"joint": m.joint, "what": m.what, "mend": m.mend} for m in examination.mistakes]
+    across = [name for name, joint in joints.items() if joint.crosses_seam]
+    console.result({"joints": rows, "mistakes": mistakes, "ranges_over_the_seam": across})
+    table = columned(str(config), ("joint", "id", "deg", "count", "offset", "V", "deg C", "state"), ("state",))
+    for row in rows:
+        cells = (row["joint"], row["id"], row["angle_deg"], row["count"], row["offset"], row["voltage_V"])
+        state = ", ".join(row["alarms"]) or ("holds" if row["torque"] else "well")
+        table.add_row(*map(str, (*cells, row["temperature_C"])), state)
+    console.out.print(table)
+    for name in across:
+        console.warn(
+            f"the range of {name} crosses the end of its encoder's turn: it can be read there, and not driven."
+        )
+    for mistake in examination.mistakes:
+        console.warn(f"{mistake.joint} {mistake.what}. {mistake.mend}")
+    if mistakes:
+        sys.exit(EXIT_BAD_INPUT)
+
+
+@click.command("wiring")
+@on_config
+def wiring_command(console: Console, config: Path, overrides: tuple[str, ...]) -> None:
+    """See by turning each joint by hand that its id and direction in CONFIG are right. Servos must be let go."""
+    wrong: dict[str, str] = {}
+    with opened(config, overrides) as (wires, joints):
+        servos = Servos(wires, joints)
+        for name in joints:
+            before = servos.positions()
+            click.echo(f"Turn {name} by 15 deg or more in its positive direction, then press Enter.", err=True)
+            if not sys.stdin.readline():
+                raise InputError(f"nobody pressed Enter for {name}.", hint="Run it at a terminal.")
+            if fault := turned(joints, before, servos.positions(), name):
+                wrong[name] = fault
+            console.line(f"{name}: {wrong.get(name, 'right')}.")
+    console.result({"wrong": wrong, "right": [name for name in joints if name not in wrong]})
+    if wrong:
+        sys.exit(EXIT_BAD_INPUT)
+
+
+for _command in (find_command, check_command, wiring_command, home_command):
+    bus.add_command(_command)

@@ -1,0 +1,97 @@
+"""``armcal bus find``."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+import click
+from armcal.cli.common import Console, speaking
+from armcal.cli.console import columned
+from armcal.errors import InputError, Location
+
+from armcal_servobus.bus import Bus, BusSettings
+from armcal_servobus.finding import FoundServo, find
+from armcal_servobus.models import BAUD_RATES
+from armcal_servobus.packets import LAST_ID, ProtocolName
+
+
+@click.command("find")
+@click.argument("port", required=False)
+@click.option("--protocol", type=click.Choice(get_args(ProtocolName)), help="Only this one [default: each in turn].")
+@click.option("--baud", type=int, multiple=True, help="Only this baud rate; may be repeated [default: each in turn].")
+@click.option("--last-id", default=30, show_default=True, type=click.IntRange(0, LAST_ID), help="Asked one by one.")
+@speaking
+def find_command(
+    console: Console, port: str | None, protocol: ProtocolName | None, baud: tuple[int, ...], last_id: int
+) -> None:
+    """List all servos on PORT: baud rate, id, model, and what they report. Nothing is written to them."""
+    place = port or _only_port()
+    servos: list[FoundServo] = []
+    spoken: ProtocolName = "feetech"
+    for spoken in (protocol,) if protocol else get_args(ProtocolName):
+        wires = Bus(BusSettings.model_validate({"port": place, "protocol": spoken}))
+        try:
+            show = lambda baud, name=spoken: console.detail(f"{name} at {baud} baud")  # noqa: E731
+            servos = list(find(wires, baud or BAUD_RATES[spoken], range(last_id + 1), show))
+        finally:
+            wires.close()
+        if any(servo.model for servo in servos):
+            break
+    if not servos:
+        rates = "these baud rates" if baud else "any baud rate"
+        raise InputError(
+            f"no servo answers at {rates}, ids 0 to {last_id}.",
+            where=Location(place),
+            hint="Switch the servos' power on and look at the plug of the first one; ids beyond that: --last-id.",
+        )
+    console.result({"port": place, "protocol": spoken, "servos": [_as_json(servo) for servo in servos]})
+    table = columned(
+        f"{place}, {spoken}", ("baud", "id", "model", "firmware", "count", "V", "deg C", "state"), ("state",)
+    )
+    for servo in servos:
+        state = "two servos with this id?" if servo.is_doubled else ", ".join(servo.alarms) or "well"
+        cells = (
+            servo.baud,
+            servo.id,
+            servo.model_name,
+            servo.firmware,
+            servo.position,
+            servo.voltage,
+            servo.temperature,
+        )
+        table.add_row(*("" if cell is None else str(cell) for cell in cells), state)
+    console.out.print(table)
+    for number in sorted({servo.id for servo in servos if servo.is_doubled}):
+        console.warn(f"two servos may have the id {number}: unplug all but one, and give it another id.")
+
+
+def _as_json(servo: FoundServo) -> dict[str, Any]:
+    return {
+        "baud": servo.baud,
+        "id": servo.id,
+        "model": servo.model.name if servo.model else None,
+        "model_number": servo.number,
+        "firmware": servo.firmware,
+        "position": servo.position,
+        "voltage_V": servo.voltage,
+        "temperature_C": servo.temperature,
+        "alarms": list(servo.alarms),
+        "doubled": servo.is_doubled,
+    }
+
+
+def _only_port() -> str:
+    """The USB serial port, where there is one.
+
+    Raises:
+        InputError: there is none, or several.
+    """
+    from serial.tools import list_ports
+
+    ports = sorted(port.device for port in list_ports.comports() if port.vid is not None)
+    if len(ports) != 1:
+        listed = ", ".join(ports) or "none"
+        raise InputError(
+            f"found {len(ports)} USB serial ports ({listed}), expected one.", hint="Name it: bus find PORT."
+        )
+    return str(ports[0])
