@@ -205,11 +205,13 @@ def conf_of(deltas):
 
 
 def turn(axis, angle):
+    """About a coordinate axis, for each of some angles."""
     i = "xyz".index(axis)
     j, k = (i + 1) % 3, (i + 2) % 3
-    matrix = np.eye(4)
-    matrix[j, j] = matrix[k, k] = np.cos(angle)
-    matrix[k, j], matrix[j, k] = np.sin(angle), -np.sin(angle)
+    matrix = np.zeros((*np.shape(angle), 4, 4))
+    matrix[..., i, i] = matrix[..., 3, 3] = 1
+    matrix[..., j, j] = matrix[..., k, k] = np.cos(angle)
+    matrix[..., k, j], matrix[..., j, k] = np.sin(angle), -np.sin(angle)
     return matrix
 
 
@@ -220,17 +222,17 @@ def shift(x, y, z):
 
 
 def dh_tip(rows, q):
-    """The flange of standard rows (theta, a, d, alpha), term by term."""
+    """The flange at angles (N x n) of standard rows (theta, a, d, alpha), term by term."""
     pose = np.eye(4)
-    for theta, a, d, alpha, angle in zip(*rows, q, strict=True):
+    for theta, a, d, alpha, angle in zip(*rows, q.T, strict=True):
         pose = pose @ turn("z", theta + angle) @ shift(0, 0, d) @ shift(a, 0, 0) @ turn("x", alpha)
     return pose
 
 
 def yaml_tip(rows, q, urdf=True):
-    """The flange of x, y, z, roll, pitch, yaw rows, term by term; else with the turns in the other order."""
+    """The same of x, y, z, roll, pitch, yaw rows; else with the turns in the other order."""
     pose = np.eye(4)
-    for (x, y, z, roll, pitch, yaw), angle in zip(rows, q, strict=True):
+    for (x, y, z, roll, pitch, yaw), angle in zip(rows, q.T, strict=True):
         turns = [turn("z", yaw), turn("y", pitch), turn("x", roll)]
         first, second, third = turns if urdf else turns[::-1]
         pose = pose @ shift(x, y, z) @ first @ second @ third @ turn("z", angle)

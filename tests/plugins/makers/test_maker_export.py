@@ -37,7 +37,7 @@ def rows_of(content):
 
 
 def tips_of(content, q):
-    return np.array([yaml_tip(rows_of(content), angles) for angles in q])
+    return yaml_tip(rows_of(content), q)
 
 
 def made(folder, model, **more):
@@ -84,13 +84,13 @@ def test_a_calibrated_table_of_rows_is_written_for_the_driver(tmp_path, robot):
     scope = "arm.mdh."
     rows = [[request.values[f"{scope}{name}{i}"][0] for i in range(1, 7)] for name in ("theta", "a", "d", "alpha")]
     exported, q = UrExporter(UrSettings(hash=HASH)).export(request), poses()
-    calibrated = np.array([dh_tip(rows, angles) for angles in q])
+    calibrated = dh_tip(rows, q)
     written = tips_of(exported.content, q)
     flange_T_tool = np.linalg.solve(written, calibrated)  # a and alpha of the last row lie behind the last joint
     assert np.abs(flange_T_tool - flange_T_tool[0]).max() < 1e-12
     assert np.abs(flange_T_tool[0] - np.eye(4)).max() < 0.03 and "TCP" in exported.remarks[0]
     assert exported.changed == 24
-    nominal = [np.linalg.norm(dh_tip(ur_rows(robot), a)[:3, 3] - t[:3, 3]) for a, t in zip(q, calibrated, strict=True)]
+    nominal = np.linalg.norm((dh_tip(ur_rows(robot), q) - calibrated)[:, :3, 3], axis=1)
     assert max(nominal) > 0.003  # it is no copy of the nominal arm
 
 
@@ -108,7 +108,7 @@ def test_of_the_makers_own_urdf_the_arm_alone_is_written(tmp_path):
     nominal = {block.name: np.array(block.nominal) for block in request.arm.parameters()}
     exported = UrExporter(UrSettings(hash=HASH)).export(replace(request, values=nominal))
     q = poses()
-    wanted = np.array([dh_tip(ur_rows("ur5e"), angles) for angles in q])
+    wanted = dh_tip(ur_rows("ur5e"), q)
     assert np.abs(tips_of(exported.content, q) - wanted).max() < 1e-12
     assert exported.remarks == ()
 
@@ -211,7 +211,7 @@ def test_a_measured_ur10_is_written_for_its_driver(tmp_path):
     values = {e["name"]: e["value"] for e in yaml.safe_load(calibration.read_text())["parameters"]}
     rows = [[values[f"arm.mdh.{name}{i}"] for i in range(1, 7)] for name in ("theta", "a", "d", "alpha")]
     q = poses()
-    written, calibrated = tips_of(out.read_bytes(), q), np.array([dh_tip(rows, angles) for angles in q])
+    written, calibrated = tips_of(out.read_bytes(), q), dh_tip(rows, q)
     flange_T_tool = np.linalg.solve(written, calibrated)
     assert np.abs(flange_T_tool - flange_T_tool[0]).max() < 1e-10
     said = json.loads(armcal("maker", out, "--json").stdout)

@@ -58,7 +58,7 @@ def test_rows_far_away_are_moved_back_to_the_links_and_the_arm_stays(tmp_path, r
     values = {line.split(" = ")[0]: line.split(" = ")[1] for line in text.splitlines() if line.startswith("delta")}
     rows = [n + np.array(json.loads(v)) for n, v in zip(ur_rows(robot), values.values(), strict=True)]
     arm, q = read(tmp_path, text, "calibration.conf", robot), poses()
-    wanted = np.array([dh_tip(rows, angles) for angles in q])
+    wanted = dh_tip(rows, q)
     assert np.abs(tips(arm.frames, q) - wanted).max() < EXACT
     assert arm.nominal.off(arm.frames)[0] < 0.02  # and its links are where links are
 
@@ -72,7 +72,7 @@ def test_the_urdf_is_the_arm_of_the_file(tmp_path, text, rows, robot):
     ran = armcal("maker", tmp_path / "k.yaml", "--out", tmp_path / "arm.urdf", "--json")
     assert ran.exit_code == 0, ran.output
     said, q = json.loads(ran.stdout), poses()
-    wanted = np.array([yaml_tip(rows, angles) for angles in q])
+    wanted = yaml_tip(rows, q)
     assert said["robot"] == robot
     assert np.abs(urdf_tips(tmp_path / "arm.urdf", q) - wanted).max() < 1e-12
 
@@ -81,7 +81,7 @@ def test_the_table_is_the_distance_to_the_nominal_arm(tmp_path):
     (tmp_path / "k.yaml").write_text(UR5E_YAML)
     said = json.loads(armcal("maker", tmp_path / "k.yaml", "--json").stdout)
     q = poses()
-    apart = [np.linalg.norm((yaml_tip(UR5E_ROWS, a) - dh_tip(ur_rows("ur5e"), a))[:3, 3]) for a in q]
+    apart = np.linalg.norm((yaml_tip(UR5E_ROWS, q) - dh_tip(ur_rows("ur5e"), q))[:, :3, 3], axis=1)
     assert said["median_mm"] == pytest.approx(1000 * np.median(apart), rel=0.1)
     assert said["largest_mm"] == pytest.approx(1000 * max(apart), rel=0.1)
     assert said["joints"]["shoulder_pan_joint"]["shift_mm"] == pytest.approx(0.2122, abs=1e-3)
@@ -91,7 +91,7 @@ def test_the_table_is_the_distance_to_the_nominal_arm(tmp_path):
 
 def test_both_readings_of_the_angles_are_compared(tmp_path):
     arm, q = read(tmp_path, UR5_YAML), poses()
-    apart = [np.linalg.norm((yaml_tip(UR5_ROWS, a) - yaml_tip(UR5_ROWS, a, urdf=False))[:3, 3]) for a in q]
+    apart = np.linalg.norm((yaml_tip(UR5_ROWS, q) - yaml_tip(UR5_ROWS, q, urdf=False))[:, :3, 3], axis=1)
     assert arm.other_order_m(q) == pytest.approx(max(apart), rel=1e-6)
     assert "in the other" in armcal("maker", tmp_path / "file.yaml").stderr
     assert read(tmp_path, XARM6_YAML).other_order_m(q) is None
