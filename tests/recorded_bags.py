@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -91,14 +91,18 @@ Sent = tuple[float, str, str, Any]
 """When it was received (s), its topic, its type, and the message."""
 
 
-def write_bag(path: Path, sent: Sequence[Sent], storage: str = "mcap", compressed: str = "") -> Path:
-    """A recording of messages, in the order of their receipt; ``compressed`` is by ``storage`` or by ``message``."""
+def _received(entry: Sent) -> float:
+    return entry[0]
+
+
+def write_bag(path: Path, sent: Iterable[Sent], storage: str = "mcap", compressed: str = "") -> Path:
+    listed = sorted(sent, key=_received) if isinstance(sent, list) else sent
     writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
     if compressed:
         writer.set_compression(CompressionMode[compressed.upper()], CompressionFormat.ZSTD)
     with writer:
         connections: dict[str, Any] = {}
-        for received, topic, kind, content in sorted(sent, key=lambda entry: entry[0]):
+        for received, topic, kind, content in listed:
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, kind, typestore=TYPES)
             writer.write(connections[topic], round(received * 1e9), bytes(TYPES.serialize_cdr(content, kind)))

@@ -22,6 +22,8 @@ from armcal_ros2.stamps import Stamps, TopicSettings, nanoseconds
 GUARD_S = 0.1
 """At the end of a rest, before joints are seen to move."""
 _BLOCK = 1000
+_LARGEST = 1e6
+"""No joint stands so far away, in any unit."""
 THINNED_S = 0.01
 MOST_THINNED = 400_000
 """So many moments of the motion are kept, enough for an hour."""
@@ -128,7 +130,7 @@ class JointLog:
         time = self.stamps.time(nanoseconds(message.header.stamp), received)
         if time is None:
             return
-        if len(message.position) != len(names) or not np.isfinite(row := message.position[places]).all():
+        if len(message.position) != len(names) or not (np.abs(row := message.position[places]) < _LARGEST).all():
             self._faulty += 1
             return
         if before is not None and time - before > self._window:

@@ -98,9 +98,11 @@ class McapFile:
         """A schema or a channel is kept, a message handed out."""
         if code == _MESSAGE:
             channel, _, received, _ = _MESSAGE_HEAD.unpack(file.read(_MESSAGE_HEAD.size))
-            topic = self._topics.get(channel)
+            topic, length = self._topics.get(channel), stop - file.tell()
+            if length < 0:
+                raise _CutOffError
             if topic is not None:
-                yield RawMessage(topic, received, file.read(stop - file.tell()) if is_read(topic) else None)
+                yield RawMessage(topic, received, file.read(length) if is_read(topic) else None)
         elif code == _SCHEMA:
             (schema,) = struct.unpack("<H", file.read(2))
             self._schemas[schema] = _text(file)

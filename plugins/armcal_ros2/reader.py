@@ -80,8 +80,8 @@ class Rosbag2Reader:
         self._digest = hashlib.sha256()
         joints, paths = self._joints(bag, request)
         remarks = joints.close(str(s.path))
-        self._refuse_degrees(request, joints)
         rests = joints.rests
+        self._refuse_degrees(request, np.abs([rest.means for rest in rests]).max(axis=0) if rests else joints.largest)
         if not rests:
             hint = "Let the arm stand at each pose, or give a wider spread_deg or a shorter window_s under still."
             self._refuse(f"found no rest of at least {s.still.window:g} s in {joints.stamps.topic}.", hint)
@@ -259,10 +259,10 @@ class Rosbag2Reader:
             self._refuse(f"{name} reads orientations, and {topic} has points.", "Set type: tip_position.")
         return {f"{name}.{own}": values[own] for own in needed}
 
-    def _refuse_degrees(self, request: ReadRequest, joints: JointLog) -> None:
+    def _refuse_degrees(self, request: ReadRequest, positions: Array) -> None:
         """Angles beyond one turn of joints that do not turn on and on."""
         turning = {w.channel for w in request.channels if w.dimension == "angle" and not w.is_endless}
-        for name, largest in zip(_joint_channels(request), joints.largest, strict=True):
+        for name, largest in zip(_joint_channels(request), positions, strict=True):
             if name in turning and largest > _FULL_TURN:
                 hint = "If these are degrees, set joints: {unit: deg}; if not, record angles within one turn."
                 self._refuse(f"{name} stands at {largest:.6g} rad, more than one turn (2 pi rad).", hint)

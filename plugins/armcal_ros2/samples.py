@@ -32,6 +32,7 @@ MEASURED = (*_FIELDS, TRANSFORMS)
 _NORM_TOLERANCE = 1e-3
 _STATIC = "/tf_static"
 _MOST_SAMPLES = 1000
+_MOST_OTHERS = 0.01
 
 
 class MeasuredSettings(TopicSettings):
@@ -145,13 +146,14 @@ class MeasuredLog:
         if not count:
             frames = ", ".join(f"{name or 'none'} ({some})" for name, some in self._frames.items()) or "no messages"
             refuse(where, f"found {frames} in {s.topic}, expected the frame {s.frame}.", "Correct frame.")
-        if s.reference is None and s.frame is None and len(self._frames) > 1:
+        usual = s.frame or max(self._frames, key=lambda name: self._frames[name], default="")
+        others = sum(some for name, some in self._frames.items() if name != usual)
+        if s.frame is None and others > _MOST_OTHERS * count:
             frames = ", ".join(f"{name or 'none'} ({some})" for name, some in self._frames.most_common())
             refuse(where, f"found several frames in {s.topic}: {frames}, expected one.", "Set frame to one of them.")
         remarks = self.stamps.check(where)
-        others = sum(some for name, some in self._frames.items() if s.frame not in (None, name))
         if others:
-            remarks.append(f"{others} messages of {s.topic} are of other frames than {s.frame}: left out.")
+            remarks.append(f"{others} messages of {s.topic} have other frames than {usual!r}.")
         if self._faults:
             listed = ", ".join(f"{some} whose {what}" for what, some in self._faults.most_common())
             remarks.append(f"of {count} messages of {s.topic} some were left out: {listed}.")

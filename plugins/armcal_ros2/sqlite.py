@@ -49,9 +49,9 @@ class SqliteFile:
             try:
                 for key, received, data in connection.execute(_ROWS.format(chosen)):
                     count += 1
-                    if key in topics:
+                    if key in topics and isinstance(received, int) and isinstance(data, bytes | None):
                         yield RawMessage(topics[key], received, data)
-            except sqlite3.Error as fault:
+            except (sqlite3.Error, MemoryError) as fault:  # memory: a length that is damaged
                 self.faults.append(f"it is cut off or damaged after {count} messages ({fault}); these were read")
 
     def _opened(self) -> tuple[sqlite3.Connection, dict[int, Topic]]:

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import shutil
+import sqlite3
+import struct
 from pathlib import Path
+from random import Random
 
+import lz4.frame
 import numpy as np
 import pytest
 import recorded_bags as bags
@@ -11,6 +17,8 @@ from armcal.base.dataset import Dataset
 from armcal.errors import DataError
 from armcal.run.experiment import Experiment
 from armcal_ros2.bag import Bag
+from armcal_ros2.survey import survey
+from rosbags.rosbag2 import Reader
 
 KINDS = [("mcap", ""), ("mcap", "storage"), ("sqlite3", "")]
 
@@ -81,11 +89,50 @@ def test_a_damaged_chunk_costs_no_more_than_itself(tour: bags.Tour) -> None:
     assert ["the chunk at byte" in remark for remark in damaged.remarks] == [True]
 
 
+@pytest.mark.parametrize(("storage", "compressed"), [*KINDS, ("mcap", "message"), ("sqlite3", "message")])
+def test_messages_are_those_that_rosbags_reads(tour: bags.Tour, storage: str, compressed: str) -> None:
+    bag, _ = recorded(tour, f"read_{storage}{compressed}", storage, compressed)
+    with Reader(bag) as reader:
+        expected = sorted((t, c.topic, c.msgtype, bytes(data)) for c, t, data in reader.messages())
+    messages = Bag(bag).messages(lambda topic: True)
+    assert sorted((m.received, m.topic.name, m.topic.type, bytes(m.data or b"")) for m in messages) == expected
+    passed_over = list(Bag(bag).messages(lambda topic: topic.name == "/tip"))
+    assert len(passed_over) == len(expected)
+    assert {m.topic.name for m in passed_over if m.data is not None} == {"/tip"}
+
+
+def test_chunks_may_be_compressed_by_lz4(tour: bags.Tour) -> None:
+    bag, file = recorded(tour, "lz4", "mcap", "")
+    whole, content, at, parts = list(Bag(bag).messages(lambda topic: True)), file.read_bytes(), 8, []
+    while at < len(content) - 8:
+        code, length = struct.unpack_from("<BQ", content, at)
+        record = content[at + 9 : at + 9 + length]
+        if code == 6:
+            packed = lz4.frame.compress(record[40:])
+            record = record[:28] + struct.pack("<I", 3) + b"lz4" + struct.pack("<Q", len(packed)) + packed
+        parts.append(struct.pack("<BQ", code, len(record)) + record)
+        at += 9 + length
+    file.write_bytes(content[:8] + b"".join(parts) + content[-8:])
+    assert file.stat().st_size < 0.8 * len(content)
+    assert list(Bag(bag).messages(lambda topic: True)) == whole
+
+
+@pytest.mark.parametrize(("storage", "compressed"), KINDS)
+def test_damaged_bytes_never_end_in_a_traceback(tour: bags.Tour, storage: str, compressed: str) -> None:
+    bag, file = recorded(tour, f"damaged_{storage}{compressed}", storage, compressed)
+    random, content = Random(1), file.read_bytes()[: 1 << 16]
+    for _ in range(40):
+        damaged = bytearray(content)
+        for _ in range(random.choice([1, 3, 20])):
+            at, length = random.randrange(len(damaged)), random.choice([1, 4, 64])
+            damaged[at : at + length] = random.choice([bytes(length), b"\xff" * length, random.randbytes(length)])
+        file.write_bytes(damaged)
+        with contextlib.suppress(DataError):
+            survey(Bag(bag))
+
+
 def test_rows_that_only_a_journal_holds_are_read(tour: bags.Tour, tmp_path: Path) -> None:
     """A recorder with a write-ahead log that was killed: nothing of the last seconds is in the file itself."""
-    import shutil
-    import sqlite3
-
     bag, file = recorded(tour, "journal", "sqlite3", "")
     count = len(list(Bag(bag).messages(lambda topic: False)))
     writer = sqlite3.connect(file)

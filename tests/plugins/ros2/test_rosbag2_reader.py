@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import heapq
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -134,6 +137,26 @@ def test_transforms_are_read_by_frames(tour: bags.Tour, name: Path) -> None:
         read(tour, bag, topic="/tf")
 
 
+def test_poses_are_read_with_their_orientation(tour: bags.Tour, name: Path) -> None:
+    """Quaternions of either sign; those that are zero, as trackers send where they see no body, are left out."""
+    turns = Rotation.random(len(tour.rests), random_state=4).as_quat()
+    sent = [m for m in tour.sent() if m[1] == "/joint_states"]
+    kind = "geometry_msgs/msg/PoseStamped"
+    for i, (t, p) in enumerate(zip(*tour.seen, strict=True)):
+        turn = turns[np.clip(np.searchsorted(tour.rests[:, 0], t) - 1, 0, None)]
+        q = bags.vector("Quaternion", turn * (-1, 1, 0)[i % 3])
+        pose = bags.message("geometry_msgs/msg/Pose", position=bags.vector("Point", p), orientation=q)
+        sent.append((t, "/tip", kind, bags.message(kind, header=bags.header(t, "world"), pose=pose)))
+    config = bags.of_bag(tour, bags.write_bag(name, sent))
+    settings = yaml.safe_load(config.read_text())
+    settings["measurements"]["tracker"] |= {"type": "tip_pose", "orientation_noise_deg": 0.1}
+    config.write_text(yaml.safe_dump(settings))
+    dataset = Experiment.load(config).read()
+    quaternions = dataset.stacked([f"tracker.{axis}" for axis in ("qx", "qy", "qz", "qw")]).T
+    np.testing.assert_allclose(quaternions, turns * np.sign(turns[:, 3:]), atol=1e-9)
+    assert any("whose quaternion is zero" in text for text in dataset.warnings)
+
+
 Change = Callable[[list[bags.Sent]], list[bags.Sent]]
 
 
@@ -209,3 +232,46 @@ def test_a_few_faulty_messages_are_counted(tour: bags.Tour, name: Path) -> None:
     require_rests(dataset, tour)
     text = " ".join(dataset.warnings)
     assert "3 of" in text and "not finite" in text and "without q3: left out" in text
+
+
+def test_a_stamp_from_elsewhere_costs_one_message(tour: bags.Tour, name: Path) -> None:
+    """A clock that is set after the first messages, and one message far in the future."""
+    sent = tour.sent()
+    for k in (0, 1, 2, 500):
+        t, topic, kind, m = sent[k]
+        stamp = t - 1e9 if k < 3 else t + 1e6
+        sent[k] = (t, topic, kind, bags.joint_state(stamp, m.name, m.position))
+    dataset = read(tour, bags.write_bag(name, sent))
+    assert len(dataset) == len(tour.rests)
+    assert any("a stamp far from that of others" in text for text in dataset.warnings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_gigabytes_of_images_take_no_memory(tmp_path: Path, storage: str) -> None:
+    """2.2 GB: the whole process stays below 200 MB."""
+    tour = bags.made_tour(tmp_path, rests=12)
+    pixels = np.random.default_rng(0).integers(0, 255, 4_000_000, np.uint8)
+    own = {"height": 1000, "width": 4000, "encoding": "mono8", "is_bigendian": 0, "step": 4000, "data": pixels}
+    times = np.linspace(tour.rests[0, 0], tour.rests[-1, 1], 550)
+    images = (
+        (t, "/image", "sensor_msgs/msg/Image", bags.message("sensor_msgs/msg/Image", header=bags.header(t), **own))
+        for t in times
+    )
+    bag = bags.write_bag(
+        tmp_path / "bag", heapq.merge(sorted(tour.sent(), key=received), images, key=received), storage
+    )
+    assert sum(path.stat().st_size for path in bag.iterdir()) > 2.2e9
+    code = (
+        "import resource, sys; from armcal.run.experiment import Experiment; "
+        "print(len(Experiment.load(sys.argv[1]).read()), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+    )
+    # by way of a shell: what a process took before it became another one counts for its peak
+    command = f'{sys.executable} -c "{code}" {bags.of_bag(tour, bag, clock_offset="estimate")}'
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
+    records, kilobytes = map(int, done.stdout.split())
+    assert records == 12 and kilobytes < 200_000
+
+
+def received(entry: bags.Sent) -> float:
+    return entry[0]
