@@ -130,90 +130,45 @@ _DYNAMIXEL2_ALARMS = MappingProxyType(
     {0x01: "voltage", 0x02: "angle sensor", 0x04: "overheating", 0x08: "encoder", 0x10: "shock", 0x20: "overload"}
 )
 
-_FEETECH = MappingProxyType(
-    {
-        "firmware": Register(0),
-        "model": Register(3, 2),
-        "id": Register(5),
-        "baud": Register(6),
-        "answers": Register(8),
-        "min": Register(9, 2),
-        "max": Register(11, 2),
-        "max_temperature": Register(13),
-        "max_voltage": Register(14, unit=0.1),
-        "min_voltage": Register(15, unit=0.1),
-        "torque": Register(40),
-        "goal": Register(42, 2),
-        "time": Register(44, 2),
-        "speed": Register(46, 2),
-        "position": Register(56, 2),
-        "load": Register(60, 2, sign_bit=10, unit=0.001),
-        "voltage": Register(62, unit=0.1),
-        "temperature": Register(63),
-        "status": Register(65),
-        "moving": Register(66),
-    }
+
+def _registers(rows: str, **units: float) -> MappingProxyType[str, Register]:
+    """A table of names, addresses, bytes (1) and ``signed``, or ``sign`` and its bit; units apart where not 1."""
+    registers: dict[str, Register] = {}
+    for row in rows.split(","):
+        name, address, *more = row.split()
+        size, kind = int(more[0]) if more else 1, more[1] if len(more) > 1 else ""
+        bit = int(kind[4:]) if kind.startswith("sign") and kind != "signed" else None
+        registers[name] = Register(int(address), size, bit, kind == "signed", units.get(name, 1.0))
+    return MappingProxyType(registers)
+
+
+_TENTHS = {"voltage": 0.1, "min_voltage": 0.1, "max_voltage": 0.1, "load": 0.001}
+_FEETECH = _registers(
+    "firmware 0, model 3 2, id 5, baud 6, answers 8, min 9 2, max 11 2, max_temperature 13, max_voltage 14,"
+    "min_voltage 15, torque 40, goal 42 2, time 44 2, speed 46 2, position 56 2, load 60 2 sign10, voltage 62,"
+    "temperature 63, status 65, moving 66",
+    **_TENTHS,
 )
-_STS = MappingProxyType(
-    {
-        **_FEETECH,
-        "phase": Register(18),
-        "offset": Register(31, 2, sign_bit=11),
-        "mode": Register(33),
-        "acceleration": Register(41, unit=100 * 2 * math.pi / 4096),
-        "goal": Register(42, 2, sign_bit=15),
-        "speed": Register(46, 2, sign_bit=15, unit=2 * math.pi / 4096),
-        "lock": Register(55),
-        "position": Register(56, 2, sign_bit=15),
-    }
+_STS = _FEETECH | _registers(
+    "phase 18, offset 31 2 sign11, mode 33, acceleration 41, goal 42 2 sign15, speed 46 2 sign15, lock 55,"
+    "position 56 2 sign15",
+    acceleration=100 * 2 * math.pi / 4096,
+    speed=2 * math.pi / 4096,
 )
-_X = MappingProxyType(
-    {
-        "model": Register(0, 2),
-        "firmware": Register(6),
-        "id": Register(7),
-        "baud": Register(8),
-        "mode": Register(11),
-        "offset": Register(20, 4, is_signed=True),
-        "max_temperature": Register(31),
-        "max_voltage": Register(32, 2, unit=0.1),
-        "min_voltage": Register(34, 2, unit=0.1),
-        "max": Register(48, 4),
-        "min": Register(52, 4),
-        "torque": Register(64),
-        "answers": Register(68),
-        "status": Register(70),
-        "acceleration": Register(108, 4, unit=214.577 * _RPM / 60),
-        "speed": Register(112, 4, unit=0.229 * _RPM),
-        "goal": Register(116, 4, is_signed=True),
-        "moving": Register(122),
-        "load": Register(126, 2, is_signed=True, unit=0.001),
-        "position": Register(132, 4, is_signed=True),
-        "voltage": Register(144, 2, unit=0.1),
-        "temperature": Register(146),
-    }
+_X = _registers(
+    "model 0 2, firmware 6, id 7, baud 8, mode 11, offset 20 4 signed, max_temperature 31, max_voltage 32 2,"
+    "min_voltage 34 2, max 48 4, min 52 4, torque 64, answers 68, status 70, acceleration 108 4, speed 112 4,"
+    "goal 116 4 signed, moving 122, load 126 2 signed, position 132 4 signed, voltage 144 2, temperature 146",
+    acceleration=214.577 * _RPM / 60,
+    speed=0.229 * _RPM,
+    **_TENTHS,
 )
-_OLD = MappingProxyType(
-    {
-        "model": Register(0, 2),
-        "firmware": Register(2),
-        "id": Register(3),
-        "baud": Register(4),
-        "min": Register(6, 2),
-        "max": Register(8, 2),
-        "max_temperature": Register(11),
-        "min_voltage": Register(12, unit=0.1),
-        "max_voltage": Register(13, unit=0.1),
-        "answers": Register(16),
-        "torque": Register(24),
-        "goal": Register(30, 2),
-        "speed": Register(32, 2, unit=0.111 * _RPM),
-        "position": Register(36, 2),
-        "load": Register(40, 2, sign_bit=10, unit=0.001),
-        "voltage": Register(42, unit=0.1),
-        "temperature": Register(43),
-        "moving": Register(46),
-    }
+_OLD = _registers(
+    "model 0 2, firmware 2, id 3, baud 4, min 6 2, max 8 2, max_temperature 11, min_voltage 12, max_voltage 13,"
+    "answers 16, torque 24, goal 30 2, speed 32 2, position 36 2, load 40 2 sign10, voltage 42, temperature 43,"
+    "moving 46",
+    speed=0.111 * _RPM,
+    **_TENTHS,
 )
 
 _STS_SERVO = ServoModel(
@@ -223,7 +178,7 @@ _SCS_SERVO = ServoModel(
     "scs0009",
     1284,
     "feetech",
-    MappingProxyType({**_FEETECH, "lock": Register(48)}),
+    _FEETECH | _registers("lock 48"),
     ((40, 27),),
     _FEETECH_ALARMS,
     counts=1024,
@@ -262,13 +217,7 @@ _MX = replace(
     counts=4096,
     turn=2 * math.pi,
     wraps=True,
-    registers=MappingProxyType(
-        {
-            **_OLD,
-            "speed": Register(32, 2, unit=0.114 * _RPM),
-            "acceleration": Register(73, unit=math.radians(8.583)),
-        }
-    ),
+    registers=_OLD | _registers("speed 32 2, acceleration 73", speed=0.114 * _RPM, acceleration=math.radians(8.583)),
 )
 
 
@@ -276,7 +225,7 @@ def _x(name: str, number: int, current: float = 0.0) -> ServoModel:
     """An X servo; with the current (A) of a count where it has that in the place of the load."""
     if not current:
         return replace(_X_SERVO, name=name, number=number)
-    registers = MappingProxyType({**_X, "load": replace(_X["load"], unit=current)})
+    registers = _X | _registers("load 126 2 signed", load=current)
     return replace(_X_SERVO, name=name, number=number, registers=registers, load="current")
 
 
