@@ -31,6 +31,8 @@ MUCH_BETTER = 3.0
 """A permutation leaves so many times less than the data as they stand."""
 FITS, MISSES = 0.1, 0.01
 """Of the spread of the positions: what a right reading leaves at most, what is worth a look."""
+_ROUGHLY_FITS, _FAR_BETTER = 0.15, 6.0
+"""Where none does: what a single one leaves at most of a poor arm, and how many times less than the data as given."""
 _MOST_RECORDS = 300
 _EQUATIONS = 2.0
 """So many numbers a parameter are needed to separate readings."""
@@ -216,6 +218,9 @@ def _of(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, arm: Ar
             readings = [elsewhere] if elsewhere.left <= enough else []
         if seen.placing is not None or not readings:
             readings = list(_several(problem, seen, arm, enough))
+    if min((reading.left for reading in readings), default=np.inf) > enough:
+        enough = min(_ROUGHLY_FITS * spread, as_given / _FAR_BETTER)
+        readings = list(_single(problem, seen, arm, straight, enough, _ROUGHLY_FITS))
     best = min(readings, key=lambda reading: reading.left, default=None)
     if best is None or best.left > enough:
         return None
@@ -295,9 +300,9 @@ def _of_axes(seen: _Seen, straight: _Positions) -> Iterator[tuple[str, Array]]:
 
 
 def _single(
-    problem: Problem, seen: _Seen, arm: Arm, straight: _Positions, enough: float = np.inf
+    problem: Problem, seen: _Seen, arm: Arm, straight: _Positions, enough: float = np.inf, fits: float = FITS
 ) -> Iterator[_Reading]:
-    smaller = _Smaller.than(straight.predicted)
+    smaller = _Smaller(spread_of(straight.predicted), fits)
     for words, measured in _of_axes(seen, straight):
         left = straight.left(measured) if seen.placing is None else _left(problem, seen, {}, measured, enough)
         yield _Reading(smaller.left(left, spread_of(measured)), words, False)
@@ -315,7 +320,7 @@ def _several(problem: Problem, seen: _Seen, arm: Arm, enough: float) -> Iterator
         return
     axes = [("", seen.measured), *((f" and {own}", moved) for own, moved in _of_axes(seen, straight))]
     axes = axes if seen.placing is None else axes[:2]
-    smaller, measured = _Smaller.than(straight.predicted), np.array([moved for _, moved in axes])
+    smaller, measured = _Smaller(spread_of(straight.predicted), FITS), np.array([moved for _, moved in axes])
     spreads = [spread_of(moved) for moved in measured]
     for words, read_as in [*single_joints(arm), *several_joints(arm)]:
         if seen.placing is not None:
@@ -332,12 +337,9 @@ class _Smaller:
     """How far the arm's positions are spread (m): measured ones near one point are near those of any arm."""
 
     size: float
-
-    @classmethod
-    def than(cls, positions: Array) -> _Smaller:
-        return cls(spread_of(positions))
+    fits: float
 
     def left(self, left: float, spread: float) -> float:
         """What a reading leaves, as many times more as its positions are spread less; infinite where it is no fit."""
         spread = max(spread, _SMALLEST)
-        return np.inf if left > FITS * spread else left * max(1.0, self.size / spread)
+        return np.inf if left > self.fits * spread else left * max(1.0, self.size / spread)
