@@ -97,13 +97,14 @@ def sections(file: MotorFile, gripper: Gripper | None, model: str) -> str:
     """Sections of a configuration: the joints of a servo bus, the limits of a plan, zeros and priors of a servo map."""
     arm = gripper.name if gripper else "arm"
     turned = [(joint, *gripper.motor_of(joint)) for joint in gripper.joints] if gripper else _same_names(file)
-    lines = [f"# From {file.path.name}, LeRobot's motor calibration.", "bench:", "  device:", "    joints:"]
+    lines = [f"# From {file.path.name}, LeRobot's motor calibration.", "bench:", "  device:"]
+    lines += ["    type: servobus", "    port: /dev/ttyACM0", "    joints:"]
     limits, values, priors = [], [], []
     for number, (joint, name, sense) in enumerate(turned, start=1):
         motor = file.motors[name]
         low, high = (f"{end:.1f}" for end in motor.limits)
         direction = "direction: -1, " if sense < 0 else ""
-        servo = f"id: {motor.id}, model: {model}, zero_count: {round(motor.middle)}"
+        servo = f"id: {motor.id}, model: {model}, zero_count: {round(motor.middle)}, offset: {motor.homing_offset}"
         lines.append(f"      {arm}.{joint}: {{{servo}, {direction}range_deg: [{low}, {high}]}}")
         limits.append(f"    {joint}: [{low} deg, {high} deg]")
         ends = gripper.limits[joint] if gripper else None

@@ -147,7 +147,7 @@ def _of_motor(t: Tracking) -> list[str]:
     if t.gain and (t.gain.low > 1 + _SAME_GAIN or t.gain.high < 1 - _SAME_GAIN):
         texts.append(
             f"{t.motor} moves {t.gain.value:.3f} times as far as commanded: ranges that differ between leader and "
-            "follower, or a limit that cuts its motion."
+            "follower, or something that stops it."
         )
     teeth = teeth_of(t.offset.value) if t.offset and t.unit == "deg" else 0
     if teeth and t.offset:

@@ -31,6 +31,10 @@ _FEWEST_CLUSTERS, _FEWEST_SIDES = 6, 3
 _LEAST_SPAN = 3.0
 _LEAST_TORQUE = 0.02
 _LEAST_GAIN = 0.1
+_L1_STEPS, _L1_FLOOR = 10, 1e-3
+_OBSTRUCTED, _FAR = 0.5, 9.0
+"""deg or %, and medians: a joint that is further off did not get where it was sent."""
+_MOST_FREE = 0.98
 _STEPS = 3
 _SETTLES_S = 0.5
 """After a fast motion, until a servo that lags has arrived."""
@@ -221,7 +225,12 @@ def _one_step(motion: Motion, index: int, known: Tracking, torque: Torque | None
     elif np.isfinite(load).all():
         doubts.append("gravity about it hardly changes in these poses")
     target = state - (middle if "gain" in columns else command)
-    fit = _fit(np.column_stack(list(columns.values())), target, cluster)
+    matrix = np.column_stack(list(columns.values()))
+    free = _unobstructed(matrix, target)
+    if np.mean(free) < _MOST_FREE:
+        text = f"in {100 - 100 * np.mean(free):.0f} % of its rests it is far from where the others let expect"
+        doubts.append(f"{text}: a limit or an obstacle stopped it; they are left out")
+    fit = _fit(matrix[free], target[free], cluster[free])
     if fit is None:
         return replace(known, doubts=(*doubts, "too few separate rests for intervals: record more episodes"))
     figures = dict(zip(columns, fit, strict=True))
@@ -281,6 +290,17 @@ def _widened(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
 
 def _clusters(number: int, frames: NDArray[np.intp], length: float) -> NDArray[np.int64]:
     return (number * 1_000_000 + frames // max(1, round(length))).astype(np.int64)
+
+
+def _unobstructed(rows: Array, y: Array) -> NDArray[np.bool_]:
+    """Frames that agree with the least sum of absolute residuals: the rest was stopped on its way, or pushed."""
+    weight = np.ones(len(y))
+    for _ in range(_L1_STEPS):
+        root = np.sqrt(weight)[:, None]
+        solution = np.linalg.lstsq(rows * root, y * root[:, 0], rcond=None)[0]
+        residual = np.abs(y - rows @ solution)
+        weight = 1 / np.maximum(residual, _L1_FLOOR)
+    return np.asarray(residual <= max(_OBSTRUCTED, _FAR * float(np.median(residual))))
 
 
 def _fit(rows: Array, y: Array, cluster: NDArray[np.int64]) -> list[Figure] | None:

@@ -75,8 +75,17 @@ def test_sections_are_a_configuration(tmp_path: Path) -> None:
     one = write_motors(tmp_path / "one.json", elbow_flex={"range_min": 1000})
     text = called("joints", one, "--arm", ARM, "--joint", "elbow_flex=-elbow_flex")
     sections = yaml.safe_load(text)
-    joint = sections["bench"]["device"]["joints"]["arm.elbow_flex"]
-    assert joint == {"id": 3, "model": "sts3215", "zero_count": 2092, "direction": -1, "range_deg": [-96.0, 96.0]}
+    device = sections["bench"]["device"]
+    assert discover().find("device", device.pop("type")).load().Settings.model_validate(device)
+    joint = device["joints"]["arm.elbow_flex"]
+    assert joint == {
+        "id": 3,
+        "model": "sts3215",
+        "zero_count": 2092,
+        "offset": -50,
+        "direction": -1,
+        "range_deg": [-96.0, 96.0],
+    }
     assert sections["plan"]["limits"]["shoulder_pan"] == ["-100.0 deg", "100.0 deg"]
     for name in ("skeleton.yaml", "arm.yaml"):
         (tmp_path / name).write_bytes((CONFIGS / name).read_bytes())

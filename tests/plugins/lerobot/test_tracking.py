@@ -105,6 +105,19 @@ def test_sag_under_gravity_is_found_per_newton_metre(tmp_path: Path, gripper: Gr
     assert "gravity about it hardly changes" in motors["shoulder_pan"]["doubts"][0]
 
 
+def test_what_stopped_a_joint_is_left_out_and_named(tmp_path: Path) -> None:
+    """A limit at 25 deg is no gain."""
+    planted, made = {"elbow_flex": Planted(offset=1.0, backlash=0.8)}, []
+    for action, state in episodes(planted, count=5, frames=800):
+        state[:, 2] = np.minimum(state[:, 2], 25.0)
+        made.append((action, state))
+    elbow = by_motor(motion_of(tmp_path / "set", made))["elbow_flex"]
+    assert elbow.gain and elbow.backlash and elbow.offset
+    assert elbow.gain.value == pytest.approx(1.0, abs=0.003) and elbow.offset.value == pytest.approx(1.0, abs=0.1)
+    assert elbow.backlash.low <= 0.8 <= elbow.backlash.high
+    assert "a limit or an obstacle stopped it" in elbow.doubts[0]
+
+
 def test_exchanged_leader_and_follower_are_named(tmp_path: Path) -> None:
     made = [(state, action) for action, state in episodes({}, count=4, frames=600)]
     findings = findings_of(trackings(motion_of(tmp_path / "set", made)))
