@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import click
@@ -18,16 +19,20 @@ from armcal.errors import EXIT_FAULT, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
 from armcal.io.signals import Signals
 from rich.table import Table
 
+from armcal_bench.acquisition.preparation import Prepared
 from armcal_bench.acquisition.tracker_monitor import StopRequested
+from armcal_bench.bench import Bench
+from armcal_bench.commands.acquire import driven
 from armcal_bench.commands.common import FILE, Question, energise_option, load, on_bench, waits, warned
+from armcal_bench.joint_check import check_joints
 from armcal_bench.servo.keys import wishes_from
 from armcal_bench.servo.outcome import Outcome
 from armcal_bench.servo.outputs import improved, results, write_results, write_servo_file
 from armcal_bench.servo.record import NAME
 from armcal_bench.servo.session import Conversation, adapter_of, evaluated, measure, park, tried
 from armcal_bench.servo.setup import Setup
-from armcal_bench.servo.trial import swapped
-from armcal_bench.wiring import carry_over
+from armcal_bench.servo.trial import Verdict, swapped
+from armcal_bench.wiring import carry_over, servo_file_of
 
 
 @click.command("servo")
@@ -54,7 +59,11 @@ def servo(
     overrides: tuple[str, ...],
 ) -> None:
     """Find which pulse makes which angle of each servo on the bench of CONFIG, and write the servo file."""
-    setup = Setup.of(load(console, config, overrides))
+    experiment = load(console, config, overrides)
+    if check and not guided and servo_file_of(Bench.of(experiment)) is None:
+        _check_joints(console, config, overrides, may_energise)
+        return
+    setup = Setup.of(experiment)
     with Signals() as signals, console.progress() as show:
         talk = Conversation(
             asked_to_stop=lambda: signals.finish,
@@ -104,16 +113,31 @@ def _evaluate(console: Console, setup: Setup, out: Path, keep: bool) -> None:
 def _check(console: Console, setup: Setup, talk: Conversation, seen: str) -> None:
     with _stoppable(console):
         verdicts = tried(setup, talk, seen)
-    pairs = swapped(verdicts)
+    _show_verdicts(console, verdicts, swapped(verdicts), [])
+
+
+def _show_verdicts(console: Console, verdicts: Sequence[Verdict], pairs: list[str], zeros: list[str]) -> None:
+    """What each joint did, ``swapped`` pairs, and zeros that are far off; fails unless all is well."""
     shown = [{**asdict(v), "turned": v.turned if v.turned == v.turned else None} for v in verdicts]
-    console.result({"joints": shown, "swapped": pairs})
+    console.result({"joints": shown, "swapped": pairs, "far_zeros": zeros})
     for verdict in verdicts:
         style = "green" if verdict.kind == "right" else "red"
         console.line(f"{verdict.sentence} {verdict.mend}".rstrip(), style)
-    for sentence in pairs:
+    for sentence in (*pairs, *zeros):
         console.line(sentence, "red")
-    if any(verdict.kind != "right" for verdict in verdicts):
+    if zeros or any(verdict.kind != "right" for verdict in verdicts):
         sys.exit(EXIT_FAULT)
+
+
+def _check_joints(console: Console, config: Path, overrides: tuple[str, ...], may_energise: Question) -> None:
+    """The check of servos that know where they stand; what is measured for it is not kept."""
+    with TemporaryDirectory() as folder:
+
+        def drive(prepared: Prepared, plan: Path, out: Path) -> None:
+            driven(console, prepared, plan, (out, "anew"), may_energise, unchecked=True)
+
+        check = check_joints(lambda more: load(console, config, (*overrides, *more)), Path(folder), drive)
+    _show_verdicts(console, check.verdicts, [], check.far_zeros)
 
 
 @contextmanager

@@ -1,0 +1,198 @@
+"""Whether servos that know where they stand turn their joints as commanded, and from which zeros: by the tracker.
+
+A check is a short measuring run from where the arm stands: each joint turns a little and back.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.devices.device import MeasuringDevice
+from armcal.errors import ConfigError
+from armcal.io.journal.journal import Journal
+from armcal.run.experiment import Experiment
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from armcal_bench.acquisition.preparation import Prepared, prepare, run_limits
+from armcal_bench.acquisition.run_log import measured_by, progress_of
+from armcal_bench.bench import SECTION, Bench
+from armcal_bench.servo.nominal import NominalArm
+from armcal_bench.servo.trial import Move, Verdict, judged
+from armcal_bench.settling import pose_of
+
+_TURNS_DEG = (12.0, -12.0, 6.0, -6.0)
+_BASE = "base"
+_LEVER_M, _MODEL_SD_M, _ZERO_SD, _TARGET_SD_M = 0.1, 0.004, math.radians(15.0), 0.01
+"""Of the pose of an arm that sags and is not as drawn; of its zeros; of where the tracker's body sits."""
+_TOOTH_DEG = 360 / 25
+"""Of the splines of hobby and bus servos; what remains beside a whole number of teeth is not the horn's."""
+_UNREMARKABLE_DEG, _CLEARLY = 10.0, 0.3
+_MENDS = {
+    "reversed": "Give its direction in bench.device the other sign.",
+    "another": "Exchange their ids in bench.device, or their plugs.",
+    "still": "Check its plug, its id and whether something blocks it.",
+    "gain": "Check its model in bench.device, and whether its horn slips.",
+}
+
+
+@dataclass(frozen=True)
+class JointCheck:
+    """What each joint did, and how far its zero is off (rad; empty where not all turned as commanded)."""
+
+    verdicts: Sequence[Verdict]
+    zeros: Mapping[str, float]
+
+    @property
+    def far_zeros(self) -> list[str]:
+        """Of zeros that are further off than a calibration by hand leaves them, and the teeth of a horn."""
+        sentences = []
+        for joint, zero in self.zeros.items():
+            degrees = math.degrees(zero)
+            if abs(degrees) < _UNREMARKABLE_DEG:
+                continue
+            teeth = abs(degrees) / _TOOTH_DEG
+            about = f"{int(teeth)} or {int(teeth) + 1}"
+            if abs(teeth - round(teeth)) < _CLEARLY:
+                about = f"about {round(teeth)}"
+            sentences.append(
+                f"{joint} stands {degrees:+.1f} deg from where its servo says, {about} teeth of a horn "
+                f"({_TOOTH_DEG:.1f} deg each). Remount the horn, or move its zero_count."
+            )
+        return sentences
+
+
+def check_joints(
+    loaded: Callable[[tuple[str, ...]], Experiment], folder: Path, drive: Callable[[Prepared, Path, Path], object]
+) -> JointCheck:
+    """Turn each joint a little, from where the arm stands.
+
+    Args:
+        loaded: the experiment, with further overrides.
+        folder: an empty one.
+        drive: does the run of a plan, in a folder.
+
+    Raises:
+        ConfigError: the device does not know where its joints stand, or the arm stands beyond a limit or too near to
+            something.
+    """
+    here = _measured(loaded(()))
+    park = ", ".join(f"{joint}: {math.degrees(angle):.4f} deg" for joint, angle in here.items())
+    at = f"{SECTION}.acquisition"
+    wide = (f"{at}.arrival.astray_mm=5000", f"{at}.arrival.astray_turned_deg=180")
+    experiment = loaded((f"{at}.park={{{park}}}", *wide))
+    plan = folder / "check.csv"
+    base = prepare(experiment, _written(plan, list(here), {_BASE: list(here.values())}))
+    poses = {_BASE: base.scheduler.park}
+    for i, joint in enumerate(here):
+        for turn in np.deg2rad(_TURNS_DEG):
+            turned = base.scheduler.park + turn * np.eye(len(here))[i]
+            if base.scheduler.planner.within(turned) and base.scheduler.planner.clear(base.scheduler.park, turned):
+                poses[joint] = turned
+                break
+    prepared = prepare(experiment, _written(plan, list(here), poses))
+    drive(prepared, plan, folder / "run")
+    with Journal.open(folder / "run" / "journal", {}) as journal:
+        measured = {name: pose_of(record) for name, record in progress_of(journal.recovered.entries).measured.items()}
+    commanded = dict(zip(prepared.plan.ids, prepared.scheduler.poses, strict=True))
+    return _judged(experiment, list(here), commanded, measured)
+
+
+def _measured(experiment: Experiment) -> dict[str, float]:
+    """Where the joints stand (rad), within their limits."""
+    bench = Bench.of(experiment)
+    device = bench.device()
+    if not isinstance(device, MeasuringDevice):
+        raise ConfigError(
+            "found a device whose servos do not know where they stand, and no servo file.",
+            where=experiment.source.where((SECTION, "device")),
+            hint="Name the servo file in bench.device.servos.",
+        )
+    with bench.clock() as clock:
+        try:
+            device.open(clock)
+            here = device.measured()
+        finally:
+            device.close()
+    limits = run_limits(experiment, bench.settings.acquisition, bench.arm)
+    ends = dict(zip(bench.arm.commanded, limits.tolist(), strict=True))
+    return {joint: min(max(here[joint], low), high) for joint, (low, high) in ends.items()}
+
+
+def _judged(
+    experiment: Experiment, joints: list[str], commanded: Mapping[str, Array], measured: Mapping[str, Array]
+) -> JointCheck:
+    bench = Bench.of(experiment)
+    nominal = NominalArm.of(bench.arm, experiment.parameters, experiment.system.environment)
+    base = dict(zip(joints, commanded[_BASE].tolist(), strict=True))
+    seen = [joint for joint in joints if joint in measured and _BASE in measured]
+    moves = [
+        Move(joint, float(commanded[joint][i] - commanded[_BASE][i]), measured[_BASE], measured[joint])
+        for i, joint in enumerate(joints)
+        if joint in seen
+    ]
+    verdicts, zeros = _verdicts(moves, base, nominal), {}
+    if len(seen) == len(joints) and {verdict.kind for verdict in verdicts} <= {"right", "unclear"}:
+        names = [_BASE, *joints]
+        poses = np.array([commanded[name] for name in names])
+        zeros = _zeros(nominal, joints, (poses, np.array([measured[name] for name in names])), _target(experiment))
+        # a zero that is far off turns the axes of the joints after it away from the model's
+        verdicts = _verdicts(moves, {joint: base[joint] + zeros[joint] for joint in joints}, nominal)
+    for joint in joints:
+        if joint not in seen:
+            sentence = f"{joint} was not measured: nowhere to turn to, or the tracker did not see it."
+            verdicts.append(Verdict(joint, "unclear", sentence, "Begin from a pose with more room about it."))
+    return JointCheck(verdicts, zeros if all(verdict.kind == "right" for verdict in verdicts) else {})
+
+
+def _verdicts(moves: Sequence[Move], base: Mapping[str, float], nominal: NominalArm) -> list[Verdict]:
+    verdicts = judged(moves, base, nominal) if moves else []
+    return [replace(verdict, mend=_MENDS.get(verdict.kind, verdict.mend)) for verdict in verdicts]
+
+
+def _target(experiment: Experiment) -> Array:
+    """Where the measured target is stated to sit (3, m, tool frame)."""
+    scope, stated = measured_by(experiment)[0], experiment.parameters
+    names = [f"{scope}.target_{axis}" for axis in "xyz"]
+    return np.array([stated[name].nominal[0] if name in stated.names else 0.0 for name in names])
+
+
+def _zeros(nominal: NominalArm, joints: list[str], poses: tuple[Array, Array], target: Array) -> dict[str, float]:
+    """How much the joints' angles are to be enlarged by (rad).
+
+    Args:
+        poses: commanded (N x joints, rad), and measured (N x 4 x 4).
+        target: as stated (3, m, tool frame).
+    """
+    commanded, measured = poses
+    count, turned = len(joints), not np.isnan(measured[:, :3, :3]).any()
+
+    def residuals(x: Array) -> Array:
+        angles = commanded + x[:count]
+        tools = nominal.tools([dict(zip(joints, row, strict=True)) for row in angles.tolist()])
+        parts = [(tools[:, :3, :3] @ x[count:] + tools[:, :3, 3] - measured[:, :3, 3]).ravel()]
+        if turned:
+            off = Rotation.from_matrix(tools[:, :3, :3].transpose(0, 2, 1) @ measured[:, :3, :3]).as_rotvec()
+            parts.append(_LEVER_M * off.ravel())
+        return np.concatenate(
+            [*(p / _MODEL_SD_M for p in parts), x[:count] / _ZERO_SD, (x[count:] - target) / _TARGET_SD_M]
+        )
+
+    start = np.concatenate([np.zeros(count), target])
+    return dict(zip(joints, least_squares(residuals, start, x_scale=0.1).x[:count].tolist(), strict=True))
+
+
+def _written(path: Path, joints: list[str], poses: Mapping[str, Sequence[float] | Array]) -> Path:
+    """A plan of poses (rad)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["pose_id", *(f"{joint}_deg" for joint in joints)])
+        writer.writerows([name, *np.rad2deg(pose).tolist()] for name, pose in poses.items())
+    return path
