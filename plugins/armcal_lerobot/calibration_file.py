@@ -14,7 +14,7 @@ from armcal.errors import DataError, Location
 from armcal.io.file_set import write_new, write_over
 from armcal.io.plain_files import input_bytes, text_of
 
-from armcal_lerobot.motors import GRIPPER, LARGEST_OFFSET, LAST_COUNT, Motor, remount
+from armcal_lerobot.motors import LARGEST_OFFSET, LAST_COUNT, Motor, is_gripper, remount
 
 _MAX_BYTES = 1 << 20
 _FIELDS = tuple(field.name for field in fields(Motor) if field.name != "name")
@@ -139,13 +139,13 @@ def _notes(motor: Motor) -> list[str]:
             f"{name} has drive_mode 1: LeRobot inverts it in percent and not in degrees, so that the joint turns the "
             "other way as soon as use_degrees changes."
         )
-    if name != GRIPPER and not motor.turns_freely and 2 * motor.half_range_deg < _NARROW_DEG:
+    if not is_gripper(name) and not motor.turns_freely and 2 * motor.half_range_deg < _NARROW_DEG:
         notes.append(
             f"{name} has a range of {2 * motor.half_range_deg:.1f} deg: it was hardly moved while the range was "
             "recorded, and its zero, the middle of the range, is wrong with it."
         )
     beside = (motor.middle - LAST_COUNT / 2) * 360 / LAST_COUNT
-    if name != GRIPPER and abs(beside) > _BESIDE_DEG:
+    if not is_gripper(name) and abs(beside) > _BESIDE_DEG:
         notes.append(
             f"{name} was {abs(beside):.0f} deg from the middle of its range when its homing was set: its zero is the "
             "middle of the recorded range, not that pose."

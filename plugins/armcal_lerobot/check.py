@@ -18,7 +18,7 @@ from armcal_lerobot.calibration_file import MotorFile
 from armcal_lerobot.comparison import poses_of
 from armcal_lerobot.gripper import Gripper, wiring_of
 from armcal_lerobot.motion import read_motion, require_motors
-from armcal_lerobot.motors import GRIPPER, Motor, Units, teeth_of, zero_shift_deg
+from armcal_lerobot.motors import Motor, Units, is_gripper, teeth_of, zero_shift_deg
 from armcal_lerobot.recordings import open_recording
 from armcal_lerobot.zeros import Zero
 
@@ -185,7 +185,7 @@ def _moved(file: MotorFile, other: MotorFile, gripper: Gripper, angles: Array, u
 
 
 def _same_names(file: MotorFile) -> list[tuple[str, str, int]]:
-    return [(name, name, 1) for name in file.motors if name != GRIPPER]
+    return [(name, name, 1) for name in file.motors if not is_gripper(name)]
 
 
 def _first(motors: Mapping[str, Any]) -> Mapping[str, Any]:

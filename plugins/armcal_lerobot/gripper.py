@@ -17,7 +17,7 @@ from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, InputError, Location
 from armcal.plugins import PluginRegistry
 
-from armcal_lerobot.motors import GRIPPER, Motor
+from armcal_lerobot.motors import Motor, is_gripper
 
 _POSES, _SEED = 2000, 1
 _STEP_RAD = 1e-3
@@ -97,7 +97,7 @@ class Gripper:
         """Raise InputError unless each joint has a motor of these, and each motor but the gripper's a joint."""
         missing = [joint for joint in self.joints if self._wiring[joint][0] not in motors]
         wired = {self._wiring[joint][0] for joint in self.joints}
-        idle = [motor for motor in motors if motor not in wired and motor != GRIPPER]
+        idle = [motor for motor in motors if motor not in wired and not is_gripper(motor)]
         if missing:
             text = f"found no motor for the joint {missing[0]}; the motors are {', '.join(motors)}."
             mend = f"Say which one turns it: --joint {(idle or [motors[0]])[0]}={missing[0]} (or =-{missing[0]})."

@@ -13,7 +13,7 @@ from armcal.errors import DataError, InputError, Location
 from numpy.typing import NDArray
 
 from armcal_lerobot.calibration_file import MotorFile
-from armcal_lerobot.motors import GRIPPER, Units
+from armcal_lerobot.motors import Units, is_gripper
 from armcal_lerobot.recordings import ACTION, STATE, Recording
 
 MOST_FRAMES = 100_000
@@ -117,7 +117,7 @@ def require_motors(file: MotorFile, motors: Sequence[str]) -> None:
 
 def unit_of(name: str, units: Units, file: MotorFile | None) -> tuple[float, str]:
     """What turns a motor's numbers into degrees, and the unit that they then have."""
-    if name == GRIPPER or (units == "percent" and file is None):
+    if is_gripper(name) or (units == "percent" and file is None):
         return 1.0, "%"
     if units == "degrees" or file is None:
         return 1.0, "deg"

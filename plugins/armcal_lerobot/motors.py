@@ -20,7 +20,6 @@ DEGREES_A_COUNT = 360 / LAST_COUNT
 """As LeRobot has it; a count of the encoder itself is 360 / 4096 deg."""
 TOOTH_DEG = 14.4
 """A horn of 25 teeth, remounted one tooth further."""
-GRIPPER = "gripper"
 
 
 @dataclass(frozen=True)
@@ -65,6 +64,11 @@ class Motor:
             return 1.0
         sign = -1.0 if self.drive_mode else 1.0  # LeRobot inverts percent by the drive mode, and never degrees
         return sign * self.half_range_deg / 100
+
+
+def is_gripper(motor: str) -> bool:
+    """Whether a motor opens a gripper, whose numbers are 0 to 100; of two arms it is ``left_gripper``."""
+    return motor.endswith("gripper")
 
 
 def zero_shift_deg(one: Motor, two: Motor) -> float:

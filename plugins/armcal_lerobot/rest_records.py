@@ -19,7 +19,7 @@ from armcal.measure.rests import StillSettings, rests
 from armcal_lerobot.calibration_file import MotorFile
 from armcal_lerobot.gripper import Follows
 from armcal_lerobot.motion import unit_of
-from armcal_lerobot.motors import GRIPPER, Units
+from armcal_lerobot.motors import Units, is_gripper
 from armcal_lerobot.recordings import ACTION, STATE, Frames, Recording
 from armcal_lerobot.tracking import sides
 
@@ -65,7 +65,7 @@ def records_of(
     for frames in _episodes(recording):
         shown = frames.vectors[STATE if angles == "state" else ACTION] * factors
         moved = np.column_stack([sides(column)[0] for column in (frames.vectors[ACTION] * factors).T])
-        turning = [i for i, name in enumerate(recording.motors) if name != GRIPPER]
+        turning = [i for i, name in enumerate(recording.motors) if not is_gripper(name)]
         for rest in rests(shown.T[turning] * _DEG, [], frames.time, still):
             part, middle = slice(rest.start, rest.stop), (rest.start + rest.stop) // 2
             records.append(
@@ -83,7 +83,7 @@ def write_records(
     out: Path, motors: Sequence[str], records: Sequence[RestRecord], wiring: Mapping[str, Follows], has_images: bool
 ) -> None:
     """Write a CSV: pose_id, angles and approaches of every joint but the gripper's, and the image's name."""
-    turned = [(i, wiring.get(name, Follows(name))) for i, name in enumerate(motors) if name != GRIPPER]
+    turned = [(i, wiring.get(name, Follows(name))) for i, name in enumerate(motors) if not is_gripper(name)]
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     names = [name for _, follows in turned for name in (f"{follows.joint}_deg", f"approach_{follows.joint}")]
