@@ -50,7 +50,7 @@ class Bag:
                 data = message.data
                 # a message of CDR begins with a zero; recorders may compress each message by itself
                 if data is not None and bytes(data[:4]) == _ZSTD:
-                    message = message._replace(data=decompressed(data, "zstd"))
+                    message = message._replace(data=decompressed(data, "zstd").getvalue())
                 yield message
             for fault in file.faults:
                 self._remark(f"{file.path.name}: {fault}.")

@@ -26,16 +26,24 @@ _LONGEST_MOTION_S = 20.0
 _WORST_MISFIT = 0.02
 """Of the variance of the measured path."""
 _WIDEST_S = 0.02
-_FAR = 4.0
+_FAR, _SURE = 4.0, 4.0
 
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """How far a clock is ahead (s), the half width of its 95 % interval (s), and from how many motions it is known."""
+    """How far a clock is ahead.
+
+    Attributes:
+        seconds: the mean (s).
+        half_width: of its 95 % interval (s).
+        motions: from how many it is known.
+        drift: by how much it grew during the recording (s); 0 if that is not sure.
+    """
 
     seconds: float
     half_width: float
     motions: int
+    drift: float
 
 
 @dataclass(frozen=True)
@@ -93,31 +101,36 @@ def estimated_offset(
         return f"no offset within {_SEARCHED_S:g} s of {guess:.3f} s fits"
     if total[best] > _WORST_MISFIT:
         return f"the measured path does not follow the joints: {100 * total[best]:.1f} % of its variance are left"
-    return _combined(np.array([_finest(motion, seen, float(steps[best])) for motion in motions]))
+    offsets = np.array([_finest(motion, seen, float(steps[best])) for motion in motions])
+    return _combined(np.array([motion.begin for motion in motions]), offsets)
 
 
-def _combined(offsets: Array) -> ClockOffset | str:
-    """The mean of those that are not far off, with its interval."""
-    motions, offsets = len(offsets), offsets[np.isfinite(offsets)]
-    if len(offsets):
-        away = np.abs(offsets - np.median(offsets))
-        offsets = offsets[away <= _FAR * max(1.4826 * float(np.median(away)), 1e-4)]
-    count = len(offsets)
-    if count < max(_FEWEST_MOTIONS, motions / 2):
-        return f"motions disagree: {count} of {motions} have about the same offset"
-    half_width = float(stdtrit(count - 1, 0.975) * offsets.std(ddof=1) / np.sqrt(count))
+def _combined(times: Array, offsets: Array) -> ClockOffset | str:
+    """The mean of those that are not far off, with its interval, and its change from the first motion to the last."""
+    away = np.abs(offsets - np.nanmedian(offsets))
+    kept = away <= _FAR * max(1.4826 * float(np.nanmedian(away)), 1e-4)
+    count, times, offsets = int(kept.sum()), times[kept], offsets[kept]
+    if count < max(_FEWEST_MOTIONS, len(kept) / 2):
+        return f"motions disagree: {count} of {len(kept)} have about the same offset"
+    mean, spread = float(offsets.mean()), float(offsets.std(ddof=1))
+    half_width = float(stdtrit(count - 1, 0.975)) * spread / np.sqrt(count)
     if half_width > _WIDEST_S:
-        return f"motions disagree: {1000 * offsets.mean():.0f} +- {1000 * half_width:.0f} ms"
-    return ClockOffset(float(offsets.mean()), half_width, count)
+        return f"motions disagree: {1000 * mean:.0f} +- {1000 * half_width:.0f} ms"
+    since = times - times.mean()
+    rate = float(since @ offsets / (since @ since))
+    doubt = float(np.std(offsets - mean - rate * since, ddof=2) / np.sqrt(since @ since))
+    drift = rate * float(np.ptp(times))
+    return ClockOffset(mean, half_width, count, drift if abs(rate) > _SURE * doubt else 0.0)
 
 
 def _motions(rests: Sequence[JointRest], path: tuple[Array, Array], tool: Callable[[Array], Array]) -> list[_Motion]:
     times, joints = path
     motions: list[_Motion] = []
-    for before, after in pairwise(rests):
+    pairs = [*pairwise(rests)]
+    for before, after in pairs[:: 1 + len(pairs) // _MOST_MOTIONS]:
         begin, end = before.end - _BESIDE_S, after.begin + _BESIDE_S
         first, last = np.searchsorted(times, (begin, end))
-        if last - first < _FEWEST_SAMPLES or end - begin > _LONGEST_MOTION_S or len(motions) == _MOST_MOTIONS:
+        if last - first < _FEWEST_SAMPLES or end - begin > _LONGEST_MOTION_S:
             continue
         places = tool(joints[first:last])
         if np.linalg.norm(places[-1] - places[0]) > _LEAST_MOTION_M:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import io
 from collections.abc import Iterator
 from functools import cache
 from typing import Any
@@ -28,13 +29,14 @@ def message_types() -> Any:
     return typesys.get_typestore(typesys.Stores.LATEST)
 
 
-def decompressed(content: bytes, compression: str) -> bytes:
+def decompressed(content: bytes, compression: str) -> io.BytesIO:
     """What was compressed by ``zstd`` or ``lz4``; of content that was cut off or damaged, what comes before."""
-    parts = []
+    unpacked = io.BytesIO()
     with contextlib.suppress(Exception):  # each library has errors of its own
         for part in _parts(content, compression):
-            parts.append(part)
-    return b"".join(parts)
+            unpacked.write(part)
+    unpacked.seek(0)
+    return unpacked
 
 
 def _parts(content: bytes, compression: str) -> Iterator[bytes]:

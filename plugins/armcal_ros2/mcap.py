@@ -5,7 +5,6 @@ Every record states its length, and messages that nobody asked for are passed ov
 
 from __future__ import annotations
 
-import io
 import os
 import struct
 from collections.abc import Callable, Iterator
@@ -77,14 +76,15 @@ class McapFile:
         _, _, unpacked_bytes, _ = _CHUNK_HEAD.unpack(file.read(_CHUNK_HEAD.size))
         compression = _text(file)
         (packed_bytes,) = struct.unpack("<Q", file.read(8))
-        inside, end = file, min(file.tell() + packed_bytes, size)
+        inside: BinaryIO = file
+        end = min(file.tell() + packed_bytes, size)
         is_whole = True
         if compression:
             if max(unpacked_bytes, packed_bytes) > _MAX_CHUNK_BYTES or compression not in ("lz4", "zstd"):
                 self.faults.append(f"a chunk of {unpacked_bytes} bytes ({compression}) at byte {at} was left out")
                 return
-            inside = io.BytesIO(decompressed(file.read(end - file.tell()), compression))
-            end = len(inside.getbuffer())
+            inside = unpacked = decompressed(file.read(end - file.tell()), compression)
+            end = len(unpacked.getbuffer())
             is_whole = end == unpacked_bytes
         try:
             for code, _, until in _records(inside, end):

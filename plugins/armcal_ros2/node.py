@@ -45,23 +45,21 @@ class Ros2NodeExporter:
         """
         s = self._settings
         name, is_pose = self._measurement(request)
-        joints = list(request.arm.commanded)
-        sliding = [joint for joint, kind in request.arm.commanded.items() if kind == "length"]
+        constants = {
+            "ARM": request.name,
+            "CALIBRATION": request.digest,
+            "JOINTS": list(request.arm.commanded),
+            "SLIDING": [joint for joint, kind in request.arm.commanded.items() if kind == "length"],
+            "MEASUREMENT": name,
+            "IS_POSE": is_pose,
+        }
         kind = "PoseStamped" if is_pose else "PointStamped"
-        constants = {"ARM": request.name, "CALIBRATION": request.digest, "JOINTS": joints, "SLIDING": sliding}
-        constants |= {"MEASUREMENT": name, "IS_POSE": is_pose}
-        words = {
+        words = {f"={key}": str(value) if value is is_pose else json.dumps(value) for key, value in constants.items()}
+        words |= {
             "ARM": _comment(request.name),
             "EXPERIMENT": _comment(request.origin.experiment),
-            "ARM_TEXT": json.dumps(request.name),
-            "DIGEST": json.dumps(request.digest),
-            "JOINTS": json.dumps(joints),
-            "SLIDING": json.dumps(sliding),
-            "MEASUREMENT": json.dumps(name),
-            "IS_POSE": str(is_pose),
-            "MEASURED_TYPE": f"geometry_msgs/{kind}",
-            "MEASURED_CLASS": kind,
-            "MEASURED_IMPORT": kind if is_pose else f"{kind}, PoseStamped",
+            "MEASURED": kind,
+            "IMPORTED": kind if is_pose else f"{kind}, PoseStamped",
             "RECALIBRATE_PORT": str(s.recalibrate_port),
             "SERVE_PORT": str(s.serve_port),
         }

@@ -24,10 +24,10 @@ from armcal_ros2.bag import Bag
 from armcal_ros2.clock import estimated_offset
 from armcal_ros2.joints import GUARD_S, JointLog, JointRest, JointsSettings, RestSettings, channels_of
 from armcal_ros2.message import JOINT_STATE, Topic
-from armcal_ros2.samples import MEASURED, TRANSFORMS, MeasuredLog, MeasuredSettings, is_static
+from armcal_ros2.samples import MEASURED, TRANSFORMS, MeasuredLog, MeasuredSettings
 
 _FEWEST_SAMPLES = 4
-_CLOCKS_APART_S = 0.5
+_CLOCKS_APART_S, _DRIFT_S = 0.5, 0.01
 _NAMED = 5
 _FULL_TURN = 2 * np.pi * (1 + 1e-9)
 
@@ -115,14 +115,12 @@ class Rosbag2Reader:
 
     def _follow(self, bag: Bag, logs: Sequence[MeasuredLog], joints: JointLog | None = None) -> None:
         """Once through the recording; each message goes to those that read its topic."""
-        s, seen = self._settings, set[Topic]()
-        tree = {log.settings.topic for log in logs if log.settings.reference is not None}
+        s, types = self._settings, dict[str, str]()
 
         def is_read(topic: Topic) -> bool:
-            seen.add(topic)
+            types[topic.name] = topic.type
             is_joints = joints is not None and topic.type == JOINT_STATE and s.joints.topic in (None, topic.name)
-            is_tree = bool(tree) and topic.type == TRANSFORMS and is_static(topic.name)
-            return is_joints or is_tree or any(topic.name == log.settings.topic for log in logs)
+            return is_joints or any(log.reads(topic) for log in logs)
 
         for (topic, received, data), message in bag.decoded(is_read):
             if message is None:
@@ -131,26 +129,23 @@ class Rosbag2Reader:
             if joints is not None and topic.type == JOINT_STATE:
                 joints.add(topic.name, message, received)
             for log in logs:
-                if log.settings.topic == topic.name or (log.settings.reference is not None and is_static(topic.name)):
-                    log.add(topic.type, message, received, is_static=is_static(topic.name))
-        self._require(seen, logs)
-
-    def _require(self, seen: set[Topic], logs: Sequence[MeasuredLog]) -> None:
-        """Refuse topics that are not there, or whose messages measure nothing."""
-        types = {topic.name: topic.type for topic in seen}
+                if log.reads(topic):
+                    log.add(topic, message, received)
         for log in logs:
-            topic, types_read = (
-                log.settings.topic,
-                (TRANSFORMS,) if log.settings.reference is not None else MEASURED[:-1],
-            )
-            if types.get(topic) not in types_read:
-                have = ", ".join(name for name, own in sorted(types.items()) if own in MEASURED) or "none"
-                kind = f"the type {types[topic]}" if topic in types else "no such topic"
-                expected = ", ".join(name.rpartition("/")[2] for name in types_read)
-                hint = f"Topics that measure are {have}."
-                if types.get(topic) == TRANSFORMS:
-                    hint = "Give reference and frame: the pose of frame in reference is read."
-                self._refuse(f"found {kind} for {log.instance} ({topic}), expected {expected}.", hint)
+            self._require(log, types)
+
+    def _require(self, log: MeasuredLog, types: Mapping[str, str]) -> None:
+        """Refuse a topic that is not there, or whose messages (types by topic) measure nothing."""
+        topic = log.settings.topic
+        if types.get(topic) in log.types:
+            return
+        have = ", ".join(name for name, own in sorted(types.items()) if own in MEASURED) or "none"
+        kind = f"the type {types[topic]}" if topic in types else "no such topic"
+        expected = ", ".join(name.rpartition("/")[2] for name in log.types)
+        hint = f"Topics that measure are {have}."
+        if types.get(topic) == TRANSFORMS:
+            hint = "Give reference and frame: the pose of frame in reference is read."
+        self._refuse(f"found {kind} for {log.instance} ({topic}), expected {expected}.", hint)
 
     def _offset(
         self, name: str, request: ReadRequest, joints: JointLog, seen: MeasuredLog | None
@@ -169,7 +164,10 @@ class Rosbag2Reader:
             self._refuse(f"the clock offset of {name} cannot be estimated: {estimate}.", hint)
         width, count = 1000 * estimate.half_width, estimate.motions
         text = f"the clock of {name} is {1000 * estimate.seconds:.2f} +- {width:.2f} ms ahead of that of the joints"
-        return estimate.seconds, [f"{text} (95 %, from {count} motions)."]
+        text += f" (95 %, from {count} motions)"
+        if abs(estimate.drift) > _DRIFT_S:
+            text += f"; it grew by {1000 * estimate.drift:.1f} ms during the recording: let rests be longer"
+        return estimate.seconds, [f"{text}."]
 
     def _clock_remarks(self, log: MeasuredLog, joints: JointLog) -> list[str]:
         apart = joints.stamps.delay - log.stamps.delay

@@ -17,6 +17,7 @@ from pydantic import model_validator
 from scipy.spatial.transform import Rotation
 
 from armcal_ros2.joints import MOST_THINNED, THINNED_S, JointRest
+from armcal_ros2.message import Topic
 from armcal_ros2.stamps import Stamps, TopicSettings, nanoseconds
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -112,10 +113,20 @@ class MeasuredLog:
         self._path = array("d")
         self._moved_at: float | None = None
 
-    def add(self, topic_type: str, message: Any, received: int, *, is_static: bool = False) -> None:
-        """The next message; ``is_static`` says that its transforms hold for good."""
-        if topic_type == TRANSFORMS:
-            for at, pose in self._moved(message, received, is_static):
+    @property
+    def types(self) -> tuple[str, ...]:
+        """Of the messages that it reads."""
+        return tuple(_FIELDS) if self.settings.reference is None else (TRANSFORMS,)
+
+    def reads(self, topic: Topic) -> bool:
+        """Whether messages of a topic are for it: its own, and transforms that hold for good."""
+        is_static = self.settings.reference is not None and topic.name.endswith(_STATIC)
+        return topic.type in self.types and (topic.name == self.settings.topic or is_static)
+
+    def add(self, topic: Topic, message: Any, received: int) -> None:
+        """The next message of a topic that it reads."""
+        if topic.type == TRANSFORMS:
+            for at, pose in self._moved(message, received, topic.name.endswith(_STATIC)):
                 self._take(at, pose[:3, 3], Rotation.from_matrix(pose[:3, :3]).as_quat())
             return
         self._frames[message.header.frame_id] += 1
@@ -124,7 +135,7 @@ class MeasuredLog:
         time = self.stamps.time(nanoseconds(message.header.stamp), received)
         if time is None:
             return
-        body, position, orientation = _FIELDS[topic_type]
+        body, position, orientation = _FIELDS[topic.type]
         held = getattr(message, body) if body else message
         q = getattr(held, orientation) if orientation else None
         p = getattr(held, position)
@@ -213,8 +224,3 @@ class MeasuredLog:
             kept = self.by_rest.setdefault(place, array("d"))
             if len(kept) < 8 * _MOST_SAMPLES:
                 kept.extend(sample)
-
-
-def is_static(topic: str) -> bool:
-    """Whether transforms of a topic hold for good."""
-    return topic.endswith(_STATIC)

@@ -76,7 +76,7 @@ def survey(bag: Bag) -> Survey:
         time = received / 1e9
         own = topics.setdefault(topic.name, TopicSummary(topic.type, time))
         own.count, own.last, own.first = own.count + 1, max(own.last, time), min(own.first, time)
-        if message is None:
+        if message is None or (topic.type == JOINT_STATE and not message.name):
             continue
         if topic.type == JOINT_STATE:
             if topic.name not in joints:

@@ -39,6 +39,15 @@ def test_info_lists_topics_and_rests_and_suggests_a_data_section_that_reads(tour
     assert "6 rests of 0.9 to 1.0 s" in shown and "type: rosbag2" in shown
 
 
+def test_joint_states_without_names_are_counted(tour: bags.Tour) -> None:
+    sent = [entry for entry in tour.sent() if entry[1] == "/tip"]
+    sent += [(t, "/joint_states", "sensor_msgs/msg/JointState", bags.joint_state(t, [], [])) for t in tour.joints[0]]
+    path = bags.write_bag(tour.config.with_name("nameless"), sent)
+    content = json.loads(CliRunner().invoke(command, ["info", str(path), "--json"], catch_exceptions=False).stdout)
+    assert content["topics"]["/joint_states"]["count"] == len(tour.joints[0])
+    assert content["joints"] == {} and content["data"] == {}
+
+
 def image(time: float, grey: np.ndarray, encoding: str) -> Any:
     """An image whose pixels are shades of grey, in an encoding of ROS."""
     height, width = grey.shape

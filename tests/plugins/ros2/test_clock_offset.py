@@ -34,6 +34,15 @@ def test_an_offset_is_found_within_its_interval(tour: bags.Tour, ahead_ms: float
     assert abs(offset - ahead_ms) < 2 * half_width
 
 
+def test_clocks_that_drift_apart_are_named(tour: bags.Tour) -> None:
+    at, seen = tour.seen
+    fast = replace(tour, seen=(at + 0.002 * (at - at[0]), seen))
+    bag = bags.write_bag(tour.config.with_name("fast"), fast.sent())
+    dataset = Experiment.load(bags.of_bag(tour, bag, clock_offset="estimate")).read()
+    sentence = re.search(r"it grew by (\S+) ms during the recording", " ".join(dataset.warnings))
+    assert sentence is not None and float(sentence[1]) == pytest.approx(2 * np.ptp(tour.rests[:-1]), rel=0.15)
+
+
 @pytest.mark.slow
 def test_intervals_hold_as_often_as_they_state(tmp_path: Path) -> None:
     """Of 40 recordings the 95 % interval holds the offset in at least 34: less has a probability of 0.003."""

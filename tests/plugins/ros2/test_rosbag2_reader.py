@@ -211,6 +211,27 @@ def test_recordings_that_are_refused(tour: bags.Tour, name: Path, change: Change
         read(tour, bag)
 
 
+def test_topics_that_measure_nothing_are_refused(tour: bags.Tour, name: Path) -> None:
+    bag = bags.write_bag(name, tour.sent())
+    with pytest.raises(
+        DataError, match=r"the type sensor_msgs/msg/JointState for tracker.*Topics that measure are /tip"
+    ):
+        read(tour, bag, topic="/joint_states")
+    with pytest.raises(DataError, match=r"the type geometry_msgs/msg/PointStamped .*expected TFMessage"):
+        read(tour, bag, reference="world", frame="tip")
+
+
+def test_a_recording_of_several_files_is_one(tour: bags.Tour, name: Path) -> None:
+    """Without metadata.yaml the second file comes before the tenth."""
+    sent = sorted(tour.sent(), key=lambda entry: entry[0])
+    name.mkdir()
+    for number, first in ((1, 0), (2, len(sent) // 3), (10, len(sent) // 2)):
+        last = {1: len(sent) // 3, 2: len(sent) // 2, 10: len(sent)}[number]
+        part = bags.write_bag(name.with_name(f"{name.name}_{number}"), sent[first:last])
+        (part / f"{part.name}.mcap").rename(name / f"part_{number}.mcap")
+    require_rests(read(tour, name), tour)
+
+
 def test_times_of_receipt_stand_for_stamps_that_are_zero(tour: bags.Tour, name: Path) -> None:
     bag = bags.write_bag(name, _stamped(lambda i, t: 0.0)(tour.sent()))
     require_rests(read(tour, bag, stamps="receive"), tour)
