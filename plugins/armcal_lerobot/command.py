@@ -48,12 +48,14 @@ _UNITS = click.option(
 @_of_arm
 @speaking
 def check(console: Console, calibration: Path, other: Path | None, folder: Path | None, **given: Any) -> None:
-    """Check a calibration file, and say what its zeros cost at the gripper.
+    """Check a calibration file; what its zeros cost in mm.
 
     With OTHER (yesterday's file and today's) also how far the same command moves each joint, and the gripper.
     """
     from armcal_lerobot.check import check_content, show_check
 
+    if folder is not None and given["config"] is None:
+        raise InputError("found --data without --arm.", hint="Give --arm CONFIG: poses matter for mm at its gripper.")
     file, second = read_motors(calibration), read_motors(other) if other else None
     gripper = _gripper(console, list(file.motors), **given)
     content = check_content(file, second, gripper, folder, given["units"])
@@ -69,7 +71,10 @@ def check(console: Console, calibration: Path, other: Path | None, folder: Path 
 @_of_arm
 @speaking
 def joints(console: Console, calibration: Path, model: str, **given: Any) -> None:
-    """Print a calibration file as sections of an armcal configuration: joints of the bus, limits, zeros and priors."""
+    """A calibration file as sections of a configuration.
+
+    The joints of a servo bus, limits of a plan, zeros and priors of a servo map.
+    """
     from armcal_lerobot.check import sections
 
     file = read_motors(calibration)
@@ -88,9 +93,10 @@ def joints(console: Console, calibration: Path, model: str, **given: Any) -> Non
 @click.option("--yes", is_flag=True, help="Write without a question.")
 @speaking
 def zeros(console: Console, calibrated: Path, calibration: Path, arm_name: str | None, yes: bool, **given: Any) -> None:
-    """Write the zeros of a calibrated arm into LeRobot's calibration file, after showing what changes.
+    """Write calibrated zeros into LeRobot's file.
 
-    The records must have been taken with this very file. Its old content is kept beside it.
+    What changes is shown first, and a question asked. The records must have been taken with this very file. Its old
+    content is kept beside it.
     """
     from armcal_lerobot.check import show_zeros, wired_zeros
     from armcal_lerobot.zeros import rezeroed, zeros_of
@@ -129,7 +135,10 @@ def zeros(console: Console, calibrated: Path, calibration: Path, arm_name: str |
 @_of_arm
 @speaking
 def compare(console: Console, dataset: Path, second: Path | None, out: Path | None, **given: Any) -> None:
-    """How a follower follows its commands in recorded data, joint by joint, with intervals; or two arms' data sets."""
+    """How a follower follows its commands, joint by joint.
+
+    Offset, gain, backlash and delay from recorded data, with intervals; of two data sets also what differs.
+    """
     from armcal_lerobot.motion import read_motion
     from armcal_lerobot.recordings import open_recording
     from armcal_lerobot.tracking_report import compare_content, page, show_compare
@@ -173,7 +182,10 @@ def compare(console: Console, dataset: Path, second: Path | None, out: Path | No
 @_UNITS
 @speaking
 def rests(console: Console, dataset: Path, out: Path, calibration: Path | None, units: Units, **given: Any) -> None:
-    """Write where an arm stood at rest in a data set, as records to calibrate from, and a camera's images of it."""
+    """Where an arm rested in a data set, as records.
+
+    A CSV to calibrate from, and a camera's images of these moments.
+    """
     from armcal_lerobot.gripper import wiring_of
     from armcal_lerobot.recordings import open_recording
     from armcal_lerobot.rest_records import records_of, write_images, write_records

@@ -156,6 +156,9 @@ def open_recording(folder: Path) -> Recording:
         PluginError: pyarrow is not installed.
     """
     where = _info(folder)
+    if not folder.is_dir():
+        hint = "Give the folder that holds meta and data."
+        raise DataError("it is no folder, expected a LeRobot data set.", where=Location(str(folder)), hint=hint)
     info = _json(Path(str(where.file)))
     version = str(info.get("codebase_version", ""))
     if not version.startswith(_KNOWN):

@@ -176,6 +176,16 @@ def test_wiring_that_is_none_is_refused(texts: list[str], message: str) -> None:
         wiring_of(texts)
 
 
+def test_options_without_an_arm_are_refused(tmp_path: Path) -> None:
+    path = write_motors(tmp_path / "arm.json")
+    for options in (["--data", tmp_path], ["--arm-name", "arm"], ["--joint", "a=b"]):
+        with pytest.raises(InputError, match=r"without --arm\."):
+            called("check", path, *options)
+    pytest.importorskip("pyarrow")
+    with pytest.raises(ArmcalError, match="expected a LeRobot data set"):
+        called("compare", path)
+
+
 def test_joints_without_a_motor_are_named(tmp_path: Path) -> None:
     path = write_motors(tmp_path / "arm.json")
     path.write_text(path.read_text().replace("wrist_roll", "roll"))
