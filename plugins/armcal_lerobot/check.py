@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from armcal.base.domains import Array
+from armcal.calibration.joint_zeros import Zero
 from armcal.cli.common import Console
 from armcal.cli.console import columned
 from armcal.errors import InputError, Location
@@ -20,7 +21,6 @@ from armcal_lerobot.gripper import Gripper, wiring_of
 from armcal_lerobot.motion import read_motion, require_motors
 from armcal_lerobot.motors import Motor, Units, is_gripper, teeth_of, zero_shift_deg
 from armcal_lerobot.recordings import open_recording
-from armcal_lerobot.zeros import Zero
 
 _MOST_UNSWEPT_DEG = 6.0
 _LEAST_SHIFT_DEG = 0.2

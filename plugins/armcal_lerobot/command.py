@@ -98,8 +98,10 @@ def zeros(console: Console, calibrated: Path, calibration: Path, arm_name: str |
     What changes is shown first, and a question asked. The records must have been taken with this very file. Its old
     content is kept beside it.
     """
+    from armcal.calibration.joint_zeros import zeros_of
+
     from armcal_lerobot.check import show_zeros, wired_zeros
-    from armcal_lerobot.zeros import rezeroed, zeros_of
+    from armcal_lerobot.zeros import rezeroed
 
     file = read_motors(calibration)
     known, left = zeros_of(calibrated, arm_name, console.registry())

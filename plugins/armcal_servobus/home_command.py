@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from armcal.cli.console import columned
 from armcal.errors import InputError
 
 from armcal_servobus.configured import on_config, opened
-from armcal_servobus.homing import Homing, keep, kept_offsets, planned, write_offset
+from armcal_servobus.homing import Homing, corrected, held_at, keep, kept_offsets, planned, restored, write_offset
 from armcal_servobus.joints import ServoJoint
 from armcal_servobus.servos import Servos
 
@@ -23,6 +22,7 @@ from armcal_servobus.servos import Servos
 @click.option("--at", "stated", multiple=True, metavar="JOINT=DEG", help="Where a joint stands now [default: 0].")
 @click.option("--joint", "chosen", multiple=True, metavar="NAME", help="Only this joint; may be repeated.")
 @click.option("--keep", "kept", type=FILE, help="The new file for the old values [default: beside CONFIG].")
+@click.option("--calibration", type=FILE, help="Write the zeros that this calibration.yaml found: nothing is held.")
 @click.option("--restore", type=FILE, help="Write the offsets of such a file back, in place of new ones.")
 @click.option("--release", is_flag=True, help="Let servos go that hold; hold the arm.")
 @click.option("--yes", is_flag=True, help="Write without asking.")
@@ -33,6 +33,7 @@ def home_command(
     stated: tuple[str, ...],
     chosen: tuple[str, ...],
     kept: Path | None,
+    calibration: Path | None,
     restore: Path | None,
     release: bool,
     yes: bool,
@@ -44,35 +45,47 @@ def home_command(
     """
     with opened(config, overrides) as (wires, all_joints):
         joints = _chosen(all_joints, chosen)
-        angles = _angles(joints, stated)
+        targets = held_at(_angles(joints, stated))
+        if calibration is not None:
+            zeros = _zeros(console, calibration, joints)
+            joints, targets = {name: joints[name] for name in zeros}, corrected(zeros)
+        elif restore is not None:
+            targets = restored(kept_offsets(restore, joints))
         if release:
             for name in reversed(joints):
                 Servos(wires, joints).release(joints[name])
-        plans = planned(wires, joints, angles)
-        if restore is not None:
-            offsets = kept_offsets(restore, joints)
-            plans = [replace(plan, after=offsets[plan.joint.name], target=_restored(plan, offsets)) for plan in plans]
+        plans = planned(wires, joints, targets)
         _show_plans(console, config, plans)
         path = kept or config.with_name(f"{config.stem}.servos-{datetime.now():%Y%m%d-%H%M%S}.json")
         if not yes:
-            if not sys.stdin.isatty():
-                raise InputError("nothing was written: there is no terminal to ask at.", hint="Give --yes.")
-            if not click.confirm(f"Write these offsets to the servos? The old ones go to {path}.", err=True):
-                raise InputError("nothing was written.", hint="Say yes, or give --yes.")
+            _ask(path)
         keep(path, wires, joints)
+        console.line(f"what the servos hold is kept in {path}; --restore writes it back.")
         for plan in plans:
-            write_offset(wires, plan.joint, plan.after, plan.target)
-    content = {
-        p.joint.name: {"before": p.before, "after": p.after, "change_deg": math.degrees(p.change)} for p in plans
-    }
-    console.result({"kept": str(path), "offsets": content})
-    console.line(f"written and read back. The old values are in {path}; --restore writes them back.")
+            write_offset(wires, plan)
+    console.result({"kept": str(path), "offsets": {plan.joint.name: plan.content for plan in plans}})
+    console.line("the offsets are written and read back.")
+    if calibration is not None:
+        console.line("Now the zeros of the configuration are those of before: set them to 0, and measure anew.")
 
 
-def _restored(plan: Homing, offsets: dict[str, int]) -> int:
-    """What a servo will report with its old offset (counts)."""
-    model = plan.joint.model
-    return (plan.position + model.offset_sign * (offsets[plan.joint.name] - plan.before)) % model.counts
+def _ask(path: Path) -> None:
+    """Raise InputError unless somebody at the terminal agrees."""
+    if not sys.stdin.isatty():
+        raise InputError("nothing was written: there is no terminal to ask at.", hint="Give --yes.")
+    if not click.confirm(f"Write these offsets to the servos? The old ones go to {path}.", err=True):
+        raise InputError("nothing was written.", hint="Say yes, or give --yes.")
+
+
+def _zeros(console: Console, calibration: Path, joints: dict[str, ServoJoint]) -> dict[str, float]:
+    """The zeros (rad) that a calibration found, by joint; the joints without one are named."""
+    from armcal.calibration.joint_zeros import zeros_of
+
+    known, reasons = zeros_of(calibration, None, console.registry())
+    for name, reason in reasons.items():
+        console.warn(f"{name} keeps its zero: {reason}.")
+    by_local = {name: name.rpartition(".")[2] for name in joints}
+    return {name: math.radians(known[local].degrees) for name, local in by_local.items() if local in known}
 
 
 def _show_plans(console: Console, config: Path, plans: list[Homing]) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from armcal.devices.faults import DeviceError, DeviceRefusedError
+from armcal.devices.faults import DeviceError
 from armcal.errors import InputError, Location
 from armcal.io.file_set import write_new
 
@@ -53,6 +53,11 @@ class Homing:
         return self.joint.settings.direction * moved * model.step
 
     @property
+    def content(self) -> dict[str, float]:
+        """For programs."""
+        return {"before": self.before, "after": self.after, "change_deg": math.degrees(self.change)}
+
+    @property
     def finding(self) -> str:
         """What the change looks like; empty if it looks like nothing."""
         teeth, tooth = self.joint.model.teeth, 2 * math.pi / max(self.joint.model.teeth, 1)
@@ -63,33 +68,51 @@ class Homing:
         return f"about {abs(number)} {unit} of its spline ({turned:+.1f} deg): is its horn put on wrong?"
 
 
-def planned(bus: Bus, joints: Mapping[str, ServoJoint], angles: Mapping[str, float]) -> list[Homing]:
-    """Offsets by which the joints' servos report these angles (rad; zero if not stated) where they stand.
+Targets = Callable[[ServoJoint, int, int], float]
+"""What a servo is to report (counts): of a joint, the count that it reports and the offset that it has now."""
+
+
+def held_at(angles: Mapping[str, float]) -> Targets:
+    """The arm is held at these angles (rad); joints that are not named at zero."""
+    return lambda joint, position, before: joint.exact_count(angles.get(joint.name, 0.0))
+
+
+def corrected(zeros: Mapping[str, float]) -> Targets:
+    """Joints stand by so much (rad) beyond what they report."""
+    return lambda joint, position, before: position + joint.settings.direction * zeros[joint.name] / joint.model.step
+
+
+def restored(offsets: Mapping[str, int]) -> Targets:
+    """Servos get these offsets (counts)."""
+    return lambda joint, position, before: position + joint.model.offset_sign * (offsets[joint.name] - before)
+
+
+def planned(bus: Bus, joints: Mapping[str, ServoJoint], targets: Targets) -> list[Homing]:
+    """Offsets by which the joints' servos report the targets where they stand.
 
     Raises:
-        InputError: a servo has no offset, or none as large as needed; what to do is said.
+        InputError: a servo has no offset, or none as large as needed, or holds; what to do is said.
         DeviceError: a servo does not answer well.
     """
-    positions = Servos(bus, joints).positions()
+    readings = Servos(bus, joints).readings()
+    if holding := [name for name in joints if readings[name].has_torque]:
+        hint = "Hold the arm, and let its servos go with --release."
+        raise InputError(f"{', '.join(holding)} hold, expected servos without torque.", where=bus.where, hint=hint)
     plans, mends = [], []
     for name, joint in joints.items():
-        model = joint.model
+        model, position = joint.model, readings[name].position
         if not model.offset_limit:
-            raise InputError(
-                f"{name} is a {model.name}, which has no homing offset.",
-                hint="Set its zero_count in the configuration.",
-            )
+            hint = "Set its zero_count in the configuration."
+            raise InputError(f"{name} is a {model.name}, which has no homing offset.", hint=hint)
         before = read_number(bus, joint.id, model, "offset")
-        target = round(joint.settings.zero_count + joint.settings.direction * angles.get(name, 0.0) / model.step)
-        target %= model.counts
-        encoder = (positions[name] - model.offset_sign * before) % model.counts
-        after = model.offset_sign * (target - encoder)
+        target = round(targets(joint, position, before)) % model.counts
+        after = before + model.offset_sign * (target - position)
         after -= model.counts * round(after / model.counts)
         try:
             check_offset(model, after)
         except ValueError as fault:
             mends.append(f"{name}: {fault}")
-        plans.append(Homing(joint, positions[name], before, after, target))
+        plans.append(Homing(joint, position, before, after, target))
     if mends:
         raise InputError(f"{'; '.join(mends)}.", hint="Nothing was written.")
     return plans
@@ -130,46 +153,34 @@ def kept_offsets(path: Path, joints: Mapping[str, ServoJoint]) -> dict[str, int]
     return offsets
 
 
-def write_offset(bus: Bus, joint: ServoJoint, offset: int, target: int | None) -> None:
+def write_offset(bus: Bus, plan: Homing) -> None:
     """Write a homing offset to a servo's EEPROM, and read it back.
 
-    Args:
-        target: what the servo must report afterwards (counts); None: that is not known.
-
     Raises:
-        DeviceRefusedError: it holds its joint.
-        DeviceError: it holds another value afterwards, or does not report the target.
+        DeviceError: it holds another value afterwards, or does not report what it should.
     """
-    model = joint.model
+    joint, model = plan.joint, plan.joint.model
 
     def write(name: str, value: int) -> None:
         bus.write(joint.id, model.registers[name].address, model.pack(name, value))
         time.sleep(_EEPROM_S)
 
-    if read_number(bus, joint.id, model, "torque"):
-        hint = "Hold the arm and let its servos go first: armcal bus home CONFIG --release."
-        raise DeviceRefusedError(f"{bus.name(joint.id)} holds.", where=bus.where, hint=hint)
     if "lock" in model.registers:
         write("lock", 0)
     if "phase" in model.registers and (phase := read_number(bus, joint.id, model, "phase")) & SEVERAL_TURNS:
         write("phase", phase & ~SEVERAL_TURNS)
-    write("offset", offset)
+    write("offset", plan.after)
     if "lock" in model.registers:
         write("lock", 1)
-    after = read_number(bus, joint.id, model, "offset")
-    position = joint.model.unpack("position", bus.read(joint.id, *_place(joint)))
-    off = 0 if target is None else (position - target + model.counts // 2) % model.counts - model.counts // 2
-    if after != offset or abs(off) > _SAME_COUNTS:
+    after, position = (read_number(bus, joint.id, model, name) for name in ("offset", "position"))
+    off = (position - plan.target + model.counts // 2) % model.counts - model.counts // 2
+    if after != plan.after or abs(off) > _SAME_COUNTS:
         raise DeviceError(
-            f"{bus.name(joint.id)} holds the offset {after} and reports {position}, expected {offset} and {target}.",
+            f"{bus.name(joint.id)} holds the offset {after} and reports {position}, expected {plan.after} and "
+            f"{plan.target}.",
             where=bus.where,
             hint="Was the arm moved meanwhile? Hold it still, and do it again.",
         )
-
-
-def _place(joint: ServoJoint) -> tuple[int, int]:
-    register = joint.model.registers["position"]
-    return register.address, register.size
 
 
 def turned(joints: Mapping[str, ServoJoint], before: Mapping[str, int], after: Mapping[str, int], meant: str) -> str:

@@ -117,8 +117,7 @@ class ServoJoint:
     @cached_property
     def count_range(self) -> tuple[int, int]:
         """The lowest and the highest count of its range; beyond 0 or the last one where the range crosses the seam."""
-        s = self.settings
-        ends = sorted(s.zero_count + s.direction * angle / self.model.step for angle in s.range)
+        ends = sorted(map(self.exact_count, self.settings.range))
         return math.ceil(ends[0] - _SLACK), math.floor(ends[1] + _SLACK)
 
     @property
@@ -135,6 +134,10 @@ class ServoJoint:
     def angle(self, count: float) -> float:
         """Of a count (rad), as it stands."""
         return self.settings.direction * self.model.step * (count - self.settings.zero_count)
+
+    def exact_count(self, angle: float) -> float:
+        """Of an angle (rad), not rounded; ``angle`` turned round."""
+        return self.settings.zero_count + self.settings.direction * angle / self.model.step
 
     def unwrapped(self, count: int, before: float | None = None) -> int:
         """The count that is meant, nearest to the one before it or to the middle of its range."""
@@ -157,7 +160,7 @@ class ServoJoint:
                 where=Location(field=f"joints.{self.name}.range"),
                 hint="Keep the plan within the range; or move the arm by hand, with torque off, if it hangs beyond it.",
             )
-        count = round(self.settings.zero_count + self.settings.direction * angle / self.model.step)
+        count = round(self.exact_count(angle))
         return min(max(count, self.count_range[0]), self.count_range[1])
 
 

@@ -7,10 +7,11 @@ import math
 from pathlib import Path
 
 import pytest
+from armcal.calibration.joint_zeros import Zero
 from armcal.errors import DataError, InputError
 from armcal_lerobot.calibration_file import read_motors
 from armcal_lerobot.motors import Motor, teeth_of, zero_shift_deg
-from armcal_lerobot.zeros import Zero, rezeroed
+from armcal_lerobot.zeros import rezeroed
 
 from tests.plugins.lerobot.planted import motor_entries, write_motors
 

@@ -6,16 +6,19 @@ import json
 import math
 from pathlib import Path
 
+import armcal
 import pytest
 import yaml
 from armcal.cli.main import cli
-from armcal_servobus.homing import planned, turned
+from armcal_servobus.homing import held_at, planned, turned
 from armcal_servobus.joints import ServoJointsSettings
 from click.testing import CliRunner, Result
 
 from tests.plugins.servobus.fake_bus import FakeBus, sts
 from tests.plugins.servobus.test_device_on_simulated_bus import PtyDesk
 from tests.plugins.servobus.test_servobus_device import word
+
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 
 
 def written(folder: Path, path: str, model: str = "sts3215", **changes: object) -> Path:
@@ -27,7 +30,7 @@ def written(folder: Path, path: str, model: str = "sts3215", **changes: object) 
     return config
 
 
-def armcal(*words: object, stdin: str = "") -> Result:
+def called(*words: object, stdin: str = "") -> Result:
     return CliRunner().invoke(cli, ["bus", *map(str, words)], input=stdin)
 
 
@@ -39,31 +42,31 @@ def refusal(ran: Result) -> str:
 def test_find_lists_the_servos():
     with FakeBus([sts(1, 10), sts(3, 30), sts(3, 900)]) as fake:
         words = ("find", fake.path, "--protocol", "feetech", "--baud", 1000000, "--last-id", 4)
-        servos = json.loads(armcal(*words, "--json").stdout)["servos"]
+        servos = json.loads(called(*words, "--json").stdout)["servos"]
         assert [(s["id"], s["model"], s["doubled"]) for s in servos] == [(1, "sts3215", False), (3, "sts3215", True)]
         assert servos[0] | {"baud": 1000000, "position": 10, "voltage_V": 12.1, "firmware": "3.10"} == servos[0]
-        shown = armcal(*words)
+        shown = called(*words)
         assert "two servos" in shown.output and "id 3" in shown.output
 
 
 def test_find_says_plainly_what_is_wrong(tmp_path):
     with FakeBus([]) as fake:
         words = ("find", fake.path, "--protocol", "feetech", "--baud", 1000000, "--last-id", 1)
-        assert "no servo answers at these baud rates, ids 0 to 1" in refusal(armcal(*words))
-    assert "no such serial port" in refusal(armcal("find", tmp_path / "ttyUSB7"))
+        assert "no servo answers at these baud rates, ids 0 to 1" in refusal(called(*words))
+    assert "no such serial port" in refusal(called("find", tmp_path / "ttyUSB7"))
 
 
 def test_check_shows_the_joints_and_names_mistakes(tmp_path):
     with FakeBus([sts(1, 2148, **word(31, 0x800 | 5)), sts(2)]) as fake:
         config = written(tmp_path, fake.path)
-        content = json.loads(armcal("check", config, "--json").stdout)
+        content = json.loads(called("check", config, "--json").stdout)
         assert content["mistakes"] == []
         assert content["joints"][0] | {"angle_deg": 8.79, "offset": -5, "torque": False} == content["joints"][0]
         fake.servos[1].memory[33] = 1
-        ran = armcal("check", config)
+        ran = called("check", config)
         assert ran.exit_code == 2 and "q2 (id 2) is in operating mode 1" in ran.output
         fake.servos.pop()
-        assert "q2 (id 2) does not answer" in armcal("check", config).output
+        assert "q2 (id 2) does not answer" in called("check", config).output
 
 
 @pytest.mark.parametrize("model", ["sts3215", "xl430-w250", "xl330-m288"])
@@ -76,16 +79,16 @@ def test_home_sets_offsets_and_restores_them(tmp_path, model):
         desk.servos[0].motor._gear = desk.servos[0].motor.target = 0.2
         desk.servos[1].motor._gear = desk.servos[1].motor.target = -0.1
         kept = tmp_path / "kept.json"
-        ran = armcal("home", config, "--at", "q2=30", "--keep", kept, "--yes", "--json")
+        ran = called("home", config, "--at", "q2=30", "--keep", kept, "--yes", "--json")
         offsets = json.loads(ran.stdout)["offsets"]
         assert offsets["q1"]["change_deg"] == pytest.approx(-math.degrees(0.2), abs=0.1)
-        rows = json.loads(armcal("check", config, "--json").stdout)["joints"]
+        rows = json.loads(called("check", config, "--json").stdout)["joints"]
         assert [row["angle_deg"] for row in rows] == pytest.approx([0.0, 30.0], abs=0.1)
         assert desk.servos[0].get("homing_offset") == offsets["q1"]["after"] != 0
         desk.bus.boot()
         assert desk.servos[0].get("homing_offset") == offsets["q1"]["after"], "it is in the EEPROM"
         assert json.loads(kept.read_text())["servos"]["q1"]["offset"] == 0
-        again = armcal("home", config, "--restore", kept, "--keep", tmp_path / "second.json", "--yes")
+        again = called("home", config, "--restore", kept, "--keep", tmp_path / "second.json", "--yes")
         assert again.exit_code == 0, again.output
         assert [servo.get("homing_offset") for servo in desk.servos] == [0, 0]
     finally:
@@ -95,15 +98,18 @@ def test_home_sets_offsets_and_restores_them(tmp_path, model):
 def test_home_asks_and_writes_nothing_unasked(tmp_path):
     with FakeBus([sts(1, 2000), sts(2)]) as fake:
         config = written(tmp_path, fake.path)
-        assert "no terminal to ask at" in refusal(armcal("home", config))
-        assert "JOINT=DEG" in refusal(armcal("home", config, "--at", "q1=x", "--yes"))
-        assert "found no joint q9" in refusal(armcal("home", config, "--joint", "q9", "--yes"))
+        assert "no terminal to ask at" in refusal(called("home", config))
+        assert "JOINT=DEG" in refusal(called("home", config, "--at", "q1=x", "--yes"))
+        assert "found no joint q9" in refusal(called("home", config, "--joint", "q9", "--yes"))
         fake.servos[0].memory[40] = 1
-        assert "holds" in refusal(armcal("home", config, "--yes", "--keep", tmp_path / "a.json"))
+        assert "q1 hold, expected servos without torque" in refusal(
+            called("home", config, "--yes", "--keep", tmp_path / "a.json")
+        )
         assert not [i for i in fake.instructions if i[1] in (3, 0x83)]
+        fake.servos[0].memory[40] = 0
         (tmp_path / "b.json").write_text("{}")
-        assert "there already" in refusal(armcal("home", config, "--yes", "--keep", tmp_path / "b.json"))
-        assert "holds no offsets" in refusal(armcal("home", config, "--restore", tmp_path / "b.json", "--yes"))
+        assert "there already" in refusal(called("home", config, "--yes", "--keep", tmp_path / "b.json"))
+        assert "holds no offsets" in refusal(called("home", config, "--restore", tmp_path / "b.json", "--yes"))
 
 
 def joints_of(fake: FakeBus, model: str = "sts3215"):
@@ -120,13 +126,13 @@ def joints_of(fake: FakeBus, model: str = "sts3215"):
 def test_offsets_at_the_ends_of_the_register(tmp_path):
     """Half a turn off is the one offset that an STS3215 cannot hold: -2048."""
     with FakeBus([sts(1, 0), sts(2)]) as fake:
-        ran = armcal("home", written(tmp_path, fake.path), "--yes")
+        ran = called("home", written(tmp_path, fake.path), "--yes")
         assert "remount its horn by 1 tooth of 14.4 deg" in refusal(ran)
         assert not [i for i in fake.instructions if i[1] in (3, 0x83)]
         for count, offset in ((1, -2047), (4095, 2047), (2049, 1)):
             fake.servos[0].memory[56:58] = count.to_bytes(2, "little")
             bus, joints = joints_of(fake)
-            assert planned(bus, joints, {})[0].after == offset
+            assert planned(bus, joints, held_at({}))[0].after == offset
             bus.close()
 
 
@@ -134,7 +140,7 @@ def test_a_horn_that_is_a_tooth_off_is_named():
     tooth = round(4096 / 25)
     with FakeBus([sts(1, 2048 - tooth), sts(2, 2048 + 80)]) as fake:
         bus, joints = joints_of(fake)
-        first, second = planned(bus, joints, {})
+        first, second = planned(bus, joints, held_at({}))
         assert first.finding == "about 1 tooth of its spline (+14.4 deg): is its horn put on wrong?"
         assert second.finding == ""
         bus.close()
@@ -151,13 +157,33 @@ def test_wiring_names_inverted_and_exchanged_joints(tmp_path):
         assert "nothing turned" in turned(joints, still, still, "q1")
         assert turned(joints, {"q1": 4000, "q2": 0}, {"q1": 200, "q2": 0}, "q1") == "", "over the seam"
         bus.close()
-        ran = armcal("wiring", written(tmp_path, fake.path), stdin="\n\n")
+        ran = called("wiring", written(tmp_path, fake.path), stdin="\n\n")
         assert ran.exit_code == 2 and "q1: nothing turned" in ran.output
 
 
 def test_a_configuration_without_a_servo_bus_is_refused(tmp_path):
     config = tmp_path / "bench.yaml"
     config.write_text("bench: {device: {type: pca9685}}\n")
-    assert "found no servo bus" in refusal(armcal("check", config))
+    assert "found no servo bus" in refusal(called("check", config))
     config.write_text("bench: {device: {type: servobus, port: tty, joints: {q1: {id: 1, model: sts3215}}}}\n")
-    assert "range" in refusal(armcal("check", config))
+    assert "range" in refusal(called("check", config))
+
+
+def test_calibrated_zeros_go_into_the_servos(tmp_path):
+    """Afterwards each servo reports the angle at which its joint truly stands."""
+    true = {"shoulder_pan": 4.4, "shoulder_lift": 6.2, "elbow_flex": -4.7, "wrist_flex": 5.6, "wrist_roll": -7.3}
+    armcal.Experiment.load(CONFIGS / "so101" / "demo.yaml", ["validation.folds=0"]).run().write(tmp_path / "run")
+    desk = PtyDesk("sts3215", 5)
+    directions = dict(zip(true, (1, -1, 1, -1, 1), strict=True))
+    servo = {"model": "sts3215", "range_deg": [-100, 100]}
+    joints = {n: {"id": i, "direction": directions[n], **servo} for i, n in enumerate(true, start=1)}
+    try:
+        config = written(tmp_path, desk.path, joints=joints)
+        before = json.loads(called("check", config, "--json").stdout)["joints"]
+        ran = called("home", config, "--calibration", tmp_path / "run" / "calibration.yaml", "--yes")
+        assert ran.exit_code == 0 and "set them to 0" in ran.output, ran.output
+        after = json.loads(called("check", config, "--json").stdout)["joints"]
+    finally:
+        desk.close()
+    moved = {a["joint"]: b["angle_deg"] - a["angle_deg"] for a, b in zip(before, after, strict=True)}
+    assert moved == pytest.approx(true, abs=0.3)

@@ -1,0 +1,70 @@
+"""The zeros of joints that a calibration found: what is written back to the arm's own servos or files."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.calibration_file import ParameterRecord
+from armcal.errors import InputError, Location
+from armcal.plugins import PluginRegistry
+
+_MODEL_ZERO = re.compile(r"(theta|offset)(\d+)")
+_SERVO_MAP = "servo_map"
+
+
+@dataclass(frozen=True)
+class Zero:
+    """How far a joint stands from its command at zero (deg), with its standard deviation."""
+
+    degrees: float
+    sd_deg: float
+
+
+def zeros_of(path: Path, arm: str | None, registry: PluginRegistry) -> tuple[dict[str, Zero], dict[str, str]]:
+    """The zeros that a calibration found, by joint; and joints without one, with the reason.
+
+    A zero is the offset of a ``servo_map`` as it stands, and what a model's own ``theta`` or ``offset`` differs from
+    its drawing.
+
+    Raises:
+        ConfigError: the calibration is refused.
+        InputError: it has no zero, or several arms and none was named.
+    """
+    loaded, where = Calibration.load(path, registry), Location(str(path))
+    arms = loaded.system.arms
+    if arm not in arms and (arm is not None or len(arms) > 1):
+        raise InputError(f"found the arms {', '.join(arms)}.", where=where, hint="Choose one with --arm-name NAME.")
+    chosen = arms[arm or next(iter(arms))]
+    described = loaded.system.description["arms"][chosen.name].get("effects") or {}
+    maps = {name for name, effect in described.items() if effect.get("type") == _SERVO_MAP}
+    zeros: dict[str, Zero] = {}
+    reasons = dict.fromkeys(chosen.commanded, "its zero was not free")
+    for entry in loaded.record.parameters:
+        _, part, local = (*entry.name.split(".", 2), "", "")[:3]
+        match = _MODEL_ZERO.fullmatch(local)
+        owned = entry.name.startswith(f"{chosen.name}.") and match and entry.unit == "rad"
+        if not owned or match is None or not (part in maps or part == chosen.model_name):
+            continue
+        joint = chosen.joint_names[int(match[2]) - 1]
+        if joint in chosen.commanded:
+            _take(zeros, reasons, joint, entry, part in maps)
+    if not zeros:
+        hint = "Free them in parameters.free (arm.EFFECT.offset*, of an effect servo_map), and run again."
+        raise InputError("found no calibrated zero of a joint.", where=where, hint=hint)
+    return zeros, {joint: reason for joint, reason in reasons.items() if joint not in zeros}
+
+
+def _take(zeros: dict[str, Zero], reasons: dict[str, str], joint: str, entry: ParameterRecord, is_map: bool) -> None:
+    if entry.free and (entry.sd is None or not entry.determined):
+        reasons[joint] = f"the records do not determine {entry.name}"
+        return
+    value = entry.value if is_map else entry.value - entry.nominal
+    if not entry.free and not (is_map and value):
+        return
+    before = zeros.get(joint, Zero(0.0, 0.0))
+    sd = math.hypot(before.sd_deg, math.degrees(entry.sd or 0.0))
+    zeros[joint] = Zero(before.degrees + math.degrees(value), sd)
