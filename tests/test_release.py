@@ -250,7 +250,7 @@ WITH = {
     "lerobot": "import pyarrow.parquet",
     "i2c": "import smbus2; smbus2.i2c_msg.write(64, [0]); from armcal_pca9685.linux_i2c import _library; _library()",
     "mujoco": "import mujoco; mujoco.MjModel.from_xml_string('<mujoco><worldbody/></mujoco>')",
-    "camera": "import cv2; cv2.CharucoBoard((5, 4), 0.04, 0.03, cv2.aruco.getPredefinedDictionary(0))",
+    "camera": "import cv2; cv2.aruco.CharucoBoard((5, 4), 0.04, 0.03, cv2.aruco.getPredefinedDictionary(0))",
     "ros2": "from armcal_ros2.library import message_types; message_types()",
     "docs": "import mkdocs, material, pymdownx, latex2mathml",
     "dev": "import ruff, mypy.api, yaml",
