@@ -12,6 +12,7 @@ from armcal.devices.faults import DeviceLostError, DeviceRefusedError
 from armcal_servobus.bus import Bus
 from armcal_servobus.finding import looked_at, present, read_number
 from armcal_servobus.joints import ServoJoint
+from armcal_servobus.models import ANY
 
 _READINGS = 2
 _SILENT_MEND = "Look at its plug and its power; armcal bus find shows who answers, and at which baud rate."
@@ -139,7 +140,7 @@ def _wrong_servo(bus: Bus, label: str, joint: ServoJoint) -> Mistake | None:
         what = f"answers damaged or twice ({servo.damaged} times)"
         mend = f"Two servos may have the id {joint.id}: unplug all but one, and give it another id."
         return Mistake(label, what, mend)
-    if servo.model is not None and servo.model.name == joint.model.name:
+    if joint.model.number in (servo.number, ANY):
         return None
     other = servo.model.name if servo.model else f"a model of number {servo.number}"
     mend = f"Set model, or plug in the {joint.model.name}; ids may be exchanged."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, get_args
 
 import click
@@ -26,24 +27,7 @@ def find_command(
 ) -> None:
     """List all servos on PORT: baud rate, id, model, and what they report. Nothing is written to them."""
     place = port or _only_port()
-    servos: list[FoundServo] = []
-    spoken: ProtocolName = "feetech"
-    for spoken in (protocol,) if protocol else get_args(ProtocolName):
-        wires = Bus(BusSettings.model_validate({"port": place, "protocol": spoken}))
-        try:
-            show = lambda baud, name=spoken: console.detail(f"{name} at {baud} baud")  # noqa: E731
-            servos = list(find(wires, baud or BAUD_RATES[spoken], range(last_id + 1), show))
-        finally:
-            wires.close()
-        if any(servo.model for servo in servos):
-            break
-    if not servos:
-        rates = "these baud rates" if baud else "any baud rate"
-        raise InputError(
-            f"no servo answers at {rates}, ids 0 to {last_id}.",
-            where=Location(place),
-            hint="Switch the servos' power on and look at the plug of the first one; ids beyond that: --last-id.",
-        )
+    spoken, servos = _searched(console, place, (protocol,) if protocol else get_args(ProtocolName), baud, last_id)
     console.result({"port": place, "protocol": spoken, "servos": [_as_json(servo) for servo in servos]})
     table = columned(
         f"{place}, {spoken}", ("baud", "id", "model", "firmware", "count", "V", "deg C", "state"), ("state",)
@@ -63,6 +47,41 @@ def find_command(
     console.out.print(table)
     for number in sorted({servo.id for servo in servos if servo.is_doubled}):
         console.warn(f"two servos may have the id {number}: unplug all but one, and give it another id.")
+
+
+def _searched(
+    console: Console, place: str, protocols: Sequence[ProtocolName], bauds: Sequence[int], last_id: int
+) -> tuple[ProtocolName, list[FoundServo]]:
+    """The first protocol in which servos of known models answer, else in which any do, and they.
+
+    Raises:
+        InputError: none answers.
+    """
+    rates = [(protocol, baud) for protocol in protocols for baud in bauds or BAUD_RATES[protocol]]
+    there: dict[ProtocolName, list[FoundServo]] = {}
+    with console.progress() as show:
+        for protocol in protocols:
+            wires = Bus(BusSettings.model_validate({"port": place, "protocol": protocol}))
+
+            def tried(baud: int, protocol: ProtocolName = protocol) -> None:
+                show("looking for servos", rates.index((protocol, baud)) / len(rates))
+                console.detail(f"{protocol} at {baud} baud")
+
+            try:
+                servos = list(find(wires, bauds or BAUD_RATES[protocol], range(last_id + 1), tried))
+            finally:
+                wires.close()
+            if servos:
+                there[protocol] = servos
+            if any(servo.model for servo in servos):
+                return protocol, servos
+    if there:
+        return next(iter(there.items()))
+    raise InputError(
+        f"no servo answers at {'these baud rates' if bauds else 'any baud rate'}, ids 0 to {last_id}.",
+        where=Location(place),
+        hint="Switch the servos' power on and look at the plug of the first one; ids beyond that: --last-id.",
+    )
 
 
 def _as_json(servo: FoundServo) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from typing import Literal
 
 from armcal_servobus.packets import ProtocolName
 
+ANY = -1
 _RPM = 2 * math.pi / 60
 _OLD_TURN = math.radians(300.0) * 1024 / 1023
 """Servos with potentiometers: count 0 is at 0 degrees and count 1023 at 300."""
@@ -62,7 +63,7 @@ class ServoModel:
 
     Attributes:
         name: as configurations have it.
-        number: as its register has it.
+        number: as its register has it; ``ANY``: of all that are alike.
         protocol: that it speaks.
         registers: by armcal's name of what they hold; those that it lacks are not there.
         polled: the stretches (address, bytes) that hold what changes while it works.
@@ -233,7 +234,9 @@ _ALL = (
     _STS_SERVO,
     replace(_STS_SERVO, name="sts3250", number=2825, teeth=0),
     replace(_STS_SERVO, name="sm8512bl", number=11272, teeth=0),
+    replace(_STS_SERVO, name="sts", number=ANY, teeth=0),
     _SCS_SERVO,
+    replace(_SCS_SERVO, name="scs", number=ANY),
     _X_SERVO,
     _x("xc430-w150", 1070),
     _x("xc430-w240", 1080),

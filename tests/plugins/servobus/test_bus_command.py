@@ -49,6 +49,18 @@ def test_find_lists_the_servos():
         assert "two servos" in shown.output and "id 3" in shown.output
 
 
+def test_a_servo_of_an_unknown_model_is_found_and_can_be_driven_as_its_kin(tmp_path):
+    with FakeBus([sts(1, **word(3, 0x0A0B)), sts(2)]) as fake:
+        fake.servos.pop()
+        ran = called("find", fake.path, "--baud", 1000000, "--last-id", 2, "--json")
+        content = json.loads(ran.stdout)
+        assert (content["protocol"], content["servos"][0]["model_number"]) == ("feetech", 0x0A0B)
+        fake.servos.append(sts(2))
+        config = written(tmp_path, fake.path)
+        assert "a model of number 2571, expected sts3215" in refusal(called("check", config))
+        assert called("check", written(tmp_path, fake.path, "sts")).exit_code == 0
+
+
 def test_find_says_plainly_what_is_wrong(tmp_path):
     with FakeBus([]) as fake:
         words = ("find", fake.path, "--protocol", "feetech", "--baud", 1000000, "--last-id", 1)
