@@ -17,7 +17,7 @@ from armcal.base.settings import Angle, InputPath, Settings
 from armcal.base.units import from_unit
 from armcal.errors import DataError, Location
 from armcal.io.file_set import write_over
-from armcal.io.parallel import Automatic
+from armcal.io.parallel import Automatic, Report
 from armcal.io.plain_files import input_bytes, refuse
 from armcal.measure.reader import ReadRequest
 from pydantic import Field, model_validator
@@ -101,8 +101,9 @@ class ImagesReader:
         count = len(dataset) + len(dataset.set_aside)
         faults: list[dict[int, str]] = []
         known = {w.channel for w in request.channels}
-        for name, boards in cameras.items():
-            views = _sharp_enough(self._views(name, boards, len(cameras)))
+        for number, (name, boards) in enumerate(cameras.items()):
+            report = partial(_report_one, request.report, number, len(cameras))
+            views = _sharp_enough(self._views(name, boards, len(cameras), report))
             place = str(_own(self._settings.folder or self._settings.corners, name, len(cameras)))
             chosen = _matched(dataset, views, place, count)
             faults.append({i: views[image].fault for i, image in enumerate(chosen) if views[image].fault})
@@ -111,7 +112,7 @@ class ImagesReader:
         blind = set.intersection(*(set(fault) for fault in faults))  # of several cameras one will do
         return _left(replace(dataset, ids=ids), {i: "; ".join(fault[i] for fault in faults) for i in blind})
 
-    def _views(self, camera: str, boards: tuple[Board, ...], cameras: int) -> dict[str, View]:
+    def _views(self, camera: str, boards: tuple[Board, ...], cameras: int, report: Report) -> dict[str, View]:
         """What each image of a camera says, by its name."""
         folder = _own(self._settings.folder, camera, cameras)
         corners = _own(self._settings.corners, camera, cameras)
@@ -121,13 +122,19 @@ class ImagesReader:
             digest = hashlib.sha256(content).hexdigest()
             return {name: View(pixels, _too_few(pixels), sha256=digest) for name, pixels in given.items()}
         paths = _images_in(folder)
-        views = dict(zip([path.name for path in paths], Automatic().map(partial(look, boards), paths), strict=True))
+        made = Automatic().map(partial(look, boards), paths, report)
+        views = dict(zip([path.name for path in paths], made, strict=True))
         forget_old()
         views = _of_one_size(views)
         if corners is not None:
             seen = {name: view.corners for name, view in views.items() if not view.fault}
             write_over({corners: corners_text(seen, boards).encode()})
         return views
+
+
+def _report_one(report: Report, number: int, cameras: int, done: float) -> None:
+    """Report how much is done of all cameras when so much is done of one."""
+    report((number + done) / cameras)
 
 
 def _sees_boards(measurement: object) -> TypeGuard[_SeesBoards]:

@@ -33,7 +33,8 @@ def check(console: Console, config: Path, data: Path | None, overrides: tuple[st
     """Check CONFIG and its data without solving: counts, units, rank, excitation."""
     registry = console.registry()
     experiment = Experiment.load(config, overrides, data, registry)
-    ready = assemble(experiment, Stopwatch())
+    with console.progress() as progress:
+        ready = assemble(experiment, Stopwatch(), progress=progress)
     start = ready.problem.parameters.nominal()
     known = identify(ready.problem, start, ready.training)
     refused: ProblemError | None = None

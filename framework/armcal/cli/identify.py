@@ -55,7 +55,8 @@ def identify(
     """
     registry = console.registry()
     experiment = Experiment.load(config, overrides, data, registry)
-    ready = assemble(experiment, Stopwatch())
+    with console.progress() as progress:
+        ready = assemble(experiment, Stopwatch(), progress=progress)
     parameters = ready.problem.parameters
     if not parameters.free:
         raise ConfigError("no parameter is free.", where=Location(str(config)), hint="Name some under parameters.free.")

@@ -10,6 +10,7 @@ from typing import Protocol
 from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.base.units import DIMENSIONLESS, units_of
+from armcal.io.parallel import Report, unreported
 from armcal.measure.measurement import Measurement, noise_channels
 from armcal.measure.points import PointMeasurement
 
@@ -49,11 +50,15 @@ class RequestedChannel:
 
 @dataclass(frozen=True)
 class ReadRequest:
-    """What a reader is asked for: channels, for these arms and measurements (by instance name)."""
+    """What a reader is asked for: channels, for these arms and measurements (by instance name).
+
+    A reader that takes long calls ``report`` with the fraction of its work that is done.
+    """
 
     arms: Mapping[str, Arm]
     measurements: Mapping[str, Measurement]
     channels: tuple[RequestedChannel, ...]
+    report: Report = unreported
 
 
 class Reader(Protocol):

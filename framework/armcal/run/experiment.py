@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from armcal.config.system import System, build_component, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource, load_config
 from armcal.errors import ConfigError
-from armcal.estimate.estimator import Estimator
+from armcal.estimate.estimator import Estimator, Progress, no_progress
 from armcal.estimate.simulation import SimulationRequest, Simulator
 from armcal.estimate.weighing import weighed
 from armcal.measure.environment import noticed, require_conditions
@@ -106,7 +107,7 @@ class Experiment:
         texts = tuple(_gravity_warnings(settings, np.array(system.environment.gravity)))
         return cls(str(name), source, settings, system, parameters, weighed(estimator, settings.noise), registry, texts)
 
-    def read(self) -> Dataset:
+    def read(self, progress: Progress = no_progress) -> Dataset:
         """The measured records.
 
         Raises:
@@ -121,7 +122,7 @@ class Experiment:
             )
         reader: Reader
         reader, _ = build_component(self.source, self.registry, "reader", ("data",))
-        request = self.request(measured=True)
+        request = replace(self.request(measured=True), report=partial(progress, "reading"))
         dataset = reader.read(request)
         elastic = [block.name for block in self.parameters.free if block.unit == "rad_per_Nm"]
         if elastic and self.settings.statics.payload is None and not dataset.has("payload"):

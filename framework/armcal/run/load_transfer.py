@@ -69,7 +69,7 @@ def transfer(
     first = next(iter(study.experiments.values()))
     with watch.stage("prepare"):
         simulated = first.settings.data is None
-        dataset = _simulated(first, settings) if simulated else first.read()
+        dataset = _simulated(first, settings) if simulated else first.read(progress)
         groups, payloads = _groups(dataset, settings)
         ready = {name: naming(name, partial(_prepared, e, dataset, groups)) for name, e in study.experiments.items()}
     plan = [fit for name in ready for fit in _plan(name, groups, settings)]

@@ -90,19 +90,23 @@ class Prepared:
         return self.problem.subset(self.records, self.split.train)
 
 
-def prepare(experiment: Experiment, watch: Stopwatch, accept: bool = False) -> Prepared:
+def prepare(
+    experiment: Experiment, watch: Stopwatch, accept: bool = False, progress: Progress = no_progress
+) -> Prepared:
     """Everything that can be done and refused before solving; see ``assemble``.
 
     Raises:
         InputError: data, units, counts or rank do not allow a calibration.
     """
-    ready = assemble(experiment, watch, accept)
+    ready = assemble(experiment, watch, accept, progress)
     with watch.stage("check"):
         problems = require_solvable(ready.problem, ready.training, ready.problem.parameters.nominal())
     return replace(ready, warnings=(*ready.warnings, *problems))
 
 
-def assemble(experiment: Experiment, watch: Stopwatch, accept: bool = False) -> Prepared:
+def assemble(
+    experiment: Experiment, watch: Stopwatch, accept: bool = False, progress: Progress = no_progress
+) -> Prepared:
     """Data read and checked, and the problem that it makes, whether or not it can be solved.
 
     With ``accept``, data that look mixed up are not refused, but a bad finding.
@@ -111,7 +115,7 @@ def assemble(experiment: Experiment, watch: Stopwatch, accept: bool = False) -> 
         InputError: data, units or counts do not allow a calibration.
     """
     with watch.stage("read"):
-        dataset = experiment.read()
+        dataset = experiment.read(progress)
         experiment = experiment.of_records(dataset)
     system = experiment.system
     with watch.stage("build"):
@@ -156,7 +160,7 @@ def calibrate(
 ) -> RunResult:
     """Calibrate (see ``outputs.write``), starts and folds by ``executor``; InputError if refused (see ``assemble``)."""
     watch, registry = watch or Stopwatch(), experiment.registry
-    ready = prepare(experiment, watch, accept)
+    ready = prepare(experiment, watch, accept, progress)
     faults = _notify_started(registry, experiment.name, ready.dataset)
     fitted = _fitted(experiment, ready, progress, executor, watch)
     faults += registry.notify("armcal_estimate_changed", estimate=fitted.estimate)

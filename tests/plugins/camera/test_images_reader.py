@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -92,6 +92,18 @@ def test_each_image_is_a_record_in_the_order_of_numbers(folder: Path) -> None:
     for i in range(COUNT):
         pixels = [[1000 * dataset.column(f"camera.{axis}_{k}")[i] for axis in "uv"] for k in range(20)]
         np.testing.assert_allclose(pixels, truth(i), atol=0.05)
+
+
+def test_how_much_is_looked_at_is_reported(folder: Path) -> None:
+    seen: list[float] = []
+    asked = replace(request_of(), report=seen.append)
+    read(asked, folder=folder, poses=folder / "poses.csv")
+    assert len(seen) > COUNT and seen == sorted(seen) and (seen[0], seen[-1]) == (0.0, 1.0)
+    seen.clear()
+    joints = tuple(channel for channel in asked.channels if not channel.parts)
+    two = replace(asked, measurements={"left": Camera(), "right": Camera()}, channels=joints)
+    read(two, folder={"left": str(folder), "right": str(folder)}, poses=folder / "poses.csv")
+    assert seen == sorted(seen) and 0.5 in seen and seen[-1] == 1.0
 
 
 def test_detections_are_kept_by_content(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
