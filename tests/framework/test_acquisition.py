@@ -121,6 +121,19 @@ def test_a_joint_that_stays_keeps_the_side_it_came_from() -> None:
     assert sides[0::2] == sides[1::2] == signs[:4, 0].tolist()
 
 
+def test_a_turn_back_that_may_end_within_the_play_takes_the_play_up_first() -> None:
+    run = Run()
+    run.poses = np.array([[0.5, 0.2], [0.5 - np.deg2rad(0.5), 0.4]])
+    assert run.run() == "done"
+    first, second = (c for kind, c in run.log.entries if kind == "measured")
+    times = [c["at"] - 1.7e9 for c in (first, second)]
+    between = [a["q1"] for t, what, a in run.device.log if what == "command" and times[0] < t < times[1]]
+    assert first["approach"]["q1"] == 1.0
+    assert second["approach"]["q1"] != 0.0
+    turned = max(between) - min(between)
+    assert turned >= np.deg2rad(2.9), "half a degree back is less than the play of some servos"
+
+
 def test_the_board_is_always_told_a_way_home_that_begins_on_the_leg_that_is_driven() -> None:
     run = Run()
     run.run()

@@ -30,6 +30,8 @@ _MOST_WAYPOINTS = 6
 """So many are given to a board whose memory the whole path does not fit."""
 _PLAY_RAD = np.deg2rad(3.0)
 """More than servos have play."""
+_TAKEN_UP_RAD = np.deg2rad(1.5)
+"""A turn by less may end within the play, on neither side of it."""
 
 
 class Motion(ABC):
@@ -98,7 +100,7 @@ class Drive(Motion):
     Attributes:
         settings: rate, period and the park pose, among others.
         at: the commanded joint angles (joints, rad).
-        approach: the sign of each joint's last motion, 0 before its first (joints).
+        approach: the sign of each joint's last motion; 0 before its first, and where that took up no play (joints).
     """
 
     def __init__(
@@ -119,6 +121,8 @@ class Drive(Motion):
         self.at = self.park.copy()
         self._is_energised = False
         self.approach = np.zeros(len(self.joints))
+        self._one_way = np.zeros(len(self.joints))
+        """How far each has turned since it last turned back (rad, with its sign)."""
 
     @property
     def angles(self) -> dict[str, float]:
@@ -145,7 +149,7 @@ class Drive(Motion):
             if joint not in self.device.state().angles:
                 self._log.record(ENERGISED, {"joint": joint, "angle": angle, "at": self.clock.wall()})
                 self.device.energise(joint, angle)
-                self.approach[i] = 0.0  # it may have jumped from either side
+                self.approach[i] = self._one_way[i] = 0.0  # it may have jumped from either side
                 self.stand(self.settings.between_joints, unguarded)
         self._guard(self.at)
 
@@ -181,7 +185,7 @@ class Drive(Motion):
             difference, gone, before = goal - start, 0.0, self.clock.now()
             length = float(np.max(np.abs(difference)))
             commanded = self.device.standing(self.angles)
-            self.approach = np.where(np.abs(difference) > _SAME_RAD, np.sign(difference), self.approach)
+            self._note_turns(difference)
             while gone < length:
                 moves = self.tick(may_move)
                 now = self.clock.now()
@@ -197,6 +201,13 @@ class Drive(Motion):
                     self.device.command(standing)
                     commanded = standing
         self._guard(path[-1])
+
+    def _note_turns(self, turns: Array) -> None:
+        """On which side of their play joints come to lie by turns (joints, rad)."""
+        turned, signs = np.abs(turns) > _SAME_RAD, np.sign(turns)
+        self._one_way = np.where(turned, turns + np.where(self._one_way * signs > 0, self._one_way, 0.0), self._one_way)
+        lies = (np.abs(self._one_way) >= _TAKEN_UP_RAD) | (self.approach == signs)
+        self.approach = np.where(turned, np.where(lies, signs, 0.0), self.approach)
 
     def preload_backlash(self, sides: Array, may_move: MayMove) -> None:
         """Come to the pose from the stated sides: a little away, and back. See ``go`` for what it raises.

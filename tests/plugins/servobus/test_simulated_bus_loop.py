@@ -21,8 +21,6 @@ from armcal.devices.simulated import BOARD, CLOCK
 from armcal.run.experiment import Experiment
 from armcal_bench.acquisition.rehearsal import overrides_for, simulated_bench
 from armcal_bench.bench import Bench
-from armcal_servobus.bus import Bus, BusSettings
-from armcal_servobus.finding import find
 from bench_runs import free_port
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "so101"
@@ -36,7 +34,7 @@ class Loop:
     """What the commands left behind; ``ids`` answered on the bus, ``state`` is the bench's truth at the end."""
 
     folder: Path
-    ids: list[int]
+    ids: list[tuple[int, int, str]]
     state: dict[str, object]
 
     def positions(self, name: str) -> np.ndarray:
@@ -62,9 +60,9 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loop]:
     fresh = ("plan.seed=5", "plan.starts=1", "plan.goal=A")
     armcal(folder, "plan", CONFIG, "--poses", str(FRESH), "--out", folder / "fresh.csv", sets=fresh)
     with simulated_bench(CONFIG, ports, folder / "bench"):
-        bus = Bus(BusSettings.model_validate({"port": str(folder / "bench" / BOARD), "protocol": "feetech"}))
-        ids = [servo.id for servo in find(bus, (1_000_000,), range(8))]
-        bus.close()
+        found = json.loads(armcal(folder, "bus", "find", folder / "bench" / BOARD, "--last-id", "8", "--json"))
+        ids = [(servo["baud"], servo["id"], servo["model"]) for servo in found["servos"]]
+        armcal(folder, "servo", CONFIG, "--check", "--yes", sets=sets)
         armcal(folder, "acquire", CONFIG, "--plan", folder / "plan.csv", "--out", folder / "runs", "--yes", sets=sets)
         armcal(folder, "acquire", CONFIG, "--plan", folder / "fresh.csv", "--out", folder / "again", "--yes", sets=sets)
         clock = SimulatedClock(folder / "bench" / CLOCK)
@@ -94,7 +92,7 @@ def true_values() -> dict[str, float]:
 
 
 def test_all_servos_are_found_on_the_bus(loop: Loop) -> None:
-    assert loop.ids == [1, 2, 3, 4, 5]
+    assert loop.ids == [(1_000_000, number, "sts3215") for number in range(1, 6)]
 
 
 def test_the_bench_was_safe_and_quick(loop: Loop) -> None:
