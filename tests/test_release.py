@@ -248,7 +248,7 @@ WITH = {
     "convex": "from armcal_cvxpy.estimator import CvxpyEstimator",
     "figures": "from armcal_capability.drawing import empty_figure; empty_figure((1, 1))",
     "lerobot": "import pyarrow.parquet",
-    "i2c": "import smbus2; smbus2.i2c_msg.write(64, [0]); from armcal_pca9685.linux_i2c import _library; _library()",
+    "i2c": "import smbus2; smbus2.i2c_msg.write(64, [0]); import armcal_pca9685.linux_i2c",
     "mujoco": "import mujoco; mujoco.MjModel.from_xml_string('<mujoco><worldbody/></mujoco>')",
     "camera": "import cv2; cv2.aruco.CharucoBoard((5, 4), 0.04, 0.03, cv2.aruco.getPredefinedDictionary(0))",
     "ros2": "from armcal_ros2.library import message_types; message_types()",

@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
-from importlib import metadata
+from importlib import import_module, metadata
+from typing import Any
 
 from armcal.errors import ArmcalError, PluginError
 
 _DISTRIBUTIONS = {"cv2": "opencv-python-headless"}
 """Of modules that are called otherwise than the distribution that they come with."""
+
+
+def library(module: str, needed_by: str) -> Any:
+    """A library that only ``needed_by`` needs ("reading images").
+
+    Raises:
+        ArmcalError: it is not installed, or does not load.
+    """
+    try:
+        return import_module(module)
+    except ImportError as fault:
+        raise missing_library(fault, needed_by) from fault
 
 
 def missing_library(fault: ImportError, needed_by: str = "this") -> ArmcalError:

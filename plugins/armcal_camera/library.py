@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import Any
 
 from armcal.errors import PluginError
+from armcal.extras import library
 
 
 def opencv() -> Any:
@@ -14,11 +14,7 @@ def opencv() -> Any:
     Raises:
         PluginError: it is not installed, or too old to know boards of tags.
     """
-    try:
-        cv2 = importlib.import_module("cv2")
-    except ImportError as fault:
-        hint = "Run pip install 'armcal[camera]'."
-        raise PluginError(f"looking at images needs OpenCV ({fault}).", hint=hint) from fault
+    cv2 = library("cv2", "looking at images")
     if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
         version = getattr(cv2, "__version__", "of an unknown version")
         hint = "Run pip install --upgrade 'armcal[camera]'."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,7 +13,8 @@ from typing import Any, NoReturn
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.errors import DataError, Location, PluginError
+from armcal.errors import DataError, Location
+from armcal.extras import library
 from armcal.io.plain_files import input_bytes, text_of
 from numpy.typing import NDArray
 
@@ -34,11 +34,7 @@ def parquet() -> Any:
     Raises:
         PluginError: pyarrow is not installed.
     """
-    try:
-        return importlib.import_module("pyarrow.parquet")
-    except ImportError as fault:
-        hint = "Run pip install 'armcal[lerobot]'."
-        raise PluginError(f"reading LeRobot's data sets needs pyarrow ({fault}).", hint=hint) from fault
+    return library("pyarrow.parquet", "reading LeRobot's data sets")
 
 
 @dataclass(frozen=True)

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import csv
-import importlib
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.errors import DataError, InputError, Location, PluginError
+from armcal.errors import DataError, InputError, Location
+from armcal.extras import library
 from armcal.io.file_set import write_over
 from armcal.measure.rests import StillSettings, rests
 
@@ -105,11 +105,7 @@ def write_images(recording: Recording, camera: str, records: Sequence[RestRecord
         DataError: a video is missing, or ends before a rest.
         PluginError: OpenCV is not installed.
     """
-    try:
-        cv2: Any = importlib.import_module("cv2")
-    except ImportError as fault:
-        hint = "Run pip install 'armcal[camera]'."
-        raise PluginError(f"reading videos needs OpenCV ({fault}).", hint=hint) from fault
+    cv2 = library("cv2", "reading videos")
     by_video: dict[Path, list[tuple[int, RestRecord]]] = {}
     for record in records:
         path, first = recording.video(camera, record.episode)

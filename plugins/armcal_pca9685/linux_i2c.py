@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import importlib
 from collections.abc import Callable, Mapping
 from types import ModuleType
 from typing import Annotated, Any, ClassVar
@@ -13,7 +12,8 @@ from armcal.base.settings import Settings
 from armcal.devices.clock import Clock
 from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError
 from armcal.devices.link import Link, LinkIdentity
-from armcal.errors import Location, PluginError
+from armcal.errors import Location
+from armcal.extras import library
 from pydantic import Field
 from typing_extensions import override
 
@@ -45,7 +45,7 @@ class LinuxI2cLink(Link):
             PluginError: the library is not installed.
         """
         self.close()
-        self._smbus2 = _library()
+        self._smbus2 = library("smbus2", "the link linux_i2c")
         try:
             self._bus = self._smbus2.SMBus(self._path)
             fcntl.flock(self._bus.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -99,14 +99,4 @@ class LinuxI2cLink(Link):
             f"the device at 0x{address:02x} does not answer ({fault}).",
             where=Location(self._path),
             hint=f"Check its address, power and wires; i2cdetect -y {self._path.rpartition('-')[2]} lists who answers.",
-        ) from fault
-
-
-def _library() -> ModuleType:
-    try:
-        return importlib.import_module("smbus2")
-    except ImportError as fault:
-        raise PluginError(
-            "the link linux_i2c needs the library smbus2, which is not installed.",
-            hint="Install it: pip install 'armcal[i2c]'.",
         ) from fault

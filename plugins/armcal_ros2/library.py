@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
-from armcal.errors import PluginError
+from armcal.extras import library
 
 _PIECE_BYTES = 64 * 1024
 
@@ -21,11 +21,7 @@ def message_types() -> Any:
     Raises:
         PluginError: it is not installed.
     """
-    try:
-        typesys = importlib.import_module("rosbags.typesys")
-    except ImportError as fault:
-        hint = "Run pip install 'armcal[ros2]'."
-        raise PluginError(f"reading recordings of ROS 2 needs rosbags ({fault}).", hint=hint) from fault
+    typesys = library("rosbags.typesys", "reading recordings of ROS 2")
     return typesys.get_typestore(typesys.Stores.LATEST)
 
 

@@ -140,7 +140,7 @@ def test_actions_of_other_motors_are_refused(folder: Path) -> None:
 
 def test_without_pyarrow_one_sentence(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyarrow.parquet", None)
-    with pytest.raises(PluginError, match=r"needs pyarrow.*pip install 'armcal\[lerobot\]'"):
+    with pytest.raises(PluginError, match=r"needs the library pyarrow.*pip install 'armcal\[lerobot\]'"):
         all_of(open_recording(folder))
 
 

@@ -120,5 +120,5 @@ def test_without_rosbags_one_sentence_says_what_to_install(tour: bags.Tour, monk
     path = bags.write_bag(tour.config.with_name("unread"), tour.sent()[:5])
     message_types.cache_clear()
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
-    with pytest.raises(PluginError, match=r"needs rosbags.*pip install 'armcal\[ros2\]'"):
+    with pytest.raises(PluginError, match=r"needs the library rosbags.*pip install 'armcal\[ros2\]'"):
         CliRunner().invoke(command, ["info", str(path)], catch_exceptions=False)
