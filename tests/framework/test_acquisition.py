@@ -123,9 +123,9 @@ def test_a_joint_that_stays_keeps_the_side_it_came_from() -> None:
 
 def test_a_turn_back_that_may_end_within_the_play_takes_the_play_up_first() -> None:
     run = Run()
-    run.poses = np.array([[0.5, 0.2], [0.5 - np.deg2rad(0.5), 0.4]])
+    run.poses = np.tile([[0.5, 0.2], [0.5 - np.deg2rad(0.5), 0.4]], (len(IDS) // 2, 1))
     assert run.run() == "done"
-    first, second = (c for kind, c in run.log.entries if kind == "measured")
+    first, second = [c for kind, c in run.log.entries if kind == "measured"][:2]
     times = [c["at"] - 1.7e9 for c in (first, second)]
     between = [a["q1"] for t, what, a in run.device.log if what == "command" and times[0] < t < times[1]]
     assert first["approach"]["q1"] == 1.0
