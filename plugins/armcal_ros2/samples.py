@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from bisect import bisect_right
 from collections import Counter
@@ -57,27 +58,28 @@ class MeasuredSettings(TopicSettings):
 
 
 class _Tree:
-    """The newest transforms, by child frame: parent, matrix and time (None: always)."""
+    """The newest transforms, by child frame: parent, message and time (None: always)."""
 
     def __init__(self) -> None:
-        self.edges: dict[str, tuple[str, Array, float | None]] = {}
+        self.edges: dict[str, tuple[str, Any, float | None]] = {}
 
-    def pose(self, reference: str, frame: str) -> tuple[Array, float | None, set[str]] | None:
-        """Of a frame in another (4 x 4), the time of its oldest part, and the frames on the way; None without a way."""
-        ups = [self._above(frame), self._above(reference)]
-        shared = next((name for name in ups[0] if name in ups[1]), None)
-        if shared is None:
-            return None
-        matrices, times, ways = [], list[float](), set[str]()
-        for up in ups:
-            matrix = np.eye(4)
-            for name in up[: up.index(shared)]:
-                _, step, at = self.edges[name]
-                matrix = step @ matrix
-                ways.add(name)
-                times += [] if at is None else [at]
-            matrices.append(matrix)
-        return np.linalg.inv(matrices[1]) @ matrices[0], min(times, default=None), ways
+    def way(self, reference: str, frame: str) -> tuple[list[str], list[str]] | None:
+        """The frames above a frame, itself first, and above another, as far as they are not the same; None without."""
+        above, beside = self._above(frame), self._above(reference)
+        shared = next((name for name in above if name in beside), None)
+        return None if shared is None else (above[: above.index(shared)], beside[: beside.index(shared)])
+
+    def pose(self, names: Sequence[str]) -> Array:
+        """Of the first frame in the parent of the last (4 x 4)."""
+        pose = np.eye(4)
+        for name in names:
+            moved = self.edges[name][1]
+            t, q = moved.translation, moved.rotation
+            step = np.eye(4)
+            step[:3, :3] = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
+            step[:3, 3] = (t.x, t.y, t.z)
+            pose = step @ pose
+        return pose
 
     def _above(self, frame: str) -> list[str]:
         names = [frame]
@@ -139,7 +141,7 @@ class MeasuredLog:
         held = getattr(message, body) if body else message
         q = getattr(held, orientation) if orientation else None
         p = getattr(held, position)
-        turn = np.array([q.x, q.y, q.z, q.w]) if q is not None else np.full(4, np.nan)
+        turn = None if q is None else np.array([q.x, q.y, q.z, q.w])
         self._take(time, np.array([p.x, p.y, p.z]), turn)
 
     def close(self, place: str) -> list[str]:
@@ -182,35 +184,35 @@ class MeasuredLog:
     def _moved(self, message: Any, received: int, is_static: bool) -> Iterator[tuple[float, Array]]:
         """Times and poses that new transforms give."""
         s, changed = self.settings, set[str]()
-        for transform in message.transforms:
-            t, q = transform.transform.translation, transform.transform.rotation
-            turn = np.array([q.x, q.y, q.z, q.w])
-            norm = float(np.linalg.norm(turn))
-            if not abs(norm - 1) <= _NORM_TOLERANCE:
+        for part in message.transforms:
+            q = part.transform.rotation
+            if not abs(math.hypot(q.x, q.y, q.z, q.w) - 1) <= _NORM_TOLERANCE:
                 self._faults["quaternion is not of length 1"] += 1
                 continue
-            matrix = np.eye(4)
-            matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(turn).as_matrix(), (t.x, t.y, t.z)
-            header = transform.header
-            own = (nanoseconds(header.stamp) if s.stamps == "header" else received) / 1e9
-            child = transform.child_frame_id.lstrip("/")
-            self._tree.edges[child] = (header.frame_id.lstrip("/"), matrix, None if is_static else own)
+            at = (nanoseconds(part.header.stamp) if s.stamps == "header" else received) / 1e9
+            child = part.child_frame_id.lstrip("/")
+            self._tree.edges[child] = (part.header.frame_id.lstrip("/"), part.transform, None if is_static else at)
             changed.add(child)
-        known = self._tree.pose((s.reference or "").lstrip("/"), (s.frame or "").lstrip("/"))
-        # where several frames move, the oldest says when all of the pose was seen
-        if known is None or known[1] is None or not changed & known[2] or known[1] == self._moved_at:
+        way = self._tree.way((s.reference or "").lstrip("/"), (s.frame or "").lstrip("/"))
+        if way is None or changed.isdisjoint(names := [*way[0], *way[1]]):
             return
-        self._moved_at = known[1]
-        time = self.stamps.time(round(known[1] * 1e9), received)
+        # where several frames move, the oldest says when all of the pose was seen
+        times = (self._tree.edges[name][2] for name in names)
+        oldest = min((at for at in times if at is not None), default=None)
+        if oldest is None or oldest == self._moved_at:
+            return
+        self._moved_at = oldest
+        time = self.stamps.time(round(oldest * 1e9), received)
         if time is not None:
-            yield time, known[0]
+            yield time, np.linalg.inv(self._tree.pose(way[1])) @ self._tree.pose(way[0])
 
-    def _take(self, time: float, position: Array, turn: Array) -> None:
-        norm = float(np.linalg.norm(turn))
+    def _take(self, time: float, position: Array, turn: Array | None) -> None:
         if not np.isfinite(position).all():
             self._faults["position is not finite"] += 1
             return
-        if not (np.isnan(turn).all() or abs(norm - 1) <= _NORM_TOLERANCE):
+        if turn is None:
+            turn = np.full(4, np.nan)
+        elif not abs((norm := float(np.linalg.norm(turn))) - 1) <= _NORM_TOLERANCE:
             self._faults["quaternion is zero" if norm < _NORM_TOLERANCE else "quaternion is not of length 1"] += 1
             return
         sample = (time, *position.tolist(), *turn.tolist())
