@@ -23,6 +23,7 @@ _NUMBERS = ("timestamp", "episode_index", "frame_index")
 _VECTOR_TYPES = ("float32", "float64", "int64", "int32")
 _MAX_META = 64 << 20
 _ROWS_AT_ONCE = 4096
+_MOST_NUMBERS = 1000
 _EPISODE_FILE = re.compile(r"episode_(\d+)\.parquet")
 _KNOWN = ("v2.0", "v2.1", "v3.")
 _RECORD_AGAIN = "Take the file again from where it was recorded."
@@ -91,6 +92,10 @@ class Recording:
             raise DataError(
                 text, where=_info(self.folder), hint="Only joint actions can be compared with joint states."
             )
+        twice = next((name for name in state if state.count(name) > 1), None)
+        if twice is not None:
+            text = f"found the motor {twice!r} twice, expected it once."
+            raise DataError(text, where=_info(self.folder), hint="Correct the names of the features.")
         return state
 
     def video(self, camera: str, episode: int) -> tuple[Path, int]:
@@ -161,9 +166,9 @@ def open_recording(folder: Path) -> Recording:
         text = f"found codebase_version {version[:20]!r}, expected v2.1 or v3.0."
         raise DataError(text, where=where, hint="Convert it with LeRobot's own scripts.")
     fps, frames = (info.get(key) for key in ("fps", "total_frames"))
-    if not isinstance(fps, int | float) or not 0 < fps <= 10_000 or not isinstance(frames, int):
-        hint = "Take it whole from where it was recorded."
-        raise DataError("found no fps and total_frames, expected numbers.", where=where, hint=hint)
+    if not (isinstance(fps, int | float) and 1 <= fps <= 10_000 and isinstance(frames, int) and 0 <= frames < 1 << 53):
+        text = "found no fps and total_frames, expected numbers (fps from 1)."
+        raise DataError(text, where=where, hint="Take it whole from where it was recorded.")
     names = _vector_names(info, where)
     files = tuple(sorted((folder / "data").glob("chunk-*/*.parquet")))
     if not files:
@@ -187,10 +192,12 @@ def _vector_names(info: Mapping[str, Any], where: Location) -> dict[str, tuple[s
         raise DataError("found no features.", where=where, hint="Take it whole from where it was recorded.")
     names = {}
     for feature, about in features.items():
-        shape = about.get("shape") if isinstance(about, dict) else None
-        if about.get("dtype") not in _VECTOR_TYPES or not isinstance(shape, list) or len(shape) != 1:
+        about = about if isinstance(about, dict) else {}
+        shape, stated = about.get("shape"), about.get("names")
+        if str(about.get("dtype")) not in _VECTOR_TYPES or not isinstance(shape, list) or len(shape) != 1:
             continue
-        stated = about.get("names")
+        if type(shape[0]) is not int or not 1 <= shape[0] <= _MOST_NUMBERS:
+            continue
         listed = next(iter(stated.values()), None) if isinstance(stated, dict) else stated
         listed = listed if isinstance(listed, list) and len(listed) == shape[0] else range(shape[0])
         names[feature] = tuple(map(str, listed))
@@ -214,7 +221,7 @@ def _lengths_of_lines(folder: Path) -> dict[int, int]:
             entry = json.loads(line) if line.strip() else None
             if entry is not None:
                 lengths[int(entry["episode_index"])] = int(entry["length"])
-        except (ValueError, KeyError, TypeError) as fault:
+        except (ValueError, KeyError, TypeError, OverflowError) as fault:
             text = "found a line without episode_index and length."
             raise DataError(text, where=Location(str(path), line=number), hint=_RECORD_AGAIN) from fault
     return lengths

@@ -115,7 +115,10 @@ def test_a_missing_episode_is_named(tmp_path: Path) -> None:
     [
         ({"codebase_version": "v1.6"}, "expected v2.1 or v3.0"),
         ({"fps": "30"}, "no fps"),
+        ({"total_frames": 10**30}, "no fps and total_frames"),
         ({"features": []}, "no features"),
+        ({"features": {"action": 3, "observation.state": [1]}}, "found no feature observation.state"),
+        ({"features": {"observation.state": {"dtype": "float32", "shape": ["x"]}}}, "found no feature observation"),
         ({"features": {"action": {"dtype": "float32", "shape": [6]}}}, "found no feature observation.state"),
     ],
 )
@@ -127,6 +130,13 @@ def test_meta_data_that_cannot_be_used_are_refused(folder: Path, changed: dict, 
     path.write_text("{")
     with pytest.raises(DataError, match="it is not JSON"):
         open_recording(folder)
+
+
+def test_a_motor_that_comes_twice_is_named(folder: Path) -> None:
+    path = folder / "meta" / "info.json"
+    path.write_text(path.read_text().replace("elbow_flex.pos", "wrist_flex.pos"))
+    with pytest.raises(DataError, match="found the motor 'wrist_flex' twice"):
+        read_motion(open_recording(folder), "degrees", None)
 
 
 def test_actions_of_other_motors_are_refused(folder: Path) -> None:
