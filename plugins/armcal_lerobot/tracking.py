@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from armcal.base.domains import Array
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 from scipy.stats import t as student
 
 from armcal_lerobot.motion import Motion, Stretch
@@ -154,7 +155,7 @@ def _delay(motion: Motion, index: int) -> tuple[Figure | None, str]:
     fps = motion.fps
     grid = np.arange(_EARLIEST_S * fps, _LATEST_S * fps + _FINEST, _FINEST)
     speeds = [np.gradient(command) * fps for command, _ in pairs]
-    moving = [_widened(np.abs(speed) > FAST_A_SECOND, round(_LATEST_S * fps)) for speed in speeds]
+    moving = [binary_dilation(np.abs(speed) > FAST_A_SECOND, iterations=round(_LATEST_S * fps)) for speed in speeds]
     if sum(int(mask.sum()) for mask in moving) < 3 * fps:
         return None, "it hardly moves fast: its delay cannot be known"
     best = min(grid, key=lambda frames: _left(pairs, moving, frames))
@@ -228,7 +229,7 @@ def _one_step(motion: Motion, index: int, known: Tracking, torque: Torque | None
     matrix = np.column_stack(list(columns.values()))
     free = _unobstructed(matrix, target)
     if np.mean(free) < _MOST_FREE:
-        text = f"in {100 - 100 * np.mean(free):.0f} % of its rests it is far from where the others let expect"
+        text = f"in {100 - 100 * np.mean(free):.0f} % of its frames at rest it is far from where the others let expect"
         doubts.append(f"{text}: a limit or an obstacle stopped it; they are left out")
     fit = _fit(matrix[free], target[free], cluster[free])
     if fit is None:
@@ -277,15 +278,6 @@ def _slow_part(
     blocks = np.arange(len(command)) // max(1, round(_CLUSTER_S * motion.fps))
     cluster = (number * 10**10 + turns * 10**5 + blocks)[keep]
     return played(command, width)[keep], state[keep], speed[keep], side[keep], load, cluster.astype(float)
-
-
-def _widened(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
-    """A mask (N) that also holds for so many neighbours."""
-    return (
-        np.convolve(mask, np.ones(2 * by + 1), mode="same")[: len(mask)] > 0.5
-        if len(mask) > 2 * by
-        else mask | mask.any()
-    )
 
 
 def _clusters(number: int, frames: NDArray[np.intp], length: float) -> NDArray[np.int64]:
