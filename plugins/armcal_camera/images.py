@@ -16,6 +16,8 @@ Grey = NDArray[np.uint8]
 SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".pnm"))
 _ENDS = ((b"\x89PNG", b"IEND", 64), (b"\xff\xd8", b"\xff\xd9", 4096))
 _FEWEST_PIXELS = 1024
+MOST_BYTES = 512 * 1024**2
+"""Of an image file."""
 
 
 def is_image(path: Path) -> bool:

@@ -26,10 +26,9 @@ from armcal_camera.board import Board
 from armcal_camera.corners_csv import corners_text, read_corners
 from armcal_camera.detection import Detection, detect
 from armcal_camera.detection_cache import detection_key, forget_old, keep_detection, kept_detection
-from armcal_camera.images import grey_image, is_image
+from armcal_camera.images import MOST_BYTES, grey_image, is_image
 from armcal_camera.pose_table import read_poses
 
-_MAX_BYTES = 512 * 1024**2
 _FEWEST = 3
 _BLURRED = 3.0
 _NAMED = 5
@@ -68,13 +67,14 @@ class _SeesBoards(Protocol):
 
 @dataclass(frozen=True)
 class View:
-    """What one image says: corners over all boards (K x 2, px), why it says nothing, its size and its sharpness."""
+    """What one image says: corners over all boards (K x 2, px), why it says nothing, its size, sharpness and path."""
 
     corners: Array
     fault: str = ""
     size: tuple[int, int] | None = None
     blur: float = float("nan")
     sha256: str = ""
+    path: str = ""
 
 
 class ImagesReader:
@@ -123,7 +123,7 @@ class ImagesReader:
             return {name: View(pixels, _too_few(pixels), sha256=digest) for name, pixels in given.items()}
         paths = _images_in(folder)
         made = Automatic().map(partial(look, boards), paths, report)
-        views = dict(zip([path.name for path in paths], made, strict=True))
+        views = {path.name: replace(view, path=str(path)) for path, view in zip(paths, made, strict=True)}
         forget_old()
         views = _of_one_size(views)
         if corners is not None:
@@ -156,7 +156,7 @@ def _own(places: Path | Mapping[str, Path] | None, camera: str, cameras: int) ->
 
 def look(boards: Sequence[Board], path: Path) -> View:
     """What an image says of boards; from what was kept, if it was looked at before."""
-    content = input_bytes(path, _MAX_BYTES, "an image")
+    content = input_bytes(path, MOST_BYTES, "an image")
     digest, nothing = hashlib.sha256(content).hexdigest(), np.full((sum(len(b.points) for b in boards), 2), np.nan)
     keys = [detection_key(content, board) for board in boards]
     detections = [kept_detection(key, board) for key, board in zip(keys, boards, strict=True)]
@@ -255,7 +255,8 @@ def _with_corners(dataset: Dataset, camera: str, views: Sequence[View], known: s
         if f"{camera}.{axis}_{k}" in known
     }
     digest = hashlib.sha256("".join([dataset.sha256, *(view.sha256 for view in views)]).encode()).hexdigest()
-    return replace(dataset, channels={**dataset.channels, **channels}, sha256=digest)
+    files = {**dataset.files, camera: tuple(view.path for view in views)}
+    return replace(dataset, channels={**dataset.channels, **channels}, sha256=digest, files=files)
 
 
 def _left(dataset: Dataset, faulty: Mapping[int, str]) -> Dataset:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from html import escape
 
 import numpy as np
-from armcal.base.domains import Array
 from armcal.report import svg
 from armcal.report.numbers import significant
 from armcal.report.sections import ReportSection
@@ -14,53 +12,29 @@ from armcal.report.svg import Axis, Box, Figure
 from armcal.run.result import RunResult
 
 from armcal_camera.camera import Camera
+from armcal_camera.image_figures import drawn_images
+from armcal_camera.residuals import CameraResiduals, residuals_of
 
-_PX = 1000.0
-_MOST_VECTORS, _WORST = 4000, 8
-
-
-@dataclass(frozen=True)
-class _Residuals:
-    """Of one camera: where corners were seen (2 x P x N, px), and measured minus predicted (NaN if unseen)."""
-
-    name: str
-    seen: Array
-    off: Array
-
-    @property
-    def by_image(self) -> Array:
-        """Root mean square of the distances (N, px)."""
-        with np.errstate(invalid="ignore"):
-            return np.asarray(np.sqrt(np.nanmean(np.sum(self.off**2, axis=0), axis=0)))
+_MOST_VECTORS, _WORST, _MOST_BYTES = 4000, 8, 200_000
 
 
 def cameras(result: RunResult) -> ReportSection | None:
     """Reprojection residuals over the sensor and by image, of every camera of the run."""
-    start, parts = 0, list[str]()
+    start, parts, count = 0, list[str](), sum(isinstance(m, Camera) for m in result.system.measurements.values())
     for name, measurement in result.system.measurements.items():
         rows = len(measurement.noise())
         if isinstance(measurement, Camera):
             own = result.errors.calibrated_residual_mm[start : start + rows]
-            parts += _of_camera(result, _residuals(result, name, measurement, own))
+            parts += _of_camera(residuals_of(result, name, measurement, own), _MOST_BYTES // count)
         start += rows
     return ReportSection("Cameras", "".join(parts)) if parts else None
 
 
-def _residuals(result: RunResult, name: str, camera: Camera, residual: Array) -> _Residuals:
-    """The rows of one camera (px), those of corners that were not seen left out."""
-    points = len(camera.points)
-    seen = result.dataset.stacked([f"{name}.{channel.name}" for channel in camera.channels()])
-    shape = (points, 2, len(result.dataset))
-    places = _PX * seen.reshape(shape).transpose(1, 0, 2)
-    off = residual.reshape(shape).transpose(1, 0, 2)
-    return _Residuals(name, places, np.where(np.isfinite(places).all(axis=0), off, np.nan))
-
-
-def _of_camera(result: RunResult, residuals: _Residuals) -> list[str]:
+def _of_camera(residuals: CameraResiduals, most_bytes: int) -> list[str]:
     figure, errors = _over_the_sensor(residuals), residuals.by_image
     order = [int(i) for i in np.argsort(-np.nan_to_num(errors))[:_WORST]]
     rows = "".join(
-        f"<tr><td>{escape(result.dataset.ids[i])}</td><td>{significant(float(errors[i]))}</td>"
+        f"<tr><td>{escape(residuals.images[i])}</td><td>{significant(float(errors[i]))}</td>"
         f"<td>{int(np.isfinite(residuals.off[0, :, i]).sum())}</td></tr>"
         for i in order
     )
@@ -68,10 +42,11 @@ def _of_camera(result: RunResult, residuals: _Residuals) -> list[str]:
         f"<table><thead><tr><th>image</th><th>rms, px</th><th>corners</th></tr></thead><tbody>{rows}</tbody></table>"
     )
     heading = f"<h3>{escape(residuals.name)}</h3>"
-    return [heading, f"<figure>{figure.wide}<figcaption>{escape(figure.caption)}</figcaption></figure>", table]
+    over = f"<figure>{figure.wide}<figcaption>{escape(figure.caption)}</figcaption></figure>"
+    return [heading, over, table, drawn_images(residuals, most_bytes)]
 
 
-def _over_the_sensor(residuals: _Residuals) -> Figure:
+def _over_the_sensor(residuals: CameraResiduals) -> Figure:
     """All residuals of all images as lines from where the corners were seen."""
     there = np.isfinite(residuals.off).all(axis=0)
     places, off = residuals.seen[:, there], residuals.off[:, there]
