@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import NoReturn
 
-from armcal.devices.faults import DeviceError, DeviceResetError
+from armcal.devices.faults import DeviceError, DeviceResetError, DeviceUnwellError
 
 from armcal_servobus.checks import Eeprom
 from armcal_servobus.joints import ServoJoint
@@ -41,26 +41,28 @@ class Health:
         self._joints, self._limits = joints, limits
         self._eeprom: Mapping[str, Eeprom] = {}
         self._loaded_since: dict[str, float] = {}
+        self._reported: set[tuple[str, str]] = set()
 
     def begin(self, eeprom: Mapping[str, Eeprom]) -> None:
         """With what the servos' EEPROMs hold."""
-        self._eeprom, self._loaded_since = eeprom, {}
+        self._eeprom, self._loaded_since, self._reported = eeprom, {}, set()
 
     def check(self, readings: Mapping[str, ServoReading], now: float) -> None:
         """Readings of a moment (s).
 
         Raises:
-            DeviceError: a servo is unwell, too hot, without voltage or blocked.
+            DeviceUnwellError: a servo is too hot, or blocked; once for each.
+            DeviceError: a servo reports an alarm, or has not its voltage.
         """
         for name, reading in readings.items():
             if reading.alarms:
                 mends = " ".join(dict.fromkeys(_MENDS.get(word, "") for word in reading.alarms)).strip()
                 self._fail(name, f"reports {' and '.join(reading.alarms)}", mends or "See the servo's manual.")
             eeprom = self._eeprom.get(name, Eeprom())
-            if reading.temperature >= (limit := min(self._limits.temperature, eeprom.max_temperature)):
-                self._fail(
-                    name, f"is at {reading.temperature:.0f} deg C, expected below {limit:.0f}", _MENDS["overheating"]
-                )
+            limit = min(self._limits.temperature, eeprom.max_temperature)
+            if reading.temperature >= limit:
+                text = f"is at {reading.temperature:.0f} deg C, expected below {limit:.0f}"
+                self._report(name, text, _MENDS["overheating"], "heat")
             low, high = eeprom.voltage_range
             if not low - _VOLTAGE_SLACK <= reading.voltage <= high + _VOLTAGE_SLACK:
                 text = f"has {reading.voltage:.1f} V, expected {low:.1f} to {high:.1f}"
@@ -86,10 +88,16 @@ class Health:
             self._loaded_since.pop(name, None)
         elif now - self._loaded_since.setdefault(name, now) >= _BLOCKED_S:
             text = f"works with {100 * abs(reading.load):.0f} % of its torque for {_BLOCKED_S:g} s"
-            self._fail(name, text, "It is blocked or carries too much: free it, or take the load away.")
+            self._report(name, text, "It is blocked or carries too much: free it, or take the load away.", "load")
 
     def _label(self, name: str) -> str:
         return f"{name} (id {self._joints[name].id})"
+
+    def _report(self, name: str, what: str, mend: str, kind: str) -> None:
+        """The first time only: on its way to where it parks the arm is not stopped by it."""
+        if (name, kind) not in self._reported:
+            self._reported.add((name, kind))
+            raise DeviceUnwellError(f"{self._label(name)} {what}.", hint=mend)
 
     def _fail(self, name: str, what: str, mend: str) -> NoReturn:
         raise DeviceError(f"{self._label(name)} {what}.", hint=mend)

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from armcal.devices.faults import DeviceError, DeviceLostError
+from armcal.devices.faults import DeviceError, DeviceLostError, DeviceUnwellError
 from armcal_bench.acquisition.acquisition_run import AcquisitionRun
 from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.heat import HeatModel
@@ -333,3 +333,20 @@ def test_servos_that_know_where_they_stand_do_not_jump_and_are_measured(chosen) 
     for record, pose in zip(records, POSES, strict=True):
         assert list(record["standing"].values()) == pytest.approx(pose + offset, abs=1e-9)
         assert list(record[other].values()) == pytest.approx(pose + 0.01 - offset, abs=1e-9)
+
+
+def test_a_servo_that_is_too_hot_parks_the_arm_and_lets_it_go() -> None:
+    class Hot(FakeDevice):
+        def keep_alive(self) -> None:
+            super().keep_alive()
+            if self.clock.now() > 30 and not self.boots > 1:
+                self.boots = 2
+                raise DeviceUnwellError("q2 is at 66 deg C.")
+
+    clock = FakeClock()
+    run = Run(device=Hot(clock), clock=clock)
+    assert run.run() == "parked"
+    assert 0 < len(run.measured()) < len(POSES)
+    assert not run.device.running and "66 deg C" in run.log.entries[-1][1]["sentence"]
+    last = [angles for _, what, angles in run.device.log if what == "command"][-1]
+    assert last == pytest.approx({"q1": 0.0, "q2": 0.0}, abs=COUNT_RAD)

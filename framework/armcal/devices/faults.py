@@ -17,5 +17,9 @@ class DeviceResetError(DeviceError):
     """A device has started anew since it was opened: what it was told before is forgotten."""
 
 
+class DeviceUnwellError(DeviceError):
+    """A device works, and must not go on for long: a servo is too hot, or blocked. Raised once; it can be parked."""
+
+
 class DeviceRefusedError(InputError):
     """A device is not the one that was calibrated, is used by another program, or cannot do what is asked."""

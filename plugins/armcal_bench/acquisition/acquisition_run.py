@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from armcal.base.domains import Array
 from armcal.devices.device import DeviceIdentity
+from armcal.devices.faults import DeviceUnwellError
 
 from armcal_bench.acquisition import run_log as entry
 from armcal_bench.acquisition.arrival import Arrival
@@ -93,7 +94,7 @@ class AcquisitionRun:
                 return self._park_and_end("refused", str(refusal))
             except JointGivesWay as fault:
                 return self._park_and_end("failed", str(fault))
-            except StopRequested as request:
+            except (StopRequested, DeviceUnwellError) as request:
                 return self._park_and_end("parked", str(request))
             except DeviceLost as loss:
                 return self._end(Ending("held", f"{loss}; {_AS_IT_IS}"))
@@ -259,7 +260,7 @@ class AcquisitionRun:
                 return self._end(Ending("held", f"{why}; no clear path to where it parks was found"))
             if self._settings.at_end == "release":  # a device that comes back must not energise what hangs by then
                 self._persist(self._drive.release, lambda: None)
-        except DeviceLost as loss:
+        except (DeviceLost, DeviceUnwellError) as loss:
             return self._end(Ending("held", f"{why}; then {loss}; {_AS_IT_IS}"))
         return self._end(Ending(how, why))
 

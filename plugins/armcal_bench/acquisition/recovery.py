@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from armcal.devices.device import DeviceIdentity, JointDevice
-from armcal.devices.faults import DeviceError, DeviceRefusedError
+from armcal.devices.faults import DeviceError, DeviceRefusedError, DeviceUnwellError
 
 from armcal_bench.acquisition.tracker_monitor import MotionGate
 
@@ -52,10 +52,13 @@ class Recovery:
 
         Raises:
             DeviceLost: it does not come back, or fails again at once, time after time.
+            DeviceUnwellError: it works, and the arm is to be parked.
         """
         while True:
             try:
                 return action()
+            except DeviceUnwellError:
+                raise
             except DeviceError as fault:
                 self._notice("trouble", str(fault))
                 self._reopen(fault, restore)

@@ -7,7 +7,13 @@ from collections.abc import Callable
 
 import pytest
 from armcal.devices.device import MeasuringDevice
-from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
+from armcal.devices.faults import (
+    DeviceError,
+    DeviceLostError,
+    DeviceRefusedError,
+    DeviceResetError,
+    DeviceUnwellError,
+)
 from armcal_servobus.device import ServoBusDevice
 
 from tests.plugins.servobus.fake_bus import FakeBus, FakeServo, sts, xl430
@@ -150,7 +156,7 @@ def energised(fake: FakeBus) -> tuple[ServoBusDevice, Bench]:
 @pytest.mark.parametrize(
     ("address", "value", "fault", "words"),
     [
-        (63, 66, DeviceError, r"q2 \(id 2\) is at 66 deg C, expected below 65.*Let it cool"),
+        (63, 66, DeviceUnwellError, r"q2 \(id 2\) is at 66 deg C, expected below 65.*Let it cool"),
         (62, 38, DeviceError, r"q2 \(id 2\) has 3\.8 V, expected 4\.0 to 14\.0"),
         (40, 0, DeviceResetError, r"q2 \(id 2\) lost torque"),
     ],
@@ -180,8 +186,9 @@ def test_a_blocked_joint_is_named_after_a_second():
         fake.servos[0].memory[60:62] = (0x400 | 980).to_bytes(2, "little")
         made.keep_alive()
         clock.sleep(1.1)
-        with pytest.raises(DeviceError, match=r"q1 \(id 1\) works with 98 % of its torque for 1 s"):
+        with pytest.raises(DeviceUnwellError, match=r"q1 \(id 1\) works with 98 % of its torque for 1 s"):
             made.keep_alive()
+        made.keep_alive()  # on its way home it is not stopped again
 
 
 def test_a_goal_that_was_lost_is_sent_again():
