@@ -14,6 +14,7 @@ from armcal.base.settings import InputPath, Settings
 from armcal.calibration.rigid_chain import tool_poses
 from armcal.io.plain_files import refuse
 from armcal.measure.checks import check_dataset, layout_of
+from armcal.measure.layout import warned
 from armcal.measure.missing import with_absent
 from armcal.measure.reader import ReadRequest
 from armcal.measure.stillness import deviations_of_mean, judged, mean_pose
@@ -29,6 +30,10 @@ from armcal_ros2.samples import MEASURED, TRANSFORMS, MeasuredLog, MeasuredSetti
 _FEWEST_SAMPLES = 4
 _CLOCKS_APART_S, _DRIFT_S = 0.5, 0.01
 _NAMED = 5
+_NO_NOISE_M = 1e-5
+"""Smaller than what any arm errs by."""
+_FEWEST_COMPARED = 26
+"""Twice the numbers of an affine map of the tool's pose."""
 _FULL_TURN = 2 * np.pi * (1 + 1e-9)
 
 
@@ -94,6 +99,12 @@ class Rosbag2Reader:
         for log in logs:
             remarks += log.close(str(s.path)) + self._clock_remarks(log, joints)
         dataset = self._dataset(request, joints, logs, (*bag.remarks, *remarks))
+        for name in s.measurements:
+            if _follows_nominal(request, name, dataset):
+                text = (
+                    f"{name} follows the nominal arm to {1e6 * _NO_NOISE_M:g} um: it seems to be computed from joints"
+                )
+                dataset = warned(dataset, f"{text}, as robot_state_publisher does, and not measured.")
         dataset = with_absent(dataset, request.channels)
         return check_dataset(dataset, layout_of(request.channels, dataset, {}, {}, by_line=False))
 
@@ -273,17 +284,29 @@ def _joint_channels(request: ReadRequest) -> list[str]:
     return [f"{name}.{joint}" for name, arm in request.arms.items() for joint in arm.commanded]
 
 
+def _tool_of(request: ReadRequest, name: str) -> Callable[[Array], Array]:
+    """The pose of the nominal tool that a measurement sees (N x 4 x 4, m) at the joints of all arms (N x joints)."""
+    own = request.measurements[name].arms[0]
+    arm, channels = request.arms[own], _joint_channels(request)
+    columns = [channels.index(f"{own}.{joint}") for joint in arm.commanded]
+    return lambda joints: tool_poses(arm.nominal_chain, np.stack(arm.joint_commands([*joints[:, columns].T]), axis=1))
+
+
 def _target_of(request: ReadRequest, name: str) -> Callable[[Array], Array]:
     """The place of a measurement's target on the nominal arm (N x 3, m) at the joints of all arms (N x joints)."""
-    measurement = request.measurements[name]
-    arm = request.arms[measurement.arms[0]]
-    channels = _joint_channels(request)
-    own = [channels.index(f"{measurement.arms[0]}.{joint}") for joint in arm.commanded]
-    stated = {block.name: block.nominal[0] for block in measurement.parameters() if len(block.nominal) == 1}
-    target = np.array([stated.get(f"target_{axis}", 0.0) for axis in "xyz"])
+    blocks, tool = request.measurements[name].parameters(), _tool_of(request, name)
+    stated = {block.name: block.nominal[0] for block in blocks if len(block.nominal) == 1}
+    target = np.array([stated.get(f"target_{axis}", 0.0) for axis in "xyz"] + [1.0])
+    return lambda joints: np.asarray((tool(joints) @ target)[:, :3])
 
-    def places(joints: Array) -> Array:
-        poses = tool_poses(arm.nominal_chain, np.stack(arm.joint_commands([*joints[:, own].T]), axis=1))
-        return np.asarray(poses[:, :3, 3] + poses[:, :3, :3] @ target)
 
-    return places
+def _follows_nominal(request: ReadRequest, name: str, dataset: Dataset) -> bool:
+    """Whether measured places are those of a point on the nominal tool, whatever point and base, beyond any noise."""
+    places = np.array([dataset.channels.get(f"{name}.{axis}", np.full(len(dataset), np.nan)) for axis in "xyz"])
+    known = np.isfinite(places).all(axis=0)
+    if known.sum() < _FEWEST_COMPARED:
+        return False
+    tools = _tool_of(request, name)(dataset.stacked(_joint_channels(request)).T[known])
+    design = np.column_stack([np.ones(len(tools)), tools[:, :3].reshape(len(tools), 12)])
+    left = places.T[known] - design @ np.linalg.lstsq(design, places.T[known], rcond=None)[0]
+    return bool(np.sqrt((left**2).mean()) < _NO_NOISE_M)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,3 +46,18 @@ def test_a_recording_gives_the_calibration_of_the_table(tour: bags.Tour) -> None
         errors[name] = np.linalg.norm(tips - true, axis=1).mean()
     # each record of the recording is the mean of some 35 samples, each of the table one
     assert errors["bag"] < 0.12e-3 and errors["bag"] < errors["table"]
+
+
+def test_a_frame_that_is_computed_from_joints_is_named(tmp_path: Path) -> None:
+    """What robot_state_publisher publishes is the nominal arm: nothing is measured."""
+    tour = bags.made_tour(tmp_path, rests=30)
+    (tmp_path / "truth.yaml").write_text("{}\n")
+    experiment = Experiment.load(tour.config, ("simulation.noise_mm=0.0000001",))
+    at, _ = tour.seen
+    times, joints = tour.joints
+    exact = np.column_stack([np.interp(at, times, column) for column in joints.T])
+    for name, noise, expected in (("computed", 0.0, True), ("measured", 3e-4, False)):
+        seen = bags.simulated(experiment, exact) + np.random.default_rng(2).normal(0.0, noise, (len(at), 3))
+        bag = bags.write_bag(tour.config.with_name(name), replace(tour, seen=(at, seen)).sent())
+        warnings = Experiment.load(bags.of_bag(tour, bag)).read().warnings
+        assert any("follows the nominal arm" in text for text in warnings) == expected
