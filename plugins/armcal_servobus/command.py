@@ -28,7 +28,10 @@ def bus() -> None:
 @click.command("check")
 @on_config
 def check_command(console: Console, config: Path, overrides: tuple[str, ...]) -> None:
-    """Compare the servos with CONFIG: ids, models, offsets, limits, voltage. Nothing is written to them."""
+    """Compare the servos with CONFIG.
+
+    Ids, models, homing offsets, limits, modes, voltages, alarms. Nothing is written to them.
+    """
     with opened(config, overrides) as (wires, joints):
         examination = examined(wires, joints)
         there = {name: joints[name] for name in joints if name in examination.eeproms}
@@ -62,7 +65,10 @@ def check_command(console: Console, config: Path, overrides: tuple[str, ...]) ->
 @click.command("wiring")
 @on_config
 def wiring_command(console: Console, config: Path, overrides: tuple[str, ...]) -> None:
-    """See by turning each joint by hand that its id and direction in CONFIG are right. Servos must be let go."""
+    """Check ids and directions by turning joints by hand.
+
+    The servos must be let go.
+    """
     wrong: dict[str, str] = {}
     with opened(config, overrides) as (wires, joints):
         servos = Servos(wires, joints)

@@ -25,7 +25,10 @@ from armcal_servobus.packets import LAST_ID, ProtocolName
 def find_command(
     console: Console, port: str | None, protocol: ProtocolName | None, baud: tuple[int, ...], last_id: int
 ) -> None:
-    """List all servos on PORT: baud rate, id, model, and what they report. Nothing is written to them."""
+    """List all servos on PORT.
+
+    Their baud rates, ids, models, and what they report. Nothing is written to them.
+    """
     place = port or _only_port()
     spoken, servos = _searched(console, place, (protocol,) if protocol else get_args(ProtocolName), baud, last_id)
     console.result({"port": place, "protocol": spoken, "servos": [_as_json(servo) for servo in servos]})

@@ -39,9 +39,10 @@ def home_command(
     yes: bool,
     overrides: tuple[str, ...],
 ) -> None:
-    """Set homing offsets so that the servos report the angles at which you hold the arm.
+    """Set homing offsets, after a question.
 
-    The differences are shown first, and the servos' old values are kept in a file.
+    Afterwards the servos report the angles at which you hold the arm, or those that a calibration found. The
+    differences are shown first, and what the servos hold is kept in a file.
     """
     with opened(config, overrides) as (wires, all_joints):
         joints = _chosen(all_joints, chosen)
