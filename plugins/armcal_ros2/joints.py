@@ -59,13 +59,12 @@ class RestSettings(Settings):
 
 @dataclass(frozen=True)
 class JointRest:
-    """A rest of the joints: begin and end (s), means and the largest standard deviation, by joint (rad or m)."""
+    """A rest of the joints: begin and end (s), means and standard deviations by joint (rad or m)."""
 
     begin: float
     end: float
     means: Array
-    scatter: float
-    samples: int
+    scatter: Array
 
 
 class JointLog:
@@ -213,7 +212,7 @@ class JointLog:
         begin, end = float(rows.time[0]), float(rows.time[-1])
         settled = (rows.time >= begin + self._settle) & (rows.time <= end - GUARD_S)
         joints = (rows.joints[:, settled] if settled.any() else rows.joints) * self._limits[:, None]
-        return JointRest(begin, end, joints.mean(axis=1), float(joints.std(axis=1).max()), joints.shape[1])
+        return JointRest(begin, end, joints.mean(axis=1), joints.std(axis=1))
 
 
 def channels_of(commanded: Mapping[str, Mapping[str, str]], names: Mapping[str, str]) -> dict[str, str]:

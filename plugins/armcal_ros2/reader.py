@@ -201,6 +201,7 @@ class Rosbag2Reader:
         channels["time"] = np.array([(rest.begin + rest.end) / 2 for rest in rests])
         seen = {log.instance: [self._seen(log, i, rest) for i, rest in enumerate(rests)] for log in logs}
         extra = {"rest_s": tuple(f"{rest.end - rest.begin:.3f}" for rest in rests)}
+        extra["joint_scatter"] = tuple(f"{rest.scatter.max():.2g}" for rest in rests)
         for name, own in seen.items():
             channels |= self._measured(name, request, own)
             extra[f"{name}_samples"] = tuple(str(one.samples) for one in own)
