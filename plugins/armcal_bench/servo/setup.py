@@ -77,7 +77,8 @@ class Setup:
             raise ConfigError(
                 "found no servo file.",
                 where=experiment.source.where((SECTION, "device")),
-                hint="Name it in bench.device.servos, or in bench.servo.servos.",
+                hint="Name it in bench.device.servos, or in bench.servo.servos. Servos on a serial bus have no pulses: "
+                "armcal bus sets their zeros.",
             )
         file = load_servo_file(path)
         arm = bench.arm
