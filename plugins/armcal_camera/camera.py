@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import casadi as ca
 import numpy as np
 from armcal.arm.assembly import ArmState
+from armcal.arm.statics import TOOL_FRAME
 from armcal.base.domains import Array, Interval
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.pose_blocks import pose_transform
@@ -34,13 +35,15 @@ class CameraSettings(InstrumentSettings):
     """Which camera, what it sees, and how well corners are found.
 
     ``noise`` is the standard deviation of a corner's u and v. ``mounting`` says what moves: ``eye_in_hand`` has the
-    camera on the tool and boards in the world, ``eye_to_hand`` the camera in the world and boards on the tool. Poses
-    and intrinsics that are not stated are found from the images, where they are free. Of a board with more than
+    camera on the tool and boards in the world, ``eye_to_hand`` the camera in the world and boards on the tool;
+    ``frame`` is another frame of the arm model that carries the camera, or the boards, in place of the tool. Poses and
+    intrinsics that are not stated are found from the images, where they are free. Of a board with more than
     ``most_points`` points so many are used, spread evenly over it. ``image`` is its width and height.
     """
 
     noise: Annotated[Pixels, Field(gt=0)]
     mounting: Literal["eye_in_hand", "eye_to_hand"] = "eye_in_hand"
+    frame: str = TOOL_FRAME
     lens: Lens | None = None
     board: BoardOrFile | None = None
     boards: tuple[BoardOrFile, ...] = ()
@@ -73,7 +76,8 @@ class Camera(PointInstrument):
     """The measurement ``camera``: channels u_K and v_K (px) of each point K of its boards, counted over all of them.
 
     Parameters: ``camera_*`` (tool_T_camera, or base_T_camera of one that stands beside the arm), ``board_*``
-    (base_T_board, or tool_T_board; ``board1_*``, ``board2_*`` where there are several), ``board_scale`` (printed size
+    (base_T_board, or tool_T_board; ``board1_*``, ``board2_*`` where there are several; the setting ``frame`` may stand
+    in place of the tool), ``board_scale`` (printed size
     over stated size), ``fx``, ``fy``, ``cx``, ``cy`` and the distortion coefficients.
     """
 
@@ -91,6 +95,11 @@ class Camera(PointInstrument):
         "pose": {"position_mm": [20, 0, 60], "rpy_deg": [5, -3, 90]},
         "board_poses": [{"position_mm": [300, 200, 2000], "rpy_deg": [10, 15, 0]}],
     }
+
+    @property
+    def carrier(self) -> str:
+        """The frame of the arm that carries the camera, or the boards."""
+        return str(self.settings.frame)
 
     @cached_property
     def boards(self) -> tuple[Board, ...]:
@@ -162,8 +171,9 @@ class Camera(PointInstrument):
         there, normals = [pose.apply(place) for pose in poses], [pose.rotation[:, 2] for pose in poses]
         if len(poses) > 1:  # the point says which board is its own
             there, normals = ([sum(point[3 + i] * x for i, x in enumerate(parts))] for parts in (there, normals))
-        tool = self.base_T_tool(arms)
-        to_camera = (tool @ camera).inverse() if self.settings.mounting == "eye_in_hand" else camera.inverse() @ tool
+        arm = arms[self.arms[0]]
+        moved = arm.base_T_tool if self.carrier == TOOL_FRAME else arm.frames[self.carrier]
+        to_camera = (moved @ camera).inverse() if self.settings.mounting == "eye_in_hand" else camera.inverse() @ moved
         return to_camera.apply(there[0]), ca.mtimes(to_camera.rotation, normals[0])
 
     def point_margin(self, arms: Mapping[str, ArmState], values: Mapping[str, Any], point: Any) -> Any:
@@ -204,7 +214,8 @@ class Camera(PointInstrument):
         if any(sd is None for sd in (*place, *turn)):
             return ""
         mm, deg = (_NORMAL_95 * float(np.linalg.norm(np.array(sds, dtype=float))) for sds in (place, turn))
-        where = "on the hand" if self.settings.mounting == "eye_in_hand" else "beside the arm"
+        hand = "the hand" if self.carrier == TOOL_FRAME else self.carrier
+        where = f"on {hand}" if self.settings.mounting == "eye_in_hand" else "beside the arm"
         return f"its place {where} is known to {1000 * mm:.2g} mm and {np.rad2deg(deg):.2g} deg (95 %)."
 
     def propose(

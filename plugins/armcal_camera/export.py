@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import yaml
+from armcal.arm.statics import TOOL_FRAME
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
 from armcal.calibration.exporter import Exported, ExportRequest, Instrument
@@ -26,10 +27,10 @@ class CameraExportSettings(Settings):
 
 
 class FramesSettings(CameraExportSettings):
-    """Which camera, and the names of frames in the other program."""
+    """Which camera, and the names of frames in the other program; ``tool_frame`` is that which carries the camera."""
 
     base_frame: str = "base_link"
-    tool_frame: str = "tool0"
+    tool_frame: str | None = None
     camera_frame: str = "camera_optical_frame"
     board_frame: str = "board"
 
@@ -127,7 +128,9 @@ class HandEyeExporter(_CameraExporter):
         """
         name, camera = self._camera(request)
         on_hand = camera.settings.get("mounting", "eye_in_hand") == "eye_in_hand"
-        parent = self._settings.tool_frame if on_hand else self._settings.base_frame
+        carrier = str(camera.settings.get("frame", TOOL_FRAME))
+        tool_frame = self._settings.tool_frame or ("tool0" if carrier == TOOL_FRAME else carrier)
+        parent = tool_frame if on_hand else self._settings.base_frame
         pose, child = _pose("camera", camera.numbers), self._settings.camera_frame
         place, quaternion = [float(x) for x in pose[:3, 3]], Rotation.from_matrix(pose[:3, :3]).as_quat()
         keys = ("qx", "qy", "qz", "qw")
@@ -135,7 +138,7 @@ class HandEyeExporter(_CameraExporter):
             "parameters": {
                 "eye_on_hand": on_hand,
                 "robot_base_frame": self._settings.base_frame,
-                "robot_effector_frame": self._settings.tool_frame,
+                "robot_effector_frame": tool_frame,
                 "tracking_base_frame": child,
                 "tracking_marker_frame": self._settings.board_frame,
             },
@@ -171,7 +174,8 @@ def _model(camera: Instrument) -> str:
 def _poses(camera: Instrument) -> dict[str, Array]:
     """The camera's pose and each board's, by what they map from and to."""
     on_hand = camera.settings.get("mounting", "eye_in_hand") == "eye_in_hand"
-    frames = ("tool", "base") if on_hand else ("base", "tool")
+    carrier = str(camera.settings.get("frame", TOOL_FRAME))
+    frames = (carrier, "base") if on_hand else ("base", carrier)
     boards = [name.removesuffix("_x") for name in camera.numbers if name.startswith("board") and name.endswith("_x")]
     poses = {f"{frames[0]}_T_camera": _pose("camera", camera.numbers)}
     return {**poses, **{f"{frames[1]}_T_{board}": _pose(board, camera.numbers) for board in boards}}

@@ -21,7 +21,7 @@ from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ArmcalError, ConfigError, PluginError
 from armcal.measure.groups import Groups, group_blocks
-from armcal.measure.measurement import Measurement
+from armcal.measure.measurement import Carried, Measurement
 from armcal.measure.reader import surroundings
 from armcal.plugins import Component, PluginRegistry
 
@@ -144,6 +144,9 @@ def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
     for name in settings.measurements:
         at: Path = ("measurements", name)
         measurements[name], described[name] = build_component(source, registry, "measurement", at, tuple(arms))
+        carried = measurements[name]
+        if isinstance(carried, Carried):
+            _check_carrier(source, (*at, "frame"), carried.carrier, arms[measurements[name].arms[0]])
     description = {"arms": described_arms, "measurements": described, "statics": settings.statics.to_config()}
     return System(arms, measurements, settings.statics, description)
 
@@ -231,6 +234,17 @@ def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm
     if settings.placement:
         described["placement"] = settings.placement.to_config()
     return arm, described
+
+
+def _check_carrier(source: ConfigSource, at: Path, frame: str, arm: Arm) -> None:
+    """Refuse a frame that the arm does not have, or that none of its joints moves."""
+    moved = [name for name, joint in frame_names(arm.nominal_chain).items() if joint]
+    if frame not in moved:
+        raise ConfigError(
+            f"no frame that a joint of {arm.name} moves is called {frame!r}.",
+            where=source.where(at),
+            hint=f"Such frames are {', '.join(moved)}.",
+        )
 
 
 def _check_link(source: ConfigSource, at: Path, link: LinkSettings, known: Mapping[str, int], joints: int) -> None:

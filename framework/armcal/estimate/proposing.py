@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 
+from armcal.arm.effects import JointCommand
+from armcal.arm.model import forward
+from armcal.arm.statics import TOOL_FRAME
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import Location, ProblemError
 from armcal.estimate.start import BETTER, Start
 from armcal.estimate.validation import record_errors
+from armcal.measure.measurement import Carried
 from armcal.measure.points import Proposing
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -44,7 +49,7 @@ def _with_proposal(
     seen = np.flatnonzero(records[number].measured)
     factor = problem.kernels[number].factor
     proposal = measurement.propose(
-        _tools(problem, before, problem.subset(records, seen), number),
+        _carriers(problem, before, problem.subset(records, seen), dataset.subset(seen), number),
         {c.removeprefix(f"{name}."): dataset.column(c)[seen] for c in factor.output_channels},
         {local: nominal[parameters.entries_of(block.name)] for local, block in own.items()},
         frozenset(local for local, block in own.items() if block.free),
@@ -75,6 +80,25 @@ def _with_proposal(
         left=left,
         taken=True,
     )
+
+
+def _carriers(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset, number: int
+) -> Array:
+    """What carries a measurement in each record (base_T_carrier, N x 4 x 4, m): the tool, or a frame of a still arm."""
+    plan = problem.blueprint
+    measurement = plan.measurements[problem.kernels[number].factor.name]
+    if not isinstance(measurement, Carried) or measurement.carrier == TOOL_FRAME:
+        return _tools(problem, values, records, number)
+    arm, parameters = plan.arms[measurement.arms[0]], problem.parameters
+    stated = {name: ca.SX(values[parameters.entries_of(name)]) for name in parameters.names}
+    chain, symbols = arm.chain(stated), ca.SX.sym("commands", len(arm.commanded))
+    joint_commands = [JointCommand(i, q, ca.SX(0)) for i, q in enumerate(arm.joint_commands(ca.vertsplit(symbols)))]
+    moved = [joint.offset + arm.displacement(stated, q) for joint, q in zip(chain.joints, joint_commands, strict=True)]
+    pose = ca.densify(forward(chain, moved, {}).named[measurement.carrier].matrix())
+    commands = dataset.stacked([f"{arm.name}.{joint}" for joint in arm.commanded])
+    shown = ca.Function("carrier", [symbols], [pose]).map(len(dataset))(commands).full()
+    return np.asarray(shown.reshape(4, -1, 4).transpose(1, 0, 2))
 
 
 def _tools(problem: Problem, values: Array, records: Sequence[FactorRecords], number: int) -> Array:

@@ -118,6 +118,15 @@ class DimensionedResidual(Protocol):
 
 
 @runtime_checkable
+class Carried(Protocol):
+    """What a measurement provides beside the rest if another frame of its arm than the tool may carry it."""
+
+    @property
+    def carrier(self) -> str:
+        """``tool``, or a frame of the arm model that a joint moves."""
+
+
+@runtime_checkable
 class StatesAccuracy(Protocol):
     """What a measurement may provide beside the rest if its own parameters are what a user wants to know."""
 

@@ -46,7 +46,8 @@ class Proposing(Protocol):
         """Its parameters from what it read, those that are free.
 
         Args:
-            tools: base_T_tool of each record (N x 4 x 4, m), of the nominal arm.
+            tools: base_T_tool of each record (N x 4 x 4, m), of the nominal arm; of the frame that carries it (see
+                ``Carried``) where that is another one.
             read: each channel (N; NaN where it is missing), by local name.
             values: canonical entries of all its parameters, by local name.
             free: local names of those that may move.

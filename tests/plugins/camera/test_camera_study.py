@@ -23,7 +23,7 @@ def test_intervals_cover_and_the_tool_is_found(monkeypatch: pytest.MonkeyPatch) 
     for seed in range(30):
         experiment = armcal.Experiment.load(DEMO, (f"simulation.seed={seed}", *_QUIET))
         dataset = experiment.simulator().simulate(experiment.simulation_request)
-        monkeypatch.setattr(type(experiment), "read", lambda _, made=dataset: made)
+        monkeypatch.setattr(type(experiment), "read", lambda *_, made=dataset: made)
         ready = prepare(experiment, Stopwatch())
         estimate = fitted_of(experiment, ready, lambda *_: None, None, Stopwatch()).estimate
         monkeypatch.undo()
