@@ -25,6 +25,8 @@ from armcal_bench.settling import Settled, pose_of
 
 T = TypeVar("T")
 _TRIES = 2
+_READINGS = 10
+"""Of servos that know where they stand: their mean is finer than a count."""
 _AS_IT_IS = "its pulses go on as they are, unless the board parks the arm by itself"
 
 
@@ -208,7 +210,8 @@ class AcquisitionRun:
 
     def _standing(self) -> dict[str, dict[str, float]]:
         """``standing``: the joint angles (rad) that the dataset has; the others, where there are any, by their name."""
-        commanded, measured = self._drive.standing(), self._drive.measured()
+        commanded, readings = self._drive.standing(), [self._drive.measured() for _ in range(_READINGS)]
+        measured = {joint: sum(reading[joint] for reading in readings) / _READINGS for joint in readings[0]}
         if self._settings.angles == "measured":
             return {"standing": measured, "commanded": commanded}
         return {"standing": commanded, **({"measured": measured} if measured else {})}
