@@ -37,8 +37,10 @@ class CameraSettings(InstrumentSettings):
     ``noise`` is the standard deviation of a corner's u and v. ``mounting`` says what moves: ``eye_in_hand`` has the
     camera on the tool and boards in the world, ``eye_to_hand`` the camera in the world and boards on the tool;
     ``frame`` is another frame of the arm model that carries the camera, or the boards, in place of the tool. Poses and
-    intrinsics that are not stated are found from the images, where they are free. Of a board with more than
-    ``most_points`` points so many are used, spread evenly over it. ``image`` is its width and height.
+    intrinsics that are not stated are found from the images, where they are free. ``boards_of`` names another
+    camera that sees the same boards in the same places: their poses and scale are then that one's parameters. Of a
+    board with more than ``most_points`` points so many are used, spread evenly over it. ``image`` is its width and
+    height.
     """
 
     noise: Annotated[Pixels, Field(gt=0)]
@@ -50,6 +52,7 @@ class CameraSettings(InstrumentSettings):
     intrinsics: IntrinsicsOrFile | None = None
     pose: PoseSettings = PoseSettings()
     board_poses: tuple[PoseSettings, ...] = ()
+    boards_of: str | None = None
     image: tuple[Pixels, Pixels] | None = None
     most_points: Annotated[int, Field(ge=4)] = 120
 
@@ -61,6 +64,8 @@ class CameraSettings(InstrumentSettings):
         number = len(self.boards) or 1
         if self.board_poses and len(self.board_poses) != number:
             raise ValueError(f"found {len(self.board_poses)} board_poses, expected one of each board: {number}")
+        if self.board_poses and self.boards_of is not None:
+            raise ValueError(f"found board_poses and boards_of: the poses are those of {self.boards_of}")
         names, given = DISTORTION[self.model], self.intrinsics.distortion if self.intrinsics else ()
         if given and len(given) != len(names) and (self.model, len(given)) != ("pinhole", 4):
             raise ValueError(f"found {len(given)} distortion coefficients, expected {len(names)}: {', '.join(names)}")
@@ -101,6 +106,32 @@ class Camera(PointInstrument):
         """The frame of the arm that carries the camera, or the boards."""
         return str(self.settings.frame)
 
+    @property
+    def lender(self) -> str | None:
+        """The camera whose boards these are."""
+        return None if self.settings.boards_of is None else str(self.settings.boards_of)
+
+    @property
+    def borrowed(self) -> Sequence[str]:
+        """The poses of boards, and their scale."""
+        parts = ("x", "y", "z", "rotation")
+        return (*(f"{name}_{part}" for name in self.board_names for part in parts), "board_scale")
+
+    def check_lender(self, lender: object) -> None:
+        """Refuse one that does not see the same boards, or has them in another frame (ValueError)."""
+        if not isinstance(lender, Camera) or lender.boards != self.boards:
+            raise ValueError(f"found other boards than {self.lender} has, expected the same, in the same order")
+        if (lender.arms, lender.board_frame) != (self.arms, self.board_frame):
+            raise ValueError(
+                f"its boards are in the frame {self.board_frame}, those of {self.lender} in {lender.board_frame} "
+                f"({lender.arms[0]}): one pose cannot be both"
+            )
+
+    @property
+    def board_frame(self) -> str:
+        """In which frame the boards are: ``base``, or that which carries them."""
+        return "base" if self.settings.mounting == "eye_in_hand" else self.carrier
+
     @cached_property
     def boards(self) -> tuple[Board, ...]:
         """What it sees, in the order in which points are counted."""
@@ -136,9 +167,9 @@ class Camera(PointInstrument):
         """Poses (m, unit quaternions), scale, intrinsics (thousands of pixels) and distortion."""
         own, s = [*self.settings.pose.blocks("camera")], self.settings
         poses = s.board_poses or (PoseSettings(),) * len(self.boards)
-        for name, pose in zip(self.board_names, poses, strict=True):
-            own += pose.blocks(name)
-        own.append(scalar("board_scale", "1", 1.0, _SCALE_SCALE, _POSITIVE))
+        if self.lender is None:
+            own += [block for name, pose in zip(self.board_names, poses, strict=True) for block in pose.blocks(name)]
+            own.append(scalar("board_scale", "1", 1.0, _SCALE_SCALE, _POSITIVE))
         given = s.intrinsics
         for name, guess in (("fx", 1.0), ("fy", 1.0), ("cx", 0.5), ("cy", 0.5)):
             value = guess if given is None else float(getattr(given, name))

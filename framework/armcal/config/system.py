@@ -21,7 +21,7 @@ from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ArmcalError, ConfigError, PluginError
 from armcal.measure.groups import Groups, group_blocks
-from armcal.measure.measurement import Carried, Measurement
+from armcal.measure.measurement import Borrowing, Carried, Measurement
 from armcal.measure.reader import surroundings
 from armcal.plugins import Component, PluginRegistry
 
@@ -147,6 +147,9 @@ def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
         carried = measurements[name]
         if isinstance(carried, Carried):
             _check_carrier(source, (*at, "frame"), carried.carrier, arms[measurements[name].arms[0]])
+    for name, measurement in measurements.items():
+        if isinstance(measurement, Borrowing) and measurement.lender is not None:
+            _check_lender(source, ("measurements", name), measurement, measurements)
     description = {"arms": described_arms, "measurements": described, "statics": settings.statics.to_config()}
     return System(arms, measurements, settings.statics, description)
 
@@ -245,6 +248,24 @@ def _check_carrier(source: ConfigSource, at: Path, frame: str, arm: Arm) -> None
             where=source.where(at),
             hint=f"Such frames are {', '.join(moved)}.",
         )
+
+
+def _check_lender(source: ConfigSource, at: Path, borrower: Borrowing, measurements: Mapping[str, Measurement]) -> None:
+    """Refuse a lender that is not there, that borrows itself, or whose parameters mean something else."""
+    lender, others = measurements.get(str(borrower.lender)), [name for name in measurements if name != at[-1]]
+    if lender is None or borrower.lender == at[-1]:
+        raise ConfigError(
+            f"found {borrower.lender!r}, whose parameters are to be used, expected another measurement.",
+            where=source.where(at),
+            hint=f"The others are {', '.join(others) or 'none'}.",
+        )
+    if isinstance(lender, Borrowing) and lender.lender is not None:
+        raise ConfigError(
+            f"{borrower.lender} has the parameters of {lender.lender} itself.",
+            where=source.where(at),
+            hint=f"Name {lender.lender}.",
+        )
+    _refusable(source, at, lambda: borrower.check_lender(lender))
 
 
 def _check_link(source: ConfigSource, at: Path, link: LinkSettings, known: Mapping[str, int], joints: int) -> None:

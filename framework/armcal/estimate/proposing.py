@@ -15,8 +15,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import Location, ProblemError
 from armcal.estimate.start import BETTER, Start
-from armcal.estimate.validation import record_errors
-from armcal.measure.measurement import Carried
+from armcal.measure.measurement import Carried, borrowed_names
 from armcal.measure.points import Proposing
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -32,8 +31,9 @@ def with_proposals(start: Start, records: Sequence[FactorRecords], dataset: Data
         NotConvergedError: a record has no elastic equilibrium at the nominal values.
         ProblemError: the records leave free parameters open that nothing else holds.
     """
-    for number, kernel in enumerate(start.problem.kernels):
-        measurement = start.problem.blueprint.measurements[kernel.factor.name]
+    measurements = [start.problem.blueprint.measurements[kernel.factor.name] for kernel in start.problem.kernels]
+    lenders_first = sorted(enumerate(measurements), key=lambda numbered: bool(borrowed_names(numbered[1])))
+    for number, measurement in lenders_first:
         if isinstance(measurement, Proposing):
             start = _with_proposal(start, records, dataset, number, measurement)
     return start
@@ -46,12 +46,14 @@ def _with_proposal(
     parameters, nominal = problem.parameters, problem.parameters.nominal()
     before = start.vectors[0] if start.vectors else nominal
     own = {b.name.removeprefix(f"{name}."): b for b in parameters.blocks if b.name.startswith(f"{name}.")}
+    lent = borrowed_names(problem.blueprint.measurements[name])
+    borrowed = {local: before[parameters.entries_of(full)] for local, full in lent.items()}
     seen = np.flatnonzero(records[number].measured)
     factor = problem.kernels[number].factor
     proposal = measurement.propose(
         _carriers(problem, before, problem.subset(records, seen), dataset.subset(seen), number),
         {c.removeprefix(f"{name}."): dataset.column(c)[seen] for c in factor.output_channels},
-        {local: nominal[parameters.entries_of(block.name)] for local, block in own.items()},
+        {**{local: nominal[parameters.entries_of(block.name)] for local, block in own.items()}, **borrowed},
         frozenset(local for local, block in own.items() if block.free),
     )
     if any(own[local].prior_sd is None for local in proposal.undetermined):
@@ -65,7 +67,7 @@ def _with_proposal(
         vector[place] = value
         if own[local].prior_sd is None:
             moved[place] = value
-    configured, left = (_typical(problem, values, records) for values in (nominal, vector))
+    configured, left = (_typical(problem, values, records, number) for values in (nominal, vector))
     if left * BETTER > configured:
         return start
     names = tuple(own[local].name for local in proposal.values)
@@ -110,7 +112,9 @@ def _tools(problem: Problem, values: Array, records: Sequence[FactorRecords], nu
     return tools
 
 
-def _typical(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> float:
-    """The median error of records, those without one left out."""
-    errors = record_errors(problem, values, records)
-    return float(np.median(np.where(np.isfinite(errors), errors, np.inf)))
+def _typical(problem: Problem, values: Array, records: Sequence[FactorRecords], number: int) -> float:
+    """The median error of what one measurement read, of the records in which it did."""
+    points = records[number].points_of(problem.kernels[number].factor) * records[number].measured
+    squares = np.sum(problem.residuals(values, records)[number] ** 2, axis=0)[points > 0]
+    errors = np.sqrt(squares / points[points > 0])
+    return float(np.median(np.where(np.isfinite(errors), errors, np.inf))) if len(errors) else np.inf

@@ -127,6 +127,25 @@ class Carried(Protocol):
 
 
 @runtime_checkable
+class Borrowing(Protocol):
+    """What a measurement provides beside the rest if some of its parameters may be another's: one board, two cameras.
+
+    The expressions get their values under the same local names as the lender has them.
+    """
+
+    @property
+    def lender(self) -> str | None:
+        """The instance whose parameters these are; None if it borrows none."""
+
+    @property
+    def borrowed(self) -> Sequence[str]:
+        """Local names of the parameters that are the lender's; ``parameters`` leaves them out."""
+
+    def check_lender(self, lender: Measurement) -> None:
+        """Refuse one whose parameters mean something else (ValueError)."""
+
+
+@runtime_checkable
 class StatesAccuracy(Protocol):
     """What a measurement may provide beside the rest if its own parameters are what a user wants to know."""
 
@@ -136,6 +155,18 @@ class StatesAccuracy(Protocol):
         Args:
             deviations: standard deviations of free coordinates by local name (``camera_x``, ``camera_rotation<rx>``).
         """
+
+
+def borrowed_names(measurement: Measurement) -> dict[str, str]:
+    """Full names of the parameters that a measurement borrows, by local name."""
+    if not isinstance(measurement, Borrowing) or measurement.lender is None:
+        return {}
+    return {local: f"{measurement.lender}.{local}" for local in measurement.borrowed}
+
+
+def borrowed_values(measurement: Measurement, values: Mapping[str, Expression]) -> dict[str, Expression]:
+    """Of all values (by full names), those that a measurement borrows, by local name."""
+    return {local: values[full] for local, full in borrowed_names(measurement).items()}
 
 
 def residual_dimensions(measurement: Measurement) -> tuple[str, ...]:

@@ -29,7 +29,13 @@ from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.se3 import Expression
 from armcal.base.units import ERROR_UNITS
 from armcal.errors import ProblemError
-from armcal.measure.measurement import GroupedMeasurement, Measurement, noise_channels, residual_dimensions
+from armcal.measure.measurement import (
+    GroupedMeasurement,
+    Measurement,
+    borrowed_values,
+    noise_channels,
+    residual_dimensions,
+)
 from armcal.measure.partners import OTHER
 from armcal.measure.points import LimitedView, PointMeasurement
 
@@ -212,7 +218,7 @@ def build_factor(
     groups = measurement if isinstance(measurement, GroupedMeasurement) else None
     group, of_group = _symbols("group", groups.group_parameters("") if groups else ())
     records, states, deflections = _arm_states(measurement, arms, values, environment, available)
-    local = {**scoped(values, f"{name}."), **of_group}
+    local = {**borrowed_values(measurement, values), **scoped(values, f"{name}."), **of_group}
     reading = _reading(name, measurement, records, states, local, unrolled)
     next_state = ca.densify(ca.vertcat(*[states[a].next_deflection for a in measurement.arms]))
     tools = ca.vertcat(*[ca.vec(states[a].base_T_tool.matrix()[:3, :]) for a in measurement.arms])

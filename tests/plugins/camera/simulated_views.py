@@ -54,8 +54,16 @@ def numbers(name: str, placed: Array) -> dict[str, float]:
 
 
 def simulated(folder: Path, cameras: dict[str, dict[str, object]], truth: dict[str, float], count: int) -> Experiment:
-    """An experiment with the records of a simulation of these cameras; poses are free and found from the images."""
+    """An experiment with the records of a simulation of these cameras."""
     (folder / "truth.yaml").write_text(yaml.safe_dump(truth))
+    experiment = configured(folder, cameras, count)
+    made = experiment.simulator().simulate(experiment.simulation_request)
+    write_csv(folder / "records.csv", made, experiment.request(measured=True).channels)
+    return experiment
+
+
+def configured(folder: Path, cameras: dict[str, dict[str, object]], count: int = 1) -> Experiment:
+    """An experiment with these cameras, whose poses are free and found from the images."""
     levels = {f"q{i + 1}": [f"{np.rad2deg(q) - 18} deg", f"{np.rad2deg(q) + 18} deg"] for i, q in enumerate(MIDDLE)}
     own = [f"{name}.camera_*" for name in cameras]
     boards = [f"{name}.board_[xyzr]*" for name, stated in cameras.items() if "boards_of" not in stated]
@@ -73,10 +81,7 @@ def simulated(folder: Path, cameras: dict[str, dict[str, object]], truth: dict[s
         "validation": {"holdout": 0, "folds": 0},
     }
     (folder / "config.yaml").write_text(yaml.safe_dump(content))
-    experiment = armcal.Experiment.load(folder / "config.yaml")
-    made = experiment.simulator().simulate(experiment.simulation_request)
-    write_csv(folder / "records.csv", made, experiment.request(measured=True).channels)
-    return experiment
+    return armcal.Experiment.load(folder / "config.yaml")
 
 
 def estimated(experiment: Experiment) -> Estimate:
