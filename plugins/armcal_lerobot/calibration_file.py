@@ -72,7 +72,7 @@ def read_motors(path: Path) -> MotorFile:
     text = text_of(input_bytes(path, _MAX_BYTES, "a LeRobot calibration file (JSON)"), path, "Save it as UTF-8 text.")
     try:
         content = json.loads(text, object_pairs_hook=lambda pairs: _unique(path, pairs))
-    except (json.JSONDecodeError, RecursionError) as fault:
+    except (ValueError, RecursionError) as fault:
         where = Location(str(path), line=getattr(fault, "lineno", None))
         hint = "Take the file that lerobot-calibrate wrote, whole."
         raise DataError(f"it is not JSON ({getattr(fault, 'msg', fault)}).", where=where, hint=hint) from fault
@@ -84,6 +84,8 @@ def read_motors(path: Path) -> MotorFile:
 
 
 def _motor(path: Path, name: str, entry: Any) -> Motor:
+    if not name.isprintable():
+        _refuse(path, ascii(name), "found a name that cannot be printed, expected a motor's.", "Rename it.")
     if not isinstance(entry, dict):
         _refuse(path, name, f"found {_kind(entry)}, expected {', '.join(_FIELDS)}.", "Give LeRobot's calibration file.")
     for field in _FIELDS:

@@ -17,7 +17,7 @@ from armcal.errors import InputError, Location
 
 from armcal_lerobot.calibration_file import MotorFile
 from armcal_lerobot.comparison import poses_of
-from armcal_lerobot.gripper import Gripper, wiring_of
+from armcal_lerobot.gripper import Gripper, require_single, wiring_of
 from armcal_lerobot.motion import read_motion, require_motors
 from armcal_lerobot.motors import Motor, Units, is_gripper, teeth_of, zero_shift_deg
 from armcal_lerobot.recordings import open_recording
@@ -119,13 +119,20 @@ def sections(file: MotorFile, gripper: Gripper | None, model: str) -> str:
     return "\n".join([*lines, "  priors:", *priors, ""])
 
 
-def wired_zeros(zeros: Mapping[str, Zero], file: MotorFile, joints: Sequence[str]) -> dict[str, tuple[Zero, int]]:
-    """Each motor's zero, with the sense of its joint.
+def wired_zeros(
+    zeros: Mapping[str, Zero], left: Mapping[str, str], file: MotorFile, joints: Sequence[str]
+) -> dict[str, tuple[Zero, int]]:
+    """Each motor's zero, with the sense of its joint; ``left`` has the joints that keep theirs.
 
     Raises:
-        InputError: a joint has no motor in the file.
+        InputError: a joint has no motor in the file, or ``joints`` names one that the arm has not, or a motor twice.
     """
     wiring = {follows.joint: (motor, follows.sense) for motor, follows in wiring_of(joints).items()}
+    unknown = [joint for joint in wiring if joint not in {**zeros, **left}]
+    if unknown:
+        hint = f"Its joints are {', '.join([*zeros, *left])}: --joint MOTOR=JOINT."
+        raise InputError(f"found no joint {unknown[0]!r} in this arm.", hint=hint)
+    require_single([wiring.get(joint, (joint, 1))[0] for joint in zeros])
     wired = {}
     for joint, zero in zeros.items():
         motor, sense = wiring.get(joint, (joint, 1))

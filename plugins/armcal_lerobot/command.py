@@ -101,12 +101,14 @@ def zeros(console: Console, calibrated: Path, calibration: Path, arm_name: str |
     from armcal.calibration.joint_zeros import zeros_of
 
     from armcal_lerobot.check import show_zeros, wired_zeros
-    from armcal_lerobot.zeros import rezeroed
+    from armcal_lerobot.zeros import require_not_written, rezeroed
 
     file = read_motors(calibration)
     known, left = zeros_of(calibrated, arm_name, console.registry())
-    wired = wired_zeros(known, file, given["joints"])
+    wired = wired_zeros(known, left, file, given["joints"])
     changed = {name: motor for name, motor in rezeroed(file, wired).items() if motor != file.motors[name]}
+    if changed:
+        require_not_written(file, wired)
     for joint, reason in left.items():
         console.warn(f"{joint} keeps its zero: {reason}")
     show_zeros(console, file, changed, wired)

@@ -96,6 +96,19 @@ def shifts(one: Motion, two: Motion) -> tuple[Shift, ...]:
     return tuple(made)
 
 
+def copy_findings(motion: Motion) -> list[str]:
+    """Whether states are a copy of the commands, of the same frame or of the one before: then nothing was measured."""
+    moves = any(np.ptp(stretch.reached, axis=0).any() for stretch in motion.stretches)
+    for late, frame in enumerate(("same frame", "frame before")):
+        pairs = ((s.commanded[: len(s.commanded) - late], s.reached[late:]) for s in motion.stretches)
+        if moves and all(np.array_equal(*pair) for pair in pairs):
+            return [
+                f"Every state is the command of the {frame}: one was copied from the other, and not measured. What "
+                "follows says nothing about the arm."
+            ]
+    return []
+
+
 def findings_of(trackings: Sequence[Tracking]) -> list[str]:
     """What is wrong between command and state, a sentence each."""
     known = [t for t in trackings if t.delay_s]

@@ -96,6 +96,7 @@ class Gripper:
     def require(self, motors: Sequence[str]) -> None:
         """Raise InputError unless each joint has a motor of these, and each motor but the gripper's a joint."""
         missing = [joint for joint in self.joints if self._wiring[joint][0] not in motors]
+        require_single([self._wiring[joint][0] for joint in self.joints])
         wired = {self._wiring[joint][0] for joint in self.joints}
         idle = [motor for motor in motors if motor not in wired and not is_gripper(motor)]
         if missing:
@@ -151,6 +152,14 @@ def _chosen(path: Path, arms: Sequence[str], arm: str | None) -> str:
             f"{text}.", where=Location(str(path)), hint=f"Choose one of {', '.join(arms)} with --arm-name."
         )
     return str(arm)
+
+
+def require_single(names: Sequence[str]) -> None:
+    """Raise InputError if a motor turns two joints, or a joint is turned by two motors."""
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        hint = "Where two are exchanged give --joint for both of them."
+        raise InputError(f"found {twice} twice, by --joint and by its own name, expected it once.", hint=hint)
 
 
 def wiring_of(texts: Sequence[str]) -> dict[str, Follows]:

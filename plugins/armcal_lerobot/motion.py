@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from armcal_lerobot.calibration_file import MotorFile
 from armcal_lerobot.motors import Units, is_gripper
-from armcal_lerobot.recordings import ACTION, STATE, Recording
+from armcal_lerobot.recordings import ACTION, STATE, Frames, Recording
 
 MOST_FRAMES = 100_000
 """Of a larger data set every second, third, ... episode is taken, so that memory stays bounded."""
 _START_FRAMES = 5
 _FEWEST = 10
+_MOST_PERCENT = 105.0
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,7 @@ def read_motion(recording: Recording, units: Units, file: MotorFile | None) -> M
     stretches, taken = [], 0
     columns: list[tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]] = []
     for frames in recording.read((ACTION, STATE)):
+        require_percent(frames, recording, units)
         keep = frames.episode % step == 0
         if keep.any() and taken < MOST_FRAMES:
             some = frames.chosen(keep)
@@ -102,6 +104,16 @@ def read_motion(recording: Recording, units: Units, file: MotorFile | None) -> M
         text = f"found no {_FEWEST} frames in a row of one episode."
         raise DataError(text, where=where, hint="Record episodes without gaps.")
     return Motion(motors, shown, recording.fps, tuple(stretches), taken, recording.frames)
+
+
+def require_percent(frames: Frames, recording: Recording, units: Units) -> None:
+    """Raise DataError if states that should be percent are more than their ranges let them be."""
+    beyond = np.argwhere(np.abs(frames.vectors[STATE]) > _MOST_PERCENT)
+    if units == "percent" and len(beyond):
+        row, column = beyond[0]
+        text = f"found {frames.vectors[STATE][row, column]:.1f} of {recording.motors[column]}, expected percent."
+        hint = "Its numbers are degrees: leave --units percent out."
+        raise DataError(text, where=Location(str(frames.file), field=STATE), hint=hint)
 
 
 def require_motors(file: MotorFile, motors: Sequence[str]) -> None:

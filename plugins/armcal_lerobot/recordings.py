@@ -315,7 +315,7 @@ def _json(path: Path) -> dict[str, Any]:
     text = text_of(input_bytes(path, _MAX_META, "a LeRobot data set's meta/info.json"), path, "Save it as UTF-8 text.")
     try:
         content = json.loads(text)
-    except (json.JSONDecodeError, RecursionError) as fault:
+    except (ValueError, RecursionError) as fault:
         where = Location(str(path), line=getattr(fault, "lineno", None))
         raise DataError(f"it is not JSON ({getattr(fault, 'msg', fault)}).", where=where, hint=_RECORD_AGAIN) from fault
     if not isinstance(content, dict):

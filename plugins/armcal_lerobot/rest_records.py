@@ -17,8 +17,8 @@ from armcal.io.file_set import write_over
 from armcal.measure.rests import StillSettings, rests
 
 from armcal_lerobot.calibration_file import MotorFile
-from armcal_lerobot.gripper import Follows
-from armcal_lerobot.motion import unit_of
+from armcal_lerobot.gripper import Follows, require_single
+from armcal_lerobot.motion import require_percent, unit_of
 from armcal_lerobot.motors import Units, is_gripper
 from armcal_lerobot.recordings import ACTION, STATE, Frames, Recording
 from armcal_lerobot.tracking import sides
@@ -63,6 +63,7 @@ def records_of(
     still = StillSettings.si(window=window_s, spread=spread_deg * _DEG)
     records = []
     for frames in _episodes(recording):
+        require_percent(frames, recording, units)
         shown = frames.vectors[STATE if angles == "state" else ACTION] * factors
         moved = np.column_stack([sides(column)[0] for column in (frames.vectors[ACTION] * factors).T])
         turning = [i for i, name in enumerate(recording.motors) if not is_gripper(name)]
@@ -82,7 +83,16 @@ def records_of(
 def write_records(
     out: Path, motors: Sequence[str], records: Sequence[RestRecord], wiring: Mapping[str, Follows], has_images: bool
 ) -> None:
-    """Write a CSV: pose_id, angles and approaches of every joint but the gripper's, and the image's name."""
+    """Write a CSV: pose_id, angles and approaches of every joint but the gripper's, and the image's name.
+
+    Raises:
+        InputError: the wiring names no motor of these, or a joint twice.
+    """
+    unknown = [name for name in wiring if name not in motors]
+    if unknown:
+        hint = f"Its motors are {', '.join(motors)}: --joint MOTOR=JOINT."
+        raise InputError(f"found no motor {unknown[0]!r} in the data set.", hint=hint)
+    require_single([wiring.get(name, Follows(name)).joint for name in motors])
     turned = [(i, wiring.get(name, Follows(name))) for i, name in enumerate(motors) if not is_gripper(name)]
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")

@@ -13,6 +13,7 @@ from armcal.report.page import rendered
 from armcal.version import __version__
 
 from armcal_lerobot.comparison import (
+    copy_findings,
     costs_at,
     findings_of,
     gravity_of,
@@ -69,7 +70,7 @@ def _content(motion: Motion, followed: Sequence[Tracking], gripper: Gripper | No
         "of_frames": motion.of,
         "episodes": len(motion.starts),
         "motors": {t.motor: asdict(t) for t in followed},
-        "findings": findings_of(followed),
+        "findings": [*copy_findings(motion), *findings_of(followed)],
     }
     if gripper is None:
         return content

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from glob import escape
 
 from armcal.calibration.joint_zeros import Zero
 from armcal.errors import InputError, Location
 
-from armcal_lerobot.calibration_file import MotorFile
+from armcal_lerobot.calibration_file import MotorFile, read_motors
 from armcal_lerobot.motors import DEGREES_A_COUNT, LARGEST_OFFSET, Motor, remount
 
 
@@ -26,6 +27,16 @@ def rezeroed(file: MotorFile, zeros: Mapping[str, tuple[Zero, int]]) -> dict[str
         InputError: an offset is larger than a servo stores, or nothing is left of a range.
     """
     return {name: _moved(file, file.motors[name], zero, sense) for name, (zero, sense) in zeros.items()}
+
+
+def require_not_written(file: MotorFile, zeros: Mapping[str, tuple[Zero, int]]) -> None:
+    """Raise InputError if these zeros made the file of an older one beside it: written again they would count twice."""
+    for path in sorted(file.path.parent.glob(f"{escape(file.path.stem)}.before-*{file.path.suffix}")):
+        old = read_motors(path)
+        if set(zeros) <= set(old.motors) and {**old.motors, **rezeroed(old, zeros)} == file.motors:
+            hint = "Record anew with this file, and calibrate from those records; or take the old file back first."
+            text = f"it has these zeros already: they were written over {path.name}."
+            raise InputError(text, where=Location(str(file.path)), hint=hint)
 
 
 def _moved(file: MotorFile, motor: Motor, zero: Zero, sense: int) -> Motor:

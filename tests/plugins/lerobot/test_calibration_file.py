@@ -115,3 +115,12 @@ def test_zeros_of_two_files() -> None:
     assert zero_shift_deg(one, Motor("q", 1, 0, 2000 - 4096, 900, 3100)) == pytest.approx(0)
     assert [teeth_of(x) for x in (14.6, -29.0, 7.0, 2.0, 43.0)] == [1, -2, 0, 0, 3]
     assert math.isclose(one.half_range_deg, 1100 * 360 / 4095)
+
+
+def test_numbers_and_names_beyond_all_measure_are_refused(tmp_path: Path) -> None:
+    path = write_motors(tmp_path / "arm.json")
+    text = path.read_text()
+    for old, new in (('"id": 1', '"id": 1' + 5000 * "0"), ('"elbow_flex"', '"\\ud800"')):
+        path.write_text(text.replace(old, new, 1))
+        with pytest.raises(DataError, match=r"arm\.json"):
+            read_motors(path)

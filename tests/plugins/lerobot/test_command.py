@@ -194,3 +194,32 @@ def test_joints_without_a_motor_are_named(tmp_path: Path) -> None:
     assert "roll" in called("check", path, "--arm", ARM, "--joint", "roll=-wrist_roll")
     with pytest.raises(ArmcalError, match="found no joint 'q9'"):
         called("check", path, "--arm", ARM, "--joint", "roll=q9")
+
+
+def test_zeros_are_written_once(tmp_path: Path, calibrated: Path) -> None:
+    path = write_motors(tmp_path / "arm.json")
+    called("zeros", calibrated, path, "--yes")
+    text = path.read_text()
+    with pytest.raises(InputError, match="it has these zeros already"):
+        called("zeros", calibrated, path, "--yes")
+    assert path.read_text() == text
+
+
+def test_zeros_of_a_misspelt_joint_are_refused(tmp_path: Path, calibrated: Path) -> None:
+    path = write_motors(tmp_path / "arm.json")
+    with pytest.raises(InputError, match="no joint 'elbow'"):
+        called("zeros", calibrated, path, "--joint", "elbow_flex=-elbow", "--yes")
+    with pytest.raises(InputError, match="found shoulder_pan twice"):
+        called("zeros", calibrated, path, "--joint", "shoulder_pan=elbow_flex", "--yes")
+    with pytest.raises(InputError, match="found elbow_flex twice"):
+        called("check", path, "--arm", ARM, "--joint", "elbow_flex=shoulder_pan")
+
+
+def test_states_that_were_copied_from_commands_are_named(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    made = episodes({}, count=2, frames=200)
+    same = write_dataset(tmp_path / "same", [(state, state) for _, state in made])
+    assert "Every state is the command of the same frame" in called("compare", same)
+    late = write_dataset(tmp_path / "late", [(np.r_[state[1:], state[-1:]], state) for _, state in made])
+    assert "Every state is the command of the frame before" in called("compare", late)
+    assert "Every state" not in called("compare", write_dataset(tmp_path / "set", made))

@@ -106,3 +106,13 @@ def test_images_are_of_the_rests(tmp_path: Path, version: str) -> None:
         called(data, "--out", tmp_path / "rests.csv", "--camera", CAMERA, "--images", tmp_path / "images")
     with pytest.raises(DataError, match="side"):
         called(data, "--out", tmp_path / "rests.csv", "--camera", "observation.images.side", "--images", tmp_path / "i")
+
+
+def test_wrong_joints_and_units_are_refused(tmp_path: Path) -> None:
+    made = [(3 * action, 3 * state) for action, state in with_rests(1)]
+    data, file = write_dataset(tmp_path / "set", made), write_motors(tmp_path / "arm.json")
+    for joint, message in (("elbow_flx=-elbow_flex", "no motor 'elbow_flx'"), ("elbow_flex=shoulder_pan", "twice")):
+        with pytest.raises(InputError, match=message):
+            called(data, "--out", tmp_path / "rests.csv", "--joint", joint)
+    with pytest.raises(DataError, match="expected percent"):
+        called(data, "--out", tmp_path / "rests.csv", "--units", "percent", "--calibration", file)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -169,3 +170,10 @@ def test_a_refusal_ends_with_2_and_writes_nothing(tmp_path):
     (tmp_path / "arm.urdf").write_text("mine")
     assert armcal("maker", tmp_path / "k.yaml", "--out", tmp_path / "arm.urdf").exit_code == 2
     assert (tmp_path / "arm.urdf").read_text() == "mine"
+
+
+def test_aliases_are_refused_before_they_grow(tmp_path: Path) -> None:
+    path = tmp_path / "k.yaml"
+    path.write_text("a: &a {x: 1}\nkinematics: {shoulder: *a}\n")
+    with pytest.raises(InputError, match=r"k\.yaml:2: found the alias \*a"):
+        read_maker(path)
