@@ -63,7 +63,8 @@ def check_content(
 
 def show_check(console: Console, content: Mapping[str, Any]) -> None:
     """A row a motor, and the sum of it."""
-    motors, has_mm, has_two = content["motors"], "poses" in content, "zero_moved_deg" in _first(content["motors"])
+    motors, has_mm = content["motors"], "poses" in content
+    has_two = all("zero_moved_deg" in motor for motor in motors.values())
     columns = ["motor", "range, deg", *(() if has_two else ("id", "offset"))]
     columns += ["mm per deg"] if has_mm else []
     columns += ["moved, deg"] if has_two else []
@@ -96,7 +97,9 @@ def show_check(console: Console, content: Mapping[str, Any]) -> None:
 def sections(file: MotorFile, gripper: Gripper | None, model: str) -> str:
     """Sections of a configuration: the joints of a servo bus, the limits of a plan, zeros and priors of a servo map."""
     arm = gripper.name if gripper else "arm"
-    turned = [(joint, *gripper.motor_of(joint)) for joint in gripper.joints] if gripper else _same_names(file)
+    turned = [(name, name, 1) for name in file.motors if not is_gripper(name)]
+    if gripper:
+        turned = [(joint, *gripper.motor_of(joint)) for joint in gripper.joints]
     lines = [f"# From {file.path.name}, LeRobot's motor calibration.", "bench:", "  device:"]
     lines += ["    type: servobus", "    port: /dev/ttyACM0", "    joints:"]
     limits, values, priors = [], [], []
@@ -189,14 +192,6 @@ def _moved(file: MotorFile, other: MotorFile, gripper: Gripper, angles: Array, u
         stretched = two.degrees_in(units) / one.degrees_in(units) - 1
         moved[name] = zero_shift_deg(one, two) + stretched * sense * np.degrees(angles[index])
     return moved
-
-
-def _same_names(file: MotorFile) -> list[tuple[str, str, int]]:
-    return [(name, name, 1) for name in file.motors if not is_gripper(name)]
-
-
-def _first(motors: Mapping[str, Any]) -> Mapping[str, Any]:
-    return next(iter(motors.values()))
 
 
 def _pair(cost: Mapping[str, float] | None) -> str:

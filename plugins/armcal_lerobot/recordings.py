@@ -29,15 +29,6 @@ _KNOWN = ("v2.0", "v2.1", "v3.")
 _RECORD_AGAIN = "Take the file again from where it was recorded."
 
 
-def parquet() -> Any:
-    """The module ``pyarrow.parquet``.
-
-    Raises:
-        PluginError: pyarrow is not installed.
-    """
-    return library("pyarrow.parquet", "reading LeRobot's data sets")
-
-
 @dataclass(frozen=True)
 class Frames:
     """Some frames in a row: their file, episode (N), frame in it (N), time (N, s), vectors (N x size) by feature."""
@@ -258,7 +249,8 @@ def _read(file: Path, features: Sequence[str], sizes: Mapping[str, int]) -> Iter
 
 
 def _batches(file: Path, columns: Sequence[str]) -> Iterator[Any]:
-    with _damage_named(file), parquet().ParquetFile(file, memory_map=True) as table:
+    parquet = library("pyarrow.parquet", "reading LeRobot's data sets")
+    with _damage_named(file), parquet.ParquetFile(file, memory_map=True) as table:
         there = table.schema_arrow.names
         for column in columns:
             if column not in there:

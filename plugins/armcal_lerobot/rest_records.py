@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +11,7 @@ import numpy as np
 from armcal.base.domains import Array
 from armcal.errors import DataError, InputError, Location
 from armcal.extras import library
+from armcal.io.cells import csv_text
 from armcal.io.file_set import write_over
 from armcal.measure.rests import StillSettings, rests
 
@@ -94,18 +93,14 @@ def write_records(
         raise InputError(f"found no motor {unknown[0]!r} in the data set.", hint=hint)
     require_single([wiring.get(name, Follows(name)).joint for name in motors])
     turned = [(i, wiring.get(name, Follows(name))) for i, name in enumerate(motors) if not is_gripper(name)]
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    names = [name for _, follows in turned for name in (f"{follows.joint}_deg", f"approach_{follows.joint}")]
-    writer.writerow(["pose_id", *names, *(["image"] if has_images else [])])
+    columns = [name for _, follows in turned for name in (f"{follows.joint}_deg", f"approach_{follows.joint}")]
+    rows: list[list[object]] = [["pose_id", *columns, *(["image"] if has_images else [])]]
     for record in records:
-        cells = [
-            text
-            for i, follows in turned
-            for text in (f"{follows.sense * record.degrees[i]:.4f}", f"{follows.sense * record.approach[i]:.0f}")
-        ]
-        writer.writerow([record.name, *cells, *([f"{record.name}.png"] if has_images else [])])
-    write_over({out: stream.getvalue().encode()})
+        row: list[object] = [record.name]
+        for i, follows in turned:
+            row += [float(follows.sense * record.degrees[i]), int(follows.sense * record.approach[i])]
+        rows.append([*row, f"{record.name}.png"] if has_images else row)
+    write_over({out: csv_text(rows, ".4f").encode()})
 
 
 def write_images(recording: Recording, camera: str, records: Sequence[RestRecord], folder: Path) -> None:

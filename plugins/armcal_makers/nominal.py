@@ -87,19 +87,17 @@ class Family:
         format: what armcal calls their file.
         base: the frame that the first transform starts from, in the maker's own URDF.
         flange: the frame of the last joint, there.
-        hashed: whether the file names the calibration that the robot itself has.
         limits: of all joints (rad), where they share them.
     """
 
     format: str
     base: str
     flange: str
-    hashed: bool
     limits: tuple[float, float] | None
 
 
-UR = Family("ur_calibration", "base_link_inertia", "wrist_3_link", True, (-2 * math.pi, 2 * math.pi))
-XARM = Family("xarm_kinematics", "link_base", "link_eef", False, None)
+UR = Family("ur_calibration", "base_link_inertia", "wrist_3_link", (-2 * math.pi, 2 * math.pi))
+XARM = Family("xarm_kinematics", "link_base", "link_eef", None)
 
 
 @dataclass(frozen=True)
