@@ -152,7 +152,8 @@ def test_the_command_asks_and_tells(tmp_path: Path) -> None:
 
     with serving(tmp_path):
         told = json.loads(armcal("what-if", "q1_deg=-10", "q2_deg=5.5").stdout)
-        assert told == {"asked": {"command": "what_if", "joints": {"q1_deg": -10.0, "q2_deg": 5.5}}}
+        asked = {"command": "what_if", "joints": {"q1_deg": -10.0, "q2_deg": 5.5}}
+        assert told == {"schema_version": 1, "asked": asked}
         assert armcal("pause", "-q").output == ""
         refused = armcal("rollback", "7")
         assert refused.exit_code == 2 and "does not reach there. Give a later one." in refused.output
