@@ -47,13 +47,13 @@ class Component:
         try:
             return getattr(import_module(module), attribute)
         except ModuleNotFoundError as fault:
-            named = f"the {self.kind} {self.name!r}"
+            named = f"the {_kind_name(self.kind)} {self.name!r}"
             raise (missing_library(fault, named) if extra_of(fault.name or "") else self._broken(fault)) from fault
         except (Exception, SystemExit) as fault:  # a plugin may fail in any way; the error names it and the reason
             raise self._broken(fault) from fault
 
     def _broken(self, fault: BaseException) -> PluginError:
-        text = f"the {self.kind} {self.name!r} of the plugin {self.plugin!r} does not load: {said(fault)}."
+        text = f"the {_kind_name(self.kind)} {self.name!r} of the plugin {self.plugin!r} does not load: {said(fault)}."
         return PluginError(text, hint="Repair or update that plugin.")
 
 
@@ -141,14 +141,19 @@ class PluginRegistry:
         return faults
 
 
-def _spoken(kind: str) -> str:
-    """A kind with its article."""
-    name = {
+def _kind_name(kind: str) -> str:
+    names = {
         "online": "online estimator",
         "joints": "joint stream",
         "bench": "simulated bench",
         "report_section": "report section",
-    }.get(kind, kind)
+    }
+    return names.get(kind, kind)
+
+
+def _spoken(kind: str) -> str:
+    """A kind with its article."""
+    name = _kind_name(kind)
     return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
 
 

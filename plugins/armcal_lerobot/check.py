@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -108,8 +110,8 @@ def sections(file: MotorFile, gripper: Gripper | None, model: str) -> str:
         low, high = (f"{end:.1f}" for end in motor.limits)
         direction = "direction: -1, " if sense < 0 else ""
         servo = f"id: {motor.id}, model: {model}, zero_count: {round(motor.middle)}, offset: {motor.homing_offset}"
-        lines.append(f"      {arm}.{joint}: {{{servo}, {direction}range_deg: [{low}, {high}]}}")
-        limits.append(f"    {joint}: [{low} deg, {high} deg]")
+        lines.append(f"      {_key(f'{arm}.{joint}')}: {{{servo}, {direction}range_deg: [{low}, {high}]}}")
+        limits.append(f"    {_key(joint)}: [{low} deg, {high} deg]")
         ends = gripper.limits[joint] if gripper else None
         middle = math.degrees(sum(ends)) / 2 if ends and not motor.turns_freely else 0.0
         unswept = abs(math.degrees(ends[1] - ends[0]) - 2 * motor.half_range_deg) / 2 if ends else 0.0
@@ -120,6 +122,11 @@ def sections(file: MotorFile, gripper: Gripper | None, model: str) -> str:
     lines += ["# With an effect {type: servo_map, gains: one} called zeros:", "parameters:"]
     lines += ["  values:           # LeRobot's zero is the middle of the range", *values] if values else []
     return "\n".join([*lines, "  priors:", *priors, ""])
+
+
+def _key(name: str) -> str:
+    """A name as a key of YAML: quoted, if it is not a plain one."""
+    return name if re.fullmatch(r"[A-Za-z_][\w.-]*", name) else json.dumps(name)
 
 
 def wired_zeros(

@@ -96,6 +96,13 @@ def test_sections_are_a_configuration(tmp_path: Path) -> None:
     assert armcal.Experiment.load(path).parameters["arm.zeros.offset3"].free
 
 
+def test_motors_of_any_name_give_sections_that_load(tmp_path: Path) -> None:
+    name = "[odd]: 'motor"
+    (tmp_path / "one.json").write_text(json.dumps({name: motor_entries()["elbow_flex"]}))
+    sections = yaml.safe_load(called("joints", tmp_path / "one.json"))
+    assert list(sections["bench"]["device"]["joints"]) == [f"arm.{name}"] and list(sections["plan"]["limits"]) == [name]
+
+
 def test_limits_of_the_arm_give_zeros_and_name_ranges_that_were_not_swept(tmp_path: Path) -> None:
     import re
 
