@@ -31,6 +31,12 @@ from armcal_bench.journal_folder import Start
 from armcal_bench.waiting import duration
 from armcal_bench.wiring import check_wiring
 
+_UNRECORDED = (
+    "what was checked of servos that know where they stand is kept nowhere: with a wrong id or direction a joint is "
+    "driven the wrong way. armcal servo {config} --check sees it by the tracker, armcal bus wiring {config} by hand; "
+    "--unchecked leaves this line out."
+)
+
 
 @click.command("acquire")
 @plan_option
@@ -61,6 +67,8 @@ def acquire_command(
         raise InputError("found no --out.", hint="Say where data and journal are to be kept, or give --dry-run.")
     if not console.json:
         show_forecast(console, prepared, forecast)
+    if isinstance(prepared.device, MeasuringDevice) and not unchecked:
+        console.warn(_UNRECORDED.format(config=config))
     outcome = driven(console, prepared, plan, (out, "resume" if resume else "anew"), may_energise, unchecked=unchecked)
     show_outcome(console, outcome, config, out)
     sys.exit(exit_code_of(outcome))

@@ -47,7 +47,7 @@ def armcal(folder: Path, *words: str | Path, sets: tuple[str, ...] = ()) -> str:
     command = [sys.executable, "-m", "armcal.cli", *map(str, words), *given]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=folder)
     assert done.returncode == 0, f"{words}: {done.stdout}\n{done.stderr}"
-    return done.stdout
+    return f"{done.stdout}{done.stderr}" if words[0] == "acquire" else done.stdout
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,10 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loop]:
         found = json.loads(armcal(folder, "bus", "find", folder / "bench" / BOARD, "--last-id", "8", "--json"))
         ids = [(servo["baud"], servo["id"], servo["model"]) for servo in found["servos"]]
         armcal(folder, "servo", CONFIG, "--check", "--yes", sets=sets)
-        armcal(folder, "acquire", CONFIG, "--plan", folder / "plan.csv", "--out", folder / "runs", "--yes", sets=sets)
+        told = armcal(
+            folder, "acquire", CONFIG, "--plan", folder / "plan.csv", "--out", folder / "runs", "--yes", sets=sets
+        )
+        assert "armcal bus wiring" in told, "no check is on record"
         armcal(folder, "acquire", CONFIG, "--plan", folder / "fresh.csv", "--out", folder / "again", "--yes", sets=sets)
         clock = SimulatedClock(folder / "bench" / CLOCK)
         state = clock.ask({"state": True})
