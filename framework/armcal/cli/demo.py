@@ -40,7 +40,8 @@ def demo(ctx: click.Context, console: Console, name: str, out: Path | None) -> N
     console.line(f"the files of {name} are in {folder}; armcal run {folder / _CONFIG} --out {results}")
     from armcal.cli.run import run  # all of the solver
 
-    options = [name for name, given in zip(("--json", "-q", "-v"), vars(console).values(), strict=True) if given]
+    spoken = {"--json": console.json, "-q": console.quiet, "-v": console.verbose}
+    options = [option for option, is_given in spoken.items() if is_given]
     arguments = [str(folder / _CONFIG), "--out", str(results), *options]
     with run.make_context("run", arguments, parent=ctx.parent) as running:
         run.invoke(running)

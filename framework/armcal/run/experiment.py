@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -167,14 +167,14 @@ class Experiment:
 
     def provenance(self, dataset: Dataset) -> dict[str, Any]:
         """Where the numbers of a run on these records come from: files, hashes, versions."""
-        packages = ("armcal", "numpy", "scipy", "casadi")
+        packages = {name: _version(name) for name in ("armcal", "numpy", "scipy", "casadi", "cvxpy")}
         return {
             "config": str(self.source.path),
             "config_files": [Path(file).name for file in self.source.files],
             "data": dataset.source,
             "data_sha256": dataset.sha256,
             "arm_sha256": identity_of(self.system.description),
-            "versions": {"python": sys.version.split()[0], **{name: version(name) for name in packages}},
+            "versions": {"python": sys.version.split()[0], **{name: v for name, v in packages.items() if v}},
             "plugins": {p.name: f"{p.distribution} {p.version}" for p in self.registry.plugins if not p.fault},
         }
 
@@ -219,3 +219,11 @@ def _gravity_warnings(settings: ExperimentSettings, gravity: Array) -> list[str]
     if gravity[2] > 0:
         texts.append("gravity points up along the base frame's z axis: right only for an arm that hangs.")
     return texts
+
+
+def _version(package: str) -> str:
+    """Of an installed package; empty of one that is not, as an extra's may be."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""

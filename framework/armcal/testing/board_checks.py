@@ -60,8 +60,9 @@ def check_device(record: Recorder, subject: Subject) -> None:
     with record.check("it may be closed before it was opened, and twice"):
         device.close()
         device.close()
+    own_port = "port" in subject.example  # one that is not there is refused
     with record.check("a link without anybody is an error of the device"):
-        _expect_lost(lambda: device.open(RealClock()), DeviceRefusedError)  # whose port is its own is not there
+        _expect_lost(lambda: device.open(RealClock()), *((DeviceRefusedError,) if own_port else ()))
     for call in (device.state, device.keep_alive, lambda: device.energise(JOINTS[0], 0.0)):
         with record.check("so is every call before it is opened"):
             _expect_lost(call)
