@@ -10,10 +10,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from armcal.base.domains import Array
 from armcal.devices.device import MeasuringDevice
+from armcal.devices.wiring import WiringRecord
 from armcal.errors import ConfigError
 from armcal.io.journal.journal import Journal
 from armcal.run.experiment import Experiment
@@ -24,7 +26,7 @@ from armcal_bench.acquisition.preparation import Prepared, prepare, run_limits
 from armcal_bench.acquisition.run_log import measured_by, progress_of
 from armcal_bench.bench import SECTION, Bench
 from armcal_bench.servo.nominal import NominalArm
-from armcal_bench.servo.trial import Move, Verdict, judged
+from armcal_bench.servo.trial import Move, Verdict, judged, noted
 from armcal_bench.settling import pose_of
 
 _TURNS_DEG = (12.0, -12.0, 6.0, -6.0)
@@ -50,9 +52,9 @@ class JointCheck:
     zeros: Mapping[str, float]
 
     @property
-    def far_zeros(self) -> list[str]:
-        """Of zeros that are further off than a calibration by hand leaves them, and the teeth of a horn."""
-        sentences = []
+    def far_zeros(self) -> dict[str, str]:
+        """Of zeros that are further off than a calibration by hand leaves them, and the teeth of a horn, by joint."""
+        sentences = {}
         for joint, zero in self.zeros.items():
             degrees = math.degrees(zero)
             if abs(degrees) < _UNREMARKABLE_DEG:
@@ -61,7 +63,7 @@ class JointCheck:
             about = f"{int(teeth)} or {int(teeth) + 1}"
             if abs(teeth - round(teeth)) < _CLEARLY:
                 about = f"about {round(teeth)}"
-            sentences.append(
+            sentences[joint] = (
                 f"{joint} stands {degrees:+.1f} deg from where its servo says, {about} teeth of a horn "
                 f"({_TOOTH_DEG:.1f} deg each). Remount the horn, or move its zero_count."
             )
@@ -71,7 +73,9 @@ class JointCheck:
 def check_joints(
     loaded: Callable[[tuple[str, ...]], Experiment], folder: Path, drive: Callable[[Prepared, Path, Path], object]
 ) -> JointCheck:
-    """Turn each joint a little, from where the arm stands.
+    """Turn each joint a little, from where the arm stands, and write down which are checked.
+
+    A zero that is far off makes limits and clearances wrong by as much: such a joint does not count as checked.
 
     Args:
         loaded: the experiment, with further overrides.
@@ -81,8 +85,9 @@ def check_joints(
     Raises:
         ConfigError: the device does not know where its joints stand, or the arm stands beyond a limit or too near to
             something.
+        InputError: it cannot be written down.
     """
-    here = _measured(loaded(()))
+    here, seen = _measured(loaded(()))
     park = ", ".join(f"{joint}: {math.degrees(angle):.4f} deg" for joint, angle in here.items())
     at = f"{SECTION}.acquisition"
     wide = (f"{at}.arrival.astray_mm=5000", f"{at}.arrival.astray_turned_deg=180")
@@ -101,11 +106,14 @@ def check_joints(
     with Journal.open(folder / "run" / "journal", {}) as journal:
         measured = {name: pose_of(record) for name, record in progress_of(journal.recovered.entries).measured.items()}
     commanded = dict(zip(prepared.plan.ids, prepared.scheduler.poses, strict=True))
-    return _judged(experiment, list(here), commanded, measured)
+    check = _judged(experiment, list(here), commanded, measured)
+    far = [replace(v, kind="unclear") if v.joint in check.far_zeros else v for v in check.verdicts]
+    noted(WiringRecord.of_config(experiment.source, here), far, seen)
+    return check
 
 
-def _measured(experiment: Experiment) -> dict[str, float]:
-    """Where the joints stand (rad), within their limits."""
+def _measured(experiment: Experiment) -> tuple[dict[str, float], dict[str, Any]]:
+    """Where the joints stand (rad), within their limits; on which adapter, when, and by what they are checked."""
     bench = Bench.of(experiment)
     device = bench.device()
     if not isinstance(device, MeasuringDevice):
@@ -116,13 +124,14 @@ def _measured(experiment: Experiment) -> dict[str, float]:
         )
     with bench.clock() as clock:
         try:
-            device.open(clock)
+            adapter = device.open(clock).adapter
             here = device.measured()
         finally:
             device.close()
+        seen = {"adapter": adapter, "by": "tracker", "at": clock.wall()}
     limits = run_limits(experiment, bench.settings.acquisition, bench.arm)
     ends = dict(zip(bench.arm.commanded, limits.tolist(), strict=True))
-    return {joint: min(max(here[joint], low), high) for joint, (low, high) in ends.items()}
+    return {joint: min(max(here[joint], low), high) for joint, (low, high) in ends.items()}, seen
 
 
 def _judged(

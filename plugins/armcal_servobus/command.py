@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ def check_command(console: Console, config: Path, overrides: tuple[str, ...]) ->
 
     Ids, models, homing offsets, limits, modes, voltages, alarms. Nothing is written to them.
     """
-    with opened(config, overrides) as (wires, joints):
+    with opened(config, overrides) as (wires, joints, _, _):
         examination = examined(wires, joints)
         there = {name: joints[name] for name in joints if name in examination.eeproms}
         readings = Servos(wires, there).readings()
@@ -67,10 +68,10 @@ def check_command(console: Console, config: Path, overrides: tuple[str, ...]) ->
 def wiring_command(console: Console, config: Path, overrides: tuple[str, ...]) -> None:
     """Check ids and directions by turning joints by hand.
 
-    The servos must be let go.
+    The servos must be let go. armcal acquire drives only joints that were right.
     """
     wrong: dict[str, str] = {}
-    with opened(config, overrides) as (wires, joints):
+    with opened(config, overrides) as (wires, joints, checks, adapter):
         servos = Servos(wires, joints)
         for name in joints:
             before = servos.positions()
@@ -80,7 +81,9 @@ def wiring_command(console: Console, config: Path, overrides: tuple[str, ...]) -
             if fault := turned(joints, before, servos.positions(), name):
                 wrong[name] = fault
             console.line(f"{name}: {wrong.get(name, 'right')}.")
-    console.result({"wrong": wrong, "right": [name for name in joints if name not in wrong]})
+    right = [name for name in joints if name not in wrong]
+    checks.note(right, wrong, {"adapter": adapter, "by": "somebody", "at": time.time()})
+    console.result({"wrong": wrong, "right": right})
     if wrong:
         sys.exit(EXIT_BAD_INPUT)
 

@@ -6,12 +6,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 from armcal.cli.common import FILE, overrides, speaking
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource, load_config
+from armcal.devices.wiring import WiringRecord
 from armcal.errors import ConfigError
 
 from armcal_servobus.bus import Bus
@@ -28,15 +29,25 @@ def on_config(command: Any) -> Any:
     return click.argument("config", type=FILE)(overrides(speaking(command)))
 
 
+class OpenBus(NamedTuple):
+    """A bus, all joints that are on it, what was checked of them, and the serial number of the adapter."""
+
+    wires: Bus
+    joints: dict[str, ServoJoint]
+    checks: WiringRecord
+    adapter: str
+
+
 @contextmanager
-def opened(config: Path, overrides: tuple[str, ...]) -> Iterator[tuple[Bus, dict[str, ServoJoint]]]:
-    """The bus of a configuration, open, and all joints that are on it."""
-    settings = _settings(load_config(config, overrides))
+def opened(config: Path, overrides: tuple[str, ...]) -> Iterator[OpenBus]:
+    """The bus of a configuration, open."""
+    source = load_config(config, overrides)
+    settings = _settings(source)
     joints = settings.chosen(settings.joints)
     wires = Bus(settings, named(joints))
-    wires.open()
+    adapter = wires.open()
     try:
-        yield wires, joints
+        yield OpenBus(wires, joints, WiringRecord.of_config(source, joints), adapter)
     finally:
         wires.close()
 

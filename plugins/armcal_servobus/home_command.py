@@ -44,7 +44,7 @@ def home_command(
     Afterwards the servos report the angles at which you hold the arm, or those that a calibration found. The
     differences are shown first, and what the servos hold is kept in a file.
     """
-    with opened(config, overrides) as (wires, all_joints):
+    with opened(config, overrides) as (wires, all_joints, checks, _):
         joints = _chosen(all_joints, chosen)
         targets = held_at(_angles(joints, stated))
         if calibration is not None:
@@ -62,6 +62,7 @@ def home_command(
             _ask(path)
         keep(path, wires, joints)
         console.line(f"what the servos hold is kept in {path}; --restore writes it back.")
+        checks.forget(joints)
         for plan in plans:
             write_offset(wires, plan)
     console.result({"kept": str(path), "offsets": {plan.joint.name: plan.content for plan in plans}})

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from armcal.cli.main import cli
@@ -10,26 +13,45 @@ from armcal_bench.acquisition.rehearsal import overrides_for
 from bench_runs import BenchRun
 from click.testing import CliRunner
 
-CONFIG = Path(__file__).resolve().parents[2] / "configs" / "so101" / "bench.yaml"
+CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "so101"
 SERVO = "bench.simulator.joints."
 
 
 def checked(folder: Path, *sets: str) -> tuple[int, str, dict[str, int]]:
-    """Exit code, what was printed, and the bench's offences."""
-    run = BenchRun(folder, sets, CONFIG, "device")
+    """Exit code, what was printed, and the bench's offences; the configuration is in the folder afterwards."""
+    config = shutil.copytree(CONFIGS, folder / "so101") / "bench.yaml"
+    run = BenchRun(folder, sets, config, "device")
     port = run.experiment.settings.bench["tracker"]["port"]  # type: ignore[index]
     with run.simulated() as clock:
         more = (f"bench.tracker.port={port}", *overrides_for(run.bench, "device"))
         words = [word for text in more for word in ("--set", text)]
-        done = CliRunner().invoke(cli, ["servo", str(CONFIG), "--check", "--yes", *words])
+        done = CliRunner().invoke(cli, ["servo", str(config), "--check", "--yes", *words])
         offences = clock.ask({"state": True})["offences"]
     return done.exit_code, " ".join(done.output.split()), offences
 
 
-def test_joints_that_turn_as_commanded_are_right(tmp_path: Path) -> None:
+def unchecked(folder: Path, *sets: str) -> str:
+    """Why ``acquire`` would not drive the arm."""
+    config, plan = folder / "so101" / "bench.yaml", folder / "one.csv"
+    plan.write_text(
+        "pose_id,shoulder_pan_deg,shoulder_lift_deg,elbow_flex_deg,wrist_flex_deg,wrist_roll_deg\np,0,-45,-25,20,0\n"
+    )
+    words = [word for text in (*overrides_for(folder / "bench", "device"), *sets) for word in ("--set", text)]
+    done = CliRunner().invoke(cli, ["acquire", str(config), "--plan", str(plan), "--dry-run", "--json", *words])
+    content: dict[str, Any] = json.loads(done.stdout)
+    return str(content["unchecked"])
+
+
+def test_joints_that_turn_as_commanded_are_right_and_only_those_are_driven(tmp_path: Path) -> None:
     code, text, offences = checked(tmp_path)
     assert (code, offences) == (0, {}), text
     assert text.count("deg, commanded +12.0 deg.") == 5
+    assert unchecked(tmp_path) == ""
+    changed = "bench.device.joints.elbow_flex.direction=-1", "bench.device.joints.wrist_roll.id=7"
+    assert "(elbow_flex, wrist_roll: changed since it was checked)" in unchecked(tmp_path, *changed)
+    assert "wrist_flex: changed" in unchecked(tmp_path, "bench.device.joints.wrist_flex.range_deg=[-95, 96]")
+    real = unchecked(tmp_path, "bench.clock=real")
+    assert "(shoulder_pan, shoulder_lift, elbow_flex, wrist_flex, wrist_roll: changed" in real, "it was a simulated one"
 
 
 @pytest.mark.parametrize(
@@ -47,3 +69,4 @@ def test_what_is_wrong_is_named_and_nothing_unsafe_is_done(tmp_path: Path, chang
     assert code != 0
     assert says in text
     assert offences == {}
+    assert f"{changes[0].partition('.')[0].partition('=')[0]}" in unchecked(tmp_path)

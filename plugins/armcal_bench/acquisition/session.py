@@ -15,6 +15,7 @@ from armcal.base.config_text import plain
 from armcal.calibration.calibration_file import identity_of
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceIdentity
+from armcal.devices.wiring import wiring_of
 from armcal.errors import InputError, Location
 
 from armcal_bench.acquisition import run_log as entry
@@ -28,7 +29,6 @@ from armcal_bench.hazards import FirstMotion
 from armcal_bench.journal_folder import Start, opened_journal
 from armcal_bench.settling import pose_of
 from armcal_bench.waiting import Waits
-from armcal_bench.wiring import check_wiring
 
 _SAME = {"plan": "plan", "config": "configuration"}
 """What a run that is resumed must have been begun with: entries of the journal's header, and their names."""
@@ -153,8 +153,9 @@ def _opened(
                 f"the run was begun with another board, or another calibration of it, than {identity.name}.",
                 hint="Connect the board that the run began with, with the servo file that it began with.",
             )
-        if not options.unchecked:
-            check_wiring(prepared.bench, device.joint_names, identity.adapter)
+        wiring = wiring_of(prepared.bench.experiment.source, device)
+        if wiring is not None and not options.unchecked:
+            wiring.check(device.joint_names, identity.adapter)
         monitor.open()
         hint = "Start it, check its address and the names of its bodies, and let it see them."
         monitor.await_first_frame(pause, hint)

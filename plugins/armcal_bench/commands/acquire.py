@@ -9,6 +9,7 @@ import click
 import numpy as np
 from armcal.cli.common import Console
 from armcal.devices.device import MeasuringDevice
+from armcal.devices.wiring import wiring_of
 from armcal.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_FAULT, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
 from armcal.io.signals import Signals
 
@@ -29,13 +30,6 @@ from armcal_bench.commands.common import (
 )
 from armcal_bench.journal_folder import Start
 from armcal_bench.waiting import duration
-from armcal_bench.wiring import check_wiring
-
-_UNRECORDED = (
-    "what was checked of servos that know where they stand is kept nowhere: with a wrong id or direction a joint is "
-    "driven the wrong way. armcal servo {config} --check sees it by the tracker, armcal bus wiring {config} by hand; "
-    "--unchecked leaves this line out."
-)
 
 
 @click.command("acquire")
@@ -43,7 +37,7 @@ _UNRECORDED = (
 @click.option("--out", type=FILE, help="The folder to keep data and journal in.")
 @click.option("--resume", is_flag=True, help="Go on with the run in that folder.")
 @click.option("--dry-run", is_flag=True, help="Say what the run would take, and open nothing.")
-@click.option("--unchecked", is_flag=True, help="Drive servos too that armcal servo --check has not seen to be right.")
+@click.option("--unchecked", is_flag=True, help="Drive servos too that no check has seen to be right.")
 @energise_option
 @on_bench
 def acquire_command(
@@ -67,8 +61,6 @@ def acquire_command(
         raise InputError("found no --out.", hint="Say where data and journal are to be kept, or give --dry-run.")
     if not console.json:
         show_forecast(console, prepared, forecast)
-    if isinstance(prepared.device, MeasuringDevice) and not unchecked:
-        console.warn(_UNRECORDED.format(config=config))
     outcome = driven(console, prepared, plan, (out, "resume" if resume else "anew"), may_energise, unchecked=unchecked)
     show_outcome(console, outcome, config, out)
     sys.exit(exit_code_of(outcome))
@@ -157,8 +149,10 @@ def _show_dry_run(console: Console, prepared: Prepared, forecast: ScheduleForeca
     measured = joints if isinstance(prepared.device, MeasuringDevice) else ()
     releases = prepared.settings.at_end == "release"
     hazards = prepared.judge.first_motion({}, {}, releases=releases, measured=measured).hazards
+    wiring = wiring_of(prepared.bench.experiment.source, prepared.device)
     try:
-        check_wiring(prepared.bench, joints)
+        if wiring is not None:
+            wiring.check(joints)
     except InputError as fault:
         unchecked = str(fault)
     content = {

@@ -15,13 +15,13 @@ import click
 from armcal.cli.common import Console
 from armcal.cli.outlet import say
 from armcal.devices.faults import DeviceError
+from armcal.devices.wiring import WiringRecord, servo_file_of
 from armcal.errors import EXIT_FAULT, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
 from armcal.io.signals import Signals
 from rich.table import Table
 
 from armcal_bench.acquisition.preparation import Prepared
 from armcal_bench.acquisition.tracker_monitor import StopRequested
-from armcal_bench.bench import Bench
 from armcal_bench.commands.acquire import driven
 from armcal_bench.commands.common import FILE, Question, energise_option, load, on_bench, waits, warned
 from armcal_bench.joint_check import check_joints
@@ -32,7 +32,6 @@ from armcal_bench.servo.record import NAME
 from armcal_bench.servo.session import Conversation, adapter_of, evaluated, measure, park, tried
 from armcal_bench.servo.setup import Setup
 from armcal_bench.servo.trial import Verdict, swapped
-from armcal_bench.wiring import carry_over, servo_file_of
 
 
 @click.command("servo")
@@ -60,7 +59,7 @@ def servo(
 ) -> None:
     """Find which pulse makes which angle of each servo on the bench of CONFIG, and write the servo file."""
     experiment = load(console, config, overrides)
-    if check and not guided and servo_file_of(Bench.of(experiment)) is None:
+    if check and not guided and servo_file_of(experiment.source) is None:
         _check_joints(console, config, overrides, may_energise)
         return
     setup = Setup.of(experiment)
@@ -95,7 +94,8 @@ def _evaluate(console: Console, setup: Setup, out: Path, keep: bool) -> None:
     write_results(out, content)
     earlier = None if keep else write_servo_file(setup.path, changed)
     if earlier is not None:
-        carry_over(setup.path, setup.file, changed)
+        before, after = (WiringRecord.of_servo_file(setup.path, file) for file in (setup.file, changed))
+        before.carry_over(after)
     console.result({**content, "servo_file": str(setup.path), "before": None if earlier is None else str(earlier)})
     _show(console, outcome, content)
     if earlier is not None:
@@ -137,7 +137,7 @@ def _check_joints(console: Console, config: Path, overrides: tuple[str, ...], ma
             driven(console, prepared, plan, (out, "anew"), may_energise, unchecked=True)
 
         check = check_joints(lambda more: load(console, config, (*overrides, *more)), Path(folder), drive)
-    _show_verdicts(console, check.verdicts, [], check.far_zeros)
+    _show_verdicts(console, check.verdicts, [], list(check.far_zeros.values()))
 
 
 @contextmanager

@@ -6,12 +6,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from armcal.base.domains import Array
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceIdentity
+from armcal.devices.wiring import WiringRecord
 from armcal.diagnose.measured_frame import FEWEST, frame_mistake
 from armcal.errors import InputError, Location
 
@@ -25,9 +26,8 @@ from armcal_bench.servo.mover import Mover, ServoDevice
 from armcal_bench.servo.outcome import Outcome, outcome_of
 from armcal_bench.servo.record import BEGUN, Record, begin, check_same, stated_by
 from armcal_bench.servo.setup import Setup
-from armcal_bench.servo.trial import Move, Verdict, answered, judged, wrapped
+from armcal_bench.servo.trial import Move, Verdict, answered, judged, noted, wrapped
 from armcal_bench.waiting import Waits
-from armcal_bench.wiring import note_checked
 
 _Glimpse = tuple[Mapping[str, float], Array]
 _AS_IT_IS = "its pulses go on as they are, unless the board brings the arm to its base pose"
@@ -103,10 +103,11 @@ def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
 
     Raises: as ``measure``.
     """
+    record = WiringRecord.of_servo_file(setup.path, setup.file)
     wrap = {joint: wrapped(joint, setup.file.servos[joint].angles, setup.ranges[joint]) for joint in setup.joints}
     away = [verdict for verdict in wrap.values() if verdict is not None]
     if away:  # by such a table no joint can be moved
-        _note(setup, away, {})
+        noted(record, away, {})
         return away
     with setup.bench.clock() as clock, _opened(setup, clock, talk, None) as (mover, identity):
         if seen == "tracker":
@@ -117,20 +118,8 @@ def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
             mover.to_base()
             with talk.wishes() as wishes:
                 verdicts = [_by_eye(mover, joint, talk, wishes) for joint in setup.joints]
-        _note(setup, verdicts, {"adapter": identity.adapter, "by": seen, "at": clock.wall()})
+        noted(record, verdicts, {"adapter": identity.adapter, "by": seen, "at": clock.wall()})
         return verdicts
-
-
-def _note(setup: Setup, verdicts: list[Verdict], seen: dict[str, Any]) -> None:
-    right = [verdict.joint for verdict in verdicts if verdict.kind == "right" and not verdict.other]
-    others = [verdict.joint for verdict in verdicts if verdict.joint not in right]
-    try:
-        note_checked(setup.path, setup.file, right, others, seen)
-    except InputError as fault:  # what was seen must not be lost with it
-        sentences = " ".join(f"{verdict.sentence} {verdict.mend}".rstrip() for verdict in verdicts)
-        raise InputError(
-            f"{fault.message} The check itself: {sentences}", where=fault.where, hint=fault.hint
-        ) from fault
 
 
 def park(setup: Setup, talk: Conversation, how: str) -> None:

@@ -14,6 +14,7 @@ from armcal.arm.servo import PulseClock, PulseTable
 from armcal.base.domains import Array
 from armcal.config.servo_file import ServoFile, load_servo_file
 from armcal.config.validate import validate
+from armcal.devices.wiring import servo_file_of
 from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment
 
@@ -25,7 +26,6 @@ from armcal_bench.hazards import HazardJudge
 from armcal_bench.servo.nominal import NominalArm
 from armcal_bench.servo.problem import KnownBoard, KnownServo, MeasuredPulse
 from armcal_bench.servo.settings import ServoCalibrationSettings
-from armcal_bench.wiring import servo_file_of
 
 AT = (SECTION, "servo")
 _LOOK_STEP = math.radians(2.0)
@@ -72,7 +72,7 @@ class Setup:
         settings = ServoCalibrationSettings()
         if bench.settings.servo is not None:
             settings = validate(ServoCalibrationSettings, experiment.source, AT)
-        path = settings.servos or servo_file_of(bench)
+        path = settings.servos or servo_file_of(experiment.source)
         if path is None:
             raise ConfigError(
                 "found no servo file.",

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 from armcal.base.domains import Array
+from armcal.devices.wiring import WiringRecord
+from armcal.errors import InputError
 from scipy.spatial.transform import Rotation
 
 from armcal_bench.servo.nominal import NominalArm
@@ -50,6 +52,21 @@ class Verdict:
     mend: str = ""
     turned: float = math.nan
     other: str = ""
+
+
+def noted(record: WiringRecord, verdicts: Sequence[Verdict], seen: Mapping[str, Any]) -> None:
+    """Write down as checked the joints that turned as commanded, and as no other joint did.
+
+    Raises:
+        InputError: it cannot be written; what was seen is said.
+    """
+    right = [verdict.joint for verdict in verdicts if verdict.kind == "right" and not verdict.other]
+    try:
+        record.note(right, [verdict.joint for verdict in verdicts if verdict.joint not in right], seen)
+    except InputError as fault:  # what was seen must not be lost with it
+        sentences = " ".join(f"{verdict.sentence} {verdict.mend}".rstrip() for verdict in verdicts)
+        message = f"{fault.message} The check itself: {sentences}"
+        raise InputError(message, where=fault.where, hint=fault.hint) from fault
 
 
 @dataclass(frozen=True, eq=False)

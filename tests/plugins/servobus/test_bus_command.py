@@ -10,6 +10,9 @@ import armcal
 import pytest
 import yaml
 from armcal.cli.main import cli
+from armcal.config.yaml_source import load_config
+from armcal.devices.wiring import WiringRecord
+from armcal.errors import InputError
 from armcal_servobus.homing import held_at, planned, turned
 from armcal_servobus.joints import ServoJointsSettings
 from click.testing import CliRunner, Result
@@ -169,8 +172,29 @@ def test_wiring_names_inverted_and_exchanged_joints(tmp_path):
         assert "nothing turned" in turned(joints, still, still, "q1")
         assert turned(joints, {"q1": 4000, "q2": 0}, {"q1": 200, "q2": 0}, "q1") == "", "over the seam"
         bus.close()
-        ran = called("wiring", written(tmp_path, fake.path), stdin="\n\n")
+        config = written(tmp_path, fake.path)
+        ran = called("wiring", config, stdin="\n\n")
         assert ran.exit_code == 2 and "q1: nothing turned" in ran.output
+        with pytest.raises(InputError, match=r"\(q1, q2: the last check did not find it right\).*armcal bus wiring"):
+            WiringRecord.of_config(load_config(config), ("q1", "q2")).check(("q1", "q2"))
+
+
+def test_what_was_checked_by_hand_lasts_until_offsets_are_written(tmp_path):
+    with FakeBus([sts(1), sts(2)]) as fake:
+        config = written(tmp_path, fake.path)
+        source = load_config(config)
+        checks = WiringRecord.of_config(source, ("arm.q1", "arm.q2"))
+        with pytest.raises(InputError, match="never checked"):
+            checks.check(("arm.q1",))
+        checks.note(("q1", "q2"), (), {"adapter": "", "by": "somebody", "at": 0.0})
+        checks.check(("arm.q1", "q2"))
+        with pytest.raises(InputError, match="an adapter without an id"):
+            checks.check(("q1",), "A1B2")
+        ran = called("home", config, "--joint", "q1", "--yes")
+        assert ran.exit_code == 0, ran.output
+        checks.check(("q2",))
+        with pytest.raises(InputError, match=r"\(q1: never checked\)"):
+            checks.check(("q1", "q2"))
 
 
 def test_a_configuration_without_a_servo_bus_is_refused(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -24,7 +25,6 @@ from armcal_bench.bench import Bench
 from bench_runs import free_port
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "so101"
-CONFIG = CONFIGS / "bench.yaml"
 POSES, FRESH = 40, 20
 pytestmark = pytest.mark.slow
 
@@ -47,31 +47,29 @@ def armcal(folder: Path, *words: str | Path, sets: tuple[str, ...] = ()) -> str:
     command = [sys.executable, "-m", "armcal.cli", *map(str, words), *given]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=folder)
     assert done.returncode == 0, f"{words}: {done.stdout}\n{done.stderr}"
-    return f"{done.stdout}{done.stderr}" if words[0] == "acquire" else done.stdout
+    return done.stdout
 
 
 @pytest.fixture(scope="module")
 def loop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loop]:
     folder = tmp_path_factory.mktemp("loop")
+    config = shutil.copytree(CONFIGS, folder / "so101") / "bench.yaml"
     port = free_port()
     ports = (f"bench.tracker.port={port}", f"bench.simulator.tracker.port={port}")
     sets = (*ports, *overrides_for(folder / "bench", "device"))
-    armcal(folder, "plan", CONFIG, "--poses", str(POSES), "--out", folder / "plan.csv")
+    armcal(folder, "plan", config, "--poses", str(POSES), "--out", folder / "plan.csv")
     fresh = ("plan.seed=5", "plan.starts=1", "plan.goal=A")
-    armcal(folder, "plan", CONFIG, "--poses", str(FRESH), "--out", folder / "fresh.csv", sets=fresh)
-    with simulated_bench(CONFIG, ports, folder / "bench"):
+    armcal(folder, "plan", config, "--poses", str(FRESH), "--out", folder / "fresh.csv", sets=fresh)
+    with simulated_bench(config, ports, folder / "bench"):
         found = json.loads(armcal(folder, "bus", "find", folder / "bench" / BOARD, "--last-id", "8", "--json"))
         ids = [(servo["baud"], servo["id"], servo["model"]) for servo in found["servos"]]
-        armcal(folder, "servo", CONFIG, "--check", "--yes", sets=sets)
-        told = armcal(
-            folder, "acquire", CONFIG, "--plan", folder / "plan.csv", "--out", folder / "runs", "--yes", sets=sets
-        )
-        assert "armcal bus wiring" in told, "no check is on record"
-        armcal(folder, "acquire", CONFIG, "--plan", folder / "fresh.csv", "--out", folder / "again", "--yes", sets=sets)
+        armcal(folder, "servo", config, "--check", "--yes", sets=sets)
+        armcal(folder, "acquire", config, "--plan", folder / "plan.csv", "--out", folder / "runs", "--yes", sets=sets)
+        armcal(folder, "acquire", config, "--plan", folder / "fresh.csv", "--out", folder / "again", "--yes", sets=sets)
         clock = SimulatedClock(folder / "bench" / CLOCK)
         state = clock.ask({"state": True})
         clock.close()
-    armcal(folder, "run", CONFIG, "--data", folder / "runs" / "dataset.csv", "--out", folder / "calibrated")
+    armcal(folder, "run", config, "--data", folder / "runs" / "dataset.csv", "--out", folder / "calibrated")
     poses = ("--poses", folder / "again" / "dataset.csv", "--out", folder / "predicted.csv")
     armcal(folder, "predict", folder / "calibrated" / "calibration.yaml", *poses)
     yield Loop(folder, ids, state)
@@ -84,7 +82,7 @@ def estimated(loop: Loop) -> dict[str, float]:
 
 def true_values() -> dict[str, float]:
     """Of the arm, with the play of the simulated servos."""
-    experiment = Experiment.load(CONFIG)
+    experiment = Experiment.load(CONFIGS / "bench.yaml")
     source = load_config(CONFIGS / "truth.yaml")
     parameters = with_values(experiment.parameters, source.data, source, ())
     true = dict(zip(parameters.entry_names, parameters.nominal().tolist(), strict=True))

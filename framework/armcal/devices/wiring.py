@@ -1,0 +1,180 @@
+"""Whether each servo was seen to move the joint that its configuration names, since that configuration was changed.
+
+``armcal servo --check`` and ``armcal bus wiring`` write what they saw beside the file that names the servos: the servo
+file of boards that make pulses, the configuration of servos on a bus. ``armcal acquire`` drives no joint that is not
+there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from armcal.base.config_text import plain, resolve_path
+from armcal.config.servo_file import ServoFile, digest, load_servo_file
+from armcal.config.yaml_source import ConfigSource
+from armcal.devices.device import JointDevice, MeasuringDevice
+from armcal.errors import InputError, Location
+from armcal.io.journal.files import REAL_FILES, write_whole
+
+_WRONG = ""
+"""In the place of the fingerprint of a servo that did not do what was commanded."""
+_PULSES, _BUS = (
+    "check them with armcal servo CONFIG --check",
+    "check them with armcal servo CONFIG --check, or by hand with armcal bus wiring CONFIG",
+)
+
+
+@dataclass(frozen=True)
+class WiringRecord:
+    """What was checked of servos.
+
+    Attributes:
+        stated_in: the file that names them; the record lies beside it.
+        digests: by joint: a fingerprint (hex) of all that is stated of its servo.
+        mend: how they are checked.
+    """
+
+    stated_in: Path
+    digests: Mapping[str, str]
+    mend: str
+
+    @classmethod
+    def of_servo_file(cls, path: Path, file: ServoFile | None = None) -> WiringRecord:
+        """Of a servo file, as it stands or as ``file`` has it.
+
+        Raises:
+            ConfigError: it is refused.
+        """
+        known = load_servo_file(path) if file is None else file
+        return cls(path, {joint: digest({joint: known.calibrated(joint)}) for joint in known.servos}, _PULSES)
+
+    @classmethod
+    def of_config(cls, source: ConfigSource, joints: Iterable[str]) -> WiringRecord:
+        """Of ``bench.device.joints``; what was checked on a simulated bench is not checked on a real one."""
+        device = {key: value for key, value in _section(source, "device").items() if key != "port"}
+        stated = device.get("joints")
+        parts = {key.rpartition(".")[2]: part for key, part in stated.items()} if isinstance(stated, dict) else {}
+        is_real = _section(source).get("clock", "real") == "real"
+        names = [joint.rpartition(".")[2] for joint in joints]
+        return cls(source.path, {name: _fingerprint([parts.get(name, device), is_real]) for name in names}, _BUS)
+
+    @property
+    def path(self) -> Path:
+        """Where it is written down."""
+        return self.stated_in.with_name(f"{self.stated_in.name}.checked")
+
+    def note(self, right: Iterable[str], others: Iterable[str], seen: Mapping[str, Any]) -> None:
+        """Write down which joints were seen to turn as commanded, and which were not.
+
+        Args:
+            right: the joints seen to turn.
+            others: joints that were tried and did not, or cannot be distinguished from another one.
+            seen: ``adapter``, ``by`` (``tracker`` or ``somebody``) and ``at`` (unix s).
+
+        Raises:
+            InputError: it cannot be written.
+        """
+        wrong = {self._key(joint): {"servo": _WRONG, **seen} for joint in others}
+        good = {key: {"servo": self.digests[key], **seen} for key in map(self._key, right)}
+        self._write({**self._entries(), **wrong, **good})
+
+    def carry_over(self, after: WiringRecord) -> None:
+        """What was checked stays so in a file whose numbers armcal itself has changed; see ``note``."""
+        kept = self._entries()
+        same = {joint: entry for joint, entry in kept.items() if self._is_of(entry, joint)}
+        if same:
+            self._write({**kept, **{joint: {**same[joint], "servo": after.digests[joint]} for joint in same}})
+
+    def forget(self, joints: Iterable[str]) -> None:
+        """Joints whose servos were changed by themselves are to be checked again; see ``note``."""
+        kept, gone = self._entries(), {self._key(joint) for joint in joints}
+        if gone & kept.keys():
+            self._write({joint: entry for joint, entry in kept.items() if joint not in gone})
+
+    def check(self, joints: Iterable[str], adapter: str = "") -> None:
+        """Whether all joints were seen to turn, on this adapter (empty: not known).
+
+        Raises:
+            InputError: one was not, or what is stated of it or the adapter is another one since.
+        """
+        checks, why = self._entries(), {}
+        for joint in joints:
+            key = self._key(joint)
+            entry = checks.get(key)
+            if entry is None or key not in self.digests:
+                why[joint] = "never checked"
+            elif entry.get("servo") == _WRONG:
+                why[joint] = "the last check did not find it right"
+            elif not self._is_of(entry, key):
+                why[joint] = "changed since it was checked"
+            elif adapter and adapter != (checked_on := str(entry.get("adapter", ""))):
+                why[joint] = f"checked on {f'the adapter {checked_on}' if checked_on else 'an adapter without an id'}"
+        if not why:
+            return
+        alike = {reason: ", ".join(joint for joint in why if why[joint] == reason) for reason in why.values()}
+        named = "; ".join(f"{joints_of}: {reason}" for reason, joints_of in alike.items())
+        raise InputError(
+            f"found servos that were not checked to move their joint ({named}); nothing was moved.",
+            where=Location(str(self.stated_in)),
+            hint=f"With exchanged plugs or ids the wrong joint moves: {self.mend}, or give --unchecked to drive them "
+            "without a check.",
+        )
+
+    def _key(self, joint: str) -> str:
+        """With its arm's name (``arm.q1``) or without."""
+        return joint if joint in self.digests else joint.rpartition(".")[2]
+
+    def _is_of(self, entry: Mapping[str, Any], joint: str) -> bool:
+        return joint in self.digests and entry.get("servo") == self.digests[joint]
+
+    def _entries(self) -> dict[str, Any]:
+        """By joint; a record that is damaged says nothing, so that its joints are checked again."""
+        try:
+            content = json.loads(self.path.read_bytes())
+        except (OSError, ValueError):
+            return {}
+        return {joint: e for joint, e in content.items() if isinstance(e, dict)} if isinstance(content, dict) else {}
+
+    def _write(self, entries: Mapping[str, Any]) -> None:
+        try:
+            write_whole(REAL_FILES, self.path, (json.dumps(entries, indent=2) + "\n").encode())
+        except OSError as fault:
+            raise InputError(
+                f"it cannot be written ({fault.strerror}), so that what was checked is not known later.",
+                where=Location(str(self.path)),
+                hint="Make the folder of that file writable, and check again.",
+            ) from fault
+
+
+def wiring_of(source: ConfigSource, device: JointDevice) -> WiringRecord | None:
+    """The record that a bench's device needs; None where its servos cannot be checked.
+
+    Raises:
+        ConfigError: its servo file is refused.
+    """
+    if (servos := servo_file_of(source)) is not None:
+        return WiringRecord.of_servo_file(servos)
+    return WiringRecord.of_config(source, device.joint_names) if isinstance(device, MeasuringDevice) else None
+
+
+def servo_file_of(source: ConfigSource) -> Path | None:
+    """The servo file of a bench's device; None where it has none."""
+    stated = _section(source, "device").get("servos")
+    return resolve_path(stated) if isinstance(stated, str) else None
+
+
+def _section(source: ConfigSource, *parts: str) -> dict[str, Any]:
+    """Of the bench, or a part of it, as it is written; empty where there is none."""
+    section: Any = source.data
+    for part in ("bench", *parts):
+        section = section.get(part) if isinstance(section, dict) else None
+    return section if isinstance(section, dict) else {}
+
+
+def _fingerprint(stated: Any) -> str:
+    return hashlib.sha256(json.dumps(plain(stated), sort_keys=True, default=str).encode()).hexdigest()
