@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar
 
 import casadi as ca
 import numpy as np
-from armcal.arm.pose_residual import ModelErrors
+from armcal.arm.pose_residual import OF_TOOL, ModelErrors
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
 from pydantic import Field
@@ -60,8 +60,12 @@ class GaussianProcess(LinearResidual):
     def learned(self, errors: ModelErrors) -> GaussianProcess | None:
         if len(errors.residuals) < _LEAST_RECORDS:
             return None
-        parts, left = of_joints(errors)
-        parts += of_tool(errors, left, self.settings.poses)
+        before = {
+            joint: [part for part in self.settings.learned if (part.first >= len(OF_TOOL)) == joint]
+            for joint in (True, False)
+        }
+        parts, left = of_joints(errors, before[True])
+        parts += of_tool(errors, left, self.settings.poses, before[False])
         if not parts:
             return None
         return GaussianProcess(self.settings.model_copy(update={"learned": tuple(parts)}), self.joint_names)

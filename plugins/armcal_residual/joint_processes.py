@@ -5,7 +5,7 @@ The long one holds on a little where no record stood, and leaves less of the err
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,17 +19,24 @@ from armcal_residual.linear import Products, Regression, packed, regressed, seen
 _JOINT_LENGTHS = (1.0, 0.5, 0.25, 0.12, 0.06)
 """Chords, about rad. The first stands beside each of the others."""
 _ROWS_PER_FEATURE = 2
+_Key = tuple[int, int]
+"""A joint (from 0), and a place in ``_JOINT_LENGTHS``."""
+_Places = tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class _JointProcess:
-    """A process of one joint (from 0) over its angle, as features of the rows of the residuals."""
+    """A process of one joint (from 0) over its angle, as features of the rows of the residuals.
+
+    ``beside`` are the rows without what the model's parameters take up.
+    """
 
     joint: int
     inputs: tuple[Input, ...]
     poses: Array
     roots: Array
     rows: Array
+    beside: Array
 
     @classmethod
     def over(cls, errors: ModelErrors, joint: int, length: float) -> _JointProcess:
@@ -46,7 +53,7 @@ class _JointProcess:
         features = correlations(errors.postures.commands, errors.postures.approaches).T @ roots
         slopes = errors.slopes[:, :, len(OF_TOOL) + joint]
         rows = -(slopes[:, :, None] * features[:, None, :]).reshape(-1, count)
-        return cls(joint, inputs, poses, roots, rows)
+        return cls(joint, inputs, poses, roots, rows, errors.apart(rows))
 
     @property
     def term(self) -> TermSettings:
@@ -54,13 +61,17 @@ class _JointProcess:
         return TermSettings(inputs=self.inputs, poses=packed(self.poses))
 
 
-def of_joints(errors: ModelErrors) -> tuple[list[ProcessSettings], Array]:
-    """Processes of the joints that turn, and what they and the model's parameters leave of the residuals (N x rows)."""
+def of_joints(errors: ModelErrors, before: Sequence[ProcessSettings] = ()) -> tuple[list[ProcessSettings], Array]:
+    """Processes of the joints that turn, and what they and the model's parameters leave of the residuals (N x rows).
+
+    Length scales are looked for near those of processes that were learned ``before``, if some were.
+    """
     left = errors.apart(errors.residuals.ravel())
     turning = [i for i, kind in enumerate(errors.dimensions) if kind == "angle"]
     moved = seen(errors, [i for i in turning if np.ptp(errors.postures.commands[i]) > _JOINT_LENGTHS[-1]])
     search = _LengthSearch(errors, moved, left)
-    chosen = search.likeliest() if moved else None
+    finest = {part.first - len(OF_TOOL): min(term.inputs[0].scale for term in part.terms) for part in before}
+    chosen = search.likeliest(finest) if moved else None
     if chosen is None:
         return [], left.reshape(errors.residuals.shape)
     regression, processes, parts = search.regression(chosen), search.processes(chosen), list[ProcessSettings]()
@@ -69,7 +80,7 @@ def of_joints(errors: ModelErrors) -> tuple[list[ProcessSettings], Array]:
         if blocks:
             parts.append(_part([processes[i] for i in blocks], regression, blocks))
         for i in blocks:
-            left = left - errors.apart(processes[i].rows @ regression.weights[i])
+            left = left - processes[i].beside @ regression.weights[i]
     return parts, left.reshape(errors.residuals.shape)
 
 
@@ -94,43 +105,70 @@ class _LengthSearch:
 
     def __init__(self, errors: ModelErrors, joints: Sequence[int], left: Array) -> None:
         self._errors, self._joints, self._left = errors, joints, left
-        self._processes: dict[tuple[int, int], _JointProcess] = {}
-        self._regressions: dict[tuple[int, ...], Regression] = {}
+        self._processes: dict[_Key, _JointProcess] = {}
+        self._products: dict[tuple[_Key, _Key], tuple[Array, Array]] = {}
+        self._regressions: dict[_Places, Regression] = {}
 
-    def likeliest(self) -> tuple[int, ...] | None:
-        """Places in ``_JOINT_LENGTHS`` of the finer ones, one a joint; None where the records are too few for any."""
-        same = [(place,) * len(self._joints) for place in range(len(_JOINT_LENGTHS))]
-        possible = [places for places in same if self._is_possible(places)]
+    def likeliest(self, before: Mapping[int, float]) -> _Places | None:
+        """Places in ``_JOINT_LENGTHS`` of the finer ones, one a joint; None where the records are too few for any.
+
+        ``before`` are length scales of some joints by which the search begins, the longest for the others.
+        """
+        begun = tuple(_JOINT_LENGTHS.index(before.get(joint, _JOINT_LENGTHS[0])) for joint in self._joints)
+        possible = [begun] if any(begun) and self._is_possible(begun) else []
+        if not possible:
+            same = [(place,) * len(self._joints) for place in range(len(_JOINT_LENGTHS))]
+            possible = [places for places in same if self._is_possible(places)]
         if not possible:
             return None
-        best = max(possible, key=self._evidence)
+        best = max(possible, key=lambda places: self.regression(places).evidence)
         for i in range(len(self._joints)):
-            own = range(max(0, best[i] - 1), min(len(_JOINT_LENGTHS), best[i] + 2))
-            tried = [(*best[:i], place, *best[i + 1 :]) for place in own]
-            best = max((places for places in tried if self._is_possible(places)), key=self._evidence)
+            near = best
+            own = range(max(0, near[i] - 1), min(len(_JOINT_LENGTHS), near[i] + 2))
+            tried = [(*near[:i], place, *near[i + 1 :]) for place in own]
+            possible = [places for places in tried if self._is_possible(places)]
+            best = max(possible, key=lambda places, near=near: self.regression(places, near).evidence)
         return best
 
-    def processes(self, places: tuple[int, ...]) -> list[_JointProcess]:
+    def processes(self, places: _Places) -> list[_JointProcess]:
         """Those of the joints with the first of the length scales, and with these."""
-        keys = dict.fromkeys([(joint, 0) for joint in self._joints] + list(zip(self._joints, places, strict=True)))
-        for key in keys:
-            if key not in self._processes:
-                self._processes[key] = _JointProcess.over(self._errors, key[0], _JOINT_LENGTHS[key[1]])
-        return [self._processes[key] for key in keys]
+        return [self._process(key) for key in self._keys(places)]
 
-    def regression(self, places: tuple[int, ...]) -> Regression:
-        """On their features."""
+    def regression(self, places: _Places, near: _Places | None = None) -> Regression:
+        """On their features, from what is likeliest of others that are ``near``."""
         if places not in self._regressions:
-            own = self.processes(places)
-            features = np.hstack([process.rows for process in own])
-            sizes = [len(process.poses) for process in own]
-            products = Products.of(self._errors.apart(features), self._left)
-            self._regressions[places] = regressed(products, sizes, features.T @ features)
+            keys, start = self._keys(places), None
+            matrix, whole = (np.block([[self._product(a, b)[i] for b in keys] for a in keys]) for i in (0, 1))
+            vector = np.concatenate([self._process(key).beside.T @ self._left for key in keys])
+            products = Products(matrix, vector, float(self._left @ self._left), len(self._left))
+            if near is not None:
+                known = dict(zip(self._keys(near), self._regressions[near].variances, strict=True))
+                finer = dict(zip(self._joints, near, strict=True))
+                variances = [known.get(key, known[key[0], finer[key[0]]]) for key in keys]
+                start = np.array(variances), self._regressions[near].noise
+            sizes = [len(self._process(key).poses) for key in keys]
+            self._regressions[places] = regressed(products, sizes, whole, start)
         return self._regressions[places]
 
-    def _evidence(self, places: tuple[int, ...]) -> float:
-        return self.regression(places).evidence
+    def _keys(self, places: _Places) -> list[_Key]:
+        return list(
+            dict.fromkeys([(joint, 0) for joint in self._joints] + list(zip(self._joints, places, strict=True)))
+        )
 
-    def _is_possible(self, places: tuple[int, ...]) -> bool:
+    def _process(self, key: _Key) -> _JointProcess:
+        if key not in self._processes:
+            self._processes[key] = _JointProcess.over(self._errors, key[0], _JOINT_LENGTHS[key[1]])
+        return self._processes[key]
+
+    def _product(self, one: _Key, other: _Key) -> tuple[Array, Array]:
+        """Of two processes' features, without what the model's parameters take up, and with it."""
+        if (one, other) not in self._products:
+            a, b = self._process(one), self._process(other)
+            self._products[one, other] = a.beside.T @ b.beside, a.rows.T @ b.rows
+            beside, whole = self._products[one, other]
+            self._products[other, one] = beside.T, whole.T
+        return self._products[one, other]
+
+    def _is_possible(self, places: _Places) -> bool:
         features = sum(len(process.poses) for process in self.processes(places))
         return _ROWS_PER_FEATURE * features <= len(self._left)

@@ -15,7 +15,9 @@ from armcal.arm.pose_residual import OF_TOOL, ModelErrors, PoseResidual, Posture
 from armcal.base.domains import Array
 from armcal.base.se3 import Expression
 from armcal.base.settings import Settings
+from numpy.linalg import LinAlgError
 from pydantic import Field
+from scipy.linalg.lapack import dpotrf, dpotri
 from typing_extensions import override
 
 Numbers = Annotated[str, Field(min_length=1)]
@@ -165,10 +167,13 @@ class Products:
         return cls(features.T @ features, features.T @ errors, float(errors @ errors), len(errors))
 
 
-def regressed(products: Products, sizes: Sequence[int], whole: Array | None = None) -> Regression:
+def regressed(
+    products: Products, sizes: Sequence[int], whole: Array | None = None, start: tuple[Array, float] | None = None
+) -> Regression:
     """The most likely variances of blocks of ``sizes`` features with independent weights of equal variance each.
 
-    ``whole`` is X'X of features from which nothing was taken off; by default that of ``products``.
+    ``whole`` is X'X of features from which nothing was taken off; by default that of ``products``. ``start`` has
+    variances of the blocks and of the noise that are near.
     """
     edges = np.cumsum([0, *sizes])
     blocks = [slice(a, b) for a, b in itertools.pairwise(edges)]
@@ -180,8 +185,10 @@ def regressed(products: Products, sizes: Sequence[int], whole: Array | None = No
     acting = diagonal if whole is None else np.diag(whole)
     least = np.array([max(float(acting[b].sum()), 1e-300) for b in blocks]) / (_MOST**2 * max(products.square, 1e-300))
     noise = spread / 2
+    if start is not None:
+        precisions, noise = np.clip(1 / start[0], least, 1e30), start[1]
     for _ in range(_ROUNDS):
-        inverse, weights = _posterior(products, precisions, noise, sizes)
+        inverse, weights, _ = _posterior(products, precisions, noise, sizes)
         known = np.array([b.stop - b.start - precisions[i] * np.trace(inverse[b, b]) for i, b in enumerate(blocks)])
         squares = np.array([max(float(weights[b] @ weights[b]), 1e-300) for b in blocks])
         error = products.square - 2 * weights @ products.vector + weights @ products.matrix @ weights
@@ -191,26 +198,37 @@ def regressed(products: Products, sizes: Sequence[int], whole: Array | None = No
         precisions = following
         if moved < _SETTLED:
             break
-    inverse, weights = _posterior(products, precisions, noise, sizes)
+    inverse, weights, size = _posterior(products, precisions, noise, sizes)
     error = products.square - 2 * weights @ products.vector + weights @ products.matrix @ weights
-    size = float(np.linalg.slogdet(inverse)[1]) + float(np.sum(np.array(sizes) * np.log(precisions)))
     squares = np.array([float(weights[b] @ weights[b]) for b in blocks])
-    evidence = (size - products.rows * np.log(noise) - error / noise - precisions @ squares) / 2
+    evidence = -(size + products.rows * np.log(noise) + error / noise + precisions @ squares) / 2
     known = np.array([b.stop - b.start - precisions[i] * np.trace(inverse[b, b]) for i, b in enumerate(blocks)])
     if whole is not None:
-        inverse, _ = _posterior(replace(products, matrix=whole), precisions, noise, sizes)
+        inverse, _, _ = _posterior(replace(products, matrix=whole), precisions, noise, sizes)
     scale = np.sqrt(np.repeat(precisions, sizes))
     left = scale[:, None] * inverse * scale
     return Regression(tuple(weights[b] for b in blocks), 1 / precisions, left, known, float(evidence), float(noise))
 
 
-def _posterior(products: Products, precisions: Array, noise: float, sizes: Sequence[int]) -> tuple[Array, Array]:
-    """Covariance and mean of the weights."""
-    precise = np.repeat(precisions, sizes)
-    scale = 1 / np.sqrt(precise)
-    inner = np.linalg.inv(scale[:, None] * products.matrix * scale / noise + np.eye(len(scale)))
+def _posterior(products: Products, precisions: Array, noise: float, sizes: Sequence[int]) -> tuple[Array, Array, float]:
+    """Covariance and mean of the weights, and the logarithm of how many times their prior covariance is larger."""
+    scale = 1 / np.sqrt(np.repeat(precisions, sizes))
+    inner, size = inverted(scale[:, None] * products.matrix * scale / noise + np.eye(len(scale)))
     inverse = scale[:, None] * inner * scale
-    return inverse, inverse @ products.vector / noise
+    return inverse, inverse @ products.vector / noise, size
+
+
+def inverted(matrix: Array) -> tuple[Array, float]:
+    """The inverse of a positive definite matrix (n x n), and the logarithm of its determinant.
+
+    Raises:
+        LinAlgError: it is not.
+    """
+    lower, failed = dpotrf(matrix, lower=1, clean=1)
+    if failed:
+        raise LinAlgError("a covariance is not positive definite")
+    inverse, _ = dpotri(lower, lower=1)
+    return inverse + np.tril(inverse, -1).T, 2 * float(np.sum(np.log(np.diag(lower))))
 
 
 def seen(errors: ModelErrors, joints: Sequence[int]) -> list[int]:

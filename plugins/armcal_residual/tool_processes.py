@@ -11,15 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from armcal.arm.pose_residual import ModelErrors
 from armcal.base.domains import Array
-from scipy.linalg import cho_solve
 from scipy.optimize import minimize
 
 from armcal_residual.correlations import Correlations, Input, Kind, ProcessSettings, TermSettings, roots_of
-from armcal_residual.linear import packed, taken_root
+from armcal_residual.linear import inverted, packed, taken_root
 
 _FEWEST = 12
 """Records an input of the process."""
 _STARTS = (0.4, 2.0)
+_FIRST_NOISE = 0.7
 _FIRST, _SECOND = 250, 500
 """Records by which its length scales are found, first from each start, then from the best of them."""
 _STEPS = 20
@@ -32,13 +32,19 @@ _LEFT = 0.01
 """Of the noise's variance: so little of the process may be left between its poses."""
 
 
-def of_tool(errors: ModelErrors, left: Array, most: int) -> list[ProcessSettings]:
-    """Processes of the tool's shifts, and turns, where what is left of the residuals (N x rows) follows one."""
+def of_tool(
+    errors: ModelErrors, left: Array, most: int, before: Sequence[ProcessSettings] = ()
+) -> list[ProcessSettings]:
+    """Processes of the tool's shifts, and turns, where what is left of the residuals (N x rows) follows one.
+
+    Length scales are looked for near those of processes that were learned ``before``, if some were.
+    """
     inputs, tool = _inputs(errors), errors.of_tool
     if not tool or len(left) < _FEWEST * len(inputs):
         return []
     own = -np.einsum("ncr,nr->nc", np.linalg.pinv(errors.slopes[:, :, :tool]), left)
-    processes = [_process(errors, own[:, i : i + 3], inputs, most, i) for i in range(0, tool, 3)]
+    known = {part.first: part.terms[0].inputs for part in before}
+    processes = [_process(errors, own[:, i : i + 3], inputs, most, i, known.get(i, ())) for i in range(0, tool, 3)]
     return [part for part in processes if part is not None]
 
 
@@ -62,16 +68,24 @@ def _squares(numbers: Array, inputs: Sequence[tuple[Kind, int]], to: Array | Non
 
 
 def _process(
-    errors: ModelErrors, own: Array, inputs: Sequence[tuple[Kind, int]], most: int, first: int
+    errors: ModelErrors,
+    own: Array,
+    inputs: Sequence[tuple[Kind, int]],
+    most: int,
+    first: int,
+    before: Sequence[Input],
 ) -> ProcessSettings | None:
     """Of three corrections of the tool (N x 3)."""
     postures = errors.postures
     raw = np.array([(postures.approaches if kind == "approach" else postures.commands)[i] for kind, i in inputs])
     spans = np.array([1.0 if kind == "angle" else np.ptp(row) for row, (kind, _) in zip(raw, inputs, strict=True)])
     numbers, order = raw / spans[:, None], np.random.default_rng(0).permutation(len(own))
-    starts = [np.log(np.append(np.full(len(inputs), length), 0.7)) for length in _STARTS]
-    some = order[:_FIRST]
-    candidates = [_likeliest(_Likelihood(_squares(numbers[:, some], inputs), own[some]), start) for start in starts]
+    if [(known.of, known.joint - 1) for known in before] == list(inputs):
+        candidates = [np.log(np.append([known.scale for known in before] / spans, _FIRST_NOISE))]
+    else:
+        starts = [np.log(np.append(np.full(len(inputs), length), _FIRST_NOISE)) for length in _STARTS]
+        some = order[:_FIRST]
+        candidates = [_likeliest(_Likelihood(_squares(numbers[:, some], inputs), own[some]), start) for start in starts]
     some = order[:_SECOND]
     likelihood = _Likelihood(_squares(numbers[:, some], inputs), own[some])
     best = _likeliest(likelihood, min(candidates, key=likelihood.cost))
@@ -111,10 +125,10 @@ class _Likelihood:
     def __call__(self, at: Array) -> tuple[float, Array]:
         """With the gradient."""
         (count, outputs), ratio = self.errors.shape, np.exp(2 * at[-1])
-        kernel, lower, inverse = self._factored(at)
+        kernel, inverse, size = self._factored(at)
         solved = inverse @ self.errors
         variances = np.maximum(np.mean(self.errors * solved, axis=0), 1e-300)
-        value = outputs * np.sum(np.log(np.diag(lower))) + count / 2 * np.sum(np.log(variances))
+        value = outputs / 2 * size + count / 2 * np.sum(np.log(variances))
         by_kernel = outputs / 2 * inverse - (solved / variances) @ solved.T / 2
         slope = np.tensordot(self.squares, by_kernel * kernel, axes=2) * np.exp(-2 * at[:-1])
         # the kernel falls with its squares by half, and weights are exp(-2 l)
@@ -122,13 +136,13 @@ class _Likelihood:
 
     def scales(self, at: Array) -> Array:
         """Of the process, by output."""
-        solved = self._factored(at)[2] @ self.errors
+        solved = self._factored(at)[1] @ self.errors
         return np.asarray(np.sqrt(np.maximum(np.mean(self.errors * solved, axis=0), 1e-24)))
 
-    def _factored(self, at: Array) -> tuple[Array, Array, Array]:
+    def _factored(self, at: Array) -> tuple[Array, Array, float]:
+        """The correlations, the inverse with the noise, and the logarithm of its determinant."""
         kernel = np.exp(-np.tensordot(np.exp(-2 * at[:-1]), self.squares, axes=1) / 2)
-        lower = np.linalg.cholesky(kernel + np.exp(2 * at[-1]) * np.eye(len(kernel)))
-        return kernel, lower, cho_solve((lower, True), np.eye(len(kernel)))
+        return kernel, *inverted(kernel + np.exp(2 * at[-1]) * np.eye(len(kernel)))
 
 
 def _likeliest(likelihood: _Likelihood, start: Array) -> Array:

@@ -88,7 +88,7 @@ class PoseResidual(ABC):
 
     @abstractmethod
     def learned(self, errors: ModelErrors) -> PoseResidual | None:
-        """The same with what records say; None where they are too few."""
+        """The same with what records say; None where they are too few. What it has learned before is a mere start."""
 
     @abstractmethod
     def correction(self, commands: Expression, approaches: Expression) -> Expression:

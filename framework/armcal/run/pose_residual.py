@@ -167,7 +167,7 @@ class LayeredFit(PredictedFit):
 
 @dataclass(frozen=True)
 class Layer:
-    """What a fold needs to learn: whose pose residual, and all records' postures."""
+    """What a fold needs to learn: whose pose residual, as far as it has learned, and all records' postures."""
 
     arm: str
     residual: PoseResidual
@@ -237,7 +237,7 @@ def learned_residual(
     splits = splits or folds(count, _FOLDS, 0)
     pieces = [np.sort(part) for part in np.array_split(order, _STRETCHES)]
     stretches = tuple(Split(np.setdiff1d(np.arange(count), part), part) for part in pieces)
-    judge = partial(judged_with, layer=layer)
+    judge = partial(judged_with, layer=replace(layer, residual=learned))
     parts = (experiment.estimator, fitted.estimate.values, progress, executor, judge)
     crossed = cross_validate(problem, training, splits, *parts)
     if crossed.failed_folds:
