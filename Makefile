@@ -18,7 +18,7 @@ demo: $(READY)
 	$(BIN)/armcal run configs/lrm_arm/demo.yaml --out runs/demo
 
 test: $(READY)
-	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not slow" tests
+	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not slow and not page" tests
 
 test-all: $(READY)
 	$(BIN)/python -m pytest -n 3 --dist worksteal tests
@@ -36,9 +36,10 @@ lint: $(READY)
 types: $(READY)
 	$(BIN)/mypy
 
-# Every command of README.md and docs/ that is meant to be typed as it stands.
+# What README.md and docs/ show: every command that is meant to be typed as it stands, and pages done word for word.
 docs-commands: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m tests.docs_commands README.md docs
+	$(BIN)/python -m pytest -n 2 -m page tests/framework/test_new_robot.py tests/framework/test_new_plugin.py
 
 # The pages as a site that works without a network, in site/; its figures are made anew from real runs.
 docs: $(READY)

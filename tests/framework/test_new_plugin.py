@@ -154,6 +154,7 @@ def test_the_page_shows_components_that_are_short() -> None:
     assert all(lines[name] < most for name, most in MOST_LINES.items()), lines
 
 
+@pytest.mark.page
 def test_the_page_is_done_word_for_word(tmp_path: Path) -> None:
     """An effect and a measurement, each one file that nobody packaged, from records to C code."""
     text = page("write_a_plugin.md")

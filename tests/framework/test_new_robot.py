@@ -54,6 +54,7 @@ def table(folder: Path, text: str | bytes, name: str = "rows.csv") -> str:
 # The page, word for word
 
 
+@pytest.mark.page
 def test_the_page_takes_five_joints_from_a_table_to_a_calibrated_urdf(here: Path) -> None:
     for name, content in files_of(PAGE).items():
         table(here, content, name)

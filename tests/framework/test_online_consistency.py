@@ -121,8 +121,8 @@ NOTICED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lie", NOTICED)
-@pytest.mark.quick("1 mm bias")
 def test_the_recalibrator_notices(lie: str) -> None:
     of, changed, world = NOTICED[lie]
     recalibrator = begun(settings(**changed), **of)

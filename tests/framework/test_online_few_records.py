@@ -13,6 +13,7 @@ NOMINAL = 0.001
 """Share of good records that the gate rejects by default."""
 
 
+@pytest.mark.slow
 @dataclass(frozen=True)
 class Study:
     """Of good records after calibrations: those rejected, all of them, decisions, levels at the end."""
@@ -34,7 +35,6 @@ class Study:
 
 
 @pytest.mark.parametrize(("rows", "trained"), [(3, 5), (6, 10), (12, 10)])
-@pytest.mark.quick("3-5")
 def test_good_records_after_few_are_believed(rows: int, trained: int, tmp_path: Path) -> None:
     """Of 120, chance rejects two or more in one study of a hundred; a noise taken for well known rejects 35."""
     found = Study.of(rows, trained, range(2), 60, tmp_path)

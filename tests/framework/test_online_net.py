@@ -138,7 +138,7 @@ def test_records_that_only_the_net_sees_change_its_digest() -> None:
 
 @pytest.mark.parametrize(
     ("outliers", "count"),
-    [(0.0, 100), (0.2, 50), *(pytest.param(o, n, marks=pytest.mark.slow) for o in (0.0, 0.2) for n in (100, 2500))],
+    [(0.0, 100), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((0.2, 100), (0.0, 2500), (0.2, 2500)))],
 )
 def test_no_refit_takes_over_from_a_filter_that_is_right(count: int, outliers: float) -> None:
     recalibrator, arm = begun(), World.drawn(8, outliers=outliers, outlier=0.2)

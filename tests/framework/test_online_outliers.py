@@ -90,6 +90,7 @@ def test_outliers_of_any_size_change_nothing(size_mm: int) -> None:
     assert decisions_of([arm.record() for _ in range(220)]) == []
 
 
+@pytest.mark.slow
 def test_a_slip_is_named_among_large_outliers() -> None:
     arm = World.drawn(6, outliers=0.1, outlier=0.3)
     records = [arm.record() for _ in range(SETTLED)]

@@ -47,6 +47,7 @@ def lines(out: Path) -> list[dict[str, Any]]:
 
 
 class TestARefusedRunLeavesNothing:
+    @pytest.mark.slow
     def test_the_next_run_with_another_base_is_measured_and_judged_by_its_own(self, post: Bench) -> None:
         arm = post.arm
         refused = arm.armcal("servo", "--out", arm.out, "--yes", sets=(*FEW, TOO_HOT))
@@ -60,6 +61,7 @@ class TestARefusedRunLeavesNothing:
         truth = yaml.safe_load(POST_SERVOS)["servos"]["c"]["pulses_us"]
         assert arm.pulses()["c"] == pytest.approx(truth, abs=3)
 
+    @pytest.mark.slow
     def test_a_beginning_without_measurements_is_kept_aside_and_that_is_said(self, post: Bench) -> None:
         """As an earlier version, or one that was killed, left it."""
         arm = post.arm
@@ -89,6 +91,7 @@ class TestARefusedRunLeavesNothing:
 
 
 class TestPulsesThatNoServoBears:
+    @pytest.mark.slow
     def test_tables_keep_the_travel_of_their_servos_and_comments_stay(self, tmp_path: Path) -> None:
         """One of 270 degrees is measured over its limits and keeps its ends; knots are not those of another joint."""
         arm = OwnArm(tmp_path, TOWER)

@@ -183,6 +183,7 @@ def test_limits_and_clearance_are_kept(tmp_path: Path, kind: str) -> None:
     assert (told["candidates"]["refined"] > 0) == (kind == "continuous")
 
 
+@pytest.mark.slow
 def test_moving_on_through_joint_space_tells_more(tmp_path: Path) -> None:
     few = ("--poses", "15", "--set", "plan.candidates=continuous", "--set", "plan.count=300")
     held = planned(tmp_path / "a.csv", *few, "--set", "plan.sweeps=0", config=PLAN)

@@ -117,6 +117,7 @@ def test_defaults_are_the_configured_load(arms, name):
         np.testing.assert_allclose(compiled.forward(record)[1], pose[:3], rtol=0, atol=1e-12)
 
 
+@pytest.mark.quick("counts and heat", "mimic and slide")
 @pytest.mark.parametrize("name", [*CASES, "mimic and slide"])
 def test_the_jacobian_is_the_slope_of_the_arm_in_equilibrium(arms, name):
     _, compiled = arms(name)
@@ -288,6 +289,7 @@ def test_arms_that_passes_lead_astray_settle_by_newton(arms):
     assert astray > 5
 
 
+@pytest.mark.slow
 def test_slopes_column_by_column_are_the_same(arms, monkeypatch, tmp_path):
     calibration, compiled = arms("elastic")
     monkeypatch.setattr(c_expressions, "MOST_WHOLE", 0)

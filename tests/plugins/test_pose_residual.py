@@ -109,6 +109,7 @@ def test_the_report_says_where_it_acts_and_how_much():
     assert "What was learned beside the model" in page and "shift by the pose residual" in page
 
 
+@pytest.mark.quick("fourier")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_calibration_predicts_what_the_run_found_and_compensates_to_the_same_arm(kind):
     run = learned_run(kind)
@@ -182,6 +183,7 @@ def test_a_study_compares_with_and_without(tmp_path):
     assert errors["learned"] < 0.3 * errors["plain"]
 
 
+@pytest.mark.slow
 def test_what_a_drift_could_explain_is_learned_all_the_same(tmp_path):
     data = recorded(tmp_path)
     head, *rows = data.read_text().splitlines()

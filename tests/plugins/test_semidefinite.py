@@ -200,6 +200,7 @@ def test_all_of_the_curvature_is_that_of_differences_whatever_the_gradient(posed
 # ---------------------------------------------------------------- the cone against the root
 
 
+@pytest.mark.slow
 def test_ipopt_evaluates_all_records_no_more_than_three_times_as_often_as_cvxpy(lrm, monkeypatch):
     """It moves roots, along whose curves it would take some hundred steps."""
     problem, records = springs_measured(lrm, 3, 60)
@@ -275,8 +276,8 @@ def rank_one(problem):
     return start
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [CONE, ROOT], ids=["cone", "root"])
-@pytest.mark.quick("root")
 def test_a_start_on_the_boundary_does_not_keep_a_solver_there(lrm, solver):
     q = oracle.random_poses(80, 7)
     definite = [np.diag([0.03, 0.02, 0.05])] * 7
