@@ -9,11 +9,12 @@ from typing import Annotated, Any, ClassVar, Literal
 import casadi as ca
 import numpy as np
 from armcal.arm.assembly import ArmState
-from armcal.arm.statics import TOOL_FRAME
+from armcal.arm.statics import BASE_FRAME, TOOL_FRAME
 from armcal.base.domains import Array, Interval
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.pose_blocks import pose_transform
 from armcal.base.pose_settings import PoseSettings
+from armcal.base.se3 import identity
 from armcal.measure.instrument import InstrumentSettings
 from armcal.measure.measurement import Channel
 from armcal.measure.points import PointInstrument, Proposal, spread_points
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from armcal_camera.board import Board, BoardOrFile, require_distinct
-from armcal_camera.first_guess import Setup, first_guess
+from armcal_camera.first_guess import Setup, certified_place, first_guess
 from armcal_camera.intrinsics import IntrinsicsOrFile, Lens, Pixels
 from armcal_camera.lens import DISTORTION, projected
 
@@ -36,16 +37,18 @@ class CameraSettings(InstrumentSettings):
 
     ``noise`` is the standard deviation of a corner's u and v. ``mounting`` says what moves: ``eye_in_hand`` has the
     camera on the tool and boards in the world, ``eye_to_hand`` the camera in the world and boards on the tool;
-    ``frame`` is another frame of the arm model that carries the camera, or the boards, in place of the tool. Poses and
+    ``frame`` is another frame of the arm model that carries the camera, or the boards, in place of the tool;
+    ``board_frame`` carries the boards in place of what ``mounting`` says: ``base``, ``tool`` or another. Poses and
     intrinsics that are not stated are found from the images, where they are free. ``boards_of`` names another
     camera that sees the same boards in the same places: their poses and scale are then that one's parameters. Of a
     board with more than ``most_points`` points so many are used, spread evenly over it. ``image`` is its width and
-    height.
+    height. ``certificate`` shows that no other place of the camera fits the poses of the board better (cvxpy).
     """
 
     noise: Annotated[Pixels, Field(gt=0)]
     mounting: Literal["eye_in_hand", "eye_to_hand"] = "eye_in_hand"
     frame: str = TOOL_FRAME
+    board_frame: str | None = None
     lens: Lens | None = None
     board: BoardOrFile | None = None
     boards: tuple[BoardOrFile, ...] = ()
@@ -55,6 +58,7 @@ class CameraSettings(InstrumentSettings):
     boards_of: str | None = None
     image: tuple[Pixels, Pixels] | None = None
     most_points: Annotated[int, Field(ge=4)] = 120
+    certificate: bool = True
 
     @model_validator(mode="after")
     def _complete(self) -> CameraSettings:
@@ -66,6 +70,8 @@ class CameraSettings(InstrumentSettings):
             raise ValueError(f"found {len(self.board_poses)} board_poses, expected one of each board: {number}")
         if self.board_poses and self.boards_of is not None:
             raise ValueError(f"found board_poses and boards_of: the poses are those of {self.boards_of}")
+        if self.mounting == "eye_to_hand" and self.board_frame is not None and self.frame != TOOL_FRAME:
+            raise ValueError("found frame and board_frame of a camera beside the arm: both say what carries the boards")
         names, given = DISTORTION[self.model], self.intrinsics.distortion if self.intrinsics else ()
         if given and len(given) != len(names) and (self.model, len(given)) != ("pinhole", 4):
             raise ValueError(f"found {len(given)} distortion coefficients, expected {len(names)}: {', '.join(names)}")
@@ -77,13 +83,19 @@ class CameraSettings(InstrumentSettings):
         return self.lens or (self.intrinsics.model if self.intrinsics else None) or "pinhole"
 
 
+def carrying_frames(mounting: str, frame: str, board_frame: str | None) -> tuple[str, str]:
+    """What carries the camera and what carries the boards, by the settings."""
+    carrying = (frame, BASE_FRAME) if mounting == "eye_in_hand" else (BASE_FRAME, frame)
+    return carrying[0], board_frame or carrying[1]
+
+
 class Camera(PointInstrument):
     """The measurement ``camera``: channels u_K and v_K (px) of each point K of its boards, counted over all of them.
 
     Parameters: ``camera_*`` (tool_T_camera, or base_T_camera of one that stands beside the arm), ``board_*``
-    (base_T_board, or tool_T_board; ``board1_*``, ``board2_*`` where there are several; the setting ``frame`` may stand
-    in place of the tool), ``board_scale`` (printed size
-    over stated size), ``fx``, ``fy``, ``cx``, ``cy`` and the distortion coefficients.
+    (base_T_board, or tool_T_board; ``board1_*``, ``board2_*`` where there are several; the settings ``frame`` and
+    ``board_frame`` name other frames), ``board_scale`` (printed size over stated size), ``fx``, ``fy``, ``cx``, ``cy``
+    and the distortion coefficients.
     """
 
     Settings = CameraSettings
@@ -102,9 +114,10 @@ class Camera(PointInstrument):
     }
 
     @property
-    def carrier(self) -> str:
-        """The frame of the arm that carries the camera, or the boards."""
-        return str(self.settings.frame)
+    def carriers(self) -> Mapping[str, str]:
+        """The frames of the arm that carry the camera and the boards."""
+        stated = {"frame": self.settings.frame, "board_frame": self.settings.board_frame or BASE_FRAME}
+        return {setting: frame for setting, frame in stated.items() if setting == "frame" or frame != BASE_FRAME}
 
     @property
     def lender(self) -> str | None:
@@ -118,7 +131,7 @@ class Camera(PointInstrument):
         return (*(f"{name}_{part}" for name in self.board_names for part in parts), "board_scale")
 
     def check_lender(self, lender: object) -> None:
-        """Refuse one that does not see the same boards, or has them in another frame (ValueError)."""
+        """Refuse one that does not see the same boards, has them elsewhere or cannot place them (ValueError)."""
         if not isinstance(lender, Camera) or lender.boards != self.boards:
             raise ValueError(f"found other boards than {self.lender} has, expected the same, in the same order")
         if (lender.arms, lender.board_frame) != (self.arms, self.board_frame):
@@ -126,11 +139,21 @@ class Camera(PointInstrument):
                 f"its boards are in the frame {self.board_frame}, those of {self.lender} in {lender.board_frame} "
                 f"({lender.arms[0]}): one pose cannot be both"
             )
+        if lender.camera_frame == lender.board_frame != self.camera_frame:
+            raise ValueError(
+                f"{self.lender} does not move against its boards and cannot find their place: state boards_of there, "
+                "and the boards' poses here"
+            )
+
+    @property
+    def camera_frame(self) -> str:
+        """In which frame the camera is: ``base``, or that which carries it."""
+        return carrying_frames(self.settings.mounting, self.settings.frame, self.settings.board_frame)[0]
 
     @property
     def board_frame(self) -> str:
         """In which frame the boards are: ``base``, or that which carries them."""
-        return "base" if self.settings.mounting == "eye_in_hand" else self.carrier
+        return carrying_frames(self.settings.mounting, self.settings.frame, self.settings.board_frame)[1]
 
     @cached_property
     def boards(self) -> tuple[Board, ...]:
@@ -203,8 +226,8 @@ class Camera(PointInstrument):
         if len(poses) > 1:  # the point says which board is its own
             there, normals = ([sum(point[3 + i] * x for i, x in enumerate(parts))] for parts in (there, normals))
         arm = arms[self.arms[0]]
-        moved = arm.base_T_tool if self.carrier == TOOL_FRAME else arm.frames[self.carrier]
-        to_camera = (moved @ camera).inverse() if self.settings.mounting == "eye_in_hand" else camera.inverse() @ moved
+        frames = {**arm.frames, BASE_FRAME: identity(), TOOL_FRAME: arm.base_T_tool}
+        to_camera = (frames[self.camera_frame] @ camera).inverse() @ frames[self.board_frame]
         return to_camera.apply(there[0]), ca.mtimes(to_camera.rotation, normals[0])
 
     def point_margin(self, arms: Mapping[str, ArmState], values: Mapping[str, Any], point: Any) -> Any:
@@ -245,15 +268,34 @@ class Camera(PointInstrument):
         if any(sd is None for sd in (*place, *turn)):
             return ""
         mm, deg = (_NORMAL_95 * float(np.linalg.norm(np.array(sds, dtype=float))) for sds in (place, turn))
-        hand = "the hand" if self.carrier == TOOL_FRAME else self.carrier
-        where = f"on {hand}" if self.settings.mounting == "eye_in_hand" else "beside the arm"
+        where = {BASE_FRAME: "beside the arm", TOOL_FRAME: "on the hand"}.get(
+            self.camera_frame, f"on {self.camera_frame}"
+        )
         return f"its place {where} is known to {1000 * mm:.2g} mm and {np.rad2deg(deg):.2g} deg (95 %)."
 
     def propose(
-        self, tools: Array, read: Mapping[str, Array], values: Mapping[str, Array], free: frozenset[str]
+        self,
+        frames: Mapping[str, Array],
+        read: Mapping[str, Array],
+        values: Mapping[str, Array],
+        free: frozenset[str],
     ) -> Proposal:
         """Where a fit may start, from the images alone; see ``Proposing``."""
+        return first_guess(self._setup, frames, read, values, free)
+
+    def certificate(
+        self,
+        frames: Mapping[str, Array],
+        read: Mapping[str, Array],
+        values: Mapping[str, Array],
+        free: frozenset[str],
+    ) -> str:
+        """Whether no other place of the camera fits the poses of the board better; see ``Certifying``."""
+        return certified_place(self._setup, frames, read, values, free) if self.settings.certificate else ""
+
+    @property
+    def _setup(self) -> Setup:
+        """What a start depends on."""
         s = self.settings
         points = tuple(board.points[used] for board, used in zip(self.boards, self.used, strict=True))
-        in_hand, is_stated = s.mounting == "eye_in_hand", s.intrinsics is not None
-        return first_guess(Setup(self.board_names, points, s.model, in_hand, is_stated), tools, read, values, free)
+        return Setup(self.board_names, points, s.model, s.intrinsics is not None, (self.camera_frame, self.board_frame))

@@ -7,13 +7,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 import yaml
-from armcal.arm.statics import TOOL_FRAME
+from armcal.arm.statics import BASE_FRAME, TOOL_FRAME
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
 from armcal.calibration.exporter import Exported, ExportRequest, Instrument
 from armcal.errors import ConfigError
 from scipy.spatial.transform import Rotation
 
+from armcal_camera.camera import carrying_frames
 from armcal_camera.lens import DISTORTION
 
 _PX = 1000.0
@@ -127,8 +128,8 @@ class HandEyeExporter(_CameraExporter):
             ConfigError: no such camera.
         """
         name, camera = self._camera(request)
-        on_hand = camera.settings.get("mounting", "eye_in_hand") == "eye_in_hand"
-        carrier = str(camera.settings.get("frame", TOOL_FRAME))
+        frames = _frames(camera)
+        on_hand, carrier = frames[0] != BASE_FRAME, frames[frames[0] == BASE_FRAME]
         tool_frame = self._settings.tool_frame or ("tool0" if carrier == TOOL_FRAME else carrier)
         parent = tool_frame if on_hand else self._settings.base_frame
         pose, child = _pose("camera", camera.numbers), self._settings.camera_frame
@@ -171,11 +172,15 @@ def _model(camera: Instrument) -> str:
     return str(camera.settings.get("lens") or stated.get("model") or "pinhole")
 
 
+def _frames(camera: Instrument) -> tuple[str, str]:
+    """What carries the camera and what carries the boards."""
+    s = camera.settings
+    return carrying_frames(s.get("mounting", "eye_in_hand"), s.get("frame", TOOL_FRAME), s.get("board_frame"))
+
+
 def _poses(camera: Instrument) -> dict[str, Array]:
     """The camera's pose and each board's, by what they map from and to."""
-    on_hand = camera.settings.get("mounting", "eye_in_hand") == "eye_in_hand"
-    carrier = str(camera.settings.get("frame", TOOL_FRAME))
-    frames = (carrier, "base") if on_hand else ("base", carrier)
+    frames = _frames(camera)
     boards = [name.removesuffix("_x") for name in camera.numbers if name.startswith("board") and name.endswith("_x")]
     poses = {f"{frames[0]}_T_camera": _pose("camera", camera.numbers)}
     return {**poses, **{f"{frames[1]}_T_{board}": _pose(board, camera.numbers) for board in boards}}

@@ -11,11 +11,11 @@ from armcal.base.pose_settings import quaternion_of
 from armcal.base.quaternions import rotation_matrix
 from armcal.measure.points import Proposal
 
+from armcal_camera.certificate import sentence
 from armcal_camera.hand_eye import hand_eye, open_motion
 from armcal_camera.lens import DISTORTION, normalised
 from armcal_camera.views import FEWEST_POINTS, board_pose, homography, intrinsics
 
-_PLACE = ("camera_x", "camera_y", "camera_z", "camera_rotation")
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _FEWEST_VIEWS = 3
 
@@ -28,15 +28,15 @@ class Setup:
         names: the first part of the names of each board's parameters.
         points: of each board those that are used (P x 3, m).
         lens: ``pinhole`` or ``fisheye``.
-        in_hand: whether the camera is on the tool.
         is_stated: whether its intrinsics are.
+        frames: which carry the camera and the boards.
     """
 
     names: tuple[str, ...]
     points: tuple[Array, ...]
     lens: str
-    in_hand: bool
     is_stated: bool
+    frames: tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -50,41 +50,90 @@ class _View:
 
 
 def first_guess(
-    setup: Setup, tools: Array, read: Mapping[str, Array], values: Mapping[str, Array], free: frozenset[str]
+    setup: Setup,
+    frames: Mapping[str, Array],
+    read: Mapping[str, Array],
+    values: Mapping[str, Array],
+    free: frozenset[str],
 ) -> Proposal:
-    """Free parameters of a camera from what it saw; the others are held. See ``Proposing.propose``."""
+    """Free parameters of a camera from what it saw; the others are held. See ``Proposing.propose``.
+
+    With A the frame of the camera as seen from that of the boards, A camera_pose = board_pose camera_T_board^-1 in
+    every record: one equation wherever camera and boards are. Boards whose place is held or another camera's do where
+    the motion leaves it open.
+    """
     own = dict(values)
     views = _views(setup, read, float(own["board_scale"][0]))
     if free & set(_INTRINSICS) and not setup.is_stated:
         own |= _intrinsics(views, free)
     poses = _poses(setup, views, own)
     proposed = {name: own[name] for name in _INTRINSICS if name in free}
-    is_open = open_motion(tools)
-    if is_open is not None:
-        return Proposal(proposed, *is_open, tuple(name for name in _PLACE if name in free))
-    in_hand, camera_pose = setup.in_hand, None
-    for number, name in sorted(enumerate(setup.names), key=lambda b: -len(poses[b[0]])):
+    camera_frame, board_frame = setup.frames
+    moved = np.linalg.inv(frames[board_frame]) @ frames[camera_frame]
+    known = [not free & set(_place(name)) for name in setup.names]
+    is_open = _still(camera_frame) if camera_frame == board_frame else open_motion(moved, camera_frame)
+    if is_open is not None and not any(held and own_poses for held, own_poses in zip(known, poses, strict=True)):
+        return Proposal(proposed, *is_open, tuple(name for name in _place("camera") if name in free))
+    camera_pose = None
+    for number, name in sorted(
+        enumerate(setup.names), key=lambda b: (is_open is not None and not known[b[0]], -len(poses[b[0]]))
+    ):
         records = list(poses[number])
         if not records:
             continue
-        a, b = tools[records], np.array([poses[number][i] for i in records])
+        a, b = moved[records], np.array([poses[number][i] for i in records])
         if camera_pose is None and _placed("camera", free):
-            solved = hand_eye(a, np.linalg.inv(b) if in_hand else b)
-            if solved is None:
+            solved = hand_eye(a, np.linalg.inv(b))
+            if solved is None and not known[number]:
                 continue
-            camera_pose, board_pose_ = (solved.x, solved.y) if in_hand else (solved.y, solved.x)
+            every = np.linalg.inv(a) @ _matrix(name, own) @ np.linalg.inv(b)
+            camera_pose = every[_middle(every)] if solved is None else solved.x
+            board_pose_ = _matrix(name, own) if solved is None else solved.y
             proposed |= _pose_values("camera", camera_pose)
         else:
-            held = _matrix("camera", own) if camera_pose is None else camera_pose
-            every = a @ held @ b if in_hand else np.linalg.inv(a) @ held @ b
+            every = a @ (_matrix("camera", own) if camera_pose is None else camera_pose) @ b
             board_pose_ = every[_middle(every)]
         if _placed(name, free):
             proposed |= _pose_values(name, board_pose_)
     return Proposal(proposed)
 
 
+def certified_place(
+    setup: Setup,
+    frames: Mapping[str, Array],
+    read: Mapping[str, Array],
+    values: Mapping[str, Array],
+    free: frozenset[str],
+) -> str:
+    """Whether another place of the camera would fit the poses of the board seen most better; empty if not asked."""
+    camera_frame, board_frame = setup.frames
+    if camera_frame == board_frame or not _placed("camera", free):
+        return ""
+    views = _views(setup, read, float(values["board_scale"][0]))
+    name, poses = max(zip(setup.names, _poses(setup, views, values), strict=True), key=lambda board: len(board[1]))
+    moved = (np.linalg.inv(frames[board_frame]) @ frames[camera_frame])[list(poses)]
+    seen = np.linalg.inv(np.array(list(poses.values())).reshape(-1, 4, 4))
+    solved = hand_eye(moved, seen)
+    if solved is None:
+        return "that no other place of the camera is better could not be shown: the motions leave it open."
+    return sentence(moved[solved.kept], seen[solved.kept], solved, (_matrix("camera", values), _matrix(name, values)))
+
+
+def _place(name: str) -> tuple[str, ...]:
+    return tuple(f"{name}_{part}" for part in ("x", "y", "z", "rotation"))
+
+
 def _placed(name: str, free: frozenset[str]) -> bool:
-    return {f"{name}_x", f"{name}_y", f"{name}_z", f"{name}_rotation"} <= free
+    return set(_place(name)) <= free
+
+
+def _still(frame: str) -> tuple[str, str]:
+    """What is open of a camera that never moves against its boards, and what would close it."""
+    return (
+        f"camera and boards are both on the frame {frame} and never move against one another: where they are is not "
+        "determined.",
+        "Name a camera that moves against the same boards in boards_of, or state board_poses and hold them.",
+    )
 
 
 def _views(setup: Setup, read: Mapping[str, Array], scale: float) -> list[_View]:

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from armcal.arm.assembly import Arm
 from armcal.arm.model import Vector3, forward
-from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME, frame_names
+from armcal.arm.statics import BASE_FRAME, MOUNT_FRAME, TOOL_FRAME, frame_names
 from armcal.base.domains import Array
 
 Mask = NDArray[np.bool_]
-BASE_FRAME = "base"
 EVERYTHING = "everything"
 _AT_ONCE = 4096
 _NO_LENGTH = 1e-18

@@ -16,7 +16,7 @@ from armcal.arm.model import Chain, Frames, Joint, Site
 from armcal.base import se3
 from armcal.base.se3 import Expression
 
-MOUNT_FRAME, TOOL_FRAME = "mount", "tool"
+BASE_FRAME, MOUNT_FRAME, TOOL_FRAME = "base", "mount", "tool"
 
 
 @dataclass(frozen=True)

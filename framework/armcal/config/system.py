@@ -146,7 +146,8 @@ def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
         measurements[name], described[name] = build_component(source, registry, "measurement", at, tuple(arms))
         carried = measurements[name]
         if isinstance(carried, Carried):
-            _check_carrier(source, (*at, "frame"), carried.carrier, arms[measurements[name].arms[0]])
+            for setting, frame in carried.carriers.items():
+                _check_carrier(source, (*at, setting), frame, arms[measurements[name].arms[0]])
     for name, measurement in measurements.items():
         if isinstance(measurement, Borrowing) and measurement.lender is not None:
             _check_lender(source, ("measurements", name), measurement, measurements)

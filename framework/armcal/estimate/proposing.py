@@ -10,13 +10,14 @@ import numpy as np
 
 from armcal.arm.effects import JointCommand
 from armcal.arm.model import forward
-from armcal.arm.statics import TOOL_FRAME
+from armcal.arm.statics import BASE_FRAME, TOOL_FRAME
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.base.parameters import ParameterBlock
 from armcal.errors import Location, ProblemError
 from armcal.estimate.start import BETTER, Start
 from armcal.measure.measurement import Carried, borrowed_names
-from armcal.measure.points import Proposing
+from armcal.measure.points import Certifying, Proposing
 from armcal.problem.problem import FactorRecords, Problem
 
 _TOOL_ROWS = 12
@@ -45,17 +46,8 @@ def _with_proposal(
     problem, name = start.problem, start.problem.kernels[number].factor.name
     parameters, nominal = problem.parameters, problem.parameters.nominal()
     before = start.vectors[0] if start.vectors else nominal
-    own = {b.name.removeprefix(f"{name}."): b for b in parameters.blocks if b.name.startswith(f"{name}.")}
-    lent = borrowed_names(problem.blueprint.measurements[name])
-    borrowed = {local: before[parameters.entries_of(full)] for local, full in lent.items()}
-    seen = np.flatnonzero(records[number].measured)
-    factor = problem.kernels[number].factor
-    proposal = measurement.propose(
-        _carriers(problem, before, problem.subset(records, seen), dataset.subset(seen), number),
-        {c.removeprefix(f"{name}."): dataset.column(c)[seen] for c in factor.output_channels},
-        {**{local: nominal[parameters.entries_of(block.name)] for local, block in own.items()}, **borrowed},
-        frozenset(local for local, block in own.items() if block.free),
-    )
+    own = _own(problem, name)
+    proposal = measurement.propose(*_read(problem, nominal, before, records, dataset, number))
     if any(own[local].prior_sd is None for local in proposal.undetermined):
         hint = f"{proposal.close} Or give priors, or hold {', '.join(proposal.undetermined)}."
         raise ProblemError(f"{name}: {proposal.open}", where=Location(dataset.source or None), hint=hint)
@@ -84,20 +76,67 @@ def _with_proposal(
     )
 
 
+def certificates(problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset) -> dict[str, str]:
+    """What measurements show of whether another answer could be better, sentences by their names."""
+    sentences = {}
+    for number, kernel in enumerate(problem.kernels):
+        measurement = problem.blueprint.measurements[kernel.factor.name]
+        if isinstance(measurement, Certifying):
+            read = _read(problem, values, values, records, dataset, number)
+            sentences[kernel.factor.name] = measurement.certificate(*read)
+    return {name: text for name, text in sentences.items() if text}
+
+
+def _own(problem: Problem, name: str) -> dict[str, ParameterBlock]:
+    """Parameters of a measurement by local name."""
+    blocks = problem.parameters.blocks
+    return {b.name.removeprefix(f"{name}."): b for b in blocks if b.name.startswith(f"{name}.")}
+
+
+def _read(
+    problem: Problem, own_values: Array, values: Array, records: Sequence[FactorRecords], dataset: Dataset, number: int
+) -> tuple[dict[str, Array], dict[str, Array], dict[str, Array], frozenset[str]]:
+    """What a measurement needs to find its parameters without a fit; see ``Proposing.propose``.
+
+    Arm and borrowed parameters are at ``values``, its own at ``own_values``.
+    """
+    name, parameters = problem.kernels[number].factor.name, problem.parameters
+    own, lent = _own(problem, name), borrowed_names(problem.blueprint.measurements[name])
+    borrowed = {local: values[parameters.entries_of(full)] for local, full in lent.items()}
+    seen = np.flatnonzero(records[number].measured)
+    return (
+        _carriers(problem, values, problem.subset(records, seen), dataset.subset(seen), number),
+        {c.removeprefix(f"{name}."): dataset.column(c)[seen] for c in problem.kernels[number].factor.output_channels},
+        {**{local: own_values[parameters.entries_of(block.name)] for local, block in own.items()}, **borrowed},
+        frozenset(local for local, block in own.items() if block.free),
+    )
+
+
 def _carriers(
     problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset, number: int
-) -> Array:
-    """What carries a measurement in each record (base_T_carrier, N x 4 x 4, m): the tool, or a frame of a still arm."""
+) -> dict[str, Array]:
+    """What carries a measurement in each record (base_T_frame, N x 4 x 4, m): the tool, or frames of a still arm."""
     plan = problem.blueprint
     measurement = plan.measurements[problem.kernels[number].factor.name]
-    if not isinstance(measurement, Carried) or measurement.carrier == TOOL_FRAME:
-        return _tools(problem, values, records, number)
-    arm, parameters = plan.arms[measurement.arms[0]], problem.parameters
+    frames = {BASE_FRAME: np.tile(np.eye(4), (len(dataset), 1, 1))}
+    for name in set(measurement.carriers.values()) if isinstance(measurement, Carried) else {TOOL_FRAME}:
+        is_tool = name == TOOL_FRAME
+        frames[name] = (
+            _tools(problem, values, records, number)
+            if is_tool
+            else _frame(problem, values, dataset, measurement.arms[0], name)
+        )
+    return frames
+
+
+def _frame(problem: Problem, values: Array, dataset: Dataset, of: str, name: str) -> Array:
+    """A frame of a still arm in each record (base_T_frame, N x 4 x 4, m)."""
+    arm, parameters = problem.blueprint.arms[of], problem.parameters
     stated = {name: ca.SX(values[parameters.entries_of(name)]) for name in parameters.names}
     chain, symbols = arm.chain(stated), ca.SX.sym("commands", len(arm.commanded))
     joint_commands = [JointCommand(i, q, ca.SX(0)) for i, q in enumerate(arm.joint_commands(ca.vertsplit(symbols)))]
     moved = [joint.offset + arm.displacement(stated, q) for joint, q in zip(chain.joints, joint_commands, strict=True)]
-    pose = ca.densify(forward(chain, moved, {}).named[measurement.carrier].matrix())
+    pose = ca.densify(forward(chain, moved, {}).named[name].matrix())
     commands = dataset.stacked([f"{arm.name}.{joint}" for joint in arm.commanded])
     shown = ca.Function("carrier", [symbols], [pose]).map(len(dataset))(commands).full()
     return np.asarray(shown.reshape(4, -1, 4).transpose(1, 0, 2))

@@ -119,11 +119,11 @@ class DimensionedResidual(Protocol):
 
 @runtime_checkable
 class Carried(Protocol):
-    """What a measurement provides beside the rest if another frame of its arm than the tool may carry it."""
+    """What a measurement provides beside the rest if other frames of its arm than the tool may carry its parts."""
 
     @property
-    def carrier(self) -> str:
-        """``tool``, or a frame of the arm model that a joint moves."""
+    def carriers(self) -> Mapping[str, str]:
+        """By the setting that names it: ``tool``, or a frame of the arm model that a joint moves."""
 
 
 @runtime_checkable

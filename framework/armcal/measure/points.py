@@ -41,16 +41,37 @@ class Proposing(Protocol):
     """What a measurement provides beside the rest if it finds its own parameters without a fit: a hand-eye pose."""
 
     def propose(
-        self, tools: Array, read: Mapping[str, Array], values: Mapping[str, Array], free: frozenset[str]
+        self,
+        frames: Mapping[str, Array],
+        read: Mapping[str, Array],
+        values: Mapping[str, Array],
+        free: frozenset[str],
     ) -> Proposal:
         """Its parameters from what it read, those that are free.
 
         Args:
-            tools: base_T_tool of each record (N x 4 x 4, m), of the nominal arm; of the frame that carries it (see
-                ``Carried``) where that is another one.
+            frames: base_T_tool of each record (N x 4 x 4, m), of the nominal arm, as ``tool``; for one that is
+                ``Carried``, the poses of its carriers, and ``base``.
             read: each channel (N; NaN where it is missing), by local name.
             values: canonical entries of all its parameters, by local name.
             free: local names of those that may move.
+        """
+
+
+@runtime_checkable
+class Certifying(Protocol):
+    """What a measurement provides beside the rest if it can show that no other answer is better."""
+
+    def certificate(
+        self,
+        frames: Mapping[str, Array],
+        read: Mapping[str, Array],
+        values: Mapping[str, Array],
+        free: frozenset[str],
+    ) -> str:
+        """Whether its parameters are the best there are, as a sentence; empty if there is nothing to show.
+
+        The arguments are those of ``Proposing.propose``, at the estimate.
         """
 
 

@@ -28,6 +28,7 @@ from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.outside import predicted_positions
 from armcal.diagnose.residual_structure import structure
 from armcal.diagnose.verdict import Verdict, judge
+from armcal.estimate.proposing import certificates
 from armcal.estimate.validation import error_unit
 from armcal.measure.measurement import StatesAccuracy
 from armcal.planning.candidates import deviations as deviations_of
@@ -74,7 +75,9 @@ def verdict_of(
         if estimate.names and all(kernel.factor.output_channels for kernel in problem.kernels):
             joints = {f"{name}.{j}": kind for name, arm in system.arms.items() for j, kind in arm.commanded.items()}
             suggestions = suggest(problem, run.dataset.subset(train), estimate, joints)
-    worse = worse_than_nominal(judged, errors.nominal_mm, errors.unit) + _overfitted(run, errors, judged)
+    worse = _overfitted(run, errors, judged)
+    if any(block.name.partition(".")[0] in system.arms for block in problem.parameters.free):
+        worse += worse_than_nominal(judged, errors.nominal_mm, errors.unit)
     verdict = judge(
         estimate,
         _whitened(run),
@@ -103,7 +106,9 @@ def _accuracies(run: FittedRecords) -> list[Finding]:
             own = {n.removeprefix(f"{name}."): float(sd) for n, sd in deviations.items() if n.startswith(f"{name}.")}
             text = measurement.accuracy(own)
             findings += [Finding("note", f"{name}: {text}")] if text else []
-    return findings
+    train = run.split.train
+    shown = certificates(problem, estimate.values, problem.subset(run.records, train), run.dataset.subset(train))
+    return [*findings, *(Finding("note", f"{name}: {text}") for name, text in shown.items())]
 
 
 def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | None) -> Evidence:

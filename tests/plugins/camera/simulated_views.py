@@ -91,6 +91,15 @@ def estimated(experiment: Experiment) -> Estimate:
     return fitted_of(experiment, ready, lambda *_: None, None, Stopwatch()).estimate
 
 
+def assert_found(estimate: Estimate, **poses: Array) -> None:
+    """Each body is where it truly is, within its stated region and within 2 mm; its name has a dot for a blank."""
+    for name, truth in poses.items():
+        place, covariance = of(estimate, name.replace("_", ".", 1))
+        off = place - truth[:3, 3]
+        assert off @ np.linalg.solve(covariance, off) < 7.8, f"{name}: chi-squared of 3, 95 %"
+        assert np.linalg.norm(off) < 2e-3 and np.sqrt(np.trace(covariance)) < 2e-3
+
+
 def of(estimate: Estimate, name: str) -> tuple[Array, Array]:
     """Where a body stands (3, m) by the fit, and the covariance of that (3 x 3)."""
     entries, free = estimate.parameters.entry_names, list(estimate.free_entries)

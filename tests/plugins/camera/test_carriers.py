@@ -8,11 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from armcal.errors import ConfigError
+from armcal.errors import ConfigError, ProblemError
 from armcal.run.experiment import Experiment
+from armcal.run.pipeline import Stopwatch, prepare
 from armcal_camera.export import FramesSettings, HandEyeExporter, OpenCvExporter
 
-from tests.plugins.camera.simulated_views import ARM, base_T, estimated, numbers, of, pose, simulated
+from tests.plugins.camera.simulated_views import ARM, assert_found, base_T, estimated, numbers, pose, simulated
 
 CAMERA_T_BOARD = pose((-0.08, -0.05, 0.8), (8, -6, 3))
 
@@ -25,11 +26,25 @@ def test_what_the_forearm_carries_is_found(mounting: str, tmp_path: Path) -> Non
     board = forearm @ carried @ CAMERA_T_BOARD if in_hand else carried
     truth = {**numbers("camera.camera", camera), **numbers("camera.board", board)}
     estimate = estimated(simulated(tmp_path, {"camera": {"mounting": mounting, "frame": "row3"}}, truth, 30))
-    for name, stated in (("camera.camera", camera), ("camera.board", board)):
-        place, covariance = of(estimate, name)
-        off = place - stated[:3, 3]
-        assert off @ np.linalg.solve(covariance, off) < 16.3, "chi-squared of 3, one in a thousand"
-        assert np.linalg.norm(off) < 2e-3 and np.sqrt(np.trace(covariance)) < 2e-3
+    assert_found(estimate, camera_camera=camera, camera_board=board)
+
+
+def test_a_camera_on_the_forearm_sees_a_board_on_the_tool(tmp_path: Path) -> None:
+    to_tool = np.linalg.inv(base_T("row3")) @ base_T("tool")
+    board = pose((-0.08, -0.05, 0.05), (170, 8, 5))
+    camera = to_tool @ board @ np.linalg.inv(CAMERA_T_BOARD)
+    truth = {**numbers("camera.camera", camera), **numbers("camera.board", board)}
+    estimate = estimated(simulated(tmp_path, {"camera": {"frame": "row3", "board_frame": "tool"}}, truth, 30))
+    assert_found(estimate, camera_camera=camera, camera_board=board)
+
+
+def test_a_camera_that_never_moves_against_its_board_is_refused(tmp_path: Path) -> None:
+    beside = {"mounting": "eye_to_hand", "board_frame": "base"}
+    truth = {**numbers("camera.camera", np.eye(4)), **numbers("camera.board", CAMERA_T_BOARD)}
+    experiment = simulated(tmp_path, {"camera": beside}, truth, 4)
+    with pytest.raises(ProblemError, match="never move against one another") as refused:
+        prepare(experiment, Stopwatch())
+    assert "boards_of" in refused.value.hint
 
 
 def test_a_frame_that_is_not_there_or_stands_still_is_refused() -> None:

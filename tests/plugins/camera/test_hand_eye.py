@@ -104,12 +104,16 @@ def test_a_small_board_beside_a_large_one_has_its_pose_found() -> None:
             there = points @ seen[:3, :2].T + seen[:3, 3]
             image[i, part] = there[:, :2] / there[:, 2:]
     names = ("board1", "board2")
-    setup = Setup(names, tuple(np.c_[points, np.zeros(len(points))] for points in boards), "pinhole", True, True)
+    setup = Setup(
+        names, tuple(np.c_[points, np.zeros(len(points))] for points in boards), "pinhole", True, ("tool", "base")
+    )
     place = {f"{n}_{a}": np.zeros(1) for n in ("camera", *names) for a in "xyz"}
     turns = {f"{n}_rotation": np.array([1.0, 0, 0, 0]) for n in ("camera", *names)}
     lens = {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0, "board_scale": 1.0, **dict.fromkeys(DISTORTION["pinhole"], 0.0)}
     values = {**place, **turns, **{name: np.array([value]) for name, value in lens.items()}}
     read = {f"{axis}_{k}": image[:, k, j] for k in range(58) for j, axis in enumerate("uv")}
-    proposal = first_guess(setup, tools, read, values, frozenset({*place, *turns}))
+    proposal = first_guess(
+        setup, {"tool": tools, "base": np.tile(np.eye(4), (8, 1, 1))}, read, values, frozenset({*place, *turns})
+    )
     for name, expected in (("camera", x), ("board1", y), ("board2", y @ tag)):
         assert np.allclose([proposal.values[f"{name}_{a}"][0] for a in "xyz"], expected[:3, 3], atol=1e-5), name

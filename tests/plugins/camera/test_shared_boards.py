@@ -10,7 +10,16 @@ import yaml
 from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment
 
-from tests.plugins.camera.simulated_views import base_T, configured, estimated, numbers, of, pose, simulated
+from tests.plugins.camera.simulated_views import (
+    assert_found,
+    base_T,
+    configured,
+    estimated,
+    numbers,
+    of,
+    pose,
+    simulated,
+)
 
 LEFT, RIGHT = pose((0.05, 0.02, 0.06), (5, 20, -40)), pose((0.05, -0.13, 0.06), (-2, 17, -38))
 BOARD = base_T("tool") @ LEFT @ pose((-0.08, -0.05, 0.8), (8, -6, 3))
@@ -35,6 +44,16 @@ def test_a_board_is_known_better_by_two_cameras(order: tuple[str, str], tmp_path
             off = found - truth
             assert off @ np.linalg.solve(covariance, off) < 16.3, "chi-squared of 3, one in a thousand"
             assert np.linalg.norm(off) < 2e-3
+
+
+def test_a_camera_beside_the_arm_is_placed_by_the_board_of_the_hand_camera(tmp_path: Path) -> None:
+    beside = BOARD @ np.linalg.inv(pose((-0.08, -0.05, 1.2), (25, -20, 100)))
+    truth = {**TRUTH, **numbers("right.camera", beside)}
+    fixed = {"mounting": "eye_to_hand", "board_frame": "base", "boards_of": "left"}
+    estimate = estimated(simulated(tmp_path, {"left": {}, "right": fixed}, truth, 30))
+    assert_found(estimate, left_camera=LEFT, left_board=BOARD, right_camera=beside)
+    still = {name: value for name, value in fixed.items() if name != "boards_of"}
+    assert "does not move against its boards" in refused(tmp_path, left={"boards_of": "right"}, right=still)
 
 
 def refused(tmp_path: Path, **cameras: dict[str, object]) -> str:
