@@ -72,19 +72,23 @@ def first_guess(
     moved = np.linalg.inv(frames[board_frame]) @ frames[camera_frame]
     known = [not free & set(_place(name)) for name in setup.names]
     is_open = _still(camera_frame) if camera_frame == board_frame else open_motion(moved, camera_frame)
-    if is_open is not None and not any(held and own_poses for held, own_poses in zip(known, poses, strict=True)):
+    if is_open is not None and not any(own_poses for own_poses, held in zip(poses, known, strict=True) if held):
         return Proposal(proposed, *is_open, tuple(name for name in _place("camera") if name in free))
-    camera_pose = None
-    for number, name in sorted(
-        enumerate(setup.names), key=lambda b: (is_open is not None and not known[b[0]], -len(poses[b[0]]))
-    ):
-        records = list(poses[number])
-        if not records:
-            continue
-        a, b = moved[records], np.array([poses[number][i] for i in records])
+    boards = [board for board in zip(setup.names, poses, known, strict=True) if board[1]]
+    boards.sort(key=lambda board: (is_open is not None and not board[2], -len(board[1])))
+    return Proposal({**proposed, **_places(boards, moved, own, free)})
+
+
+def _places(
+    boards: Sequence[tuple[str, dict[int, Array], bool]], moved: Array, own: Mapping[str, Array], free: frozenset[str]
+) -> dict[str, Array]:
+    """Places of the camera and of boards (name, camera_T_board by record, whether its own place is known)."""
+    proposed, camera_pose = dict[str, Array](), None
+    for name, poses, is_known in boards:
+        a, b = moved[list(poses)], np.array(list(poses.values()))
         if camera_pose is None and _placed("camera", free):
             solved = hand_eye(a, np.linalg.inv(b))
-            if solved is None and not known[number]:
+            if solved is None and not is_known:
                 continue
             every = np.linalg.inv(a) @ _matrix(name, own) @ np.linalg.inv(b)
             camera_pose = every[_middle(every)] if solved is None else solved.x
@@ -95,7 +99,7 @@ def first_guess(
             board_pose_ = every[_middle(every)]
         if _placed(name, free):
             proposed |= _pose_values(name, board_pose_)
-    return Proposal(proposed)
+    return proposed
 
 
 def certified_place(

@@ -75,9 +75,7 @@ def verdict_of(
         if estimate.names and all(kernel.factor.output_channels for kernel in problem.kernels):
             joints = {f"{name}.{j}": kind for name, arm in system.arms.items() for j, kind in arm.commanded.items()}
             suggestions = suggest(problem, run.dataset.subset(train), estimate, joints)
-    worse = _overfitted(run, errors, judged)
-    if any(block.name.partition(".")[0] in system.arms for block in problem.parameters.free):
-        worse += worse_than_nominal(judged, errors.nominal_mm, errors.unit)
+    worse = _worse(run, errors, judged)
     verdict = judge(
         estimate,
         _whitened(run),
@@ -154,6 +152,17 @@ def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array
         *displacement_findings(figure),
         *limit_findings(figure, scale_deviation(problem, rows, read, estimate.noise_scale)),
     ]
+
+
+def _worse(run: FittedRecords, errors: RecordErrors, judged_mm: Array) -> list[Finding]:
+    """Where records that did not train are missed by more than before, or by more than those that did.
+
+    An arm of which no parameter is free is its nominal one: what was before is then the start, which all records gave.
+    """
+    problem = run.problem
+    moves = any(block.name.partition(".")[0] in problem.blueprint.arms for block in problem.parameters.free)
+    worse = worse_than_nominal(judged_mm, errors.nominal_mm, errors.unit) if moves else []
+    return worse + _overfitted(run, errors, judged_mm)
 
 
 def _overfitted(run: FittedRecords, errors: RecordErrors, judged_mm: Array) -> list[Finding]:
