@@ -33,7 +33,7 @@ class Certificate:
     Attributes:
         x, y: 4 x 4 (m).
         gap: share by which the sum of squares of another answer may be lower at most; 0 for a best one.
-        ratio: the sum of squares of another answer that was asked about, over the best one's.
+        ratio: the sum of squares of another answer that is compared, over the best one's.
     """
 
     x: Array
@@ -42,16 +42,16 @@ class Certificate:
     ratio: float
 
 
-def sentence(a: Array, b: Array, start: HandEye, asked: tuple[Array, Array]) -> str:
+def sentence(a: Array, b: Array, start: HandEye, other: tuple[Array, Array]) -> str:
     """What is shown of an answer; or why nothing is. Arguments as ``certificate`` has them."""
     try:
-        shown = certificate(a, b, start, asked)
+        shown = certificate(a, b, start, other)
     except PluginError as fault:
         return f"that no other place of the camera is better could not be shown: {fault.message} {fault.hint}"
     if shown.gap > _ENOUGH:
         more = f"by {100 * shown.gap:.2g} % of the squared error" if shown.gap < 1 else "by any amount"
         return f"that no other place of the camera is better could not be shown: one may be better {more}."
-    off = np.linalg.inv(shown.x) @ asked[0]
+    off = np.linalg.inv(shown.x) @ other[0]
     mm, deg = 1000 * np.linalg.norm(off[:3, 3]), np.rad2deg(Rotation.from_matrix(off[:3, :3]).magnitude())
     best = (
         f"no other place of the camera fits the {len(a)} poses of the board better than one {mm:.2g} mm, {deg:.2g} deg"
@@ -63,14 +63,14 @@ def sentence(a: Array, b: Array, start: HandEye, asked: tuple[Array, Array]) -> 
     )
 
 
-def certificate(a: Array, b: Array, start: HandEye, asked: tuple[Array, Array]) -> Certificate:
+def certificate(a: Array, b: Array, start: HandEye, other: tuple[Array, Array]) -> Certificate:
     """The answer nearest to a start, and a bound of all.
 
     Args:
         a: poses (N x 4 x 4, m).
         b: poses (N x 4 x 4, m).
         start: an answer in closed form; its misfits weigh turns against places.
-        asked: X and Y of another answer.
+        other: X and Y of another answer.
 
     Raises:
         PluginError: cvxpy is not installed.
@@ -80,10 +80,10 @@ def certificate(a: Array, b: Array, start: HandEye, asked: tuple[Array, Array]) 
     solved = least_squares(lambda moved: np.concatenate(_misfits(a, b, *_moved(start, moved), weights)), np.zeros(12))
     x, y = _moved(start, solved.x)
     best = float(2 * solved.cost)
-    other = sum(float(np.sum(part**2)) for part in _misfits(a, b, *asked, weights))
+    compared = sum(float(np.sum(part**2)) for part in _misfits(a, b, *other, weights))
     size = max(best, 1.0)  # poses without any error have a sum of zero
     bound = _bound(_form(a, b, weights) / size)
-    return Certificate(x, y, max(0.0, best / size - bound), other / size)
+    return Certificate(x, y, max(0.0, best / size - bound), compared / size)
 
 
 def _misfits(a: Array, b: Array, x: Array, y: Array, weights: Array) -> tuple[Array, Array]:
