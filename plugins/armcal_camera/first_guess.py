@@ -109,7 +109,7 @@ def certified_place(
     values: Mapping[str, Array],
     free: frozenset[str],
 ) -> str:
-    """Whether another place of the camera would fit the poses of the board seen most better; empty if there is nothing to show."""
+    """Whether another place of the camera fits the poses of the board seen most better; empty without a question."""
     camera_frame, board_frame = setup.frames
     if camera_frame == board_frame or not _placed("camera", free):
         return ""
