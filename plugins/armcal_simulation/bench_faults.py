@@ -15,7 +15,7 @@ Seconds = Annotated[float, Field(ge=0)]
 Kind = Literal[
     "drop", "duplicate", "reorder", "flip", "split", "late",
     "unplug", "replug", "reset", "brown_out", "nack", "stuck",
-    "disconnect", "connect", "jam", "free", "heat",
+    "disconnect", "connect", "jam", "free", "heat", "put",
     "lost", "silent", "frozen", "skew", "seen",
 ]  # fmt: skip
 
@@ -32,7 +32,8 @@ class FaultRequest(Settings):
         unit: serial faults: whole frames, or single bytes.
         byte: ``nack``: the index in the data; -1 is the address.
         seconds: ``stuck``: for so long.
-        joint: ``disconnect`` to ``heat``, and ``brown_out``, of smart servos: whose; all by default.
+        joint: ``disconnect`` to ``put``, and ``brown_out``, of smart servos: whose; all by default.
+        angle: ``put``: where somebody moves the joint by hand (rad); one that holds stays.
         body: ``lost`` and ``seen``: which; all by default.
         counter: ``frozen``: what the frame counter does.
         ppm: ``skew``: how much the tracker's clock gains.
@@ -47,6 +48,7 @@ class FaultRequest(Settings):
     byte: Annotated[int, Field(ge=-1, le=240)] = -1
     seconds: Seconds = 0.05
     joint: str | None = None
+    angle: float = 0.0
     body: str | None = None
     counter: Literal["rising", "same"] = "rising"
     ppm: float = 0.0

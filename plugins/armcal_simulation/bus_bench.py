@@ -158,6 +158,8 @@ class BusElectronics:
                 part.motor.stops = (part.motor.shaft, part.motor.shaft)
             elif fault.kind == "free":
                 part.motor.stops = part.motor.settings.travel
+            elif fault.kind == "put":
+                part.motor.put(fault.angle)
             elif fault.kind == "heat":
                 self._world.physics.heat[joint].winding = _BURNING
         self.moved()

@@ -93,6 +93,11 @@ class BusMotor(JointServo):
             self.setpoint = None
         self._aim()
 
+    def put(self, angle: float) -> None:
+        """Somebody turns it by hand (rad), where it does not hold."""
+        if not self.powered:
+            self._gear = self._horn = self.angle = angle
+
     @override
     def holds(self, torque: float) -> bool:
         return self.powered and abs(torque) <= self.settings.stall * self.torque_share

@@ -158,6 +158,16 @@ class ClearanceCheck:
         """The pairs of each rule."""
         return tuple(self._pairs)
 
+    def worst(self, pose: Array) -> str:
+        """What is too near in a pose (joints; rad or m), and by how much; empty where nothing is."""
+        margins = self(pose[:, None]).margins[:, 0]
+        row = int(np.argmin(margins))
+        if margins[row] >= 0:
+            return ""
+        regions = row == len(self._pairs)
+        what = "the tool and a forbidden region" if regions else " and ".join(self._clearance.rules[row].between)
+        return f"{what} are {-1000 * margins[row]:.0f} mm too near"
+
     def __call__(self, joint_angles: Array) -> Checked:
         """Check commands (joints x N; rad or m)."""
         starts = range(0, joint_angles.shape[1], _AT_ONCE)

@@ -114,8 +114,15 @@ class AcquisitionRun:
         return self._recovery.persist(action, afterwards or self._energise)
 
     def _step(self) -> None:
+        """The next.
+
+        Raises:
+            StopRequested: nothing is wrong with the pose, but with where the arm stands: no clear path leads away.
+        """
         step = self._scheduler.next(self._drive.at, self._drive.thermal_state.warmth, self._left)
         if isinstance(step, LeaveOut):
+            if (trouble := self._drive.trouble) and self._drive.path_home(self._drive.at) is None:
+                raise StopRequested(f"{trouble}: switch its servos off, and move the arm by hand")
             self._leave_out(step.pose, step.why)
         elif isinstance(step, Rest):
             self._rest(step)

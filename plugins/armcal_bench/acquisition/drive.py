@@ -232,6 +232,11 @@ class Drive(Motion):
             self.note()
         return super()._pause(seconds, may_move)
 
+    @property
+    def trouble(self) -> str:
+        """What is wrong with where the arm stands; empty if nothing is."""
+        return self._planner.trouble(self.joints, self.at)
+
     def path_home(self, start: Array) -> JointPath | None:
         """From a pose (joints, rad) to where the arm parks."""
         return self._planner.find(start, self.park)

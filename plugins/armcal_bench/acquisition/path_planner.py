@@ -51,6 +51,16 @@ class PathPlanner:
         """Whether it lies within the limits (joints, rad)."""
         return bool(np.all((pose >= self._limits[:, 0]) & (pose <= self._limits[:, 1])))
 
+    def trouble(self, joints: Sequence[str], pose: Array) -> str:
+        """What is wrong with a pose (joints, rad); empty if nothing is."""
+        rows = zip(joints, np.degrees(pose), np.degrees(self._limits), strict=True)
+        parts = [
+            f"{joint} stands at {angle:.1f} deg, beyond {low:.1f} to {high:.1f} deg"
+            for joint, angle, (low, high) in rows
+            if not low <= angle <= high
+        ]
+        return ", ".join([*parts, *filter(None, [self._check.worst(pose) if self._check else ""])])
+
     def clear(self, start: Array, goal: Array) -> bool:
         """Whether the straight line between two poses is clear, its ends included."""
         if self._check is None:
