@@ -34,8 +34,14 @@ _BASE = "base"
 _LEVER_M, _MODEL_SD_M, _ZERO_SD, _TARGET_SD_M = 0.1, 0.004, math.radians(15.0), 0.01
 """Of the pose of an arm that sags and is not as drawn; of its zeros; of where the tracker's body sits."""
 _TOOTH_DEG = 360 / 25
-"""Of the splines of hobby and bus servos; what remains beside a whole number of teeth is not the horn's."""
-_UNREMARKABLE_DEG, _CLEARLY = 10.0, 0.3
+"""Of the splines of hobby and bus servos."""
+_REST_DEG, _MOST_TEETH = 5.0, 12
+"""The standard deviation of a zero that was set by hand; a horn is a tooth off in one case of ten, two in a hundred."""
+_UNREMARKABLE_DEG, _PLAUSIBLE = 10.0, 0.05
+_TELLS = (
+    "The zeros of {joints} alone cannot tell whether a horn is on another tooth. An earlier calibration can, or the "
+    "middle between a joint's stops: turn it there by hand, and see its angle in armcal bus check."
+)
 _MENDS = {
     "reversed": "Give its direction in bench.device the other sign.",
     "another": "Exchange their ids in bench.device, or their plugs.",
@@ -45,29 +51,68 @@ _MENDS = {
 
 
 @dataclass(frozen=True)
-class JointCheck:
-    """What each joint did, and how far its zero is off (rad; empty where not all turned as commanded)."""
+class Zero:
+    """How far a joint's zero is off, and its standard deviation (rad)."""
 
-    verdicts: Sequence[Verdict]
-    zeros: Mapping[str, float]
+    value: float
+    sd: float
 
     @property
-    def far_zeros(self) -> dict[str, str]:
-        """Of zeros that are further off than a calibration by hand leaves them, and the teeth of a horn, by joint."""
-        sentences = {}
-        for joint, zero in self.zeros.items():
-            degrees = math.degrees(zero)
-            if abs(degrees) < _UNREMARKABLE_DEG:
-                continue
-            teeth = abs(degrees) / _TOOTH_DEG
-            about = f"{int(teeth)} or {int(teeth) + 1}"
-            if abs(teeth - round(teeth)) < _CLEARLY:
-                about = f"about {round(teeth)}"
-            sentences[joint] = (
-                f"{joint} stands {degrees:+.1f} deg from where its servo says, {about} teeth of a horn "
-                f"({_TOOTH_DEG:.1f} deg each). Remount the horn, or move its zero_count."
-            )
-        return sentences
+    def is_far(self) -> bool:
+        """Whether it is further off than a calibration by hand leaves it."""
+        return abs(self.value) >= math.radians(_UNREMARKABLE_DEG)
+
+    @property
+    def teeth(self) -> list[tuple[int, float]]:
+        """By how many teeth the horn may well be off, and the probability of each, the most likely one first."""
+        degrees, variance = math.degrees(self.value), _REST_DEG**2 + math.degrees(self.sd) ** 2
+        weights = {
+            k: 0.1 ** abs(k) * math.exp(-((degrees - k * _TOOTH_DEG) ** 2) / (2 * variance))
+            for k in range(-_MOST_TEETH, _MOST_TEETH + 1)
+        }
+        total = sum(weights.values())
+        likely = [(k, weight / total) for k, weight in weights.items() if weight >= _PLAUSIBLE * total]
+        return sorted(likely, key=lambda pair: -pair[1])
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether it tells the tooth."""
+        return len(self.teeth) == 1
+
+    def sentence(self, joint: str) -> str:
+        """What it looks like; empty where that is a zero set by hand."""
+        if self.is_sure and not self.teeth[0][0] and not self.is_far:
+            return ""
+        amount = f"{math.degrees(self.value):+.1f} +- {math.degrees(self.sd):.1f} deg"
+        shares = [(self._as_teeth(k), "" if self.is_sure else f" ({100 * share:.0f} %)") for k, share in self.teeth]
+        mend = " Remount the horn, or move its zero_count." if self.is_far else ""
+        return f"{joint} stands {amount} from where its servo says: {', or '.join(map(''.join, shares))}.{mend}"
+
+    def _as_teeth(self, number: int) -> str:
+        if not number:
+            return "a zero set by hand"
+        teeth = f"{abs(number)} {'tooth' if abs(number) == 1 else 'teeth'} of its horn ({_TOOTH_DEG:.1f} deg each)"
+        return f"{teeth} and a zero of {math.degrees(self.value) - number * _TOOTH_DEG:+.1f} deg"
+
+
+@dataclass(frozen=True)
+class JointCheck:
+    """What each joint did, and how far its zero is off (empty where not all turned as commanded)."""
+
+    verdicts: Sequence[Verdict]
+    zeros: Mapping[str, Zero]
+
+    @property
+    def far_zeros(self) -> list[str]:
+        """Of zeros that are further off than a calibration by hand leaves them, and the teeth of a horn."""
+        return [zero.sentence(joint) for joint, zero in self.zeros.items() if zero.is_far]
+
+    @property
+    def notes(self) -> list[str]:
+        """Of other zeros that may be a horn on another tooth; and what can tell."""
+        lines = [zero.sentence(joint) for joint, zero in self.zeros.items() if not zero.is_far]
+        unsure = [joint for joint, zero in self.zeros.items() if not zero.is_sure]
+        return [*filter(None, lines), *([_TELLS.format(joints=", ".join(unsure))] if unsure else [])]
 
 
 def check_joints(
@@ -107,8 +152,9 @@ def check_joints(
         measured = {name: pose_of(record) for name, record in progress_of(journal.recovered.entries).measured.items()}
     commanded = dict(zip(prepared.plan.ids, prepared.scheduler.poses, strict=True))
     check = _judged(experiment, list(here), commanded, measured)
-    far = [replace(v, kind="unclear") if v.joint in check.far_zeros else v for v in check.verdicts]
-    noted(WiringRecord.of_config(experiment.source, here), far, seen)
+    far = {joint for joint, zero in check.zeros.items() if zero.is_far}
+    counted = [replace(v, kind="unclear") if v.joint in far else v for v in check.verdicts]
+    noted(WiringRecord.of_config(experiment.source, here), counted, seen)
     return check
 
 
@@ -146,13 +192,14 @@ def _judged(
         for i, joint in enumerate(joints)
         if joint in seen
     ]
-    verdicts, zeros = _verdicts(moves, base, nominal), {}
+    verdicts = _verdicts(moves, base, nominal)
+    zeros: dict[str, Zero] = {}
     if len(seen) == len(joints) and {verdict.kind for verdict in verdicts} <= {"right", "unclear"}:
         names = [_BASE, *joints]
         poses = np.array([commanded[name] for name in names])
         zeros = _zeros(nominal, joints, (poses, np.array([measured[name] for name in names])), _target(experiment))
         # a zero that is far off turns the axes of the joints after it away from the model's
-        verdicts = _verdicts(moves, {joint: base[joint] + zeros[joint] for joint in joints}, nominal)
+        verdicts = _verdicts(moves, {joint: base[joint] + zeros[joint].value for joint in joints}, nominal)
     for joint in joints:
         if joint not in seen:
             sentence = f"{joint} was not measured: nowhere to turn to, or the tracker did not see it."
@@ -172,8 +219,8 @@ def _target(experiment: Experiment) -> Array:
     return np.array([stated[name].nominal[0] if name in stated.names else 0.0 for name in names])
 
 
-def _zeros(nominal: NominalArm, joints: list[str], poses: tuple[Array, Array], target: Array) -> dict[str, float]:
-    """How much the joints' angles are to be enlarged by (rad).
+def _zeros(nominal: NominalArm, joints: list[str], poses: tuple[Array, Array], target: Array) -> dict[str, Zero]:
+    """How much the joints' angles are to be enlarged by.
 
     Args:
         poses: commanded (N x joints, rad), and measured (N x 4 x 4).
@@ -194,7 +241,10 @@ def _zeros(nominal: NominalArm, joints: list[str], poses: tuple[Array, Array], t
         )
 
     start = np.concatenate([np.zeros(count), target])
-    return dict(zip(joints, least_squares(residuals, start, x_scale=0.1).x[:count].tolist(), strict=True))
+    fit = least_squares(residuals, start, x_scale=0.1)
+    jacobian = np.asarray(fit.jac)
+    sds = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))  # the priors keep it regular
+    return {joint: Zero(float(fit.x[i]), float(sds[i])) for i, joint in enumerate(joints)}
 
 
 def _written(path: Path, joints: list[str], poses: Mapping[str, Sequence[float] | Array]) -> Path:

@@ -113,18 +113,26 @@ def _evaluate(console: Console, setup: Setup, out: Path, keep: bool) -> None:
 def _check(console: Console, setup: Setup, talk: Conversation, seen: str) -> None:
     with _stoppable(console):
         verdicts = tried(setup, talk, seen)
-    _show_verdicts(console, verdicts, swapped(verdicts), [])
+    _show_verdicts(console, verdicts, swapped(verdicts))
 
 
-def _show_verdicts(console: Console, verdicts: Sequence[Verdict], pairs: list[str], zeros: list[str]) -> None:
-    """What each joint did, ``swapped`` pairs, and zeros that are far off; fails unless all is well."""
+def _show_verdicts(
+    console: Console,
+    verdicts: Sequence[Verdict],
+    pairs: list[str],
+    zeros: Sequence[str] = (),
+    notes: Sequence[str] = (),
+) -> None:
+    """What each joint did, ``swapped`` pairs, and zeros that are far off; fails unless all is well but for notes."""
     shown = [{**asdict(v), "turned": v.turned if v.turned == v.turned else None} for v in verdicts]
-    console.result({"joints": shown, "swapped": pairs, "far_zeros": zeros})
+    console.result({"joints": shown, "swapped": pairs, "far_zeros": zeros, "notes": notes})
     for verdict in verdicts:
         style = "green" if verdict.kind == "right" else "red"
         console.line(f"{verdict.sentence} {verdict.mend}".rstrip(), style)
     for sentence in (*pairs, *zeros):
         console.line(sentence, "red")
+    for sentence in notes:
+        console.line(sentence)
     if zeros or any(verdict.kind != "right" for verdict in verdicts):
         sys.exit(EXIT_FAULT)
 
@@ -137,7 +145,7 @@ def _check_joints(console: Console, config: Path, overrides: tuple[str, ...], ma
             driven(console, prepared, plan, (out, "anew"), may_energise, unchecked=True)
 
         check = check_joints(lambda more: load(console, config, (*overrides, *more)), Path(folder), drive)
-    _show_verdicts(console, check.verdicts, [], list(check.far_zeros.values()))
+    _show_verdicts(console, check.verdicts, [], check.far_zeros, check.notes)
 
 
 @contextmanager

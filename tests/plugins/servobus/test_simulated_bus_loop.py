@@ -11,6 +11,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,28 +27,80 @@ from bench_runs import free_port
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "so101"
 POSES, FRESH = 40, 20
+LIMITS = {
+    "shoulder_pan": (-82, 82),
+    "shoulder_lift": (-52, 52),
+    "elbow_flex": (-72, 62),
+    "wrist_flex": (-72, 72),
+    "wrist_roll": (-82, 82),
+}
+NARROWER = [f"plan.limits.{joint}=[{low} deg, {high} deg]" for joint, (low, high) in LIMITS.items()]
+"""The bench judges limits by shafts, which are up to 7 deg on for the same angle once zeros are written back."""
 pytestmark = pytest.mark.slow
 
 
 @dataclass(frozen=True)
 class Loop:
-    """What the commands left behind; ``ids`` answered on the bus, ``state`` is the bench's truth at the end."""
+    """What the commands left behind.
+
+    Attributes:
+        ids: baud, id and model of what answered on the bus.
+        unchecked: what ``acquire`` said before any check, after ``bus wiring``, and after ``bus home``.
+        state: the bench's truth at the end.
+        offsets: by joint, how ``bus home`` and ``lerobot zeros`` changed its homing offset (counts).
+    """
 
     folder: Path
     ids: list[tuple[int, int, str]]
-    state: dict[str, object]
+    unchecked: list[str]
+    state: dict[str, Any]
+    offsets: dict[str, tuple[int, int]]
 
     def positions(self, name: str) -> np.ndarray:
         with (self.folder / name).open() as stream:
             return np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in csv.DictReader(stream)])
 
+    def values(self, run: str) -> dict[str, float]:
+        text = yaml.safe_load((self.folder / run / "calibration.yaml").read_text())
+        return {p["name"]: p["value"] for p in text["parameters"]}
 
-def armcal(folder: Path, *words: str | Path, sets: tuple[str, ...] = ()) -> str:
-    given = [word for text in sets for word in ("--set", text)]
-    command = [sys.executable, "-m", "armcal.cli", *map(str, words), *given]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=folder)
-    assert done.returncode == 0, f"{words}: {done.stdout}\n{done.stderr}"
-    return done.stdout
+    def nominal_error_mm(self, run: str) -> float:
+        metrics = json.loads((self.folder / run / "metrics.json").read_text())
+        return float(metrics["error_mm"]["nominal"]["holdout"]["mean"])
+
+
+class Terminal:
+    """A user's commands in a folder, with overrides; exit codes are asserted."""
+
+    def __init__(self, folder: Path, sets: tuple[str, ...] = ()) -> None:
+        self._folder, self._sets = folder, [word for text in sets for word in ("--set", text)]
+
+    def words(self, *words: str | Path) -> list[str]:
+        return [sys.executable, "-m", "armcal.cli", *map(str, words), *self._sets]
+
+    def __call__(self, *words: str | Path, code: int = 0) -> str:
+        done = subprocess.run(self.words(*words), capture_output=True, text=True, timeout=600, cwd=self._folder)
+        assert done.returncode == code, f"{words}: {done.stdout}\n{done.stderr}"
+        return done.stdout if code == 0 else " ".join(done.stderr.split())
+
+    def wiring(self, config: Path, clock: SimulatedClock) -> None:
+        """``bus wiring``: each joint is turned by hand when its line asks for that, and turned back later."""
+        words, pipe = self.words("bus", "wiring", config), subprocess.PIPE
+        angles = {joint: at["shaft_rad"] for joint, at in clock.ask({"state": True})["bus"].items()}
+        asked = subprocess.Popen(words, stdin=pipe, stderr=pipe, stdout=subprocess.DEVNULL, text=True)
+        assert asked.stdin is not None and asked.stderr is not None
+        for joint, angle in angles.items():
+            assert asked.stderr.readline().startswith(f"Turn {joint} by 15 deg")
+            put(clock, joint, angle + math.radians(20))
+            asked.stdin.write("\n")
+            asked.stdin.flush()
+        assert asked.wait(60) == 0
+        for joint, angle in angles.items():
+            put(clock, joint, angle)
+
+
+def put(clock: SimulatedClock, joint: str, angle: float) -> None:
+    clock.ask({"fault": {"kind": "put", "joint": joint, "angle": angle}})
 
 
 @pytest.fixture(scope="module")
@@ -56,28 +109,61 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loop]:
     config = shutil.copytree(CONFIGS, folder / "so101") / "bench.yaml"
     port = free_port()
     ports = (f"bench.tracker.port={port}", f"bench.simulator.tracker.port={port}")
-    sets = (*ports, *overrides_for(folder / "bench", "device"))
-    armcal(folder, "plan", config, "--poses", str(POSES), "--out", folder / "plan.csv")
-    fresh = ("plan.seed=5", "plan.starts=1", "plan.goal=A")
-    armcal(folder, "plan", config, "--poses", str(FRESH), "--out", folder / "fresh.csv", sets=fresh)
+    desk, bench = Terminal(folder), Terminal(folder, (*ports, *overrides_for(folder / "bench", "device")))
+    desk("plan", config, "--poses", str(POSES), "--out", folder / "plan.csv")
+    fresh = Terminal(folder, ("plan.seed=5", "plan.starts=1", "plan.goal=A", *NARROWER))
+    fresh("plan", config, "--poses", str(FRESH), "--out", folder / "fresh.csv")
+
+    def acquire(plan: str, out: str, code: int = 0) -> str:
+        return bench("acquire", config, "--plan", folder / plan, "--out", folder / out, "--yes", code=code)
+
+    def doubt() -> str:
+        words = ("acquire", config, "--plan", folder / "plan.csv", "--dry-run", "--json")
+        return str(json.loads(bench(*words))["unchecked"])
+
     with simulated_bench(config, ports, folder / "bench"):
-        found = json.loads(armcal(folder, "bus", "find", folder / "bench" / BOARD, "--last-id", "8", "--json"))
-        ids = [(servo["baud"], servo["id"], servo["model"]) for servo in found["servos"]]
-        armcal(folder, "servo", config, "--check", "--yes", sets=sets)
-        armcal(folder, "acquire", config, "--plan", folder / "plan.csv", "--out", folder / "runs", "--yes", sets=sets)
-        armcal(folder, "acquire", config, "--plan", folder / "fresh.csv", "--out", folder / "again", "--yes", sets=sets)
         clock = SimulatedClock(folder / "bench" / CLOCK)
+        found = json.loads(desk("bus", "find", folder / "bench" / BOARD, "--last-id", "8", "--json"))
+        ids = [(servo["baud"], servo["id"], servo["model"]) for servo in found["servos"]]
+        bench("bus", "check", config)
+        unchecked = [acquire("plan.csv", "refused", code=2)]
+        bench.wiring(config, clock)
+        unchecked.append(doubt())
+        bench("servo", config, "--check", "--yes")
+        acquire("plan.csv", "runs")
+        acquire("fresh.csv", "again")
+        desk("run", config, "--data", folder / "runs" / "dataset.csv", "--out", folder / "calibrated")
+        calibration = folder / "calibrated" / "calibration.yaml"
+        home = ("bus", "home", config, "--calibration", calibration, "--release", "--yes", "--json")
+        plans = json.loads(bench(*home))["offsets"]
+        unchecked.append(doubt())
+        bench("servo", config, "--check", "--yes")
+        acquire("fresh.csv", "homed")
         state = clock.ask({"state": True})
         clock.close()
-    armcal(folder, "run", config, "--data", folder / "runs" / "dataset.csv", "--out", folder / "calibrated")
-    poses = ("--poses", folder / "again" / "dataset.csv", "--out", folder / "predicted.csv")
-    armcal(folder, "predict", folder / "calibrated" / "calibration.yaml", *poses)
-    yield Loop(folder, ids, state)
+    desk("run", config, "--data", folder / "homed" / "dataset.csv", "--out", folder / "afterwards")
+    desk("predict", calibration, "--poses", folder / "again" / "dataset.csv", "--out", folder / "predicted.csv")
+    without = without_zeros(calibration, folder / "without.yaml")
+    desk("calibration", "accept", without)
+    desk("predict", without, "--poses", folder / "homed" / "dataset.csv", "--out", folder / "homed.csv")
+    motors = folder / "motors.json"
+    motor = {"drive_mode": 0, "homing_offset": 0, "range_min": 900, "range_max": 3195}
+    motors.write_text(json.dumps({joint: {"id": i, **motor} for i, joint in enumerate(plans, start=1)}))
+    desk("lerobot", "zeros", calibration, motors, "--yes")
+    lerobot = {joint: entry["homing_offset"] for joint, entry in json.loads(motors.read_text()).items()}
+    offsets = {joint: (plan["after"] - plan["before"], lerobot[joint]) for joint, plan in plans.items()}
+    yield Loop(folder, ids, unchecked, state, offsets)
 
 
-def estimated(loop: Loop) -> dict[str, float]:
-    text = yaml.safe_load((loop.folder / "calibrated" / "calibration.yaml").read_text())
-    return {p["name"]: p["value"] for p in text["parameters"]}
+def without_zeros(calibration: Path, to: Path) -> Path:
+    """The calibration for servos that have its zeros by themselves."""
+    content = yaml.safe_load(calibration.read_text())
+    for parameter in content["parameters"]:
+        if parameter["name"].startswith("arm.zeros.offset"):
+            value = parameter["value"]
+            parameter |= {key: parameter[key] - value for key in ("value", "lower", "upper")}
+    to.write_text(yaml.safe_dump(content, sort_keys=False))
+    return to
 
 
 def true_values() -> dict[str, float]:
@@ -97,12 +183,12 @@ def test_all_servos_are_found_on_the_bus(loop: Loop) -> None:
 
 
 def test_the_bench_was_safe_and_quick(loop: Loop) -> None:
-    assert loop.state["offences"] == {}
+    assert loop.state["offences"] == {}, loop.state["worst"]
     assert float(str(loop.state["now"])) < 20 * 60
 
 
 def test_zeros_and_play_are_those_of_the_arm(loop: Loop) -> None:
-    values, true = estimated(loop), true_values()
+    values, true = loop.values("calibrated"), true_values()
     zeros = [math.degrees(values[n] - true[n]) for n in (f"arm.zeros.offset{i}" for i in range(1, 6))]
     play = [math.degrees(values[n] - true[n]) for n in (f"arm.play.lag{i}" for i in range(1, 6))]
     assert max(map(abs, zeros)) < 0.2, zeros
@@ -110,9 +196,23 @@ def test_zeros_and_play_are_those_of_the_arm(loop: Loop) -> None:
 
 
 def test_the_gripper_is_where_it_is_predicted_on_fresh_poses(loop: Loop) -> None:
-    measured = loop.positions("again/dataset.csv")
-    errors = np.linalg.norm(loop.positions("predicted.csv") - measured, axis=1)
-    metrics = json.loads((loop.folder / "calibrated" / "metrics.json").read_text())
+    errors = np.linalg.norm(loop.positions("predicted.csv") - loop.positions("again/dataset.csv"), axis=1)
     assert len(errors) == FRESH
-    assert metrics["error_mm"]["nominal"]["holdout"]["mean"] > 25
+    assert loop.nominal_error_mm("calibrated") > 25
     assert errors.max() < 3
+
+
+def test_no_arm_was_driven_whose_wiring_was_not_checked(loop: Loop) -> None:
+    before, by_hand, homed = loop.unchecked
+    assert "never checked" in before and "armcal bus wiring" in before
+    assert by_hand == "" and "never checked" in homed
+
+
+def test_the_zeros_are_in_the_servos_afterwards(loop: Loop) -> None:
+    """The calibrated arm without its zeros predicts fresh poses; LeRobot's file would get the same offsets."""
+    values = loop.values("afterwards")
+    assert max(abs(math.degrees(values[f"arm.zeros.offset{i}"])) for i in range(1, 6)) < 0.2
+    errors = np.linalg.norm(loop.positions("homed.csv") - loop.positions("homed/dataset.csv"), axis=1)
+    assert len(errors) == FRESH and errors.max() < 3
+    assert loop.nominal_error_mm("afterwards") < loop.nominal_error_mm("calibrated") / 2, "springs and lengths are left"
+    assert all(on_bus == in_file and abs(on_bus) > 30 for on_bus, in_file in loop.offsets.values()), loop.offsets
