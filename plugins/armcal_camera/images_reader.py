@@ -98,6 +98,9 @@ class ImagesReader:
             message = "found no measurement that sees boards, expected one for the images."
             raise DataError(message, hint="Add a measurement of type camera.")
         dataset = read_poses(self._settings.poses, request, tuple(cameras), self._settings.first)
+        named = dataset.extra.get(_IMAGE, ())
+        if not all(text.strip() for text in named):  # the others are there for the joints' rates
+            dataset = dataset.subset([i for i, text in enumerate(named) if text.strip()])
         count = len(dataset) + len(dataset.set_aside)
         faults: list[dict[int, str]] = []
         known = {w.channel for w in request.channels}

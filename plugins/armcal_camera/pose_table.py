@@ -13,7 +13,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.pose_settings import nearest_rotation
 from armcal.base.units import DIMENSIONLESS
-from armcal.errors import DataError
+from armcal.errors import DataError, Location
 from armcal.io.cells import is_number
 from armcal.io.plain_files import input_bytes, refuse, text_of
 from armcal.measure.checks import check_dataset, layout_of
@@ -28,6 +28,7 @@ from armcal_camera.recovered_joints import recovered_joints
 FLANGE = ("x", "y", "z", "rz", "ry", "rx")
 """Joints of an arm whose flange's pose is read: base_T_flange turns by Rz(rz) Ry(ry) Rx(rx)."""
 _QUATERNION = ("qw", "qx", "qy", "qz")
+_LONGEST_STEP_S = 0.2
 _MAX_BYTES = 256 * 1024**2
 _INSTANCE = "flange"
 _UNREACHED = "the nominal arm reaches this pose in no posture within its joints' limits"
@@ -97,6 +98,8 @@ def read_poses(
         PluginError: the reader is not known.
     """
     channels = tuple(w for w in request.channels if w.channel.partition(".")[0] not in cameras)
+    rates = [w for w in channels if w.dimension == "joint rate" and w.required]
+    channels = tuple(replace(w, required=w.required and w not in rates) for w in channels)
     rest = {name: m for name, m in request.measurements.items() if name not in cameras}
     request = ReadRequest(request.arms, rest, channels)
     arm = next(iter(request.arms.values())) if len(request.arms) == 1 else None
@@ -112,8 +115,33 @@ def read_poses(
     else:
         settings = dict(poses)
     if posed is not None and settings.get("type") == "pose_csv":
-        return _flange_poses(settings, posed, request)
-    return _reader(settings).read(request)
+        return _with_rates(_flange_poses(settings, posed, request), rates)
+    return _with_rates(_reader(settings).read(request), rates)
+
+
+def _with_rates(dataset: Dataset, rates: Sequence[RequestedChannel]) -> Dataset:
+    """Rates of joints (rad/s or m/s) that the file has not, from the times of its rows.
+
+    Raises:
+        DataError: there are no times, or rows are too far apart in time to say how fast a joint was.
+    """
+    missing = [w for w in rates if not dataset.has(w.channel)]
+    if not missing:
+        return dataset
+    hint = (
+        f"Give a column time_s and rows at most {_LONGEST_STEP_S:g} s apart (those without an image serve for rates "
+        f"alone), or columns {missing[0].channel}_deg_s and so on."
+    )
+    steps = np.diff(dataset.column("time")) if dataset.has("time") else np.zeros(0)
+    if len(steps) < 2 or steps.min() <= 0 or steps.max() > _LONGEST_STEP_S:
+        found = f"rows up to {steps.max():.3g} s apart" if len(steps) else "no times"
+        message = f"found {found}, expected how fast joints were: {missing[0].what}."
+        raise DataError(message, where=Location(dataset.source or None), hint=hint)
+    joints = {name.rpartition(".")[2]: name for name in dataset.channels}
+    rows = [
+        np.gradient(dataset.column(joints[w.channel.removesuffix("_rate")]), dataset.column("time")) for w in missing
+    ]
+    return _with(dataset, [w.channel for w in missing], rows)
 
 
 def _reader(settings: dict[str, Any]) -> Any:

@@ -19,4 +19,7 @@ def armcal_register_effects(register: Register) -> None:
     register("bearing_play", "armcal_joints.backlash:BearingPlay", "bearings that tilt with the moment they carry")
     register("gear_error", "armcal_joints.servo_map:GearError", "harmonic errors, one and two periods a turn")
     register("quantisation", "armcal_joints.quantisation:Quantisation", "the angles that a servo board can set")
+    register(
+        "delay", "armcal_joints.delay:Delay", "recorded joints that lag behind the measurement, of an arm that moves"
+    )
     register("thermal_length", "armcal_joints.thermal:ThermalLength", "links that lengthen with temperature")

@@ -111,6 +111,10 @@ def surroundings(arms: Mapping[str, Arm]) -> dict[str, str]:
                 )
             if dimension != DIMENSIONLESS:
                 units_of(dimension)
+            if dimension == "joint rate" and sum(any(c.name == name for _, c in a.declared) for a in arms.values()) > 1:
+                raise ValueError(
+                    f"{text}, and so does another arm's: a rate is of one joint, so name joints differently"
+                )
             if known.setdefault(name, dimension) != dimension:
                 raise ValueError(f"{text} as {dimension}, and it is known as {known[name]}: use another name")
     return known

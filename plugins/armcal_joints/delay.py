@@ -1,0 +1,40 @@
+"""Joints whose recorded places lag behind what was measured beside them: by how long, of an arm that moved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
+
+from armcal.arm.effects import Condition, EffectSettings, JointEffect
+from armcal.arm.model import Chain
+from armcal.base.parameters import ParameterBlock, scalar
+
+_SCALE_S = 0.01
+
+
+class Delay(JointEffect):
+    """The effect ``delay``: recorded joints are those of ``delay`` (s) before the measurement and have moved on since.
+
+    Records need a column ``NAME_rate`` of each joint (``q1_rate_deg_s``); the reader ``images`` has them from the times
+    of its joint table. A prediction without rates is one at rest.
+    """
+
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {}
+
+    def __init__(self, settings: EffectSettings, joint_names: Sequence[str]) -> None:
+        super().__init__(settings, joint_names)
+        self._rates = {joint: f"{joint_names[joint - 1]}_rate" for joint in self.joints}
+        self.conditions = tuple(Condition(name, "joint rate") for name in self._rates.values())
+
+    def parameters(self) -> tuple[ParameterBlock, ...]:
+        """How old the recorded joints are at the time of the measurement (s)."""
+        return (scalar("delay", "s", 0.0, _SCALE_S),)
+
+    def shaped(self, chain: Chain, conditions: Mapping[str, Any], values: Mapping[str, Any]) -> Chain:
+        """Joints where they were at the time of the measurement: a rate times the delay beyond the recorded place."""
+        joints = list(chain.joints)
+        for number, name in self._rates.items():
+            joint = joints[number - 1]
+            joints[number - 1] = replace(joint, offset=joint.offset + values["delay"] * conditions.get(name, 0.0))
+        return replace(chain, joints=tuple(joints))
