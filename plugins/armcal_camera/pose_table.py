@@ -134,8 +134,8 @@ def _with_rates(dataset: Dataset, rates: Sequence[RequestedChannel]) -> Dataset:
     )
     steps = np.diff(dataset.column("time")) if dataset.has("time") else np.zeros(0)
     if len(steps) < 2 or steps.min() <= 0 or steps.max() > _LONGEST_STEP_S:
-        found = f"rows up to {steps.max():.3g} s apart" if len(steps) else "no times"
-        message = f"found {found}, expected how fast joints were: {missing[0].what}."
+        spacing = f"rows up to {steps.max():.3g} s apart" if len(steps) else "no times"
+        message = f"found {spacing}, expected how fast joints were: {missing[0].what}."
         raise DataError(message, where=Location(dataset.source or None), hint=hint)
     joints = {name.rpartition(".")[2]: name for name in dataset.channels}
     rows = [
