@@ -1,7 +1,5 @@
 """What is dangerous in the first motion of an arm and in its last: first pulses, the pose it stands in, letting go."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 A check is a short measuring run from where the arm stands: each joint turns a little and back.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The folder of a measuring run or a recording: its journal is begun, or gone on with."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress

@@ -1,7 +1,5 @@
 """Whether the arm stands, by what the tracker saw in the last moments, and where it stands then."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What is typed at a terminal, by single keys, or comes from a pipe."""
 
-from __future__ import annotations
-
 import os
 import select
 import termios

@@ -1,7 +1,5 @@
 """Waiting while the arm stands: what for is said at once and once a minute."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """How far a calibrated arm may be off, posture by posture: what is not known of it, what its servos cannot set."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Figures of a survey: sections through the workspace, and designs beside one another."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

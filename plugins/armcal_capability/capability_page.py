@@ -1,7 +1,5 @@
 """The page of a survey, its tables and sentences: what the arm reaches, how well, and which design is best where."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Cells of the workspace: the map of all postures, and areas, how much of a box the tool reaches and how well."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal

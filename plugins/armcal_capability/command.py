@@ -1,7 +1,5 @@
 """``armcal capability``."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import partial
 from importlib import import_module

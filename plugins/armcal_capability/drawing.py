@@ -1,7 +1,5 @@
 """What all figures of this plugin share: an empty one, the style of its axes, and its bytes."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 

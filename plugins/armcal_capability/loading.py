@@ -1,7 +1,5 @@
 """What is surveyed, from the files a user gives: a calibration or a configuration, settings, and designs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

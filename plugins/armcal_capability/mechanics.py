@@ -1,7 +1,5 @@
 """An arm in many postures: tool, its slopes by commands and by a force, and what the joints hold, in equilibrium."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import casadi as ca

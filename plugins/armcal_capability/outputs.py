@@ -1,7 +1,5 @@
 """What a survey leaves behind as data: the map and the areas cell by cell, in CSV and npz, units in every name."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Mapping, Sequence

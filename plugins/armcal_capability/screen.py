@@ -1,7 +1,5 @@
 """The tables of pages on a terminal."""
 
-from __future__ import annotations
-
 from armcal.cli.common import Console
 from rich.box import SIMPLE_HEAD
 from rich.table import Table as ScreenTable

@@ -1,7 +1,5 @@
 """What a survey comes to: a few numbers of the map and of each area, for tables and other programs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

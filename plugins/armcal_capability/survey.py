@@ -1,7 +1,5 @@
 """A survey: an arm sampled over joint space, mapped cell by cell, and looked at in the areas that matter."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

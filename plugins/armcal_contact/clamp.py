@@ -1,7 +1,5 @@
 """A tool clamped at points that do not move: known, unknown, or known to each other. [Bergstrom2016]"""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Annotated, Any, ClassVar

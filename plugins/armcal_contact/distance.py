@@ -1,7 +1,5 @@
 """The distance between the tips of two records: a gauge block, a pair of callipers, a tape."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 

@@ -6,8 +6,6 @@ time under ``header``. And one list of all joints in order: ``{"q": [0.2, ...]}`
 mean nothing.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The joint stream ``json_lines``: a JSON object a line, in datagrams, a pipe or a file that grows."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 

@@ -4,8 +4,6 @@ The files are as their authors left them: ``front/hole_0.csv`` has a row a postu
 base to the tip, and no header.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import re

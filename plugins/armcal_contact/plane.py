@@ -1,7 +1,5 @@
 """A tip that touches a plane: one number a record, and the plane is found along with the arm. [Zhuang1999]"""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Annotated, Any, ClassVar

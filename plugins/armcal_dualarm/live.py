@@ -1,7 +1,5 @@
 """The joint stream ``two_arm_log``: motors' angles as they are logged, reading by reading or rest by rest."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Logs of several arms' motors: columns in a robot's own order, in motor radians. [Bergstrom2016]"""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import ClassVar, NoReturn

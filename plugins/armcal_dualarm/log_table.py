@@ -1,7 +1,5 @@
 """A log as a table: its delimiter and header found, chosen columns as numbers or as text, by line."""
 
-from __future__ import annotations
-
 import difflib
 import hashlib
 import math

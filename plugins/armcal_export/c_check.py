@@ -1,7 +1,5 @@
 """The test program of generated C: compiled, every warning an error, and run before the code is handed out."""
 
-from __future__ import annotations
-
 import subprocess
 import tempfile
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The exporter ``c``: the calibrated arm as C99, compiled and tested before it is handed out."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

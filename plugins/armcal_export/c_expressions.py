@@ -1,7 +1,5 @@
 """The expressions of one arm as static C functions, slopes whole where they are short, else column by column."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """Servo boards in C: from commanded angles to counts and back, where the calibration has pulse tables."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 from armcal.calibration.tool_expression import ToolExpression

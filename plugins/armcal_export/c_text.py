@@ -5,8 +5,6 @@ calling convention of pointers to pointers and work arrays along, and does not p
 instruction list, written out over local constants, needs neither.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """A calibrated arm as a description, and the rigid arm rebuilt from a description alone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """What the formats ``yaml`` and ``json`` say of an arm: every field with its unit, its frame and its meaning."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field

@@ -1,7 +1,5 @@
 """The exporters ``yaml`` and ``json``: a description of the arm, read again and rebuilt before it is written."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from importlib import resources

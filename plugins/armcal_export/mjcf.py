@@ -1,7 +1,5 @@
 """A calibrated arm as MJCF: bodies for joints, passive hinges for springs, inertials for masses. [MJCF]"""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

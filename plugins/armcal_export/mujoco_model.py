@@ -1,7 +1,5 @@
 """The exporter ``mujoco``: an MJCF model, loaded by MuJoCo, brought to rest and compared before it is written."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """An MJCF model in MuJoCo: its tool with stiff springs, and with its springs in static equilibrium."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The arm in elastic equilibrium by CasADi's interpreter: what every exported form of it is compared with."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """The exporter ``ros2``: a calibrated arm as parameters of a ROS 2 node."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from typing import Any, ClassVar

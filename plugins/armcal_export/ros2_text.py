@@ -4,8 +4,6 @@ Parameters are scalars, or lists whose entries are all of one type: bool, whole 
 may be empty or null, and lists hold no lists.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Springs as numbers: the compliance of each site of an arm, and which springs are not linear."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 from armcal.arm.assembly import scoped

@@ -5,8 +5,6 @@ take hundreds of steps along the root's curves. So it first searches a quadratic
 entries, which needs no records, and the model is made anew where that ends.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Backlash: where in its play a joint rests, by the direction it came from, or by the torque that pushes it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """How far a joint really turns for its command: a servo's gain and offset, and gear error. [Judd1990]"""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """Springs: linear and cubic ones about joint axes [Conenna2024], and 3x3 compliances under a site's full moment."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 

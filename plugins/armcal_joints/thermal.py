@@ -1,7 +1,5 @@
 """Thermal expansion of the links: lengths that grow with the temperature recorded beside each measurement."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, Literal

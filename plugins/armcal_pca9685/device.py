@@ -1,7 +1,5 @@
 """The device ``pca9685``: joints by name, on the channels and pulse tables of the servo file."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

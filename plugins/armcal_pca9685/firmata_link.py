@@ -4,8 +4,6 @@ It has no watchdog, no acknowledgement of writes and no checksum: pulses go on w
 must read back.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """Messages of the Firmata protocol: those of I2C and of a board's versions. [Firmata]"""
 
-from __future__ import annotations
-
 import re
 from typing import NamedTuple
 

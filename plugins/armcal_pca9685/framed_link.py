@@ -1,7 +1,5 @@
 """A board that speaks the framed protocol: answers to everything, and looks after the arm by itself."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """An I2C bus of this computer, ``/dev/i2c-N``, through the library smbus2."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Watches the calibration's file: which bytes are whole enough to be tried, and why others are not."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os

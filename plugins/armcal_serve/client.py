@@ -1,7 +1,5 @@
 """Asks a running server over its Unix socket; a short one, for programs in Python."""
 
-from __future__ import annotations
-
 import json
 import socket
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """``armcal serve``."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time

@@ -1,7 +1,5 @@
 """Hands requests to workers, a client at a time in turn, so that one with many requests does not delay the others."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections import deque

@@ -1,7 +1,5 @@
 """A calibration's file made ready to answer: read, checked, built and warmed up, before anybody waits for it."""
 
-from __future__ import annotations
-
 import gc
 import json
 import tempfile

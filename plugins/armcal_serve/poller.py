@@ -1,7 +1,5 @@
 """Waits for many descriptors in one thread, and calls their handlers."""
 
-from __future__ import annotations
-
 import selectors
 from collections.abc import Callable
 from typing import Any

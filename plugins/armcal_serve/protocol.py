@@ -1,7 +1,5 @@
 """Requests to `armcal serve` and its answers, version 1: a JSON object each, with the units in the keys."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from types import MappingProxyType

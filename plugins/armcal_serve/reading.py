@@ -1,7 +1,5 @@
 """From a line to a request, or to what is wrong with it."""
 
-from __future__ import annotations
-
 import difflib
 import json
 from pathlib import Path

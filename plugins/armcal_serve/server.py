@@ -1,7 +1,5 @@
 """The server: requests from its transports, answers from its workers, until a signal asks for the end."""
 
-from __future__ import annotations
-
 import gc
 import time
 from collections.abc import Callable, Mapping, Sequence

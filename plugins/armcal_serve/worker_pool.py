@@ -1,7 +1,5 @@
 """The workers that answer, those that are made ready for a newer calibration, and those that leave."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """A worker as the server sees it: a process at the other end of a socket, which may be busy, refuse, crash or hang."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import socket

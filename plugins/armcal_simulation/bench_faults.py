@@ -1,7 +1,5 @@
 """Faults of a simulated bench as requests name them: checked, and kept until their time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from heapq import heappop, heappush

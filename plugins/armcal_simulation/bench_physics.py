@@ -1,7 +1,5 @@
 """Servos, arm and tracker of a simulated bench, moved on from event to event of simulated time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a board does by itself when its host falls silent: it drives channels through waypoints, in proportion."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable

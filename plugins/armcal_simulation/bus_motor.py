@@ -4,8 +4,6 @@ The position loop is proportional: under a torque the shaft stands off by ``comp
 sees. Play lies between shaft and joint (spline, screws, bearings), which it does not see.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated
 

@@ -3,8 +3,6 @@
 [FeetechSTS] [Dynamixel1] [Dynamixel2]
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, Protocol
 

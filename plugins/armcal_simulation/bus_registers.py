@@ -3,8 +3,6 @@
 Registers have the same names in all tables where they mean the same.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Where the makers' documents leave open what happens, it does what would hurt mos
 to the goal that stands in its register (Feetech), and a written goal switches it on (Feetech, AX-12).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """The socket by which clients of a simulated bench let its time pass: a JSON object a line, and one back."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import select

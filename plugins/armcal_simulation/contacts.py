@@ -1,7 +1,5 @@
 """Contacts with a stated truth: postures that hold a socket, a clamp or each other, read by noisy joints."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 

@@ -1,7 +1,5 @@
 """Where an elastic arm's tool is, one pose after another, each begun from the springs' state of the one before."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

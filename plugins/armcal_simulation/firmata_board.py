@@ -3,8 +3,6 @@
 No acknowledgement, no checksum, no watchdog: what is damaged on the way is done as it arrived.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Callable

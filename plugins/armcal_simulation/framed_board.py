@@ -1,7 +1,5 @@
 """A board with the framed firmware: docs/link_protocol.md, the board's side."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass

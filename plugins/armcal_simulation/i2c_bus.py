@@ -1,7 +1,5 @@
 """An I2C bus with what can go wrong on it: a byte that nobody acknowledges, a line that is held down."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import reduce
 from operator import and_

@@ -1,7 +1,5 @@
 """How the truth moves over a mission: creep, temperature, and what happens to joints and camera."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """A random selection of what may happen in a mission, to be planted without the operator's knowledge."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence

@@ -4,8 +4,6 @@ Where the data sheet forbids something without saying what would follow, the mod
 would hurt most, so that a driver which breaks a rule is seen to break it.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What an arm was made to do, judged from the pulses at the pins alone, and what of it was unsafe."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter, deque
 from collections.abc import Callable, Mapping

@@ -3,8 +3,6 @@
 The port's path is a symlink, moved to another pty when the board is plugged in again.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import fcntl

@@ -1,7 +1,5 @@
 """The simulated bench ``servo_bench``: a servo board at a pty, an arm of hobby servos, and a tracker."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from functools import partial

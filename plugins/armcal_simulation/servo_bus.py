@@ -1,7 +1,5 @@
 """Smart servos on one half-duplex wire: who hears, who answers, and what arrives where several speak at once."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import reduce
 from operator import and_

@@ -3,8 +3,6 @@
 The record has the given command; the arm stands at the nearest one that its servo board can make.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal

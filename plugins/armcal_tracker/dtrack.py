@@ -1,7 +1,5 @@
 """The tracker ``dtrack``: DTrack's ASCII output over UDP. [DTrack2]"""
 
-from __future__ import annotations
-
 import ipaddress
 import socket
 from collections.abc import Mapping

@@ -9,8 +9,6 @@
 Matrices stand column by column. The angles are not used: the matrix has them.
 """
 
-from __future__ import annotations
-
 import math
 import re
 

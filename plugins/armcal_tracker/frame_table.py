@@ -1,7 +1,5 @@
 """The columns of a table of frames: ``frame``, ``t``, and for each body ``NAME_x_mm`` ..., perhaps ``NAME_qw`` ..."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Mapping, Sequence

@@ -6,8 +6,6 @@
 place of ``p_mm`` for metres; ``null`` is a body that is not seen.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from typing import Any, NoReturn

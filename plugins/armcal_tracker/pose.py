@@ -1,7 +1,5 @@
 """The position and orientation of a body on the tool, measured in the arm's base frame."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, ClassVar
 

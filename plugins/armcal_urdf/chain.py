@@ -1,7 +1,5 @@
 """The chain between two links, in the words that parameters, frames and records use, and the masses it moves."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Other origins in a URDF, in place: every byte that is not a changed number stays as it was."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

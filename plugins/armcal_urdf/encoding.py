@@ -1,7 +1,5 @@
 """Bytes of a URDF file to text and back, so that no byte is lost: the byte order mark stays in the text."""
 
-from __future__ import annotations
-
 import codecs
 import re
 from pathlib import Path

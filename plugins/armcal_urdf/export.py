@@ -1,7 +1,5 @@
 """The exporter ``urdf``: the URDF that an arm was made from, with its calibrated origins."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, ClassVar
 

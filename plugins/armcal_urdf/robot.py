@@ -1,7 +1,5 @@
 """A URDF, checked: links with their masses, and joints that make one tree of them. [URDF]"""
 
-from __future__ import annotations
-
 import difflib
 import sys
 from collections.abc import Mapping

@@ -5,8 +5,6 @@ spaces in the base frame. Distances are exact [Ericson2005] and negative where b
 nominal parameters and rigid: what springs give is to be left in the margins.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase

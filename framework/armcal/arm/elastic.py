@@ -3,8 +3,6 @@
 Springs that share a site share its coordinates: their deflections add up.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

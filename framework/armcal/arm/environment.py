@@ -1,7 +1,5 @@
 """What acts on all arms of a cell: gravity, payload and wrench, and how the real gravity is turned."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

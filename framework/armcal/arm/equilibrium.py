@@ -6,8 +6,6 @@ than its spring answers [Thompson1973]. Repeated passes lead to an equilibrium o
 smaller than one, so what they find is held, unless they start exactly where the load is balanced.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

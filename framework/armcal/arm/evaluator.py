@@ -5,8 +5,6 @@ iterated, from wherever the caller has it already: passes while these lead to re
 Its derivatives follow from one pass, by the implicit function theorem [Griewank2008].
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Joints as a user names them, and their limits: stated by a configuration, else by the arm model."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping
 from typing import TypeVar
 

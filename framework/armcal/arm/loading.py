@@ -1,7 +1,5 @@
 """Statics of the rigid arm: what its sites carry and its joints hold, and how a turn of a site moves the tip."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

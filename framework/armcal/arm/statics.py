@@ -4,8 +4,6 @@ The moment of every weight beyond a site is the cross product of one first momen
 cost does not grow with the number of masses. [Conenna2024]
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

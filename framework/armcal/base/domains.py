@@ -9,8 +9,6 @@ Priors and covariances are stated in ``coordinates`` about the base: the increme
 increment is no fair measure of the value (a factor of a semidefinite matrix).
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A rigid motion as parameters: three coordinates, and a rotation that stays one."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import casadi as ca

@@ -4,8 +4,6 @@ Its correlation falls by e over a distance (Ornstein-Uhlenbeck), so that all it 
 [Rasmussen2006]
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from armcal.base.domains import Array

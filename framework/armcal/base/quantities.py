@@ -1,7 +1,5 @@
 """Physical quantities in settings: field types that hold SI, and reading what a config writes."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Unit quaternions (w, x, y, z) as arrays of numbers. [Murray1994]"""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The base class of checked settings: strict types, and a unit for every physical quantity."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Mapping
 from enum import Enum

@@ -1,7 +1,5 @@
 """Names and texts from outside as they may be shown: what steers a terminal or breaks a file is written out."""
 
-from __future__ import annotations
-
 import unicodedata
 
 _STEERING = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})

@@ -1,7 +1,5 @@
 """Taking a calibration on purpose that was edited by hand, or that is to be used with other physics."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

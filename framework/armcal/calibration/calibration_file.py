@@ -1,7 +1,5 @@
 """The content of calibration.yaml: what it keeps, and how it is written."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

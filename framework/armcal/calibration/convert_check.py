@@ -1,7 +1,5 @@
 """Where a chain to convert comes from, and whether what it was converted to is the same arm."""
 
-from __future__ import annotations
-
 import tempfile
 import textwrap
 from collections.abc import Mapping

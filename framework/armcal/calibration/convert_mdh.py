@@ -6,8 +6,6 @@ there the next frame sits in the plane across the axis before, and a further tur
 A sliding joint's axis may lie anywhere; it is taken through the joint's frame.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """A chain as a product of exponentials, the settings of the model ``poe`` [Brockett1984], and as a small URDF."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 from xml.sax.saxutils import quoteattr

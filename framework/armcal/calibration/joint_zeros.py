@@ -1,7 +1,5 @@
 """The zeros of joints that a calibration found: what is written back to the arm's own servos or files."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

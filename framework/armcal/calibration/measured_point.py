@@ -1,7 +1,5 @@
 """The point of a tool that instruments read: a ball, a reflector or a marker, seldom at the tool's origin."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal

@@ -4,8 +4,6 @@ The check poses are the protection: they are predicted again whenever a calibrat
 explain what they find.
 """
 
-from __future__ import annotations
-
 import hashlib
 import sys
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """An arm as numbers: every joint's frame and axis at zero angles, whatever model it came from."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

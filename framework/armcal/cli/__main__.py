@@ -1,7 +1,5 @@
 """``python -m armcal.cli``: the same as ``armcal``."""
 
-from __future__ import annotations
-
 from armcal.cli.main import main
 
 if __name__ == "__main__":

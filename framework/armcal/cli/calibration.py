@@ -1,7 +1,5 @@
 """``armcal calibration``."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Options and ways of speaking that all commands share."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 import warnings

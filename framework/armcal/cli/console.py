@@ -1,7 +1,5 @@
 """What a command shows on a screen: names are data, and a table that is too wide becomes a list of its rows."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 

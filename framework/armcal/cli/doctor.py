@@ -1,7 +1,5 @@
 """``armcal doctor``. It imports as little as it can: it must speak where armcal's own libraries are broken."""
 
-from __future__ import annotations
-
 import json
 import sys
 

@@ -3,8 +3,6 @@
 ``docs/hooks.md`` is what ``as_markdown`` gives; a test compares the two.
 """
 
-from __future__ import annotations
-
 import inspect
 import re
 import textwrap

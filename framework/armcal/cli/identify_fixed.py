@@ -1,7 +1,5 @@
 """What ``armcal identify --fixed`` shows: fixed parameters, and what each would gain."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The ``armcal`` command. Commands are imported when they are called, so that help is instant."""
 
-from __future__ import annotations
-
 import difflib
 import itertools
 import os

@@ -1,7 +1,5 @@
 """What ``armcal new robot`` does."""
 
-from __future__ import annotations
-
 import math
 import sys
 from dataclasses import dataclass, replace

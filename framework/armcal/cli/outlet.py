@@ -1,7 +1,5 @@
 """Standard output and error that hold nobody up: a terminal that was stopped, a pipe that was closed."""
 
-from __future__ import annotations
-
 import errno
 import os
 import select

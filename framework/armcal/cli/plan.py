@@ -1,7 +1,5 @@
 """``armcal plan``."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping

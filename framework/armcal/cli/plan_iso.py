@@ -1,7 +1,5 @@
 """``armcal plan --iso-cube``."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``armcal predict``."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Questions for ``armcal new robot``: the rows of an arm, each number with its unit."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """``armcal simulate``."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``armcal study``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

@@ -1,7 +1,5 @@
 """Results as tables on a terminal."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

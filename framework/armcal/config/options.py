@@ -1,7 +1,5 @@
 """Checked settings from ``key=value`` texts of the command line."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar

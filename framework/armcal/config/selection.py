@@ -1,7 +1,5 @@
 """Which parameters are free, between which bounds, under which priors."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace

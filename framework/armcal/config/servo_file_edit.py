@@ -1,7 +1,5 @@
 """Numbers of a servo file changed in its text, so that its comments and its layout stay."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import yaml

@@ -1,7 +1,5 @@
 """The arms, measurements and statics that a configuration (or a calibration) describes, built from plugins."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType

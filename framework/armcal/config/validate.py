@@ -1,7 +1,5 @@
 """Settings checked against the configuration they came from: every fault at once, each at its own line."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Variants of one configuration: each the whole of it, with other files over it and values set or added."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

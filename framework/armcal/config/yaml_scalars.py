@@ -1,7 +1,5 @@
 """What a bare word in a config means: the readings that surprise people are refused, each with its mend."""
 
-from __future__ import annotations
-
 import math
 import re
 

@@ -1,7 +1,5 @@
 """Trees of configuration nodes: merged, and changed at a path; every value keeps the place where it was written."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

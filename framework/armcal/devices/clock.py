@@ -1,7 +1,5 @@
 """The time that a bench goes by: the machine's, or a simulated bench's."""
 
-from __future__ import annotations
-
 import json
 import socket
 import time

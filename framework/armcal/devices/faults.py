@@ -1,7 +1,5 @@
 """What goes wrong on a bench."""
 
-from __future__ import annotations
-
 from armcal.errors import ArmcalError, InputError
 
 

@@ -1,7 +1,5 @@
 """Lines of text as they come: standard input, datagrams, or a file that another program writes. Nothing waits."""
 
-from __future__ import annotations
-
 import os
 import select
 import socket

@@ -1,7 +1,5 @@
 """A check in a process of its own: a library that crashes, hangs or ends the process costs that check alone."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """All checks, in the order of the report; a check that fails is a finding, and stops none of the others."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Python, armcal itself, the libraries that it declares, and its extras."""
 
-from __future__ import annotations
-
 import platform
 import sys
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """The computer: serial ports, I2C buses, room on disk, processors, the cache of compiled kernels."""
 
-from __future__ import annotations
-
 import grp
 import os
 import shutil

@@ -3,8 +3,6 @@
 Each gives facts for JSON, and raises where what it tries does not work.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import subprocess

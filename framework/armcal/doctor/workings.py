@@ -1,7 +1,5 @@
 """Plugins, solvers, the compiler, and the main job: whether an arm can be calibrated here."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from importlib.metadata import entry_points
 from typing import Any

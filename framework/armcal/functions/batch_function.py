@@ -3,8 +3,6 @@
 Arrays are stored channel by channel, (entries x records).
 """
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable, Sequence
 from functools import partial

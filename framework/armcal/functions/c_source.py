@@ -8,8 +8,6 @@ A long list is written as several functions in a row: the time that a compiler t
 square of a function's length.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

@@ -6,8 +6,6 @@ either; see ``library_build`` for what a library passes before it is there. ``AR
 ``ARMCAL_CC=none`` turns compiling off, any other value names the compiler.
 """
 
-from __future__ import annotations
-
 import ctypes
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """CasADi functions by its interpreter, without a conversion for each number."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any

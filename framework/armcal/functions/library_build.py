@@ -4,8 +4,6 @@ The library is compiled, called in a process that may crash, made durable, and o
 that ends in its digest. What crashes, or gives other numbers than those expected, never gets there.
 """
 
-from __future__ import annotations
-
 import ctypes
 import hashlib
 import json

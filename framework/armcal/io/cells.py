@@ -1,7 +1,5 @@
 """Cells of a text file: what is a number in it, and what says that there is none."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

@@ -1,7 +1,5 @@
 """The file of events, kept short and given up first when a disk is full; and how it is followed by who watches it."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """Several files written together: all of them or none, and never by mistake over what is there."""
 
-from __future__ import annotations
-
 import os
 import re
 import tempfile

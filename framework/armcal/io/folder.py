@@ -6,8 +6,6 @@ point, the working directory, a file system without it), files are moved one by 
 what is put last is away first.
 """
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import fcntl

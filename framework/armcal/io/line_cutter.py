@@ -1,7 +1,5 @@
 """Bytes as they come, cut into lines."""
 
-from __future__ import annotations
-
 MAX_LINE_BYTES = 1024**2
 
 

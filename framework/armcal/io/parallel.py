@@ -4,8 +4,6 @@ A piece of work is a function of one picklable task; results come in the order o
 last bit wherever they were made, as long as BLAS keeps to one thread there (workers and the command line see to it).
 """
 
-from __future__ import annotations
-
 import os
 import pickle
 import time

@@ -1,7 +1,5 @@
 """Regular files alone: of a stated size where they are read, and never a link or a device where one is written."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from stat import S_ISDIR, S_ISLNK, S_ISREG

@@ -1,7 +1,5 @@
 """Signals become wishes that the loop looks at between records."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from types import FrameType, TracebackType

@@ -1,7 +1,5 @@
 """Lines to standard output, which may be closed or not read by anyone."""
 
-from __future__ import annotations
-
 import io
 import os
 import select

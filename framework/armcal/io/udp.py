@@ -1,7 +1,5 @@
 """UDP sockets: how they are named in a command, and whose datagrams are taken."""
 
-from __future__ import annotations
-
 import re
 import socket
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Unix sockets with a path that may be long, which only the owner may connect to."""
 
-from __future__ import annotations
-
 import os
 import socket
 from collections.abc import Iterator

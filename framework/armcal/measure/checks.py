@@ -4,8 +4,6 @@ Each check takes a dataset (SI) and the layout that says which channel is what. 
 records set aside or a warning added, or raises `DataError`. ``check_dataset`` runs them all.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

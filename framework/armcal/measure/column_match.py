@@ -3,8 +3,6 @@
 Names carry the unit as suffix (``q1_deg``, ``x_mm``); a mapping gives a file's own names in place of these.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

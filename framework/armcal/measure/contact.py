@@ -1,7 +1,5 @@
 """What contacts share: a socket, a clamp or a plane reads nothing but the joints."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Writing a dataset as a CSV that reads back to the same SI values."""
 
-from __future__ import annotations
-
 import csv
 import math
 import os

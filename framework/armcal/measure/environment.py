@@ -1,7 +1,5 @@
 """Columns of load, gravity and time: whole vectors, no misspelt names, no jump unnoticed."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Sequence
 from dataclasses import replace

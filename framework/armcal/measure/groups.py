@@ -1,7 +1,5 @@
 """Which group of records each record belongs to, and the parameters that the groups bring."""
 
-from __future__ import annotations
-
 import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Lists of record ids: a CSV with one column, or one called pose_id or id."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What the channels of a dataset are, and what they were called in its source."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 

@@ -1,7 +1,5 @@
 """Commands beyond the limits that an arm model states: a sign of joints out of order, or of other signs or units."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Values that are missing: which of them cost a record, and which only one of its measurements."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 

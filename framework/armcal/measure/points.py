@@ -1,7 +1,5 @@
 """Instruments that read the same of many points in one record, such as a camera of the corners of a board."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

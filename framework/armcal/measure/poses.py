@@ -1,7 +1,5 @@
 """Which records are of one pose: repeats tell of noise, and nothing of a model that another of them does not."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whether poses that followed each other are those of an arm that stands; means and outliers of such poses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import groupby
 

@@ -1,7 +1,5 @@
 """How far from the best a plan can be: the relaxation posed in cvxpy, certified by its tangent."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from typing import Any, Literal
 

@@ -5,8 +5,6 @@ least determined direction [Pukelsheim2006]; ``O1`` to ``O5`` are the observabil
 information is by coordinates in their typical scales, so that metres and radians can be compared.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Literal, get_args

@@ -5,8 +5,6 @@ exchange [Fedorov1972] then tries every swap. Of many candidates, the starts see
 promising; the best plan is then led to where no swap with any candidate helps.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

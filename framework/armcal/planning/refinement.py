@@ -1,7 +1,5 @@
 """Moving chosen poses through continuous joint space to where they determine more, one joint at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

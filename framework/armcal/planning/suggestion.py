@@ -1,7 +1,5 @@
 """Which few poses to measure next: D-optimal choice among poses like the recorded ones."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

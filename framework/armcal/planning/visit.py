@@ -1,7 +1,5 @@
 """The order in which planned poses are visited: soonest done, or so that no servo runs hot."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Problems with a pose residual: records with other corrections, and what it does not know of residuals."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

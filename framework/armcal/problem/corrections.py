@@ -3,8 +3,6 @@
 They depend on what was commanded alone, so they are made once, in batches, and no expression holds what was learned.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

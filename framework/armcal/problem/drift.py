@@ -6,8 +6,6 @@ parameter but a covariance of the residuals: the values found stay those of the 
 the drift, and where records lie near others they determine the drift.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

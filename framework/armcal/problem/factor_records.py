@@ -3,8 +3,6 @@
 A whitening W of a covariance S has W S W' = I; the inverse of its lower Cholesky factor is taken.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ One kernel serves any number of groups. Jacobians come a block of records at a t
 records.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace

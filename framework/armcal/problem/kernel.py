@@ -4,8 +4,6 @@ Two backends give the same numbers: CasADi's interpreter, always there, and gene
 compiler is found. Arrays are stored channel by channel, (channels x records).
 """
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Whether a factor's compiled library gives the interpreter's numbers: on a random block of records."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

@@ -5,8 +5,6 @@ CasADi's interpreter evaluates a single record. The elastic equilibrium starts f
 is a function of values and record alone, to the last bit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

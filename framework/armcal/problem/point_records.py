@@ -1,7 +1,5 @@
 """Records of many points, evaluated as records of one point each: the expressions of a point are compiled once."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

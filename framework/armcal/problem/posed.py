@@ -4,8 +4,6 @@ A solver of smooth problems moves ``x`` (n), increments in their typical scales.
 coordinates in their typical scales, in which priors are quadratic and a semidefinite block is a cone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

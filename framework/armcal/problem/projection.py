@@ -4,8 +4,6 @@ Rank is judged there. Where a Jacobian depends on measured numbers (a bearing, a
 turn undetermined directions into seemingly determined ones.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -5,8 +5,6 @@ few numbers as the rotation vector of a quaternion. What a residual means for th
 them: the smallest change of the readings, each in the size that noise gives it, that changes the residual so.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

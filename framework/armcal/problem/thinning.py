@@ -1,7 +1,5 @@
 """Records with few of their many points: enough to judge how records err, in a fraction of the time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

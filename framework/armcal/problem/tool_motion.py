@@ -1,7 +1,5 @@
 """How tools move with the parameters, which of it no contact sees, and how one set of points lies to another."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

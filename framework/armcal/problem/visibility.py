@@ -1,7 +1,5 @@
 """Which points an instrument with a limited view would see in poses that are only thought of."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

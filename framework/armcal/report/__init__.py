@@ -1,7 +1,5 @@
 """The report: one HTML file that a person decides from, readable offline and without scripts."""
 
-from __future__ import annotations
-
 from armcal.report.page import render
 from armcal.report.sections import plugin_sections
 

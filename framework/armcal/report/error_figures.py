@@ -1,7 +1,5 @@
 """Figures of errors: their distribution before and after, and in the order of recording."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Prediction intervals and profiles on the page: what was claimed beside what was measured."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

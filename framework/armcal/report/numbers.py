@@ -1,7 +1,5 @@
 """Numbers as people read them: few digits, a true minus sign, the units of the workshop."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable

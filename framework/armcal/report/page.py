@@ -1,7 +1,5 @@
 """The page: everything a run knows, laid out so that a person can decide from it in a minute."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Figures of parameters: compliances with their intervals, correlations, singular values."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

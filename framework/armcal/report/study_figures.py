@@ -1,7 +1,5 @@
 """Figures of a study: the variants as a ladder, and what a payload that was not trained at costs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The page of a study: one table, one figure, what to conclude, and which records gain and lose."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

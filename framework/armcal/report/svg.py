@@ -1,7 +1,5 @@
 """Inline SVG drawn by hand: axes, points, lines and text, styled by the page's classes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

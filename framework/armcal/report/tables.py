@@ -1,7 +1,5 @@
 """The report's tables as rows of finished text."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

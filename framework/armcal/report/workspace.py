@@ -1,7 +1,5 @@
 """The workspace: two views of the tip positions, coloured by an error or another length."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Checks of records against the model before a fit: units, permuted axes, and which way gravity points."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

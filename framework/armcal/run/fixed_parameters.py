@@ -1,7 +1,5 @@
 """Fixed parameters that the records of an experiment would rather have free, confirmed on records held out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

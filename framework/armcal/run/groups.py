@@ -1,7 +1,5 @@
 """Errors by group of records: one tool position, one fixture, one day."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Prediction intervals of a run: how wide they are, and whether they cover what they claim."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """How a run comes to its verdict: tests of the residuals, of the records that judge, and of unseen poses."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

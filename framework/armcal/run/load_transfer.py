@@ -1,7 +1,5 @@
 """Load transfer: trained at one payload, judged at another, each way."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

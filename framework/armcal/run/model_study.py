@@ -1,7 +1,5 @@
 """A study of models: each variant judged on the same folds of the same records."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Noise of a run: how records weighed, which are suspicious, and estimated variances."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any

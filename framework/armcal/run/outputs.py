@@ -1,7 +1,5 @@
 """What a run leaves behind: a directory that explains itself, written so that a crash leaves the old one whole."""
 
-from __future__ import annotations
-
 import tempfile
 import warnings
 from collections.abc import Callable

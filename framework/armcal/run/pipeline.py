@@ -1,7 +1,5 @@
 """A run: load, check, fit, validate, judge."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """A pose plan: which poses to measure, how good they are, how good any could be, and in which order to visit them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

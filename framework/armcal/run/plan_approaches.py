@@ -4,8 +4,6 @@ Come to from one side only, or from below at each upper end and from above at ea
 zero trade: each level therefore is a candidate from either side. A joint at an end of its range comes from inside.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

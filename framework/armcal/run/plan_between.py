@@ -4,8 +4,6 @@ The most informative poses of an arm of servos put each joint at few angles: its
 a servo's table is right by construction; between them it is not, and no residual says so.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a run knows when it ends: everything that the outputs, the report and the terminal show."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a study knows when it ends, and the files that it leaves: numbers, a row a record, the configuration."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from typing import Any
 

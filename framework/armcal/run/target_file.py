@@ -1,7 +1,5 @@
 """Targets as a CSV: where the tool shall be, with what load."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Denavit-Hartenberg rows from a CSV: a header with units (``alpha_deg,a_mm,theta_deg,d_mm``), a line a joint."""
 
-from __future__ import annotations
-
 import csv
 import difflib
 import math

@@ -1,7 +1,5 @@
 """Names of plugins, robots and joints: usable as identifiers, file names and columns, and not taken."""
 
-from __future__ import annotations
-
 import importlib.util
 import keyword
 import re

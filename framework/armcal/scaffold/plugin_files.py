@@ -1,7 +1,5 @@
 """The files of a new plugin: one small component with its registration and a test, as one file or as a package."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """Texts from the templates beside this file, and folders that appear whole or not at all."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

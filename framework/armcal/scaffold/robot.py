@@ -1,7 +1,5 @@
 """A robot that was never calibrated: what is known of it before anything was measured."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """The files of a new robot: its arm, what to calibrate, a plan, a simulated truth and records of it."""
 
-from __future__ import annotations
-
 import fnmatch
 import json
 from collections.abc import Mapping

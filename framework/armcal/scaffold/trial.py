@@ -1,7 +1,5 @@
 """The end of a new robot's files: a calibration on simulated records, whose truth is known."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import partial

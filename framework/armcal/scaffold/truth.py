@@ -1,7 +1,5 @@
 """A truth to try a new robot with: errors of the size that drawings and assemblies have, from a fixed seed."""
 
-from __future__ import annotations
-
 import fnmatch
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """A new robot from a URDF: the file as it is, its joints and their limits."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Checks on links to servo boards, devices, simulated benches; no port is opened, for something may be plugged in."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

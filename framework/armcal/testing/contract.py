@@ -1,7 +1,5 @@
 """The plugin contract as checks: what every component must do before a configuration may name it."""
 
-from __future__ import annotations
-
 import inspect
 import subprocess
 import sys

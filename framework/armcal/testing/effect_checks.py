@@ -1,7 +1,5 @@
 """Checks on joint effects: parameters, displacements, springs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 

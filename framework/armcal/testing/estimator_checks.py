@@ -1,7 +1,5 @@
 """Checks on estimators: a small problem whose answer is known."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Checks on exporters."""
 
-from __future__ import annotations
-
 from pathlib import PurePath
 from typing import Any
 

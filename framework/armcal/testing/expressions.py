@@ -1,7 +1,5 @@
 """What a plugin's parameter blocks and expressions must be, whatever the kind of component, and in which units."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

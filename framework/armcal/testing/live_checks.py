@@ -1,7 +1,5 @@
 """Checks on live trackers and live joint readings: they never wait; damaged bytes are counted, never raised."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from collections.abc import Callable, Mapping

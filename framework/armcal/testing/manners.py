@@ -1,7 +1,5 @@
 """What a component must leave alone, whatever its kind: standard output, random numbers, the process, its module."""
 
-from __future__ import annotations
-
 import io
 import os
 import random

@@ -1,7 +1,5 @@
 """Checks on measurements: channels, noise, residual, derivatives."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

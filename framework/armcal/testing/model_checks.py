@@ -1,7 +1,5 @@
 """Checks on arm models: names, parameters, chain, kinematics, derivatives, statics."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

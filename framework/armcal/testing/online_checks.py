@@ -1,7 +1,5 @@
 """Checks on online estimators: a small linear problem whose answer is a sum of information."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

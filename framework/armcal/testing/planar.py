@@ -1,7 +1,5 @@
 """The arm, springs and instrument of the contract's own checks: two links in a vertical plane, and their tip."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

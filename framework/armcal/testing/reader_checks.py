@@ -1,7 +1,5 @@
 """Checks on readers: what a known file says, and what becomes of damaged ones."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """Checks on pose residuals: what they learn, and what they say of poses that they did not see."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 

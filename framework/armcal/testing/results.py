@@ -1,7 +1,5 @@
 """Results of checks, and a recorder that no fault of a plugin gets past."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Checks on what every component has: checked settings, and an example of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """Checks on simulators."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

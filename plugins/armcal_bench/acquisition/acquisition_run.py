@@ -1,7 +1,5 @@
 """A measuring run: pose by pose, with rests, through faults, to an end that is safe."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass

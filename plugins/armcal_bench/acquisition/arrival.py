@@ -1,7 +1,5 @@
 """Whether the arm stands where it was commanded to, by poses compared with each other and with the model's."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

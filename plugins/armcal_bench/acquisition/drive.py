@@ -1,7 +1,5 @@
 """Moving the arm: along clear paths, never faster than its rate, with the path home known to the board."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence

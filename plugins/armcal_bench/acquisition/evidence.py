@@ -1,7 +1,5 @@
 """What the poses of a measuring run show of the tracker's frame and of joints that give way, as it goes on."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

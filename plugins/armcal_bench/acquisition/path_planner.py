@@ -1,7 +1,5 @@
 """Paths between poses on which nothing comes too near."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Callable, Sequence
 from functools import cached_property

@@ -1,7 +1,5 @@
 """A plan made ready to be driven: every pose checked before anything moves."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path

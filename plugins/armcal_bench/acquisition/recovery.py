@@ -1,7 +1,5 @@
 """A device that failed is opened again until it works; what failed with it is then done again."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TypeVar
 

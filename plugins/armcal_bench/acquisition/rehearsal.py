@@ -1,7 +1,5 @@
 """A measuring run against a simulated bench, in a process of its own."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -4,8 +4,6 @@ While one joint j turns at the rate w, the target moves by its column of the Jac
 the nominal, rigid arm, in the frame that the poses themselves lie in (``armcal.diagnose.measured_frame``).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Which pose comes next, and when the servos have to rest first."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """A measuring run in its folder, from opening the devices to what it leaves behind."""
 
-from __future__ import annotations
-
 import hashlib
 import time
 from collections.abc import Callable, Iterator

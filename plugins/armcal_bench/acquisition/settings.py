@@ -1,7 +1,5 @@
 """The settings of a measuring run."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from armcal.base.settings import Angle, Duration, Length, Settings, Temperature, Torque

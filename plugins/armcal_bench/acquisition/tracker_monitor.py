@@ -1,7 +1,5 @@
 """The bench's tracker while an arm is measured: whether it is well, where the arm stands, and whether it may go on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """``armcal acquire``."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

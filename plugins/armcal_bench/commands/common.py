@@ -1,7 +1,5 @@
 """What the commands of a bench share: options, and the question before the arm moves for the first time."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path

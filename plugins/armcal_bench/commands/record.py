@@ -1,7 +1,5 @@
 """``armcal record``."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,7 +1,5 @@
 """``armcal rehearse``, and ``armcal simulated-bench``, against which it is done."""
 
-from __future__ import annotations
-
 import math
 import sys
 from pathlib import Path

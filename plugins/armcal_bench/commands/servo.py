@@ -1,7 +1,5 @@
 """``armcal servo``."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager

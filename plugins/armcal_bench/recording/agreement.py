@@ -5,8 +5,6 @@ once in ten thousand postures (F, the noise being estimated). In a group where m
 majority is right. What disagrees takes no part in the fits that judge the others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 

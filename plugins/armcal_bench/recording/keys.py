@@ -1,7 +1,5 @@
 """What a person types while the arm is guided: single keys of a terminal, or lines where there is none."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """What the postures so far determine of the free parameters, and which joints to vary for more."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

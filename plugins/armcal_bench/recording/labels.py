@@ -1,7 +1,5 @@
 """The names of what the arm touches: which columns they fill, and what a key or a typed name stands for."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from armcal.base.dataset import Dataset

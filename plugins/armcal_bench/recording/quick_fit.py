@@ -4,8 +4,6 @@ Weak priors about the nominal values stand in for what the postures do not deter
 yet makes the expected error large, not the answer impossible.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

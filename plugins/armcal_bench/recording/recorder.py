@@ -1,7 +1,5 @@
 """Postures captured from a stream of readings, at a command or when the arm has come to rest; nothing waits here."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

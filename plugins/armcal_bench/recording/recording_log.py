@@ -1,7 +1,5 @@
 """The postures of a recording, as they were captured: their journal, and the dataset that they make."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

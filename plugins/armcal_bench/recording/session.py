@@ -1,7 +1,5 @@
 """A recording from opening the stream to its end."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass

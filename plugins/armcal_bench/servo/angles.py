@@ -1,7 +1,5 @@
 """From lines of the record to angles observed at pulses."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

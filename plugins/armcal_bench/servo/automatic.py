@@ -1,7 +1,5 @@
 """Servos measured by a tracker, one joint at a time: up over its range and down again."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass

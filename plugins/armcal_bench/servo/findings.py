@@ -1,7 +1,5 @@
 """What is remarkable about a servo calibration beside its numbers, in sentences."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

@@ -4,8 +4,6 @@ A servo's angle is that of its table at the pulse, less the lag behind the direc
 between its knots. Weighted least squares; observations far off are set aside and named.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal

@@ -1,7 +1,5 @@
 """Servos measured without a tracker: somebody says when a joint is at an angle."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What somebody wishes, by single keys of a terminal or by lines from anywhere else."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Servos moved by their pulses, slowly, one at a time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from itertools import pairwise, permutations

@@ -1,7 +1,5 @@
 """Tables, oscillators and springs from a record, round by round."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

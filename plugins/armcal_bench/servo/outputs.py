@@ -1,7 +1,5 @@
 """What a servo calibration leaves behind: the servo file, and its results."""
 
-from __future__ import annotations
-
 import errno
 import json
 import math

@@ -1,7 +1,5 @@
 """The least-squares problem of a servo fit: its unknowns, and the residuals of observations and priors."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

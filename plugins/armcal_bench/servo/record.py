@@ -3,8 +3,6 @@
 Lines are checked when they are read: one that was damaged must not become a table.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """A servo calibration from opening the devices to what it leaves behind."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Whether each joint of a new arm turns as commanded: the right one, the right way, as far as the model has it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

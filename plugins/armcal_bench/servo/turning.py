@@ -4,8 +4,6 @@ Rotations R_k = Rot(u, phi_k) C have the axis u and the rest C in common; both a
 direction along which the rotation vectors of R_k C' lie, and C as the chordal mean [Moakher2002] of Rot(u, phi_k)' R_k.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

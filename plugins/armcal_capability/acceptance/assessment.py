@@ -1,7 +1,5 @@
 """All characteristics of an arm from its visits: by pose, by pair of poses, by direction, and over time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import combinations, pairwise

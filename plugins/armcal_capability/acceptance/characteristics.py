@@ -5,8 +5,6 @@ are from that barycentre. Positions are in m. Orientations are rotation vectors 
 the attained orientation, in the axes of the frame: to first order the standard's angles a, b, c about x, y, z.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from armcal.base.domains import Array
 from armcal.estimate.prediction import RADIUS_LEVEL, Spread, quantile

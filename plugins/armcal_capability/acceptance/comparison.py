@@ -1,7 +1,5 @@
 """What was commanded beside what was attained, in one frame: where the instrument stood, stated or found."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, get_args

@@ -1,7 +1,5 @@
 """An assessment as plain numbers, for JSON and CSV, and as tables and sentences, for people."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Any

@@ -1,7 +1,5 @@
 """Figures of an assessment: accuracy and repeatability by pose, where visits fell, and how both moved over time."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

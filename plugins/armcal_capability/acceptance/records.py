@@ -1,7 +1,5 @@
 """Visits to poses: a table of records, with pose, cycle and direction of approach, checked."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Visits that cannot be of their pose: another unit, another pose's measurement, a jump of the instrument."""
 
-from __future__ import annotations
-
 import numpy as np
 from armcal.base.domains import Array
 from armcal.errors import DataError, Location

@@ -1,7 +1,5 @@
 """Datagrams on this machine: a request in each, and its answer in one to the sender."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 from functools import partial

@@ -1,7 +1,5 @@
 """A client at a stream of bytes: lines in, lines out, with bounded memory for both; and standard input and output."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections import deque

@@ -1,7 +1,5 @@
 """The interface of transports."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 

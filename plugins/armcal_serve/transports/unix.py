@@ -1,7 +1,5 @@
 """A Unix socket that many clients may connect to; only its owner may."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import socket

@@ -4,8 +4,6 @@ The tool's error is nearly linear over a few counts, so the joints are split in 
 half are laid out, and the pairs of them that cancel best are tried on the arm itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ another, and a way with fewer and shorter jumps is the better one. The sides fro
 they move, and how they move may depend on these where there is backlash.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What an arm cannot reach: limits of commands, the shell that its links span, and why a target is not reached."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 

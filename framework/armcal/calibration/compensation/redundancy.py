@@ -4,8 +4,6 @@ The way is sought along commands that keep the target to first order; the solver
 step counts only if what is to be small became smaller. [Nocedal2006]
 """
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 

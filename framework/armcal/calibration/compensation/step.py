@@ -14,8 +14,6 @@ steps before they vanish. So steps are not taken back; their damping grows with 
 the best of all steps is kept. A joint that meets its limit is held there until the target pulls it back.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import reduce

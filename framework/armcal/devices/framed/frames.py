@@ -1,7 +1,5 @@
 """Frames on a serial line: COBS [Cheshire1999], then a zero. Inside: type, sequence, payload, CRC-32, little endian."""
 
-from __future__ import annotations
-
 import zlib
 from typing import NamedTuple
 

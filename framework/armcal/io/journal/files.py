@@ -1,7 +1,5 @@
 """What a journal asks of a file system, small enough that a test can stand in for it."""
 
-from __future__ import annotations
-
 import errno
 import os
 from collections.abc import Iterator

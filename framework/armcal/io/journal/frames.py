@@ -5,8 +5,6 @@ each, JSON of that length, and a line end. The CRC-32 goes over sequence, length
 the frame before: a frame that is lost, repeated or out of place does not check, and neither does any after it.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import zlib

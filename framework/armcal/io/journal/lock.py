@@ -1,7 +1,5 @@
 """One writer of a journal: a lock that ends with the process that holds it."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A journal as it lies in a folder, read without changing it: to go on from its end, to replay it, to verify it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

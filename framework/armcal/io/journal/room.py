@@ -1,7 +1,5 @@
 """Room on the disk for a journal: segments that a newer checkpoint covers, and a reserve for one more checkpoint."""
 
-from __future__ import annotations
-
 import os
 import re
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """The cube of ISO 9283 and the five poses on its inclined plane. [ISO9283]"""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The table of the test: cycles over the five poses, then single poses from several directions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

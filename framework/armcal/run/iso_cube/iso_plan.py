@@ -1,7 +1,5 @@
 """A plan of the test of ISO 9283 for a configured arm."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

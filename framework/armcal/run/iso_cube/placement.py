@@ -3,8 +3,6 @@
 Cubes grow about the tools of many postures at once, each size from the commands of the one before, until none fits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
