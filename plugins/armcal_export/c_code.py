@@ -60,7 +60,15 @@ class CExporter:
             NotConvergedError: the arm settles in no pose.
             ProblemError: the compiler warns, or the compiled code differs.
         """
-        files = _names(request.out or "arm.c")
+        out = request.out or "arm.c"
+        if not _NAME.fullmatch(out):
+            raise InputError(
+                f"found the name {out!r}, expected that of a C file.",
+                where=Location(out),
+                hint="Write letters, digits, _ and -, and .c at the end: --out arm.c.",
+            )
+        stem = PurePath(out).stem
+        files = FileNames(out, f"{stem}.h", f"{stem}_test.c")
         unknown = [name for name in self._settings.conditions if name not in request.arm.conditions]
         if unknown:
             known = ", ".join(request.arm.conditions) or "none"
@@ -77,17 +85,6 @@ class CExporter:
         remarks = [*_remarks(request, self._settings.conditions), *compiled_and_run(named, files)]
         content = named.pop(files.source)
         return Exported(content, changed_numbers(request), companions=named, remarks=tuple(remarks))
-
-
-def _names(out: str) -> FileNames:
-    if not _NAME.fullmatch(out):
-        raise InputError(
-            f"found the name {out!r}, expected that of a C file.",
-            where=Location(out),
-            hint="Write letters, digits, _ and -, and .c at the end: --out arm.c.",
-        )
-    stem = PurePath(out).stem
-    return FileNames(out, f"{stem}.h", f"{stem}_test.c")
 
 
 def _remarks(request: ExportRequest, conditions: Sequence[str]) -> list[str]:

@@ -43,18 +43,14 @@ def arm_functions(e: ToolExpression, prefix: str) -> ArmFunctions:
         outputs = ["jacobian", "by_state", "by_command"]
         written.append(c_function(tool_slope, "tool_slope", ["record", "state"], outputs))
         return ArmFunctions("\n".join(written), _FEW_PASSES)
-    written.append(_tangent(e, twist, direction))
-    written.append(filled("columns.c.in", prefix, whole=str(whole)))
-    return ArmFunctions("\n".join(written), _MANY_PASSES)
-
-
-def _tangent(e: ToolExpression, twist: Expression, direction: Expression) -> str:
-    """How state and tool follow one direction of commands and state."""
+    # How state and tool follow one direction of commands and state
     expression, along = ca.SX.sym("told", len(e.joints)), ca.SX.sym("along", e.state.numel())
     both, ways = ca.vertcat(e.commands, e.state), ca.vertcat(expression, along)
     moved = [ca.densify(ca.jtimes(term, both, ways)) for term in (e.next_state, twist)]
     function = _function([e.record, e.state, expression, along], [moved[0], _at_tool(e, moved[1], direction)])
-    return c_function(function, "tangent", ["record", "state", "told", "along"], ["next", "twist"])
+    written.append(c_function(function, "tangent", ["record", "state", "told", "along"], ["next", "twist"]))
+    written.append(filled("columns.c.in", prefix, whole=str(whole)))
+    return ArmFunctions("\n".join(written), _MANY_PASSES)
 
 
 def _twist(e: ToolExpression) -> tuple[Expression, Expression]:

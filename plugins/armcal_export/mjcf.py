@@ -60,7 +60,13 @@ def mjcf(
         _inertial(body, arm_description, number, joint.base_T_joint)
         here = joint.base_T_joint
     at_tool = np.linalg.inv(here) @ rigid.base_T_tool
-    _tool(body, arm_description, at_tool)
+    ElementTree.SubElement(body, "site", name="tool", size="0.005", **_placed(at_tool))
+    payload = arm_description.statics.payload_kg or 0.0
+    if payload > 0:
+        at = (at_tool @ [*arm_description.statics.payload_com_m, 1.0])[:3]
+        carried = ElementTree.SubElement(body, "body", name="payload", pos=_row(at))
+        ball = _row([0.4 * payload * _RADIUS_M**2] * 3)
+        ElementTree.SubElement(carried, "inertial", pos="0 0 0", mass=_n(payload), diaginertia=ball)
     _couplings(root, rigid)
     _actuators(root, rigid, drive)
     ElementTree.indent(root)
@@ -118,16 +124,6 @@ def _inertial(body: ElementTree.Element, arm_description: ArmDescription, number
     place = 0 if body.find("joint") is None else list(body).index(body.findall("joint")[-1]) + 1
     element = ElementTree.Element("inertial", pos=_row(centre), mass=_n(float(weights.sum())), fullinertia=_row(full))
     body.insert(place, element)
-
-
-def _tool(body: ElementTree.Element, arm_description: ArmDescription, pose: Array) -> None:
-    ElementTree.SubElement(body, "site", name="tool", size="0.005", **_placed(pose))
-    payload = arm_description.statics.payload_kg or 0.0
-    if payload > 0:
-        at = (pose @ [*arm_description.statics.payload_com_m, 1.0])[:3]
-        carried = ElementTree.SubElement(body, "body", name="payload", pos=_row(at))
-        ball = _row([0.4 * payload * _RADIUS_M**2] * 3)
-        ElementTree.SubElement(carried, "inertial", pos="0 0 0", mass=_n(payload), diaginertia=ball)
 
 
 def _couplings(root: ElementTree.Element, rigid: RigidChain) -> None:

@@ -84,14 +84,11 @@ def _quoted(text: str) -> str:
     return (
         '"'
         + "".join(
-            _ESCAPES.get(character, character if character.isprintable() else _unicode(character)) for character in text
+            _ESCAPES.get(character, character if character.isprintable() else f"\\U{ord(character):08x}")
+            for character in text
         )
         + '"'
     )
-
-
-def _unicode(character: str) -> str:
-    return f"\\U{ord(character):08x}"
 
 
 def _entries(node: Any, what: str) -> list[tuple[str, Any]]:

@@ -84,7 +84,16 @@ class WorkerPool:
         """
         now = time.monotonic()
         self._poll_making(now)
-        self._poll_active(now)
+        for worker in self._active:
+            if worker.ticket is not None and now - worker.since > LONGEST_S:
+                hint = "Ask for fewer targets at a time."
+                worker.ticket.refused(ArmcalError(f"it took longer than {LONGEST_S:g} s.", hint=hint))
+                worker.ticket = None
+                worker.kill()
+        before = len(self._active)
+        self._active = [worker for worker in self._active if not self._left(worker)]
+        if before and not self._active:
+            self._without_since = now
         self._next_ready = [worker for worker in self._next_ready if not self._left(worker)]
         if self._making is None and now >= self._may_start_at:
             self._go_on(now, looking)
@@ -209,18 +218,6 @@ class WorkerPool:
         self._next, self._next_ready = None, []
         self._watch.refused(str(fault), again=passing)
         self._notify("refused", f"the new calibration is not taken: {fault}", {"why": str(fault)})
-
-    def _poll_active(self, now: float) -> None:
-        for worker in self._active:
-            if worker.ticket is not None and now - worker.since > LONGEST_S:
-                hint = "Ask for fewer targets at a time."
-                worker.ticket.refused(ArmcalError(f"it took longer than {LONGEST_S:g} s.", hint=hint))
-                worker.ticket = None
-                worker.kill()
-        before = len(self._active)
-        self._active = [worker for worker in self._active if not self._left(worker)]
-        if before and not self._active:
-            self._without_since = now
 
     def _left(self, worker: WorkerProcess) -> bool:
         """Whether a worker ended by itself."""

@@ -59,7 +59,13 @@ def befallen(request: SimulationRequest, poses: Dataset) -> tuple[Joint, ...]:
     joints = []
     for i, (joint, dimension) in enumerate(arm.commanded.items()):
         offset, play = (_alike(slopes, names, motions[:, i] * sign) for sign in (1.0, approaches[i]))
-        joints.append(Joint(f"{arm.name}.{joint}", dimension, offset, play, _link(arm, i + 1, names)))
+        number = i + 1
+        scope, link = f"{arm.name}.{arm.model_name}.", {}
+        for name in names:
+            match = _LINK.fullmatch(name.removeprefix(scope)) if name.startswith(scope) else None
+            if match and int(match["joint"]) == number < len(arm.commanded):
+                link[match["kind"]] = name
+        joints.append(Joint(f"{arm.name}.{joint}", dimension, offset, play, link))
     return tuple(joints)
 
 
@@ -77,15 +83,6 @@ def _alike(slopes: Array, names: Sequence[str], moved: Array) -> str:
     size = np.linalg.norm(slopes, axis=0) * np.linalg.norm(moved)
     alike = np.abs(slopes.T @ moved) / np.where(size > 0, size, math.inf)
     return next((name for name, cosine in zip(names, alike, strict=True) if cosine > _ALONE), "")
-
-
-def _link(arm: Arm, number: int, names: Sequence[str]) -> dict[str, str]:
-    scope, link = f"{arm.name}.{arm.model_name}.", {}
-    for name in names:
-        match = _LINK.fullmatch(name.removeprefix(scope)) if name.startswith(scope) else None
-        if match and int(match["joint"]) == number < len(arm.commanded):
-            link[match["kind"]] = name
-    return link
 
 
 @dataclass(frozen=True)

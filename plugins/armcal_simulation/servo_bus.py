@@ -160,13 +160,10 @@ class ServoBus:
         if len(packets) == 1:
             self._send(packets[0])
         elif packets:
-            self._send(self._collided(packets))
-
-    def _collided(self, packets: list[bytes]) -> bytes:
-        """Several that speak at once pull the same line down: zeros win. They begin a little apart."""
-        delays = [int(self._random.integers(_LATEST_BYTES + 1)) for _ in packets]
-        length = max(delay + len(packet) for delay, packet in zip(delays, packets, strict=True))
-        lines = [
-            (b"\xff" * delay + packet).ljust(length, b"\xff") for delay, packet in zip(delays, packets, strict=True)
-        ]
-        return bytes(reduce(and_, column) for column in zip(*lines, strict=True))
+            # Several that speak at once pull the same line down: zeros win. They begin a little apart.
+            delays = [int(self._random.integers(_LATEST_BYTES + 1)) for _ in packets]
+            length = max(delay + len(packet) for delay, packet in zip(delays, packets, strict=True))
+            lines = [
+                (b"\xff" * delay + packet).ljust(length, b"\xff") for delay, packet in zip(delays, packets, strict=True)
+            ]
+            self._send(bytes(reduce(and_, column) for column in zip(*lines, strict=True)))

@@ -36,15 +36,7 @@ def show_run(console: Console, result: RunResult, folder: Path, seconds: float) 
             out.print(compliances)
     if result.bootstrap:
         out.print(_bootstrap(result, result.bootstrap))
-    out.print(_findings(result))
-    out.print(result.verdict.headline, style="bold")
-    if result.verdict.paragraph:
-        out.print(result.verdict.paragraph)
-    console.line(f"report: {folder / 'report.html'}  ({seconds:.1f} s)")
-
-
-def _findings(result: RunResult) -> Table:
-    """A row a finding; how it was tested stands dimmed behind what it says."""
+    # A row a finding; how it was tested stands dimmed behind what it says.
     table = Table(title="Verdict", title_justify="left", box=HORIZONTALS, expand=True)
     table.add_column("", no_wrap=True)
     table.add_column("what, and how it was tested", ratio=5)
@@ -54,7 +46,11 @@ def _findings(result: RunResult) -> Table:
         if finding.test:
             text.append(f" ({finding.test})", style="dim")
         table.add_row(Text(finding.grade, style=_STYLES[finding.grade]), text, finding.action)
-    return table
+    out.print(table)
+    out.print(result.verdict.headline, style="bold")
+    if result.verdict.paragraph:
+        out.print(result.verdict.paragraph)
+    console.line(f"report: {folder / 'report.html'}  ({seconds:.1f} s)")
 
 
 def _errors(title: str, errors: ErrorTable) -> Table:

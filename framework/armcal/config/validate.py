@@ -78,7 +78,15 @@ def validate(settings_class: type[S], source: ConfigSource, at: tuple[Step, ...]
         return settings_class.model_validate(raw)
     except ValidationError as fault:
         findings = [_finding(error, raw) for error in fault.errors(include_url=False)]
-        raise _refusal(_settle(findings), source, at) from fault
+        placed = [(source.where((*at, *finding.path)), finding.text) for finding in _settle(findings)]
+        placed.sort(key=lambda place: (place[0].file or "", place[0].line or 0))
+        first, others = placed[0], placed[1:]
+        lines = [first[1], *(f"{where}: {text}" for where, text in others[: _MOST_LISTED - 1])]
+        if len(placed) > _MOST_LISTED:
+            lines.append(f"and {len(placed) - _MOST_LISTED} more.")
+        if others:
+            lines.append(f"Correct these {len(placed)} places.")
+        raise ConfigError("\n".join(lines), where=first[0]) from fault
 
 
 def _part(settings_class: type[Settings], source: ConfigSource, at: tuple[Step, ...]) -> Any:
@@ -205,15 +213,3 @@ def _merged(same: Sequence[_Finding]) -> Iterable[_Finding]:
     expected = " or ".join(dict.fromkeys(f.expected for f in same))
     mends = list(dict.fromkeys(f.mend for f in same))
     return [replace(same[0], expected=expected, mend=mends[0] if len(mends) == 1 else "write one of these")]
-
-
-def _refusal(findings: Sequence[_Finding], source: ConfigSource, at: tuple[Step, ...]) -> ConfigError:
-    placed = [(source.where((*at, *finding.path)), finding.text) for finding in findings]
-    placed.sort(key=lambda place: (place[0].file or "", place[0].line or 0))
-    first, others = placed[0], placed[1:]
-    lines = [first[1], *(f"{where}: {text}" for where, text in others[: _MOST_LISTED - 1])]
-    if len(placed) > _MOST_LISTED:
-        lines.append(f"and {len(placed) - _MOST_LISTED} more.")
-    if others:
-        lines.append(f"Correct these {len(placed)} places.")
-    return ConfigError("\n".join(lines), where=first[0])

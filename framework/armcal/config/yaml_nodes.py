@@ -80,7 +80,18 @@ def read_nodes(text: str, origin: Origin, loader: Any = LOADER) -> Node | None:
         ConfigError: with line, field and mend: invalid YAML, tab indentation, duplicate or unclear keys,
             tags, merge keys, several documents, surprising scalars, too deep or too large.
     """
-    _check_characters(text, origin)
+    if match := _UNPRINTABLE.search(text):
+        raise ConfigError(
+            f"found the control character U+{ord(match.group()):04X}, expected text.",
+            where=origin.at(text.count("\n", 0, match.start()) + 1),
+            hint="Delete it, or save the file as UTF-8 text.",
+        )
+    if match := _TAB_INDENT.search(text):
+        raise ConfigError(
+            "this line is indented with a tab, expected spaces.",
+            where=origin.at(text.count("\n", 0, match.start()) + 1),
+            hint="Replace the tab by spaces.",
+        )
     builder = _Builder(origin)
     try:
         for event in yaml.parse(text, Loader=loader):
@@ -96,21 +107,6 @@ def read_nodes(text: str, origin: Origin, loader: Any = LOADER) -> Node | None:
     except (yaml.YAMLError, ValueError, OverflowError) as fault:
         builder.refuse(f"this is not valid YAML: {fault}.", "Check quotes and escapes.", None)
     return builder.root
-
-
-def _check_characters(text: str, origin: Origin) -> None:
-    if match := _UNPRINTABLE.search(text):
-        raise ConfigError(
-            f"found the control character U+{ord(match.group()):04X}, expected text.",
-            where=origin.at(text.count("\n", 0, match.start()) + 1),
-            hint="Delete it, or save the file as UTF-8 text.",
-        )
-    if match := _TAB_INDENT.search(text):
-        raise ConfigError(
-            "this line is indented with a tab, expected spaces.",
-            where=origin.at(text.count("\n", 0, match.start()) + 1),
-            hint="Replace the tab by spaces.",
-        )
 
 
 @dataclass

@@ -67,7 +67,10 @@ class BatchFunction:
         """The outputs (entries x N each) for inputs (entries x N each)."""
         count = inputs[0].shape[1]
         if self._library is None:
-            self._count(count)
+            self._asked += count
+            if self._asked > _WORTH_COMPILING and self._compile_later is not None:
+                later, self._compile_later = self._compile_later, None
+                quietly(lambda: later())
             return self.interpreted(*inputs)
         whole = count - count % c_source.LANES
         if not whole and count:
@@ -102,12 +105,6 @@ class BatchFunction:
                 # not by plain indexing, which would turn the storage round
                 now, *rest = (np.compress(~ended, array, axis=1) for array in (now, *rest))
                 active = active[~ended]
-
-    def _count(self, records: int) -> None:
-        self._asked += records
-        if self._asked > _WORTH_COMPILING and self._compile_later is not None:
-            later, self._compile_later = self._compile_later, None
-            quietly(lambda: later())
 
     def _rest(self, inputs: Sequence[Array], start: int) -> list[Array]:
         """Records from ``start`` on, fewer than one vector of them: the last one fills it up."""

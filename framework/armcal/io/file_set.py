@@ -97,15 +97,11 @@ def _staged(place: Path, content: bytes) -> Path:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        Path(name).chmod(0o666 & ~_umask())
+        # What new files' rights are reduced by; it can only be read by setting it.
+        mask = os.umask(0)
+        os.umask(mask)
+        Path(name).chmod(0o666 & ~mask)
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise
     return Path(name)
-
-
-def _umask() -> int:
-    """What new files' rights are reduced by; it can only be read by setting it."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -173,7 +173,11 @@ def _row(line: _Line, number: int) -> Row:
     limits = _limits(line, "angle" if turns else "length")
     joint = RobotJoint(name, turns, limits or (ASSUMED_TURN if turns else ASSUMED_TRAVEL), limits is None)
     alpha, a, theta, d = (line.required(stem, dimension) for stem, dimension in _NUMBERS.items())
-    return Row(joint, alpha, a, theta, d, _mass(line))
+    mass = line.number("mass", "mass") or 0.0
+    if mass < 0:
+        line.refuse(("mass", "mass"), "found a mass below zero.", "Leave it empty where it is not known.")
+    x, y, z = (line.number(f"com_{axis}", "length") or 0.0 for axis in "xyz")
+    return Row(joint, alpha, a, theta, d, (Mass(mass, (x, y, z)) if mass else None))
 
 
 def _limits(line: _Line, dimension: str) -> Range | None:
@@ -190,11 +194,3 @@ def _limits(line: _Line, dimension: str) -> Range | None:
         key = next((stem, dimension) for stem in _LIMITS if (stem, dimension) in line.cells)
         line.refuse(key, "found no lower limit below an upper one.", "Give both, or leave both empty.")
     return low, high
-
-
-def _mass(line: _Line) -> Mass | None:
-    mass = line.number("mass", "mass") or 0.0
-    if mass < 0:
-        line.refuse(("mass", "mass"), "found a mass below zero.", "Leave it empty where it is not known.")
-    x, y, z = (line.number(f"com_{axis}", "length") or 0.0 for axis in "xyz")
-    return Mass(mass, (x, y, z)) if mass else None

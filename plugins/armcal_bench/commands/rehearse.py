@@ -56,13 +56,7 @@ def rehearse(console: Console, config: Path, plan: Path, out: Path, overrides: t
         account = truth(bench)
     outcome.summary["truth"] = account
     show_outcome(console, outcome, config, out)
-    _show_account(console, account)
-    code = exit_code_of(outcome)
-    sys.exit(EXIT_INCOMPLETE if code == EXIT_DONE and any(account.get("offences", {}).values()) else code)
-
-
-def _show_account(console: Console, account: dict[str, Any]) -> None:
-    """What the simulated arm had to bear: how often, and the worst of each kind."""
+    # What the simulated arm had to bear: how often, and the worst of each kind.
     offences, worst = account.get("offences", {}), account.get("worst", {})
     counted = []
     for kind, count in offences.items():
@@ -75,6 +69,8 @@ def _show_account(console: Console, account: dict[str, Any]) -> None:
     for kind, what in (("first_pulse", "the largest jump at a first pulse"), ("drop", "the deepest fall when let go")):
         if kind in worst:
             console.line(f"{what}: {_amount(kind, worst[kind])}.")
+    code = exit_code_of(outcome)
+    sys.exit(EXIT_INCOMPLETE if code == EXIT_DONE and any(account.get("offences", {}).values()) else code)
 
 
 def _amount(kind: str, entry: dict[str, Any]) -> str:

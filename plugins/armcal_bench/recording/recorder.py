@@ -149,7 +149,14 @@ class Recorder:
             mean = self._window.mean()
             return [_refused(mean)] if isinstance(mean, str) else self._kept(mean)
         if word == "u":
-            return self._undone()
+            posture = self._log.undo()
+            if posture is None:
+                return [_refused("there is no posture to take back.")]
+            before = self._assessment
+            self._assessment = self._assessor.anew(self._log.postures)
+            self._write()
+            messages = [Message("undone", f"posture {posture.name} is taken back.", {"posture": posture.name})]
+            return messages + _doubts_changed(before, self._assessment, self._log.postures) + self._known()
         if word == "s":
             return self._status()
         if word == "g" or word.isdecimal():
@@ -194,16 +201,6 @@ class Recorder:
         messages = [_captured(posture, self._assessment)]
         messages += _doubts_changed(before, self._assessment, postures)
         return messages + self._warnings(posture) + self._known()
-
-    def _undone(self) -> list[Message]:
-        posture = self._log.undo()
-        if posture is None:
-            return [_refused("there is no posture to take back.")]
-        before = self._assessment
-        self._assessment = self._assessor.anew(self._log.postures)
-        self._write()
-        messages = [Message("undone", f"posture {posture.name} is taken back.", {"posture": posture.name})]
-        return messages + _doubts_changed(before, self._assessment, self._log.postures) + self._known()
 
     def _status(self) -> list[Message]:
         postures, doubts = self._log.postures, self._assessment.doubts

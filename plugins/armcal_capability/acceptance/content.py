@@ -67,7 +67,7 @@ def csv_rows(assessment: Assessment) -> tuple[list[str], list[list[Any]]]:
         for row in members:
             start = [section, *row.names, row.count]
             for model, figures in (("measured", row.measured), *row.models.items()):
-                rows += [[*start, model, name, *map(_cell, _numbers(f))] for name, f in figures.items()]
+                rows += [[*start, model, name, *map(_cell, (f.value, f.low, f.high))] for name, f in figures.items()]
             for model, numbers in row.numbers.items():
                 rows += [[*start, model, name, _cell(number), "", ""] for name, number in numbers.items()]
     return headings, rows
@@ -164,10 +164,6 @@ def _text(figure: Figure) -> str:
     decimals = min(decimals_for(max(figure.value - figure.low, abs(figure.value) / 100)), 4)
     high = f"{figure.high:.{decimals}f}" if figure.high < _LARGEST else "?"
     return f"{figure.value:.{decimals}f} ({figure.low:.{decimals}f} to {high})"
-
-
-def _numbers(figure: Figure) -> tuple[float, float, float]:
-    return figure.value, figure.low, figure.high
 
 
 def _cell(number: float) -> str:

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 
 import numpy as np
-from armcal.base.domains import Array
 
 from armcal_capability.acceptance import characteristics as of
 from armcal_capability.acceptance.assessment import MM, Assessment, series_of
@@ -96,7 +95,8 @@ def _visits(visits: Visits, comparisons: Mapping[str, Comparison]) -> bytes:
                     *points[:, [across, up]].T, marks.get(group.direction, "."), ms=3.0, color=colour, alpha=0.6, lw=0
                 )
             radius = of.repeatability(first.attained[visits.main(pose).members]).value * MM
-            axes.plot(*_circle(radius), color=colour, lw=1.0, label=pose)
+            angles = np.linspace(0, 2 * np.pi, 73)
+            axes.plot(radius * np.cos(angles), radius * np.sin(angles), color=colour, lw=1.0, label=pose)
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_xlabel(f"{'xyz'[across]}, mm", fontsize=9.5, color=INK)
         axes.set_ylabel(f"{'xyz'[up]}, mm", fontsize=9.5, color=INK)
@@ -130,8 +130,3 @@ def _over_time(visits: Visits, comparisons: Mapping[str, Comparison]) -> bytes:
     handles, labels = left.get_legend_handles_labels()
     figure.legend(handles[:12], labels[:12], loc="outside lower left", ncols=6, fontsize=8, frameon=False)
     return png_of(figure)
-
-
-def _circle(radius: float) -> tuple[Array, Array]:
-    angles = np.linspace(0, 2 * np.pi, 73)
-    return radius * np.cos(angles), radius * np.sin(angles)

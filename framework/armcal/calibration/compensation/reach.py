@@ -8,7 +8,6 @@ import numpy as np
 
 from armcal.arm.assembly import Arm
 from armcal.arm.joints import Limits, joint_limits, unknown_joint
-from armcal.arm.model import Chain
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.base.se3 import Transform, identity
@@ -105,21 +104,16 @@ def reach_of(arm: Arm, parameters: Parameters, limits: Array, tool_T_point: Tran
     links = [float(np.linalg.norm(_numbers(joint.parent_T_joint.translation))) for joint in chain.joints]
     end = chain.tool.joint_T_frame @ (tool_T_point or identity())
     links.append(float(np.linalg.norm(_numbers(end.translation))))
-    travel = _travel(arm, chain, limits)
-    total = sum(links) + travel
-    nearest = 0.0 if travel else max(0.0, 2 * max(links) - total)
-    return Reach(centre, total, nearest)
-
-
-def _travel(arm: Arm, chain: Chain, limits: Array) -> float:
-    """How far sliding joints move at most (m)."""
-    most = 0.0
+    # how far sliding joints move at most (m)
+    travel = 0.0
     places = {joint: i for i, joint in enumerate(arm.commanded)}
     for joint in chain.joints:
         if not joint.is_revolute:
             own = limits[places[joint.name]] if joint.name in places else np.array([-np.inf, np.inf])
-            most += float(np.abs(own + float(_numbers(ca.SX(joint.offset)).item())).max())
-    return most
+            travel += float(np.abs(own + float(_numbers(ca.SX(joint.offset)).item())).max())
+    total = sum(links) + travel
+    nearest = 0.0 if travel else max(0.0, 2 * max(links) - total)
+    return Reach(centre, total, nearest)
 
 
 def _numbers(expression: ca.SX) -> Array:

@@ -228,18 +228,14 @@ def is_torn(data: bytes, offset: int, follows: int) -> bool:
         follows: the CRC that the frame there starts from.
     """
     end = data.find(b"\n", offset)
-    hole = _hole(data, offset, len(data) if end < 0 else end)
+    # zeros up to a border of a sector or the end of the file
+    runs = (range(*run.span()) for run in _NULS.finditer(data, offset, len(data) if end < 0 else end))
+    hole = next((run for run in runs if run.stop % SECTOR == 0 or run.stop == len(data)), None)
     if hole is not None:
         later = data[offset:].removesuffix(b"\n").split(b"\n")[1:-1]
         return not any(map(was_acknowledged, later)) and not _is_flipped(data, offset, hole, follows)
     promised = promised_end(data, offset)
     return end < 0 and (promised is None or promised >= len(data))
-
-
-def _hole(data: bytes, offset: int, line_end: int) -> range | None:
-    """Zeros up to a border of a sector or the end of the file."""
-    runs = (range(*run.span()) for run in _NULS.finditer(data, offset, line_end))
-    return next((run for run in runs if run.stop % SECTOR == 0 or run.stop == len(data)), None)
 
 
 def _is_flipped(data: bytes, offset: int, hole: range, follows: int) -> bool:
