@@ -1,11 +1,9 @@
 """The section ``bench`` of a configuration, and what it names, built: clock, device, tracker."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from armcal.arm.assembly import Arm
 from armcal.base.settings import InputPath, Settings
@@ -60,7 +58,7 @@ class Bench:
     settings: BenchSettings
 
     @classmethod
-    def of(cls, experiment: Experiment) -> Bench:
+    def of(cls, experiment: Experiment) -> Self:
         """The bench of an experiment.
 
         Raises:

@@ -1,10 +1,8 @@
 """Which of a tracker's bodies is what; from what the tracker sees to the target in the arm's base frame."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from armcal.base.domains import Array
@@ -43,7 +41,7 @@ class BodySettings(Settings):
     tool_body_T_target: PoseSettings = Field(default_factory=PoseSettings)
 
     @model_validator(mode="after")
-    def _two_bodies(self) -> BodySettings:
+    def _two_bodies(self) -> Self:
         if self.tool == self.base:
             raise ValueError(
                 f"found {self.tool!r} for both tool and base, expected two bodies (base: none for no base)"

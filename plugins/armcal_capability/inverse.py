@@ -4,9 +4,8 @@ The step by commands is J^T (J J^T + |e|^2 I)^-1 e over the joints that are free
 points too far away from where it should adds one equation, and none where it points well enough.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from armcal.arm.clearance import Mask
@@ -35,7 +34,7 @@ class Pointing:
     within: float
 
     @classmethod
-    def of(cls, settings: ToolDirectionSettings) -> Pointing:
+    def of(cls, settings: ToolDirectionSettings) -> Self:
         """As configured."""
         along = np.array(settings.along, dtype=float)
         return cls("xyz".index(settings.axis), along / np.linalg.norm(along), settings.within)

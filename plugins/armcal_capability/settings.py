@@ -1,8 +1,6 @@
 """The settings of capability maps and design studies: the section ``capability`` of a configuration."""
 
-from __future__ import annotations
-
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from armcal.base.settings import Angle, Force3, InputPath, Length, Length3, Mass, Settings, Torque
 from pydantic import Field, model_validator
@@ -16,7 +14,7 @@ class ToolDirectionSettings(Settings):
     within: Annotated[Angle, Field(gt=0, le=3.15)]
 
     @model_validator(mode="after")
-    def _has_direction(self) -> ToolDirectionSettings:
+    def _has_direction(self) -> Self:
         if not any(self.along):
             raise ValueError("along is zero: give a direction, such as [0, 0, -1] for down")
         return self
@@ -30,7 +28,7 @@ class AreaSettings(Settings):
     tool: ToolDirectionSettings | None = None
 
     @model_validator(mode="after")
-    def _ordered(self) -> AreaSettings:
+    def _ordered(self) -> Self:
         if any(low > high for low, high in zip(self.low, self.high, strict=True)):
             raise ValueError("low lies beyond high on an axis: give the smaller coordinates as low")
         return self

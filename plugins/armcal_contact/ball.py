@@ -1,10 +1,8 @@
 """A ball on the tool, seated in a socket: it touches what does not move, and measures nothing else. [Franzese2025]"""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import casadi as ca
 from armcal.arm.assembly import ArmState
@@ -27,7 +25,7 @@ class KnownDistance(Settings):
     noise: Annotated[Length, Field(gt=0)]
 
     @model_validator(mode="after")
-    def _possible(self) -> KnownDistance:
+    def _possible(self) -> Self:
         if self.between[0] == self.between[1]:
             raise ValueError(f"found {self.between[0]} twice, expected two sockets")
         return self

@@ -4,11 +4,9 @@ The pose of the right tool in the left one is the clamp's, whatever the joints d
 closing error, and it belongs to both arms at once: it is not split between them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import casadi as ca
 from armcal.arm.assembly import ArmState
@@ -37,7 +35,7 @@ class ClosedChainSettings(Settings):
     clamps: dict[str, PoseSettings] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _sane(self) -> ClosedChainSettings:
+    def _sane(self) -> Self:
         if self.left == self.right:
             raise ValueError(f"found {self.left} on both sides, expected two arms")
         return self

@@ -1,9 +1,7 @@
 """What the columns of a log of several arms' motors are, for logs that are read and logs that are followed."""
 
-from __future__ import annotations
-
 from collections import Counter
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from armcal.base.domains import Array
@@ -26,7 +24,7 @@ class ArmColumns(Settings):
     gear_ratios: tuple[float, ...] | None = None
 
     @model_validator(mode="after")
-    def _consistent(self) -> ArmColumns:
+    def _consistent(self) -> Self:
         count = len(self.columns)
         if self.order is not None and sorted(self.order) != list(range(1, count + 1)):
             raise ValueError(f"order: found {list(self.order)}, expected each of 1 to {count} once")
@@ -61,7 +59,7 @@ class LogColumns(Settings):
     still: StillSettings | None = None
 
     @model_validator(mode="after")
-    def _consistent(self) -> LogColumns:
+    def _consistent(self) -> Self:
         times = [] if self.time is None else [self.time]
         taken = Counter([*(column for arm in self.arms.values() for column in arm.columns), *times])
         twice = [str(column) for column, count in taken.items() if count > 1]

@@ -1,9 +1,7 @@
 """Command quantisation: a servo board sets whole counts, and the joint stands at the angle of the nearest."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 from armcal.arm.effects import JointCommand, chosen
 from armcal.arm.servo import PulseClock, PulseTable, SteppedEffect, quantised, without_slope
@@ -21,7 +19,7 @@ class PulseTableSettings(Settings):
     pulses: Pulses
 
     @model_validator(mode="after")
-    def _usable(self) -> PulseTableSettings:
+    def _usable(self) -> Self:
         PulseTable(self.angles, self.pulses)
         return self
 
@@ -53,7 +51,7 @@ class QuantisationSettings(Settings):
     prescale: Annotated[int, Field(ge=3, le=255)] | None = None
 
     @model_validator(mode="after")
-    def _one(self) -> QuantisationSettings:
+    def _one(self) -> Self:
         if bool(self.servos) == bool(self.tables):
             text = "both servos and tables" if self.tables else "neither servos nor tables"
             raise ValueError(f"found {text}, expected one of them: write servos: servos.yaml")

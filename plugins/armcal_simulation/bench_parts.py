@@ -1,10 +1,8 @@
 """The settings of simulated benches, and their parts, built from them and an experiment."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal, Self, TypeVar
 
 from armcal.arm.assembly import Arm
 from armcal.arm.joints import unknown_joint
@@ -47,7 +45,7 @@ class BenchTrackerSettings(DTrackSenderSettings):
     base: str | None = "base"
 
     @model_validator(mode="after")
-    def _known(self) -> BenchTrackerSettings:
+    def _known(self) -> Self:
         for name in (self.tool, self.base):
             if name is not None and name not in self.bodies:
                 raise ValueError(f"found the body {name!r}, expected one of {', '.join(self.bodies)}")

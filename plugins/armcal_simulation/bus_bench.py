@@ -1,11 +1,9 @@
 """The simulated bench ``bus_bench``: smart servos on a bus at a pty, an arm that they carry, and a tracker."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from armcal.arm.joints import unknown_joint
@@ -73,7 +71,7 @@ class BusBenchSettings(BenchTruthSettings):
     safety: SafetySettings = Field(default_factory=lambda: SafetySettings.si(together=0.0))
 
     @model_validator(mode="after")
-    def _one_protocol(self) -> BusBenchSettings:
+    def _one_protocol(self) -> Self:
         stated = {self.servo_of(joint).table.protocol for joint in self.joints if joint != ALL}
         if len(stated) > 1:
             raise ValueError(f"found servos of {' and '.join(sorted(stated))}, expected one protocol: it is one bus")

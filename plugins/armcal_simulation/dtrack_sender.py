@@ -1,14 +1,12 @@
 """A simulated DTrack: it prints noisy poses of bodies and sends them by UDP, and fails as trackers do."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import socket
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from armcal.base.domains import Array
@@ -49,7 +47,7 @@ class DTrackSenderSettings(Settings):
     first_frame: Annotated[int, Field(ge=0, lt=2**32)] = 1
 
     @model_validator(mode="after")
-    def _sane(self) -> DTrackSenderSettings:
+    def _sane(self) -> Self:
         if len(set(self.bodies.values())) != len(self.bodies):
             raise ValueError("found two bodies of one number, expected each to have its own")
         unknown = set(self.occluded) - set(self.bodies)

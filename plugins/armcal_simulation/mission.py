@@ -1,10 +1,8 @@
 """A rover's arm over some days: tilts, warmth, creep, mishaps, and records of which some are lost or wrong."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from armcal.arm.assembly import Arm
@@ -67,7 +65,7 @@ class Stands:
     @classmethod
     def drawn(
         cls, days: float, tilt: TiltSettings, hours: tuple[float, float], gravity: Array, random: np.random.Generator
-    ) -> Stands:
+    ) -> Self:
         """Tilts about random level axes, uniform up to the most; a new one after each drive in working hours."""
         drives = random.poisson(tilt.drives_per_day * days) if tilt.drives_per_day else 0
         day, hour = random.integers(0, int(np.ceil(days)), drives), random.uniform(*hours, drives)

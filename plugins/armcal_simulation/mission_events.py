@@ -1,10 +1,8 @@
 """What may happen in a simulated mission: to a joint, a link, the payload, the camera, the weather."""
 
-from __future__ import annotations
-
 import math
 import re
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from armcal.base.settings import Angle, Angle3, Length3, Mass, Settings, Temperature
@@ -46,7 +44,7 @@ class LastingSettings(EventSettings):
     until: Day | None = None
 
     @model_validator(mode="after")
-    def _ends_later(self) -> LastingSettings:
+    def _ends_later(self) -> Self:
         if self.until is not None and self.until <= self.day:
             raise ValueError(f"found until: {self.until:g} of an event on day {self.day:g}: write a later day")
         return self
@@ -63,7 +61,7 @@ class SlipSettings(EventSettings):
     angle: Angle | None = None
 
     @model_validator(mode="after")
-    def _one(self) -> SlipSettings:
+    def _one(self) -> Self:
         if (self.teeth is None) == (self.angle is None):
             raise ValueError("found both or neither of teeth and angle, expected one of them: write teeth: 1")
         return self

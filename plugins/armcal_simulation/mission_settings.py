@@ -1,9 +1,7 @@
 """The settings of a simulated mission: when records come, what the rover stands on, and what happens to the arm."""
 
-from __future__ import annotations
-
 from datetime import datetime
-from typing import Annotated
+from typing import Annotated, Self
 
 from armcal.base.settings import Angle, Duration, InputPath, Length, Settings, Temperature
 from pydantic import Field, field_validator, model_validator
@@ -27,7 +25,7 @@ class RecordSettings(Settings):
     travel: dict[str, tuple[Length, Length]] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _sane(self) -> RecordSettings:
+    def _sane(self) -> Self:
         if self.hours[0] >= self.hours[1]:
             raise ValueError("found hours that end before they begin, expected [from, to], such as [8, 18]")
         for joint, (low, high) in {**self.ranges, **self.travel}.items():
@@ -120,7 +118,7 @@ class MissionSettings(Settings):
         return value
 
     @model_validator(mode="after")
-    def _sane(self) -> MissionSettings:
+    def _sane(self) -> Self:
         began_at(self.start)
         begin = [(f"the {event.kind}", event.day) for event in self.events]
         begin += [("the gap", gap.day) for gap in self.losses.gaps]

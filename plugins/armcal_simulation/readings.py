@@ -1,11 +1,9 @@
 """What is recorded: readings disturbed by noise, some of them outliers, and the approach direction of each joint."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
 import casadi as ca
 import numpy as np
@@ -38,7 +36,7 @@ class OutlierSettings(Settings):
     largest: Length | None = None
 
     @model_validator(mode="after")
-    def _in_order(self) -> OutlierSettings:
+    def _in_order(self) -> Self:
         if self.largest is not None and self.largest < self.size:
             raise ValueError(
                 f"found outliers of {1000 * self.size:g} mm at least and {1000 * self.largest:g} mm at most: "

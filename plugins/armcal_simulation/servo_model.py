@@ -4,11 +4,9 @@ Two nodes carry its heat, in units in which a steady loss of 1 heats the winding
 ``loss = (torque / continuous)^2``. The winding lies inside the case, which the air cools; heat 1 is its limit.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_right
-from typing import Annotated
+from typing import Annotated, Self
 
 from armcal.arm.servo import PulseTable
 from armcal.base.settings import Angle, Duration, Settings, Torque
@@ -46,7 +44,7 @@ class ServoJointSettings(Settings):
     winding_share: Annotated[float, Field(gt=0, lt=1)] = 0.3
 
     @model_validator(mode="after")
-    def _physical(self) -> ServoJointSettings:
+    def _physical(self) -> Self:
         if not self.travel[0] < self.travel[1]:
             raise ValueError("the ends of travel are not in rising order: give [lowest, highest]")
         return self

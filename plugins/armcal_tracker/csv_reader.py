@@ -4,8 +4,6 @@ The file is read once, line by line, and its columns are turned into numbers a f
 neither a long file nor a broken one takes much memory. A single bad cell is looked for only when a column fails.
 """
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import os
@@ -14,7 +12,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, Literal, NoReturn
+from typing import Any, BinaryIO, ClassVar, Literal, NoReturn, Self
 
 import numpy as np
 from armcal.base.dataset import Dataset
@@ -49,7 +47,7 @@ class CsvSettings(Settings):
     decimal: Literal[".", ","] = "."
 
     @model_validator(mode="after")
-    def _two_signs(self) -> CsvSettings:
+    def _two_signs(self) -> Self:
         if self.decimal == self.delimiter:
             raise ValueError('found a comma as delimiter and as decimal, expected two signs: set delimiter: ";"')
         return self

@@ -1,10 +1,9 @@
 """Frames of a tracker as they come: what one holds, which numbers are missing or late, and what is refused."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Self
 
 import numpy as np
 from armcal.base.domains import Array
@@ -47,7 +46,7 @@ class Frame:
     wrong: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, counter: int, stamp: float | None, poses: Mapping[str, Array | str | None]) -> Frame:
+    def of(cls, counter: int, stamp: float | None, poses: Mapping[str, Array | str | None]) -> Self:
         """From the pose of each body, or why it cannot be believed; None where it is not seen."""
         wrong = tuple(pose for pose in poses.values() if isinstance(pose, str))
         return cls(counter, stamp, {n: None if isinstance(pose, str) else pose for n, pose in poses.items()}, wrong)

@@ -1,11 +1,9 @@
 """The trackers ``json_lines`` and ``csv``: a frame a line, in a file that grows or in datagrams."""
 
-from __future__ import annotations
-
 import ipaddress
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 from armcal.base.settings import InputPath, Settings
 from armcal.devices.clock import Clock
@@ -39,7 +37,7 @@ class JsonLinesSettings(Settings):
         return value
 
     @model_validator(mode="after")
-    def _one_source(self) -> JsonLinesSettings:
+    def _one_source(self) -> Self:
         if (self.port is None) == (self.path is None):
             raise ValueError("expected either a UDP port (port: 5005) or a file (path: frames.jsonl)")
         return self

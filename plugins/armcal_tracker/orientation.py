@@ -1,9 +1,7 @@
 """Columns of an orientation: quaternion, rotation matrix, angles or rotation vector; what else they might mean."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from armcal.base.domains import Array
@@ -179,7 +177,7 @@ class EulerColumns(AnglesColumns):
     order: Annotated[str, Field(pattern="^([xyz]{3}|[XYZ]{3})$")]
 
     @model_validator(mode="after")
-    def _three_turns(self) -> EulerColumns:
+    def _three_turns(self) -> Self:
         if self.order[0] == self.order[1] or self.order[1] == self.order[2]:
             raise ValueError(f"found the order {self.order!r}, expected neighbours to differ: XYZ, ZYX, ZYZ, xyz, ...")
         return self

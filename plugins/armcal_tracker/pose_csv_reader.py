@@ -1,10 +1,8 @@
 """Records from a CSV file as ``csv`` reads them, with orientations as quaternions or rotation matrices."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, ClassVar, NoReturn
+from typing import Any, ClassVar, NoReturn, Self
 
 import casadi as ca
 import numpy as np
@@ -62,7 +60,7 @@ class PoseCsvSettings(CsvSettings):
     measurement: str | None = None
 
     @model_validator(mode="after")
-    def _one_orientation(self) -> PoseCsvSettings:
+    def _one_orientation(self) -> Self:
         if sum(given is not None for given in self._given()) != 1:
             raise ValueError(
                 "expected one of quaternion: {columns: [...], order: xyzw}, rotation: {columns: [...]}, "

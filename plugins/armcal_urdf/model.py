@@ -1,10 +1,8 @@
 """The arm model ``urdf``: any serial chain between two links, with six numbers for every joint on it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 from armcal.arm.assembly import MassSpec
 from armcal.arm.model import Attachment, Chain, Joint, Vector3
@@ -67,7 +65,7 @@ class UrdfSettings(Settings):
     inertials: Literal["use", "ignore"] = "use"
 
     @model_validator(mode="after")
-    def _read(self) -> UrdfSettings:
+    def _read(self) -> Self:
         """The content of the file takes the place of its path; ends and encoding are written out."""
         if (self.path is None) == (not self.text):
             text = "both path and text" if self.text else "neither path nor text"

@@ -1,12 +1,10 @@
 """Text of a configuration that remembers where it was written, so that a path in it can be found."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from armcal.errors import ConfigError, Location
 
@@ -31,7 +29,7 @@ class ConfigText(str):
         location: Location | None = None,
         base_dir: Path | None = None,
         root: Path | None = None,
-    ) -> ConfigText:
+    ) -> Self:
         """Wrap a text; without a directory it is relative to the working directory."""
         made = super().__new__(cls, text)
         made.location = location or Location()

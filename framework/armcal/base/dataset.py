@@ -1,9 +1,8 @@
 """Datasets: records as named columns, SI inside."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,7 +71,7 @@ class Dataset:
         """Whether a channel is there."""
         return channel in self.channels
 
-    def subset(self, chosen: NDArray[np.intp] | Sequence[int]) -> Dataset:
+    def subset(self, chosen: NDArray[np.intp] | Sequence[int]) -> Self:
         """Some records, in the order of ``chosen``."""
         index = np.asarray(chosen, dtype=np.intp)
         return replace(
@@ -84,7 +83,7 @@ class Dataset:
             files={name: tuple(paths[i] for i in index) for name, paths in self.files.items()},
         )
 
-    def without(self, faulty: Mapping[int, str]) -> Dataset:
+    def without(self, faulty: Mapping[int, str]) -> Self:
         """All records but some (index to reason), which are listed as set aside."""
         if not faulty:
             return self

@@ -1,6 +1,6 @@
 """A pose as a configuration states it: a position, and a rotation in one of three ways."""
 
-from __future__ import annotations
+from typing import Self
 
 import numpy as np
 from pydantic import model_validator
@@ -29,7 +29,7 @@ class PoseSettings(Settings):
     rpy: Angle3 | None = None
 
     @model_validator(mode="after")
-    def _one_rotation(self) -> PoseSettings:
+    def _one_rotation(self) -> Self:
         given = [name for name in ("rotation", "quaternion", "rpy") if getattr(self, name) is not None]
         if len(given) > 1:
             raise ValueError(f"found {' and '.join(given)}, expected one of them")

@@ -1,12 +1,10 @@
 """A calibration as a file: everything needed to use it, check it and go on from it."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -62,7 +60,7 @@ class Calibration:
     record: CalibrationFile
 
     @classmethod
-    def load(cls, path: str | Path, registry: PluginRegistry | None = None, accept: bool = False) -> Calibration:
+    def load(cls, path: str | Path, registry: PluginRegistry | None = None, accept: bool = False) -> Self:
         """Read a calibration; a ``CalibrationWarning`` for what its user should know of it.
 
         ``accept``: even one whose recalibration found that it no longer holds.
@@ -81,7 +79,7 @@ class Calibration:
         return loaded
 
     @classmethod
-    def built(cls, source: ConfigSource, path: str | Path, registry: PluginRegistry) -> Calibration:
+    def built(cls, source: ConfigSource, path: str | Path, registry: PluginRegistry) -> Self:
         """The calibration in a file that was read, whatever its predictions were when it was written.
 
         Raises:
@@ -111,7 +109,7 @@ class Calibration:
         changed = differences(record.components, components(system, registry))
         return cls(system, parameters.with_nominal(_values(parameters, record, path, changed)), record)
 
-    def checked(self, commands: Dataset | None, registry: PluginRegistry) -> Calibration:
+    def checked(self, commands: Dataset | None, registry: PluginRegistry) -> Self:
         """The same with what its components are now and predictions at check poses (no poses: none).
 
         Raises:

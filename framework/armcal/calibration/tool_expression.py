@@ -4,11 +4,10 @@ All parameters are numbers at their calibrated values; what remains are the comm
 elastic state. From these come compensation, maps of what the arm can do, and code for other computers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Self
 
 import casadi as ca
 import numpy as np
@@ -60,7 +59,7 @@ class ToolExpression(ElasticPass):
     servos: Mapping[str, tuple[PulseTable, PulseClock]]
     tool_T_point: Transform = field(default_factory=se3.identity)
 
-    def at(self, tool_T_point: Transform) -> ToolExpression:
+    def at(self, tool_T_point: Transform) -> Self:
         """The same arm, with another point of its tool (constant) where the tool's frame is."""
         return replace(self, base_T_tool=self.base_T_tool @ tool_T_point, tool_T_point=tool_T_point)
 

@@ -1,14 +1,12 @@
 """Commands as a shell's completion needs them: their options, without the libraries that only running them needs."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.machinery import ModuleSpec
 from types import ModuleType
-from typing import Any
+from typing import Any, Self
 
 import click
 from click.shell_completion import CompletionItem
@@ -78,10 +76,10 @@ class _Placeholder(ModuleType):
     def __mro_entries__(self, bases: tuple[Any, ...]) -> tuple[type, ...]:
         return ()
 
-    def __getitem__(self, key: Any) -> _Placeholder:
+    def __getitem__(self, key: Any) -> Self:
         return self
 
-    def __or__(self, other: Any) -> _Placeholder:
+    def __or__(self, other: Any) -> Self:
         return self
 
     __ror__ = __or__

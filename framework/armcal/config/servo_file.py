@@ -3,8 +3,6 @@
 One file is read by what drives the boards and by what calibrates the arm, so that both mean the same angles.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -12,7 +10,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
@@ -64,7 +62,7 @@ class BoardSettings(Settings):
     id: str = ""
 
     @model_validator(mode="after")
-    def _usable(self) -> BoardSettings:
+    def _usable(self) -> Self:
         usable_address(self.address)
         PulseClock(self.oscillator_hz, self.prescale)
         return self
@@ -94,7 +92,7 @@ class ServoSettings(Settings):
     pulse_range: PulseRange = (300e-6, 2800e-6)
 
     @model_validator(mode="after")
-    def _usable(self) -> ServoSettings:
+    def _usable(self) -> Self:
         PulseTable(self.angles, self.pulses)
         if not 0 < self.pulse_range[0] < self.pulse_range[1]:
             raise ValueError("the pulse_range does not rise from above zero: give [shortest, longest]")
@@ -118,7 +116,7 @@ class CalibratedServo(Settings):
     pulses: Pulses
 
     @model_validator(mode="after")
-    def _usable(self) -> CalibratedServo:
+    def _usable(self) -> Self:
         usable_address(self.address)
         check_longest(self.table, self.clock)
         return self

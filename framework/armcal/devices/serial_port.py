@@ -1,14 +1,12 @@
 """A serial port that may be unplugged at any moment: opened by path or USB serial number, alone, never blocking."""
 
-from __future__ import annotations
-
 import errno
 import os
 import select
 import termios
 import time
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -43,7 +41,7 @@ class SerialPortSettings(Settings):
     baud: Annotated[int, Field(ge=300, le=4_000_000)] = 115_200
 
     @model_validator(mode="after")
-    def _one(self) -> SerialPortSettings:
+    def _one(self) -> Self:
         if self.port is None and self.serial_number is None:
             raise ValueError("found neither port nor serial_number, expected one of them: which serial port is meant?")
         if self.port is not None and self.serial_number is not None:

@@ -1,9 +1,8 @@
 """What a problem is compiled from; picklable, so that another process can compile it anew."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -67,6 +66,6 @@ class Blueprint:
         owned = ties_of(self.measurements, self.groups)
         return tuple(TieFunction.of(owned_tie, self.parameters) for owned_tie in owned)
 
-    def bare(self) -> Blueprint:
+    def bare(self) -> Self:
         """The same, its arms without what they keep of their expressions, which cannot be pickled."""
         return replace(self, arms={name: replace(arm) for name, arm in self.arms.items()})

@@ -1,12 +1,10 @@
 """A problem: arms, measurements and parameters, compiled once; records, weights and subsets are arguments."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +53,7 @@ class Problem:
         dataset: Dataset,
         evaluator: EvaluatorChoice = "auto",
         groups: Groups | None = None,
-    ) -> Problem:
+    ) -> Self:
         """Compile for datasets with the channels of this one, and its groups where none are given."""
         dataset = with_partners(dataset, measurements)
         if groups is None:
@@ -73,7 +71,7 @@ class Problem:
         choices = {k.factor.name: k.backend.name for k in self.kernels}
         return pickle.dumps((self.blueprint.bare(), choices, self.parameters))
 
-    def evaluated_by(self, evaluator: EvaluatorChoice) -> Problem:
+    def evaluated_by(self, evaluator: EvaluatorChoice) -> Self:
         """The same problem by another evaluator; ``compiled`` waits for the compiler. Records serve both."""
         choices = dict.fromkeys(self.blueprint.measurements, evaluator)
         return replace(self, kernels=self.blueprint.kernels(0, choices))

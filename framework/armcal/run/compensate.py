@@ -1,11 +1,9 @@
 """From a file of targets to a file of commands: where they lead, how sure that is, and what nominal ones would do."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import casadi as ca
 import numpy as np
@@ -84,7 +82,7 @@ class Bench:
         redundancy: Redundancy,
         registry: PluginRegistry,
         point: Point = "tool",
-    ) -> Bench:
+    ) -> Self:
         """One arm (the only one if no name is given), with the limits and the clearance of a configuration's plan.
 
         Raises:

@@ -5,12 +5,10 @@ controller must be given. Between nodes corrections are interpolated linearly al
 tried at random points between them, through the controller's own inverse kinematics.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +45,7 @@ class TableSettings(Settings):
     seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")
-    def _ordered(self) -> TableSettings:
+    def _ordered(self) -> Self:
         if any(low >= high for low, high in zip(self.low, self.high, strict=True)):
             raise ValueError("low does not lie below high on every axis: give the smaller coordinates as low")
         if np.abs([self.low, self.high]).max() > FARTHEST_M:

@@ -1,14 +1,12 @@
 """An experiment: a configuration, checked and built, before any data is read."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +68,7 @@ class Experiment:
         overrides: Sequence[str] = (),
         data: str | Path | None = None,
         registry: PluginRegistry | None = None,
-    ) -> Experiment:
+    ) -> Self:
         """Read and check a configuration.
 
         Args:
@@ -86,9 +84,7 @@ class Experiment:
         return cls.of(load_config(path, overrides), data, registry)
 
     @classmethod
-    def of(
-        cls, source: ConfigSource, data: str | Path | None = None, registry: PluginRegistry | None = None
-    ) -> Experiment:
+    def of(cls, source: ConfigSource, data: str | Path | None = None, registry: PluginRegistry | None = None) -> Self:
         """Check a configuration that was read; else as ``load``."""
         registry = registry or discover()
         if data is not None:
@@ -140,7 +136,7 @@ class Experiment:
         texts = [f"by its columns, {text}" for text in _gravity_warnings(self.settings, typical)]
         return replace(dataset, warnings=(*dataset.warnings, *texts))
 
-    def of_records(self, dataset: Dataset) -> Experiment:
+    def of_records(self, dataset: Dataset) -> Self:
         """The experiment with the parameters that the groups of these records bring.
 
         Raises:

@@ -1,12 +1,10 @@
 """The clearance that a plan keeps: settings of an arm's parts and its surroundings, made into shapes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from fnmatch import filter as matching
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Literal, Self, TypeAlias
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -64,7 +62,7 @@ class BoxSettings(Settings):
     high: Length3
 
     @model_validator(mode="after")
-    def _ordered(self) -> BoxSettings:
+    def _ordered(self) -> Self:
         if any(low > high for low, high in zip(self.low, self.high, strict=True)):
             raise ValueError("low lies beyond high on an axis: give the smaller coordinates as low")
         return self
@@ -78,7 +76,7 @@ class HalfSpaceSettings(Settings):
     normal: tuple[float, float, float]
 
     @model_validator(mode="after")
-    def _has_direction(self) -> HalfSpaceSettings:
+    def _has_direction(self) -> Self:
         if not any(self.normal):
             raise ValueError("normal is zero: give the direction out of the plane, such as [0, 0, 1]")
         return self

@@ -1,10 +1,9 @@
 """What a pose plan stands on: parameter values or draws of them, and the information there is before; its order."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -45,7 +44,7 @@ class PlanContext:
     draws: tuple[Array, ...] = ()
     base: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
-    def about(self, draws: tuple[Array, ...]) -> PlanContext:
+    def about(self, draws: tuple[Array, ...]) -> Self:
         """The same at these value vectors."""
         here = replace(self, draws=draws)
         if self.given is None:

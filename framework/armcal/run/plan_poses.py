@@ -1,12 +1,11 @@
 """Where an arm may go, and where a plan's candidates come from: recorded poses, a grid, or all of joint space."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -47,7 +46,7 @@ class JointSpace:
     dimensions: tuple[str, ...]
 
     @classmethod
-    def of(cls, experiment: Experiment) -> JointSpace:
+    def of(cls, experiment: Experiment) -> Self:
         """That of an experiment's arms."""
         arms = experiment.system.arms
         channels = tuple(f"{name}.{joint}" for name, arm in arms.items() for joint in arm.commanded)
@@ -86,7 +85,7 @@ class Pool:
     dataset: Dataset
     left_out: Mapping[str, int]
 
-    def without(self, faulty: Mask, reason: str) -> Pool:
+    def without(self, faulty: Mask, reason: str) -> Self:
         """Those that are not faulty (N, bool)."""
         if not faulty.any():
             return self

@@ -1,11 +1,9 @@
 """The pose residual of a run: learned from what the physical fit leaves, kept only if records held out say so."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -63,7 +61,7 @@ class Comparison:
     sure: float
 
     @classmethod
-    def of(cls, without: Array, with_it: Array, parts: tuple[Split, ...]) -> Comparison:
+    def of(cls, without: Array, with_it: Array, parts: tuple[Split, ...]) -> Self:
         """Of records (N) that were held out together in parts; what a part has in common is one chance."""
         gains = np.array([float(np.nanmean(without[p.holdout] - with_it[p.holdout])) for p in parts])
         gains = gains[np.isfinite(gains)]

@@ -1,8 +1,6 @@
 """The settings of a run, beyond what the arm is: data, parameters, estimator, validation, simulation, pose plan."""
 
-from __future__ import annotations
-
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
@@ -38,7 +36,7 @@ class ValidationSettings(Settings):
     limit: Length | None = None
 
     @model_validator(mode="after")
-    def _one_split(self) -> ValidationSettings:
+    def _one_split(self) -> Self:
         given = {"holdout": self.holdout > 0, "train_ids": self.train_ids, "train_groups": self.train_groups}
         several = [name for name, value in given.items() if value]
         if len(several) > 1:
@@ -91,7 +89,7 @@ class PlanSettings(Settings):
     speeds_mm_per_s: dict[str, Speed] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _ordered(self) -> PlanSettings:
+    def _ordered(self) -> Self:
         for joint, (low, high) in {**self.limits, **self.travel_limits}.items():
             if not low < high:
                 raise ValueError(f"the limits of {joint} are not in rising order: give [lowest, highest]")

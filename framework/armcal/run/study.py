@@ -1,12 +1,10 @@
 """A study: variants of one configuration, how they are judged, and what both kinds of study share."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import Field
 
@@ -81,7 +79,7 @@ class Study:
         overrides: Sequence[str] = (),
         data: str | Path | None = None,
         registry: PluginRegistry | None = None,
-    ) -> Study:
+    ) -> Self:
         """Read and check a study; the arguments are those of ``Experiment.load``.
 
         Raises:

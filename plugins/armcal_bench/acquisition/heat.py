@@ -1,9 +1,8 @@
 """How hot servos run: winding and case of each, warmed by the square of its torque."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from armcal.arm.assembly import Arm
@@ -45,7 +44,7 @@ class HeatModel:
     budget: Array
 
     @classmethod
-    def of(cls, joints: Sequence[str], settings: Mapping[str, ServoHeatSettings]) -> HeatModel:
+    def of(cls, joints: Sequence[str], settings: Mapping[str, ServoHeatSettings]) -> Self:
         """The model of these joints.
 
         Raises:

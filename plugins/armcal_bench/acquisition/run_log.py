@@ -1,14 +1,12 @@
 """The journal of a measuring run, what the run has done by it, and the dataset and summary that are left behind."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 from armcal.base.dataset import Dataset
@@ -59,7 +57,7 @@ class Progress:
     at: float = 0.0
     ended: str = ""
 
-    def after(self, kind: str, content: Mapping[str, Any]) -> Progress:
+    def after(self, kind: str, content: Mapping[str, Any]) -> Self:
         """One entry later."""
         if kind == STARTED:
             return replace(self, ended="")

@@ -1,12 +1,10 @@
 """The last readings of a stream, and the posture that they show while nothing moves."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 from armcal.arm.assembly import Arm
@@ -34,7 +32,7 @@ class JointKinds:
     endless: frozenset[str]
 
     @classmethod
-    def of(cls, arms: Mapping[str, Arm]) -> JointKinds:
+    def of(cls, arms: Mapping[str, Arm]) -> Self:
         """Those of arms by name."""
         dimensions = {f"{name}.{joint}": kind for name, arm in arms.items() for joint, kind in arm.commanded.items()}
         endless = {f"{name}.{j.name}" for name, arm in arms.items() for j in arm.nominal_chain.joints if j.endless}
@@ -168,7 +166,7 @@ class RecordingSettings(Settings):
     groups: tuple[str, ...] = ()
 
     @model_validator(mode="after")
-    def _above_zero(self) -> RecordingSettings:
+    def _above_zero(self) -> Self:
         for name in ("window", "spread", "sliding_spread", "stale", "rest", "moved", "alike"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} is not above zero")

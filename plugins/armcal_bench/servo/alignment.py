@@ -5,11 +5,10 @@ of the tool across the axis of the joint that moves have nothing to do with its 
 axes, and the compliances. They are fitted by Gauss-Newton steps [Nocedal2006], every number near its nominal value.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 from armcal.base.domains import Array
@@ -46,7 +45,7 @@ class Alignment:
     seat: Array | None = None
 
     @classmethod
-    def of(cls, nominal: NominalArm) -> Alignment:
+    def of(cls, nominal: NominalArm) -> Self:
         """The model as it is."""
         return cls(np.zeros(len(_sds(nominal))), np.zeros(len(nominal.compliances)))
 

@@ -1,10 +1,8 @@
 """The section ``bench.servo``: how servos are calibrated."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from armcal.base.quantities import UnitOf
 from armcal.base.settings import Angle, Compliance, Duration, InputPath, Length, Settings
@@ -74,7 +72,7 @@ class ServoCalibrationSettings(Settings):
     silence: PositiveDuration = 1.0
 
     @model_validator(mode="after")
-    def _usable(self) -> ServoCalibrationSettings:
+    def _usable(self) -> Self:
         if len(self.knots) == 1 or not all(a < b for a, b in pairwise(self.knots)):
             raise ValueError("the knots do not rise, or are fewer than two")
         if not 0 < self.pulses[0] < self.pulses[1]:

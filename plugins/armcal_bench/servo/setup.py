@@ -1,12 +1,11 @@
 """What a servo calibration is about: the servos of a file, the arm that they move, and where it may go."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from armcal.arm.joints import unknown_joint
@@ -62,7 +61,7 @@ class Setup:
     judge: HazardJudge
 
     @classmethod
-    def of(cls, experiment: Experiment) -> Setup:
+    def of(cls, experiment: Experiment) -> Self:
         """Of an experiment's bench.
 
         Raises:

@@ -1,11 +1,9 @@
 """The arm that is judged, and the reader of its records: from a configuration, or from a calibration."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from armcal.base.parameters import Parameters
@@ -56,7 +54,7 @@ class ArmToJudge:
         records: Path,
         registry: PluginRegistry,
         accept: bool = False,
-    ) -> ArmToJudge:
+    ) -> Self:
         """From a calibration or a configuration; ``settings`` is one whose section ``data`` is taken instead.
 
         Raises:
@@ -77,9 +75,7 @@ class ArmToJudge:
         return cls(path.name, _judged(experiment.system, path), models, source, files=files)
 
     @classmethod
-    def _of_calibration(
-        cls, calibration: Calibration, source: ConfigSource, path: Path, own_columns: bool
-    ) -> ArmToJudge:
+    def _of_calibration(cls, calibration: Calibration, source: ConfigSource, path: Path, own_columns: bool) -> Self:
         record = calibration.record
         free = {e.name.partition("[")[0] for e in record.parameters if e.free and not e.held_by_prior}
         fitted = calibration.parameters.with_free(free)

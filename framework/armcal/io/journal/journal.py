@@ -1,13 +1,11 @@
 """The journal of a recalibration: what it returns a sequence number for as a record outlasts a power loss."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 from armcal.errors import ArmcalError, DataError, InputError, Location
 from armcal.io.journal.files import REAL_FILES, FileLayer, is_full
@@ -80,7 +78,7 @@ class Journal:
         files: FileLayer = REAL_FILES,
         limits: JournalLimits = USUAL_LIMITS,
         lock: Locking = lock_folder,
-    ) -> Journal:
+    ) -> Self:
         """Begin a journal or go on with one.
 
         Args:
@@ -110,7 +108,7 @@ class Journal:
             raise
         return journal
 
-    def __enter__(self) -> Journal:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(

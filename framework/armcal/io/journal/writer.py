@@ -1,12 +1,10 @@
 """The segment that is being written: frames appended, made durable, or taken back whole."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from armcal.io.journal.files import FileLayer
 from armcal.io.journal.frames import encode_frame, payload_of
@@ -37,7 +35,7 @@ class SegmentWriter:
     @classmethod
     def begin(
         cls, files: FileLayer, path: Path, number: int, after: Link, header: Mapping[str, Any], checkpoint: Any
-    ) -> SegmentWriter:
+    ) -> Self:
         """A new segment with its header and a checkpoint, durable; nothing is left of it if that fails.
 
         Raises:
@@ -63,7 +61,7 @@ class SegmentWriter:
         return cls(files, path, number, descriptor, Tail(after.sequence + 2, crc, size), size)
 
     @classmethod
-    def go_on(cls, files: FileLayer, segment: Segment) -> SegmentWriter:
+    def go_on(cls, files: FileLayer, segment: Segment) -> Self:
         """Append to a segment that was read; its torn end is cut off, and what was read is made durable.
 
         Raises:
