@@ -142,6 +142,16 @@ def assemble(
     return Prepared(dataset, problem, records, split, texts, start, tuple(mixed_up))
 
 
+@dataclass(frozen=True)
+class _Means:
+    """What a run is done with."""
+
+    experiment: Experiment
+    progress: Progress
+    executor: Executor | None
+    watch: Stopwatch
+
+
 def acting(problem: Problem, records: tuple[FactorRecords, ...], dataset: Dataset) -> tuple[FactorRecords, ...]:
     """Records with the noise of joint readings and the drift that they share."""
     records = with_joint_noise(problem, records, problem.parameters.nominal())
@@ -160,37 +170,37 @@ def calibrate(
     watch, registry = watch or Stopwatch(), experiment.registry
     ready = prepare(experiment, watch, accept, progress)
     faults = _notify_started(registry, experiment.name, ready.dataset)
-    fitted = _fitted(experiment, ready, progress, executor, watch)
+    means = _Means(experiment, progress, executor, watch)
+    fitted = _fitted(means, ready)
     faults += registry.notify("armcal_estimate_changed", estimate=fitted.estimate)
     before = FittedRecords(ready.problem, ready.records, ready.dataset, ready.split, fitted)
-    ready, fitted, outcome = _with_pose_residual(experiment, ready, fitted, progress, executor, watch)
+    ready, fitted, outcome = _with_pose_residual(means, ready, fitted)
     run = replace(before, problem=ready.problem, records=ready.records, fitted=fitted)
-    uncertainty = _uncertainty(experiment, ready, fitted, progress, executor, watch)
-    validated = _validated(experiment, before, run, outcome, progress, executor, watch)
-    result = _judged(experiment, ready, run, outcome, validated, progress, watch)
+    uncertainty = _uncertainty(means, ready, fitted)
+    validated = _validated(means, before, run, outcome)
+    result = _judged(means, ready, run, outcome, validated)
     faults += _notify_rejected(registry, result.noise.set_aside)
     warnings = (*result.warnings, *dict.fromkeys(faults))
     return replace(result, command=command, warnings=warnings, bootstrap=uncertainty[0], profiles=uncertainty[1])
 
 
 def _judged(
-    experiment: Experiment,
+    means: _Means,
     ready: Prepared,
     run: FittedRecords,
     outcome: ResidualOutcome | None,
     validated: tuple[RecordErrors, IntervalResult],
-    progress: Progress,
-    watch: Stopwatch,
 ) -> RunResult:
     """What a run knows of its fit, with the verdict on it."""
-    dataset, split, fitted, (errors, intervals) = run.dataset, run.split, run.fitted, validated
+    experiment, (errors, intervals) = means.experiment, validated
+    dataset, split, fitted = run.dataset, run.split, run.fitted
     system, validation = experiment.system, experiment.settings.validation
     if outcome is not None:
         system = outcome.system(system)
-    with watch.stage("judge"):
-        progress("judging", 0.0)
+    with means.watch.stage("judge"):
+        means.progress("judging", 0.0)
         verdict, evidence = verdict_of(run, errors, intervals, system, validation.limit, ready.findings)
-        progress("judging", 1.0)
+        means.progress("judging", 1.0)
     return RunResult(
         name=experiment.name,
         command="",
@@ -205,7 +215,7 @@ def _judged(
         evidence=evidence,
         warnings=(*ready.warnings, *fitted.warnings, *errors.fold_warnings(validation.folds)),
         backend=run.problem.backend,
-        seconds=watch.seconds,
+        seconds=means.watch.seconds,
         provenance=replace(experiment, system=system).provenance(dataset),
         noise=noise_result(run.problem, fitted, dataset, split, errors.calibrated_mm),
         intervals=intervals,
@@ -214,42 +224,30 @@ def _judged(
     )
 
 
-def _uncertainty(
-    experiment: Experiment,
-    ready: Prepared,
-    fitted: WeighedFit,
-    progress: Progress,
-    executor: Executor | None,
-    watch: Stopwatch,
-) -> tuple[Bootstrap | None, tuple[Profile, ...]]:
+def _uncertainty(means: _Means, ready: Prepared, fitted: WeighedFit) -> tuple[Bootstrap | None, tuple[Profile, ...]]:
     """What was asked for beyond the covariance, of a fit that converged."""
+    experiment, executor, progress = means.experiment, means.executor, means.progress
     settings, estimate = experiment.settings.uncertainty, fitted.estimate
     resampled: Bootstrap | None = None
     profiled_result: tuple[Profile, ...] = ()
     if settings.bootstrap and estimate.verdict.converged and estimate.names:
-        with watch.stage("bootstrap"):
+        with means.watch.stage("bootstrap"):
             poses = experiment.poses(ready.dataset.subset(ready.split.train))
             parts = (ready.training, experiment.estimator, estimate, settings, executor, progress, poses)
             resampled = bootstrap(ready.problem, *parts)
     if settings.profile and estimate.verdict.converged:
-        with watch.stage("profile"):
+        with means.watch.stage("profile"):
             profiled_result = profiles(
                 ready.problem, fitted, experiment.estimator, settings.profile, executor, progress
             )
     return resampled, profiled_result
 
 
-def _fitted(
-    experiment: Experiment,
-    ready: Prepared,
-    progress: Progress,
-    executor: Executor | None,
-    watch: Stopwatch,
-) -> WeighedFit:
+def _fitted(means: _Means, ready: Prepared) -> WeighedFit:
     """The fit to the training records, as sure as records that may err alike allow."""
-    problem, train = ready.problem, ready.split.train
-    estimator, data = spread(experiment.estimator, executor), ready.dataset.subset(train)
-    with watch.stage("fit"):
+    problem, data, progress = ready.problem, ready.dataset.subset(ready.split.train), means.progress
+    estimator = spread(means.experiment.estimator, means.executor)
+    with means.watch.stage("fit"):
         starts = ready.start.values(problem)
         given_up = [hopeless(problem, ready.training, data, start) for start in starts]
         left = [start for start, hopeless_from in zip(starts, given_up, strict=True) if hopeless_from is None]
@@ -285,19 +283,15 @@ def _notify_started(registry: PluginRegistry, name: str, dataset: Dataset) -> li
 
 
 def _with_pose_residual(
-    experiment: Experiment,
-    ready: Prepared,
-    fitted: WeighedFit,
-    progress: Progress,
-    executor: Executor | None,
-    watch: Stopwatch,
+    means: _Means, ready: Prepared, fitted: WeighedFit
 ) -> tuple[Prepared, WeighedFit, ResidualOutcome | None]:
     """The problem and the fit with the pose residual that is to be learned, where it is kept, and what became of it."""
+    experiment, progress, executor = means.experiment, means.progress, means.executor
     training = ready.dataset.subset(ready.split.train)
     layer = layer_of(experiment.system, training)
     if layer is None or not fitted.estimate.verdict.converged:
         return ready, fitted, None
-    with watch.stage("pose residual"):
+    with means.watch.stage("pose residual"):
         splits = _folds(experiment, ready.dataset, ready.split) if experiment.settings.validation.folds else ()
         order = np.argsort(recorded_position(training), kind="stable")
         own = (ready.problem, ready.training, fitted, splits, order)
@@ -342,22 +336,16 @@ def _folds(experiment: Experiment, dataset: Dataset, split: Split) -> tuple[Spli
 
 
 def _validated(
-    experiment: Experiment,
-    before: FittedRecords,
-    run: FittedRecords,
-    outcome: ResidualOutcome | None,
-    progress: Progress,
-    executor: Executor | None,
-    watch: Stopwatch,
+    means: _Means, before: FittedRecords, run: FittedRecords, outcome: ResidualOutcome | None
 ) -> tuple[RecordErrors, IntervalResult]:
     """Errors of all records and prediction intervals, by cross-validation over the training records if configured.
 
     Nominal errors are those ``before`` a pose residual was learned. Nothing is predicted, nor cross-validated, by a fit
     that did not converge: its folds would not either, and each would take as long.
     """
-    problem, estimator = run.problem, experiment.estimator
+    experiment, problem, estimator = means.experiment, run.problem, means.experiment.estimator
     crossed: tuple[CrossValidation, tuple[Split, ...]] | None = None
-    with watch.stage("validate"):
+    with means.watch.stage("validate"):
         if not run.fitted.estimate.verdict.converged:
             return errors_of(run, None), IntervalResult()
         if outcome is not None and outcome.residual is not None and outcome.crossed is not None:
@@ -365,7 +353,7 @@ def _validated(
         elif experiment.settings.validation.folds:
             splits, start = _folds(experiment, run.dataset, run.split), problem.parameters.nominal()
             training = problem.subset(run.records, run.split.train)
-            parts = (training, splits, estimator, start, progress, executor, fit_and_predict)
+            parts = (training, splits, estimator, start, means.progress, means.executor, fit_and_predict)
             crossed = cross_validate(problem, *parts), splits
         intervals = interval_result(problem, run.fitted, run.records, run.split, estimator, crossed)
         errors = errors_of(run, crossed and crossed[0])
