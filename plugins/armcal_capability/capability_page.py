@@ -6,9 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from armcal.cli.common import Console
 from armcal.report.numbers import count
 from armcal.report.page import rendered
+from armcal.report.tables import TextTable as Table
 from armcal.version import __version__
+from rich.box import SIMPLE_HEAD
+from rich.table import Table as ScreenTable
 
 from armcal_capability.quantities import BY_NAME
 
@@ -19,15 +23,6 @@ _SHORT = {
     "effort_ratio": "Torque",
     "smallest_mm_per_rad": "Slowest, mm/rad",
 }
-
-
-@dataclass(frozen=True)
-class Table:
-    """Headings (words, whether numbers stand below) and rows of cells."""
-
-    caption: str
-    headings: tuple[tuple[str, bool], ...]
-    rows: tuple[tuple[str, ...], ...]
 
 
 def quantity_table(summary: Mapping[str, Any]) -> Table:
@@ -44,17 +39,8 @@ def quantity_table(summary: Mapping[str, Any]) -> Table:
     return Table(caption, (("Quantity", False), *((heading, True) for heading in headings)), rows)
 
 
-def area_table(areas: Mapping[str, Mapping[str, Any]]) -> Table:
-    """The areas of one arm."""
-    return _of_areas({"": areas}, "Areas")
-
-
-def design_table(designs: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Every design in every area, from ``{design: {area: summary}}``."""
-    return _of_areas(designs, "Designs over the cells of each area that all of them reach")
-
-
-def _of_areas(designs: Mapping[str, Mapping[str, Any]], caption: str) -> Table:
+def areas_table(designs: Mapping[str, Mapping[str, Any]], caption: str) -> Table:
+    """Every design in every area, from ``{design: {area: summary}}``; an arm alone is the design ``""``."""
     cells = [area for areas in designs.values() for area in areas.values()]
     shown = [name for name in _SHOWN_OF_DESIGNS if any(name in area["quantities"] for area in cells)]
     held = any(area["held"] is not None for area in cells)
@@ -153,3 +139,13 @@ def render_page(
     """One self-contained HTML file; ``kind`` is what it is a page of."""
     content = {"kind": kind, "title": title, "sentences": sentences, "tables": tables, "pictures": pictures}
     return rendered("capability.html.j2", content | {"facts": facts, "version": __version__}, Path(__file__).parent)
+
+
+def show_table(console: Console, table: Table) -> None:
+    """One table on the terminal; numbers stand to the right."""
+    shown = ScreenTable(title=table.caption, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for words, is_number in table.headings:
+        shown.add_column(words, justify="right" if is_number else "left")
+    for row in table.rows:
+        shown.add_row(*row)
+    console.out.print(shown)

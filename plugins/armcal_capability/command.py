@@ -1,7 +1,6 @@
 """``armcal capability``."""
 
 from collections.abc import Mapping
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -16,15 +15,14 @@ from armcal_capability import outputs
 from armcal_capability.capability_figures import DRAWN, designs_figure, quantity_figure, reach_figure
 from armcal_capability.capability_page import (
     Picture,
-    area_table,
+    areas_table,
     conclusions,
-    design_table,
     quantity_table,
     render_page,
+    show_table,
 )
 from armcal_capability.loading import Task, load_task
 from armcal_capability.quantities import BY_NAME
-from armcal_capability.screen import show_table
 from armcal_capability.summary import design_summaries, summary_of
 from armcal_capability.survey import Survey, survey
 
@@ -54,7 +52,11 @@ def capability(console: Console, source: Path, out: Path, settings: Path | None,
         designs: dict[str, Survey] = {}
         with watch.stage("designs"):
             for name, subject in task.designs.items():
-                designs[name] = survey(subject, task.settings, partial(_of_design, progress, name))
+
+                def of_design(_: str, done: float, name: str = name) -> None:
+                    progress(name, done)
+
+                designs[name] = survey(subject, task.settings, of_design)
     content = {"source": str(source), **summary_of(surveyed, task.settings)}
     compared = design_summaries(designs)
     content["designs"] = {n: {**summary_of(d, task.settings), "areas": compared[n]} for n, d in designs.items()}
@@ -62,9 +64,9 @@ def capability(console: Console, source: Path, out: Path, settings: Path | None,
         pictures = _pictures(task, surveyed, designs, compared)
     tables = [quantity_table(content)]
     if any(compared.values()):
-        tables.insert(0, design_table(compared))
+        tables.insert(0, areas_table(compared, "Designs over the cells of each area that all of them reach"))
     elif content["areas"]:
-        tables.insert(0, area_table(content["areas"]))
+        tables.insert(0, areas_table({"": content["areas"]}, "Areas"))
     sentences = conclusions(task.subject.name, content, compared)
     facts = {"command": command_line(), "files": ", ".join(sorted({str(file) for file in task.files}))}
     facts |= {"samples": str(task.settings.samples), "seed": str(task.settings.seed)}
@@ -78,10 +80,6 @@ def capability(console: Console, source: Path, out: Path, settings: Path | None,
     for stage, seconds in watch.seconds.items():
         console.detail(f"{stage}: {seconds:.1f} s")
     console.out.print(f"page: {out / 'capability.html'}  ({watch.total():.1f} s)", markup=False, soft_wrap=True)
-
-
-def _of_design(progress: Any, name: str, _: str, fraction: float) -> None:
-    progress(name, fraction)
 
 
 def _pictures(
@@ -113,7 +111,7 @@ def _write(
 ) -> None:
     columns = outputs.map_columns(surveyed)
     texts: dict[str, str | bytes] = {f"{picture.name}.png": picture.png for picture in pictures}
-    texts |= {"map.npz": outputs.npz_bytes(columns), "map.csv": outputs.csv_text(columns)}
+    texts |= {"map.npz": outputs.npz_bytes(columns), "map.csv": outputs.map_text(columns)}
     if surveyed.areas:
         texts["areas.csv"] = outputs.areas_text(designs or {surveyed.subject.name: surveyed})
     if designs:

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from armcal.arm.joints import unknown_joint
-from armcal.base.settings import Settings
 from armcal.calibration.calibration import Calibration
 from armcal.config.servo_file import load_servo_file
 from armcal.config.validate import validate
@@ -14,17 +13,12 @@ from armcal.config.yaml_source import ConfigSource, Reader, as_source, load_conf
 from armcal.config.yaml_tree import entries_of, override, set_at, steps_of
 from armcal.errors import ConfigError, Location
 from armcal.plugins import PluginRegistry, discover
-from pydantic import Field
 
 from armcal_capability.settings import CapabilitySettings
 from armcal_capability.subject import Corrections, Subject, of_calibration, of_config
 
 SECTION = "capability"
 _RULES = (SECTION, "plan")
-
-
-class _CapabilityPart(Settings):
-    capability: CapabilitySettings = Field(default_factory=CapabilitySettings)
 
 
 @dataclass(frozen=True)
@@ -62,8 +56,9 @@ def load_task(
         config = _nothing_but(overrides, path)
     else:
         config = load_config(path, overrides)
-    part = replace(config, data={key: value for key, value in config.data.items() if key == SECTION})
-    settings = validate(_CapabilityPart, part).capability
+    settings = CapabilitySettings()
+    if SECTION in config.data:
+        settings = validate(CapabilitySettings, config, (SECTION,))
     corrections: Corrections | None = None
     if is_calibration:
         subject = of_calibration(Calibration.load(path, registry), config, path.name)

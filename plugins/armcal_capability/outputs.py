@@ -1,12 +1,12 @@
 """What a survey leaves behind as data: the map and the areas cell by cell, in CSV and npz, units in every name."""
 
-import csv
 import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from armcal.base.domains import Array
+from armcal.io.cells import csv_text
 
 from armcal_capability.survey import Survey
 
@@ -21,47 +21,28 @@ def map_columns(survey: Survey) -> dict[str, Array]:
     return {**columns, "postures": survey.voxels.counts.astype(float), **_statistics(survey.voxels.values)}
 
 
-def area_columns(survey: Survey) -> dict[str, dict[str, Array]]:
-    """Each area as columns (cells each)."""
-    areas = {}
-    for name, area in survey.areas.items():
-        held = {} if area.held is None else {"held": area.held.astype(float)}
-        areas[name] = {
-            **_centres(area.centres),
-            "postures": area.counts.astype(float),
-            **held,
-            **_statistics(area.values),
-        }
-    return areas
-
-
-def csv_text(columns: Mapping[str, Array], before: Mapping[str, str] | None = None) -> str:
-    """Columns as CSV, six digits; empty where a number is not known; ``before`` are texts that begin every row."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*(before or {}), *columns])
-    texts = [[_text(value) for value in np.asarray(column).tolist()] for column in columns.values()]
-    writer.writerows([*(before or {}).values(), *row] for row in zip(*texts, strict=True))
-    return text.getvalue()
+def map_text(columns: Mapping[str, Array]) -> str:
+    """The map as CSV."""
+    return table_text([*columns], _rows(columns))
 
 
 def areas_text(surveys: Mapping[str, Survey]) -> str:
     """The areas of all designs in one CSV: a row a cell."""
-    parts: list[str] = []
+    headings: list[str] = []
+    rows: list[Sequence[Any]] = []
     for design, survey in surveys.items():
-        for area, columns in area_columns(survey).items():
-            text = csv_text(columns, {"design": design, "area": area})
-            parts.append(text if not parts else text.partition("\n")[2])
-    return "".join(parts)
+        for name, area in survey.areas.items():
+            held = {} if area.held is None else {"held": area.held.astype(float)}
+            counted = {"postures": area.counts.astype(float), **held}
+            columns = {**_centres(area.centres), **counted, **_statistics(area.values)}
+            headings = headings or ["design", "area", *columns]
+            rows += [(design, name, *row) for row in _rows(columns)]
+    return table_text(headings, rows)
 
 
 def table_text(headings: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """A table as CSV."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(headings)
-    writer.writerows(rows)
-    return text.getvalue()
+    """A table as CSV, six digits; empty where a number is not known."""
+    return csv_text([headings, *rows], ".6g")
 
 
 def design_rows(designs: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:
@@ -74,8 +55,8 @@ def design_rows(designs: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], li
     rows = []
     for design, areas in designs.items():
         for name, area in areas.items():
-            row = [design, name, *(_text(area[key]) for key in ("reached", "held", "postures_per_cell"))]
-            row += [_text(area["quantities"].get(quantity, {}).get(key)) for quantity in names for key in keys]
+            row = [design, name, *(area[key] for key in ("reached", "held", "postures_per_cell"))]
+            row += [area["quantities"].get(quantity, {}).get(key) for quantity in names for key in keys]
             rows.append(row)
     return headings, rows
 
@@ -87,13 +68,13 @@ def npz_bytes(columns: Mapping[str, Array]) -> bytes:
     return stream.getvalue()
 
 
+def _rows(columns: Mapping[str, Array]) -> list[tuple[float, ...]]:
+    return list(zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True))
+
+
 def _centres(centres: Array) -> dict[str, Array]:
     return {name: centres[:, i] * _MM for i, name in enumerate(_PLACES)}
 
 
 def _statistics(values: Mapping[str, Array]) -> dict[str, Array]:
     return {f"{name}_{text}": rows[i] for name, rows in values.items() for i, text in enumerate(_STATISTICS)}
-
-
-def _text(value: float | None) -> str:
-    return "" if value is None or not np.isfinite(value) else f"{value:.6g}"

@@ -11,7 +11,6 @@ from armcal.arm.clearance import ClearanceCheck, Mask
 from armcal.arm.joints import by_dimension, joint_limits, unknown_joint
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.base.settings import Settings
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.tool_expression import ToolExpression, arm_expression
 from armcal.config.selection import with_values
@@ -22,10 +21,6 @@ from armcal.errors import ConfigError, Location
 from armcal.plugins import PluginRegistry
 from armcal.run.plan_clearance import clearance_check
 from armcal.run.settings import PlanSettings
-
-
-class _PlanPart(Settings):
-    plan: PlanSettings | None = None
 
 
 @dataclass(frozen=True)
@@ -163,8 +158,8 @@ def _rules(arm: Arm, system: System, source: ConfigSource | None, name: str) -> 
     """Limits (joints x 2), those that are stated or the model's own; and clearance."""
     settings, check = PlanSettings(), None
     if source is not None:
-        part = replace(source, data={key: value for key, value in source.data.items() if key == "plan"})
-        settings = validate(_PlanPart, part).plan or settings
+        if source.data.get("plan") is not None:
+            settings = validate(PlanSettings, source, ("plan",))
         if settings.clearance is not None:
             check = clearance_check(settings.clearance, system.arms, source)
     stated = by_dimension(arm.commanded, settings.limits, settings.travel_limits, where=Location(name))

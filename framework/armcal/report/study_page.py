@@ -1,26 +1,16 @@
 """The page of a study: one table, one figure, what to conclude, and which records gain and lose."""
 
-from dataclasses import dataclass
 from typing import Any
 
 from armcal.report import study_figures
 from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural
 from armcal.report.page import rendered
 from armcal.report.svg import Figure
-from armcal.report.tables import provenance_facts
+from armcal.report.tables import TextTable, provenance_facts
 from armcal.run.study_result import StudyResult, TransferCell, TransferResult, VariantResult
 from armcal.version import __version__
 
 _SAME_MM = 1e-6
-
-
-@dataclass(frozen=True)
-class StudyTable:
-    """Headings (words, whether numbers stand below) and rows of cells."""
-
-    caption: str
-    headings: tuple[tuple[str, bool], ...]
-    rows: tuple[tuple[str, ...], ...]
 
 
 def render_study(result: StudyResult) -> str:
@@ -42,7 +32,7 @@ def _render(
     result: StudyResult | TransferResult,
     title: str,
     sentences: list[str],
-    table: StudyTable,
+    table: TextTable,
     figure: Figure,
     changes: list[Any],
 ) -> str:
@@ -125,7 +115,7 @@ def transfer_conclusions(result: TransferResult) -> list[str]:
     return texts
 
 
-def _variants(result: StudyResult) -> StudyTable:
+def _variants(result: StudyResult) -> TextTable:
     numbers = [x for v in result.variants for x in (v.train.mean, v.crossed.mean)]
     decimals = common_decimals(numbers, most=3)
     rows = []
@@ -145,10 +135,10 @@ def _variants(result: StudyResult) -> StudyTable:
     words += f" drawn {result.repeats} times" if result.repeats > 1 else ""
     turns = ("Turn mean, deg", "Turn 95 %, deg") if any(v.turns for v in result.variants) else ()
     names = ("Free", "Train mean", "Train 95 %", "Mean", "RMS", "95 %", "Max", "Change", "Helps", *turns, "Fit")
-    return StudyTable(words, (("Variant", False), *((n, True) for n in names), ("", False)), tuple(rows))
+    return TextTable(words, (("Variant", False), *((n, True) for n in names), ("", False)), tuple(rows))
 
 
-def transfer_table(result: TransferResult) -> StudyTable:
+def transfer_table(result: TransferResult) -> TextTable:
     """A row for each variant and what it was trained at, errors at each payload beside one another."""
     decimals = common_decimals([c.errors.mean for c in result.cells], most=3)
     groups: dict[tuple[str, tuple[float, ...]], list[TransferCell]] = {}
@@ -174,7 +164,7 @@ def transfer_table(result: TransferResult) -> StudyTable:
     counts = ", ".join(f"{n} at {g:g} g" for g, n in zip(result.payloads_g, result.counts, strict=True))
     caption = f"error, {result.unit}; {'simulated' if result.simulated else 'measured'} records: {counts}. "
     caption += "Cross-validated; with *, judged at another load than it trained at"
-    return StudyTable(caption, tuple(headings), tuple(rows))
+    return TextTable(caption, tuple(headings), tuple(rows))
 
 
 def _shown(value: float | None, unit: str) -> str:

@@ -33,6 +33,15 @@ _FIGURE_SPACE, _POINT_SPACE = "\u2007", "\u2008"
 _MM = 1000.0
 
 
+@dataclass(frozen=True)
+class TextTable:
+    """Headings (words, whether numbers stand below) and rows of cells."""
+
+    caption: str
+    headings: tuple[tuple[str, bool], ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
 def error_rows(table: ErrorTable) -> list[dict[str, Any]]:
     """Of each set that has records, errors before and after calibration, and their ratios.
 

@@ -7,8 +7,8 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from armcal_capability.acceptance import characteristics as of
+from armcal_capability.acceptance.characteristics import Figure
 from armcal_capability.acceptance.comparison import Comparison
-from armcal_capability.acceptance.figure import Figure
 from armcal_capability.acceptance.records import FEWEST, Group, Indices, Visits
 
 MM, DEG = 1000.0, 180.0 / np.pi

@@ -5,12 +5,32 @@ are from that barycentre. Positions are in m. Orientations are rotation vectors 
 the attained orientation, in the axes of the frame: to first order the standard's angles a, b, c about x, y, z.
 """
 
+from __future__ import annotations
+
+from dataclasses import dataclass
+
 import numpy as np
 from armcal.base.domains import Array
 from armcal.estimate.prediction import RADIUS_LEVEL, Spread, quantile
 from scipy.stats import chi2
 
-from armcal_capability.acceptance.figure import Figure
+
+@dataclass(frozen=True)
+class Figure:
+    """An estimate and its 95 % interval, in one unit (``high`` may be infinite)."""
+
+    value: float
+    low: float
+    high: float
+
+    def times(self, factor: float) -> Figure:
+        """In another unit (factor > 0)."""
+        return Figure(self.value * factor, self.low * factor, self.high * factor)
+
+    def as_dict(self) -> dict[str, float | None]:
+        """For JSON, which knows no infinity."""
+        return {"value": self.value, "low": self.low, "high": self.high if np.isfinite(self.high) else None}
+
 
 _TIMES = 3.0
 """Standard deviations that a repeatability counts."""

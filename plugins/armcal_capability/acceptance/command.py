@@ -17,9 +17,8 @@ from armcal_capability.acceptance.content import content_of, csv_rows, sentences
 from armcal_capability.acceptance.pictures import pictures
 from armcal_capability.acceptance.records import read_visits
 from armcal_capability.acceptance.subject import ArmToJudge
-from armcal_capability.capability_page import render_page
+from armcal_capability.capability_page import render_page, show_table
 from armcal_capability.outputs import table_text
-from armcal_capability.screen import show_table
 
 _FIGURES = ("by_pose.png", "visits.png", "drift.png")
 OURS = ("acceptance.html", "acceptance.json", "acceptance.csv", *_FIGURES)

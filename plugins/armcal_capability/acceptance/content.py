@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 from armcal.report.numbers import decimals_for
+from armcal.report.tables import TextTable as Table
 
 from armcal_capability.acceptance.assessment import MM, SERIES, Assessment, Row
+from armcal_capability.acceptance.characteristics import Figure
 from armcal_capability.acceptance.comparison import Comparison
-from armcal_capability.acceptance.figure import Figure
 from armcal_capability.acceptance.records import COMMANDED, Visits
-from armcal_capability.capability_page import Table
 
 ISO_CYCLES = 30
 """Visits to a pose that the standard asks for. [ISO9283]"""
@@ -67,9 +67,9 @@ def csv_rows(assessment: Assessment) -> tuple[list[str], list[list[Any]]]:
         for row in members:
             start = [section, *row.names, row.count]
             for model, figures in (("measured", row.measured), *row.models.items()):
-                rows += [[*start, model, name, *map(_cell, (f.value, f.low, f.high))] for name, f in figures.items()]
+                rows += [[*start, model, name, f.value, f.low, f.high] for name, f in figures.items()]
             for model, numbers in row.numbers.items():
-                rows += [[*start, model, name, _cell(number), "", ""] for name, number in numbers.items()]
+                rows += [[*start, model, name, number, "", ""] for name, number in numbers.items()]
     return headings, rows
 
 
@@ -164,10 +164,6 @@ def _text(figure: Figure) -> str:
     decimals = min(decimals_for(max(figure.value - figure.low, abs(figure.value) / 100)), 4)
     high = f"{figure.high:.{decimals}f}" if figure.high < _LARGEST else "?"
     return f"{figure.value:.{decimals}f} ({figure.low:.{decimals}f} to {high})"
-
-
-def _cell(number: float) -> str:
-    return f"{number:.6g}" if np.isfinite(number) else ""
 
 
 def _from_to(least: int, most: int) -> str:
