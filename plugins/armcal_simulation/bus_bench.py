@@ -7,10 +7,11 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from armcal.arm.joints import unknown_joint
-from armcal.devices.simulated import BenchRequest
+from armcal.devices.simulated import BenchRequest, SimulatedBench
 from armcal.errors import ConfigError
 from armcal.testing import EXAMPLE_TRUTH
 from pydantic import Field, field_validator, model_validator
+from typing_extensions import override
 
 from armcal_simulation import bench_parts
 from armcal_simulation.bench_faults import FaultRequest
@@ -179,7 +180,7 @@ class BusElectronics:
         return {"bus": servos, "volts": self._bus.volts()}
 
 
-class BusBench:
+class BusBench(SimulatedBench):
     """The simulated bench ``bus_bench``; time and determinism are those of ``servo_bench``."""
 
     Settings: ClassVar[type[BusBenchSettings]] = BusBenchSettings
@@ -193,13 +194,8 @@ class BusBench:
     def __init__(self, settings: BusBenchSettings) -> None:
         self._settings = settings
 
+    @override
     def serve(self, request: BenchRequest) -> None:
-        """See ``armcal.devices.simulated.SimulatedBench``.
-
-        Raises:
-            ConfigError: the settings do not fit the experiment.
-            InputError: the folder cannot be used.
-        """
         serve_world(bus_world(self._settings, request), request.folder)
 
 

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from armcal.config.servo_file import ServoFile
-from armcal.devices.simulated import BenchRequest
+from armcal.devices.simulated import BenchRequest, SimulatedBench
 from armcal.run.experiment import Experiment
 from armcal.testing import EXAMPLE_TRUTH
+from typing_extensions import override
 
 from armcal_simulation import bench_parts
 from armcal_simulation.bench_faults import FaultRequest
@@ -159,7 +160,7 @@ def pulse_bench(settings: ServoBenchSettings, experiment: Experiment, folder: Pa
     )
 
 
-class ServoBench:
+class ServoBench(SimulatedBench):
     """The simulated bench ``servo_bench``.
 
     Everything happens in simulated time, which passes only on requests to the clock's socket. The same
@@ -179,11 +180,6 @@ class ServoBench:
     def __init__(self, settings: ServoBenchSettings) -> None:
         self._settings = settings
 
+    @override
     def serve(self, request: BenchRequest) -> None:
-        """See ``armcal.devices.simulated.SimulatedBench``.
-
-        Raises:
-            ConfigError: the settings do not fit the experiment.
-            InputError: the folder cannot be used.
-        """
         serve_world(pulse_bench(self._settings, request.experiment, request.folder), request.folder)

@@ -7,11 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import yaml
 from pydantic import Field
 
-from armcal.base.config_text import plain
+from armcal.base.config_text import finite, plain
 from armcal.base.settings import Settings
 from armcal.calibration.intervals import PredictionRecord
 from armcal.calibration.physics import CheckRecord, ComponentRecord
@@ -203,16 +202,12 @@ def _uncertainty(estimate: Estimate, index: int) -> dict[str, Any]:
     moved = abs(free - estimate.values[estimate.free_entries[index]])
     return {
         "unconstrained": free if moved > UNMOVED_SD * estimate.deviations[index] else None,
-        "sd": _finite(estimate.deviations[index]),
-        "lower": _finite(interval.lower),
-        "upper": _finite(interval.upper),
+        "sd": finite(float(estimate.deviations[index])),
+        "lower": finite(float(interval.lower)),
+        "upper": finite(float(interval.upper)),
         "determined": estimate.identified_by_data[index],
         "held_by_prior": estimate.determined[index] and not estimate.identified_by_data[index],
     }
-
-
-def _finite(number: float) -> float | None:
-    return float(number) if np.isfinite(number) else None
 
 
 def lost_calibration(record: CalibrationFile, path: str | Path) -> ConfigError:

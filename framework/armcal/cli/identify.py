@@ -7,6 +7,7 @@ from typing import Any
 import click
 import numpy as np
 
+from armcal.base.config_text import finite
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.cli.common import FILE, Console, data, overrides, speaking
@@ -68,7 +69,7 @@ def identify(
             "kept": list(smallest.kept),
             "redundant": [_dropped(dropped) for dropped in smallest.redundant],
             "left_out": [_dropped(dropped) for dropped in smallest.left_out],
-            "sd_ordinary_sizes": {name: _finite(sd) for name, sd in smallest.deviations.items()},
+            "sd_ordinary_sizes": {name: finite(sd) for name, sd in smallest.deviations.items()},
         }
     if fixed:
         content["fixed"] = fixed_content(console, experiment.of_records(ready.dataset), ready)
@@ -116,7 +117,7 @@ def _content(experiment: Experiment, ready: Prepared, triangle: Array, known: Id
         ],
         "held_by_nothing": [_terms(combination) for combination in held_by_nothing(parameters, known)],
         "hardly_determined": [
-            {**_terms(combination), "sd_ordinary_sizes": _finite(sd)} for combination, sd in known.hardly
+            {**_terms(combination), "sd_ordinary_sizes": finite(sd)} for combination, sd in known.hardly
         ],
         "correlated": [
             {"one": one, "other": other, "correlation": r}
@@ -135,10 +136,6 @@ def _terms(combination: Combination) -> dict[str, Any]:
             for (name, weight), amount in zip(combination.terms, combination.amounts, strict=True)
         ],
     }
-
-
-def _finite(number: float) -> float | None:
-    return number if np.isfinite(number) else None
 
 
 def _dropped(dropped: Dropped) -> dict[str, Any]:

@@ -36,4 +36,5 @@ class SimulatedBench(Protocol):
 
         Raises:
             ConfigError: its settings do not fit the experiment.
+            InputError: the folder cannot be used.
         """

@@ -146,7 +146,7 @@ def metrics(result: RunResult) -> dict[str, Any]:
             ],
             "at_bound": list(estimate.at_bound),
             "undetermined": [str(combination) for combination in known.undetermined],
-            "scaled_condition": _finite(known.condition),
+            "scaled_condition": finite(float(known.condition)),
         },
         "noise": _noise(result),
         "solver": asdict(estimate.verdict),
@@ -308,10 +308,6 @@ def _bootstrap_metrics(result: RunResult) -> dict[str, Any] | None:
         "failed": bootstrap.failed,
         "block_records": bootstrap.block,
         "parameters": {
-            name: {"sd": _finite(sd), "lower": _finite(low), "upper": _finite(high)} for name, sd, (low, high) in rows
+            name: finite({"sd": float(sd), "lower": float(low), "upper": float(high)}) for name, sd, (low, high) in rows
         },
     }
-
-
-def _finite(number: float) -> float | None:
-    return float(number) if np.isfinite(number) else None

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from armcal.arm.servo import PulseTable
+from armcal.base.config_text import finite
 from armcal.config.servo_file import BoardSettings, ServoFile, ServoSettings, load_servo_file, servo_file_text
 from armcal.config.servo_file_edit import edited_text
 from armcal.errors import ConfigError, InputError, Location
@@ -193,7 +194,7 @@ def _servo(servo: FittedServo, outcome: Outcome, changed: ServoFile) -> dict[str
             {
                 "angle_deg": math.degrees(angle),
                 "pulse_us": 1e6 * pulse,
-                "sd_us": _finite(1e6 * sd),
+                "sd_us": finite(1e6 * sd),
                 "told": is_determined,
                 "before_us": 1e6 * before,
                 "change_us": 1e6 * (pulse - before),
@@ -202,7 +203,7 @@ def _servo(servo: FittedServo, outcome: Outcome, changed: ServoFile) -> dict[str
             for angle, pulse, sd, is_determined, before, slope in zip(*columns, strict=True)
         ],
         "backlash_deg": None if servo.lag is None else 2 * math.degrees(servo.lag),
-        "backlash_sd_deg": _finite(2 * math.degrees(servo.lag_sd)),
+        "backlash_sd_deg": finite(2 * math.degrees(servo.lag_sd)),
         "scatter_deg": math.degrees(servo.scatter),
         "observations": servo.used,
         "set_aside": len(servo.outliers),
@@ -210,7 +211,3 @@ def _servo(servo: FittedServo, outcome: Outcome, changed: ServoFile) -> dict[str
         "axis": None if sweeps.turning is None else sweeps.turning.axis.tolist(),
         "written": _is_written(servo, outcome, changed),
     }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
