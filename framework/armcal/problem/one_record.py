@@ -1,8 +1,8 @@
-"""One record at a time: a factor's residual and Jacobian without the arrangements for many.
+"""One record or a few at a time: a factor's residuals and Jacobians without the arrangements for many.
 
-The compiled functions work on a whole vector of records, so all its places hold the same one. Without a compiler
-CasADi's interpreter evaluates a single record. The elastic equilibrium starts from rest each time: what comes out
-is a function of values and record alone, to the last bit.
+The compiled functions work on a whole vector of records; where there are fewer, its last places hold the last one.
+Without a compiler CasADi's interpreter evaluates a single record. The elastic equilibrium starts from rest each time:
+what comes out is a function of values and records alone, to the last bit.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from armcal.problem.kernel import Compiled, Kernel
 
 
 class OneRecord:
-    """Buffers of one kernel for one record; not to be shared between threads."""
+    """Buffers of one kernel for one record or a few; not to be shared between threads."""
 
     def __init__(self, kernel: Kernel) -> None:
         factor = kernel.factor
@@ -42,14 +42,31 @@ class OneRecord:
         Raises:
             NotConvergedError: the record has no equilibrium.
         """
+        residuals, jacobians = self.linearise_several(values, record[None])
+        return residuals[0], jacobians[0]
+
+    def linearise_several(self, values: Array, records: Array) -> tuple[Array, Array]:
+        """Residuals (k x n_r) and their Jacobians (k x n_r x n_v) of records (k x n_c), in equilibrium.
+
+        Raises:
+            NotConvergedError: a record has no equilibrium.
+        """
+        count, width = len(records), self._record.shape[1]
+        residuals, jacobians = np.empty((count, self._sizes[0])), np.empty((count, *self._sizes))
         self._values[:] = values
-        self._record[:] = record[:, None]
-        self._state[:] = 0.0
-        if self._evaluate() or not np.abs(self._state).max(initial=0.0) <= MOST_DEFLECTION:
-            # The rare way: Newton, arranged for many records.
+        for start in range(0, count, width):
+            part = records[start : start + width]
+            self._record[:] = part[-1][:, None]
+            self._record[:, : len(part)] = part.T
             self._state[:] = 0.0
-            self._kernel.linearise(self._values, self._record, self._state, self._residual, self._jacobian)
-        return self._residual[:, 0].copy(), self._jacobian[:, 0].reshape(self._sizes).copy()
+            if self._evaluate() or not np.abs(self._state).max(initial=0.0) <= MOST_DEFLECTION:
+                # The rare way: Newton, arranged for many records.
+                self._state[:] = 0.0
+                self._kernel.linearise(self._values, self._record, self._state, self._residual, self._jacobian)
+            done = slice(start, start + len(part))
+            residuals[done] = self._residual.T[: len(part)]
+            jacobians[done] = self._jacobian.T[: len(part)].reshape(-1, *self._sizes)
+        return residuals, jacobians
 
 
 def _linearised(kernel: Kernel, arrays: tuple[Array, Array, Array, Array, Array]) -> Callable[[], int]:

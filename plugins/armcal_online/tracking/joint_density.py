@@ -66,4 +66,4 @@ def _solved(covariance: Array, innovation: Array) -> tuple[float, float]:
     root, weighted, fault = dposv(covariance, innovation)
     if fault:
         raise np.linalg.LinAlgError("a covariance is not positive definite")
-    return float(innovation @ weighted), 2 * float(np.log(np.diag(root)).sum())
+    return float(innovation @ weighted), 2 * float(np.log(root.diagonal()).sum())

@@ -38,6 +38,8 @@ _UNEXPLAINED = 3
 """So many changes that nothing explains, or windows of too large NIS: the model no longer fits."""
 _LONGEST_NAMING = 100
 """After so many records joints that could not be distinguished are left so."""
+_STATED = 40
+"""The stated share of outliers counts as if it came from so many records."""
 _TOO_MANY = 1e-3
 """More outliers than chance makes with this probability are a reason to watch."""
 
@@ -84,7 +86,7 @@ class Judge:
             return health
         if recent.rejected:
             window, rejected = settings.gate.window, sum(record.rejected for record in state.recent)
-            odd = many_outliers(rejected, window, settings.outliers.fraction) < _TOO_MANY
+            odd = many_outliers(rejected, window, self._outliers(state)) < _TOO_MANY
             return health.troubled(
                 "watch" if odd else "nominal", f"{rejected} of the last {window} records do not fit."
             )
@@ -123,13 +125,20 @@ class Judge:
             return self._follow_change(state, alike, others)
         state = replace(state, wary=bool(best.log_odds > 0))
         rejected = sum(record.rejected for record in state.recent)
-        by_chance = many_outliers(rejected, gate.window, self._settings.outliers.fraction)
+        by_chance = many_outliers(rejected, gate.window, self._outliers(state))
         if rejected >= gate.window - 1 and len(state.recent) >= gate.window:
             text = f"{rejected} of the last {len(state.recent)} records do not fit"
             return state, (sentences.no_longer_fits(state, self._steps, text, log_odds_of(by_chance)),)
         if rejected < gate.rejected or by_chance >= settings.probability:
             return state, ()
         return state, (sentences.unexplained(state, rejected, by_chance, best),)
+
+    def _outliers(self, state: State) -> float:
+        """The share of wrong records: as stated, or more where records before the last ones had more."""
+        stated, lately = self._settings.outliers.fraction, sum(record.rejected for record in state.recent)
+        rejected = state.counts["rejected"] - lately
+        earlier = rejected + state.counts["accepted"] - (len(state.recent) - lately)
+        return max(stated, (_STATED * stated + rejected) / (_STATED + earlier))
 
     def _weighed(self, state: State, large: Sequence[int]) -> list[Explanation]:
         """All changes, the likeliest first; two at once where one does not explain what the records say."""
@@ -148,7 +157,7 @@ class Judge:
         late = state.changes and state.sequence - state.changes[-1] < 2 * self._settings.gate.window
         if late and best.hypothesis.kind != "general_change":
             return False  # what is left of a change that nothing explained is no joint's
-        if many_outliers(*best.outliers, self._settings.outliers.fraction) < _LEFT:
+        if many_outliers(*best.outliers, self._outliers(state)) < _LEFT:
             return False
         return agreeing >= (_AGREEING if best.hypothesis.is_simple else LEAST_RECORDS) and best.share >= _SHARE
 

@@ -182,17 +182,30 @@ class Observer:
         Raises:
             NotConvergedError: no equilibrium there.
         """
-        grouped, one = self.problem.grouped[reading.factor], self._one_record[reading.factor]
-        entries = self._plain[reading.factor]
+        innovations, slopes = self.linearise_several(values, [reading])
+        return innovations[0], slopes[0]
+
+    def linearise_several(self, values: Array, readings: Sequence[Reading]) -> tuple[Array, Array]:
+        """The same of readings of one factor (k x n_r, k x n_r x n).
+
+        Raises:
+            NotConvergedError: no equilibrium there.
+        """
+        factor, count = readings[0].factor, len(readings)
+        grouped, evaluator, entries = self.problem.grouped[factor], self._one_record[factor], self._plain[factor]
+        records = np.array([reading.record for reading in readings])
         if entries is not None:
-            residual, jacobian = one.linearise(values[entries], reading.record)
-            return residual, -self.space.by_coordinates(values, jacobian)
-        residual, own = one.linearise(grouped.values(values, reading.group), reading.record)
-        free = grouped.free[reading.group]
-        moving: NDArray[np.intp] = np.flatnonzero(free != HELD)
-        jacobian = np.zeros((len(residual), grouped.width))
-        jacobian[:, free[moving]] = own[:, moving]
-        return residual, -self.space.by_coordinates(values, jacobian)
+            residual, jacobian = evaluator.linearise_several(values[entries], records)
+        else:
+            rows, groups = grouped.kernel.factor.rows, np.array([reading.group for reading in readings])
+            residual, jacobian = np.zeros((count, rows)), np.zeros((count, rows, grouped.width))
+            for group in np.unique(groups).tolist():
+                at = np.flatnonzero(groups == group)
+                residual[at], own = evaluator.linearise_several(grouped.values(values, group), records[at])
+                moving: NDArray[np.intp] = np.flatnonzero(grouped.free[group] != HELD)
+                jacobian[np.ix_(at, np.arange(rows), grouped.free[group][moving])] = own[:, :, moving]
+        slope = -self.space.by_coordinates(values, jacobian.reshape(-1, jacobian.shape[2]))
+        return residual, slope.reshape(*jacobian.shape[:2], -1)
 
     def observation(self, belief: Belief, readings: tuple[Reading, ...], noise: JointNoise = ()) -> RecordObservation:
         """A record for estimators whose belief this is."""
@@ -228,19 +241,28 @@ class RecordObservation(Observation):
         return self._last[key]
 
     def _linearised(self, point: Array) -> Linearised:
+        inside, outside = self._place(point)
+        return self._assembled(point, outside, [self.observer.linearise(inside, reading) for reading in self.readings])
+
+    def _place(self, point: Array) -> tuple[Array, Array]:
+        """Values within their domains at which a point is evaluated, and scaled coordinates of the way on to it."""
         observer, space = self.observer, self.observer.space
         n = len(space.scales)
-        beside = point[n:]
         which, coordinate, size = observer.drifts
         moved = point[:n] - self.base[:n]
         if len(which):
-            np.add.at(moved, coordinate, size * beside[which])
+            np.add.at(moved, coordinate, size * point[n:][which])
         values = space.moved(self.origin, moved)
         inside = space.inside(values)
-        outside = self.base[:n] if (inside == values).all() else self.base[:n] + space.between(inside, values)
+        return inside, self.base[:n] if (inside == values).all() else self.base[:n] + space.between(inside, values)
+
+    def _assembled(self, point: Array, outside: Array, evaluated: Sequence[tuple[Array, Array]]) -> Linearised:
+        """What the readings' innovations and slopes where they are evaluated make of a point."""
+        observer = self.observer
+        beside = point[len(observer.space.scales) :]
+        which, coordinate, size = observer.drifts
         innovations, slopes, drifting = [], [], []
-        for reading in self.readings:
-            innovation, slope = observer.linearise(inside, reading)
+        for reading, (innovation, slope) in zip(self.readings, evaluated, strict=True):
             innovation = innovation - slope @ outside
             if len(observer.noisy_drifts[1]):
                 drifting.append(slope[:, observer.noisy_drifts[1]] * observer.noisy_drifts[2])
@@ -261,3 +283,27 @@ class RecordObservation(Observation):
         if single:
             return Linearised(innovations[0], slopes[0], noise)
         return Linearised(np.concatenate(innovations), np.vstack(slopes), noise)
+
+
+def linearised(observations: Sequence[RecordObservation], points: Sequence[Array]) -> list[Linearised]:
+    """Records of one belief, each at a point; where these are the same values, they are evaluated together.
+
+    Raises:
+        NotConvergedError: no equilibrium there.
+    """
+    distinct = {id(point): point for point in points}
+    known = {key: observations[0]._place(point) for key, point in distinct.items()}
+    places = [known[id(point)] for point in points]
+    inside, observer = places[0][0], observations[0].observer
+    if not all(other is inside or np.array_equal(other, inside) for other, _ in places):
+        return [one.at(point) for one, point in zip(observations, points, strict=True)]
+    evaluated: list[list[tuple[Array, Array]]] = [[] for _ in observations]
+    for factor in range(len(observer.problem.kernels)):
+        # The readings of a record are in the order of the factors.
+        of = [(i, r) for i, one in enumerate(observations) for r in one.readings if r.factor == factor]
+        if of:
+            innovations, slopes = observer.linearise_several(inside, [reading for _, reading in of])
+            for (i, _), innovation, slope in zip(of, innovations, slopes, strict=True):
+                evaluated[i].append((innovation, slope))
+    made = zip(observations, points, places, evaluated, strict=True)
+    return [one._assembled(point, outside, own) for one, point, (_, outside), own in made]

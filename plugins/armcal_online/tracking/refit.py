@@ -16,8 +16,6 @@ from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
 from armcal.estimate.loss import Loss, median_norm, tuned
 from armcal.estimate.online import Gaussian, normalised_innovation_squared
-from armcal.functions.c_source import LANES
-from armcal.problem.factor_records import FactorRecords
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
@@ -151,17 +149,7 @@ class Refitter:
         What the Gauss-Markov states share between neighbours counts as noise of each.
         """
         observer, factor, count = self._observer, readings[0].factor, len(readings)
-        grouped, kernel = observer.problem.grouped[factor], observer.problem.kernels[factor]
-        fill = [*readings, *[readings[-1]] * (-count % LANES)]
-        record = np.ascontiguousarray(np.array([reading.record for reading in fill]).T)
-        group = None if len(grouped.entries) <= 1 else np.array([reading.group for reading in fill], dtype=np.intp)
-        state = np.zeros((kernel.factor.state.numel(), len(fill)))
-        packed = FactorRecords(count, record, np.ones(len(fill)), state, group=group)
-        jacobian, residual = (np.concatenate(p, axis=-1) for p in zip(*grouped.linearised(values, packed), strict=True))
-        stated = np.array(kernel.factor.noise)
-        raw = np.moveaxis(residual[:, :count] * stated[:, None], 1, 0)
-        rows = np.moveaxis(jacobian[:, :, :count] * stated[:, None, None], 2, 0)
-        slope = -observer.space.by_coordinates(values, rows.reshape(-1, rows.shape[2])).reshape(*rows.shape[:2], -1)
+        raw, slope = observer.linearise_several(values, readings)
         covariance = np.array([r.noise if a is None else r.noise + a for r, a in zip(readings, added, strict=True)])
         which, coordinate, size = observer.drifts
         if len(observer.gauss_markov):

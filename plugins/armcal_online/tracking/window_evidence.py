@@ -15,11 +15,13 @@ from itertools import accumulate, combinations, pairwise
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.estimate.online import Linearised, Observation
+from armcal.estimate.online import Linearised
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.joint_density import JointDensity
+from armcal_online.tracking.observer import RecordObservation, linearised
 from armcal_online.tracking.outliers import log_density_of_outlier
 from armcal_online.tracking.process_noise import ProcessNoise
 
@@ -58,7 +60,7 @@ class RecordsSince:
     def __init__(
         self,
         before: Belief,
-        observations: Sequence[Observation],
+        observations: Sequence[RecordObservation],
         passed: Sequence[Mapping[str, float]],
         process_noise: ProcessNoise,
         outlier_covariances: Sequence[Array],
@@ -77,7 +79,7 @@ class RecordsSince:
         self._left = np.ones((len(passed), len(passed), len(gaussian.mean) - self._n))
         for i, j in combinations(range(len(passed)), 2):
             self._left[i, j] = np.prod(kept[i:j], axis=0)
-        self._unmoved = [one.at(mean) for one, mean in zip(observations, self._means, strict=True)]
+        self._unmoved = linearised(observations, self._means)
         self._log_outliers = math.log(1 - share), math.log(share) + self._outlier_densities(outlier_covariances)
 
     def weigh(self, directions: Array, factor: float = 1.0) -> Weighed:
@@ -94,7 +96,7 @@ class RecordsSince:
             weighed = self._with_likeliest_outliers(directions, shift, fits, factor)
             if best is not None and weighed.log_likelihood <= best.log_likelihood:
                 break
-            is_settled = best is not None and np.array_equal(weighed.fits, best.fits)
+            is_settled = np.array_equal(weighed.fits, fits)
             best, fits = weighed, weighed.fits
             if is_settled:
                 break
@@ -113,14 +115,17 @@ class RecordsSince:
         if not shift.any():
             return self._unmoved
         moved = directions @ shift
-        return [one.at(mean + moved) for one, mean in zip(self._observations, self._means, strict=True)]
+        points = {id(mean): mean + moved for mean in self._means}
+        return linearised(self._observations, [points[id(mean)] for mean in self._means])
 
     def _likeliest_shift(self, directions: Array, shift: Array, fits: NDArray[np.bool_], factor: float) -> Array:
-        """By the records that fit (k; in standard deviations)."""
+        """By the records that fit (k; in standard deviations), weighted as without the change."""
+        root, chosen = cho_factor(self._stacked(self._unmoved, fits, factor)[2]), np.flatnonzero(fits).tolist()
         for _ in range(_STEPS):
-            innovation, slope, covariance, _ = self._stacked(self._records(directions, shift), fits, factor)
-            across = slope @ directions
-            weighted = np.linalg.solve(covariance, np.column_stack([across, innovation + across @ shift]))
+            records = self._records(directions, shift)
+            across = np.concatenate([records[i].slope for i in chosen]) @ directions
+            innovation = np.concatenate([records[i].innovation for i in chosen])
+            weighted = cho_solve(root, np.column_stack([across, innovation + across @ shift]))
             own = np.eye(len(shift)) + across.T @ weighted[:, :-1]
             following = np.asarray(np.linalg.solve(own, across.T @ weighted[:, -1]))
             moved, shift = float(np.abs(following - shift).max()), following
