@@ -124,6 +124,11 @@ def armcal_register_joint_streams(register: Register) -> None:
 
 
 @hookspec
+def armcal_register_cameras(register: Register) -> None:
+    """Live cameras: what they see while an arm stands."""
+
+
+@hookspec
 def armcal_register_benches(register: Register) -> None:
     """Simulated benches: what stands in for board, arm and tracker in a rehearsal."""
 
@@ -244,6 +249,7 @@ COMPONENTS: Mapping[str, ComponentKind] = MappingProxyType(
             "armcal.devices.joint_stream:JointStream",
             ("armcal.devices.joint_stream:RestStream",),
         ),
+        "camera": ComponentKind("armcal_register_cameras", "Camera(settings)", "armcal.devices.camera:LiveCamera"),
         "bench": ComponentKind("armcal_register_benches", "Bench(settings)", "armcal.devices.simulated:SimulatedBench"),
         "command": ComponentKind("armcal_register_commands", "Command", "armcal.hooks:Command"),
         "report_section": ComponentKind(

@@ -145,6 +145,7 @@ def _kind_name(kind: str) -> str:
     names = {
         "online": "online estimator",
         "joints": "joint stream",
+        "camera": "live camera",
         "bench": "simulated bench",
         "report_section": "report section",
     }

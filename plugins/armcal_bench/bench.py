@@ -9,6 +9,7 @@ from armcal.arm.assembly import Arm
 from armcal.base.settings import InputPath, Settings
 from armcal.config.system import build_component
 from armcal.config.validate import validate
+from armcal.devices.camera import LiveCamera
 from armcal.devices.clock import Clock, RealClock, SimulatedClock
 from armcal.devices.device import JointDevice
 from armcal.devices.joint_stream import JointStream
@@ -43,6 +44,7 @@ class BenchSettings(Settings):
     device: dict[str, Any] | None = None
     tracker: dict[str, Any] | None = None
     joints: dict[str, Any] | None = None
+    camera: dict[str, Any] | None = None
     bodies: BodySettings = Field(default_factory=BodySettings)
     acquisition: AcquisitionSettings = Field(default_factory=AcquisitionSettings)
     recording: RecordingSettings = Field(default_factory=RecordingSettings)
@@ -123,6 +125,10 @@ class Bench:
         """The stream of joint readings; see ``device``."""
         built: JointStream = self._built("joints")
         return built
+
+    def camera(self) -> LiveCamera | None:
+        """The live camera, if one is configured; see ``device``."""
+        return None if self.settings.camera is None else self._built("camera")
 
     def simulator(self) -> SimulatedBench:
         """The simulated bench; see ``device``."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -25,6 +25,7 @@ from armcal_camera.board import Board, BoardOrFile, require_distinct
 from armcal_camera.first_guess import Setup, certified_place, first_guess
 from armcal_camera.intrinsics import IntrinsicsOrFile, Lens, Pixels
 from armcal_camera.lens import DISTORTION, projected
+from armcal_camera.rendered_records import rendered_records
 
 _PIXELS_SCALE, _DISTORTION_SCALE, _SCALE_SCALE = 0.01, 0.05, 0.01
 _NEAREST_M, _LEAST_FACING, _FEWEST_POINTS = 0.02, 0.3, 4
@@ -272,6 +273,10 @@ class Camera(PointInstrument):
             self.camera_frame, f"on {self.camera_frame}"
         )
         return f"its place {where} is known to {1000 * mm:.2g} mm and {np.rad2deg(deg):.2g} deg (95 %)."
+
+    def rendered(self, frames: Mapping[str, Array], values: Mapping[str, Array]) -> Iterator[bytes]:
+        """An image of each record, blurred and with noise as an ordinary camera has them."""
+        return rendered_records(self, frames, values)
 
     def propose(
         self,

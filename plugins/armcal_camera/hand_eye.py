@@ -78,7 +78,7 @@ def open_motion(a: Array, frame: str = "tool") -> tuple[str, str] | None:
             "Turn the hand about two axes that are not parallel, 30 deg and more each.",
         )
     spread = np.linalg.svd(turns, compute_uv=False) ** 2
-    if spread[1] < _PARALLEL * spread[0]:
+    if len(spread) < 2 or spread[1] < _PARALLEL * spread[0]:
         axis = np.linalg.svd(turns)[2][0]
         named = ", ".join(f"{x:.2f}" for x in axis)
         return (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -59,7 +59,7 @@ class ImagesSettings(Settings):
 
 
 @runtime_checkable
-class _SeesBoards(Protocol):
+class SeesBoards(Protocol):
     """A measurement whose channels ``u_K`` and ``v_K`` are the points of its boards."""
 
     boards: Sequence[Board]
@@ -67,7 +67,10 @@ class _SeesBoards(Protocol):
 
 @dataclass(frozen=True)
 class View:
-    """What one image says: corners over all boards (K x 2, px), why it says nothing, its size, sharpness and path."""
+    """What one image says: corners over all boards (K x 2, px), why it says nothing, its size, sharpness and path.
+
+    ``oblique`` is the angle between line of sight and normal of the board that is seen most obliquely (rad).
+    """
 
     corners: Array
     fault: str = ""
@@ -75,6 +78,7 @@ class View:
     blur: float = float("nan")
     sha256: str = ""
     path: str = ""
+    oblique: float = float("nan")
 
 
 class ImagesReader:
@@ -93,7 +97,7 @@ class ImagesReader:
             DataError: a file is refused, poses and images differ in number, or fewer than three images are left.
             PluginError: OpenCV is not there.
         """
-        cameras = {name: tuple(m.boards) for name, m in request.measurements.items() if _sees_boards(m)}
+        cameras = {name: tuple(m.boards) for name, m in request.measurements.items() if sees_boards(m)}
         if not cameras:
             message = "found no measurement that sees boards, expected one for the images."
             raise DataError(message, hint="Add a measurement of type camera.")
@@ -106,7 +110,7 @@ class ImagesReader:
         known = {w.channel for w in request.channels}
         for number, (name, boards) in enumerate(cameras.items()):
             report = partial(_report_one, request.report, number, len(cameras))
-            views = _sharp_enough(self._views(name, boards, len(cameras), report))
+            views = as_the_others(self._views(name, boards, len(cameras), report))
             place = str(_own(self._settings.folder or self._settings.corners, name, len(cameras)))
             chosen = _matched(dataset, views, place, count)
             faults.append({i: views[image].fault for i, image in enumerate(chosen) if views[image].fault})
@@ -128,9 +132,8 @@ class ImagesReader:
         made = Automatic().map(partial(look, boards), paths, report)
         views = {path.name: replace(view, path=str(path)) for path, view in zip(paths, made, strict=True)}
         forget_old()
-        views = _of_one_size(views)
         if corners is not None:
-            seen = {name: view.corners for name, view in views.items() if not view.fault}
+            seen = {name: view.corners for name, view in _of_one_size(views).items() if not view.fault}
             write_over({corners: corners_text(seen, boards).encode()})
         return views
 
@@ -140,8 +143,9 @@ def _report_one(report: Report, number: int, cameras: int, done: float) -> None:
     report((number + done) / cameras)
 
 
-def _sees_boards(measurement: object) -> TypeGuard[_SeesBoards]:
-    return isinstance(measurement, _SeesBoards)
+def sees_boards(measurement: object) -> TypeGuard[SeesBoards]:
+    """Whether a measurement is a camera's."""
+    return isinstance(measurement, SeesBoards)
 
 
 def _own(places: Path | Mapping[str, Path] | None, camera: str, cameras: int) -> Path | None:
@@ -158,13 +162,17 @@ def _own(places: Path | Mapping[str, Path] | None, camera: str, cameras: int) ->
 
 
 def look(boards: Sequence[Board], path: Path) -> View:
-    """What an image says of boards; from what was kept, if it was looked at before."""
-    content = input_bytes(path, MOST_BYTES, "an image")
+    """What the image in a file says of boards."""
+    return look_at(boards, input_bytes(path, MOST_BYTES, "an image"), path.name)
+
+
+def look_at(boards: Sequence[Board], content: bytes, name: str) -> View:
+    """What an image file's content says of boards; from what was kept, if it was looked at before."""
     digest, nothing = hashlib.sha256(content).hexdigest(), np.full((sum(len(b.points) for b in boards), 2), np.nan)
     keys = [detection_key(content, board) for board in boards]
     detections = [kept_detection(key, board) for key, board in zip(keys, boards, strict=True)]
     try:
-        image = grey_image(content, path.name)
+        image = grey_image(content, name)
     except DataError as fault:
         return View(nothing, fault.message.rstrip("."), sha256=digest)
     made: list[Detection] = []
@@ -177,7 +185,8 @@ def look(boards: Sequence[Board], path: Path) -> View:
     if not seen:
         return View(nothing, "; ".join(d.fault for d in made), image.shape[::-1], sha256=digest)
     corners = np.vstack([np.where(d.fault != "", np.nan, d.corners) for d in made])
-    return View(corners, "", image.shape[::-1], max(d.blur for d in seen), digest)
+    blur, oblique = max(d.blur for d in seen), max(d.oblique for d in seen)
+    return View(corners, "", image.shape[::-1], blur, digest, oblique=oblique)
 
 
 def _images_in(folder: Path) -> list[Path]:
@@ -198,6 +207,11 @@ def _natural(name: str) -> list[tuple[int, str]]:
 def _too_few(pixels: Array) -> str:
     count = int(np.isfinite(pixels).all(axis=1).sum())
     return "" if count >= 4 else f"it has {count} corners, at least 4 are needed"
+
+
+def as_the_others(views: Mapping[str, View]) -> dict[str, View]:
+    """Views, with a fault where the image differs from the others in size or is far less sharp."""
+    return _sharp_enough(_of_one_size(views))
 
 
 def _of_one_size(views: Mapping[str, View]) -> dict[str, View]:
@@ -247,16 +261,21 @@ def _matched(dataset: Dataset, views: Mapping[str, View], place: str, count: int
     return chosen
 
 
-def _with_corners(dataset: Dataset, camera: str, views: Sequence[View], known: set[str]) -> Dataset:
-    """The dataset with the channels of a camera that are asked for."""
-    pixels = [np.full_like(view.corners, np.nan) if view.fault else view.corners for view in views]
-    corners = from_unit(np.stack(pixels, axis=1), "px")
-    channels = {
-        f"{camera}.{axis}_{k}": np.ascontiguousarray(corners[k, :, i])
-        for k in range(len(corners))
+def corner_channels(camera: str, corners: Array, known: Collection[str]) -> dict[str, Array]:
+    """The channels of a camera that are asked for, of corners in images (K x N x 2, px)."""
+    values = from_unit(corners, "px")
+    return {
+        f"{camera}.{axis}_{k}": np.ascontiguousarray(values[k, :, i])
+        for k in range(len(values))
         for i, axis in enumerate("uv")
         if f"{camera}.{axis}_{k}" in known
     }
+
+
+def _with_corners(dataset: Dataset, camera: str, views: Sequence[View], known: set[str]) -> Dataset:
+    """The dataset with the channels of a camera that are asked for."""
+    pixels = [np.full_like(view.corners, np.nan) if view.fault else view.corners for view in views]
+    channels = corner_channels(camera, np.stack(pixels, axis=1), known)
     digest = hashlib.sha256("".join([dataset.sha256, *(view.sha256 for view in views)]).encode()).hexdigest()
     files = {**dataset.files, camera: tuple(view.path for view in views)}
     return replace(dataset, channels={**dataset.channels, **channels}, sha256=digest, files=files)

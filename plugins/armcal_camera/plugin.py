@@ -28,6 +28,12 @@ def armcal_register_measurements(register: Register) -> None:
 
 
 @hookimpl
+def armcal_register_cameras(register: Register) -> None:
+    """Announce the live camera."""
+    register("opencv", "armcal_camera.live:Camera", "a camera of OpenCV, or a folder to which images come one by one")
+
+
+@hookimpl
 def armcal_register_exporters(register: Register) -> None:
     """Announce the exporters."""
     register("camera_info", "armcal_camera.export:CameraInfoExporter", "a camera's intrinsics as ROS camera_info YAML")

@@ -109,10 +109,7 @@ class ElasticArmSimulator:
         named = [f"{arm.name}.{joint}" for joint in arm.commanded]
         given, true = request.poses, at_truth(request, settings.truth)
         commands = _in_view(true, settings.poses, arm, random) if given is None else given.stacked(named)
-        reached, step = commands.copy(), settings.quantisation
-        if step:
-            turning = [dimension == "angle" for dimension in arm.commanded.values()]
-            reached[turning] = np.round(commands[turning] / step) * step
+        reached = self._reached(arm, commands)
         approach = approach_of(commands)
         channels = {f"{arm.name}.approach.{j}": approach[i] for i, j in enumerate(arm.commanded)}
         moved_to = dict(zip(named, reached, strict=True))
@@ -127,6 +124,21 @@ class ElasticArmSimulator:
         moved = {channel: values for channel, values in read.items() if not is_orientation(channel)}
         pushed, _ = with_outliers(moved, settings.outliers, random)
         return with_channels(standing, {**dict(zip(named, commands, strict=True)), **read, **pushed})
+
+    def stood(self, request: SimulationRequest, dataset: Dataset) -> tuple[SimulationRequest, Dataset]:
+        """The truth, and where the arm stood for the commands of records that this simulator made."""
+        arm = next(iter(request.arms.values()))
+        named = [f"{arm.name}.{joint}" for joint in arm.commanded]
+        reached = dict(zip(named, self._reached(arm, dataset.stacked(named)), strict=True))
+        return at_truth(request, self._settings.truth), with_channels(dataset, reached)
+
+    def _reached(self, arm: Arm, commands: Array) -> Array:
+        """Where a servo board puts the joints (joints x poses)."""
+        reached, step = commands.copy(), self._settings.quantisation
+        if step:
+            turning = [dimension == "angle" for dimension in arm.commanded.values()]
+            reached[turning] = np.round(commands[turning] / step) * step
+        return reached
 
 
 def _in_view(true: SimulationRequest, poses: PoseSettings, arm: Arm, random: np.random.Generator) -> Array:

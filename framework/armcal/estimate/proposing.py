@@ -105,14 +105,14 @@ def _read(
     borrowed = {local: values[parameters.entries_of(full)] for local, full in lent.items()}
     seen = np.flatnonzero(records[number].measured)
     return (
-        _carriers(problem, values, problem.subset(records, seen), dataset.subset(seen), number),
+        carriers_of(problem, values, problem.subset(records, seen), dataset.subset(seen), number),
         {c.removeprefix(f"{name}."): dataset.column(c)[seen] for c in problem.kernels[number].factor.output_channels},
         {**{local: own_values[parameters.entries_of(block.name)] for local, block in own.items()}, **borrowed},
         frozenset(local for local, block in own.items() if block.free),
     )
 
 
-def _carriers(
+def carriers_of(
     problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset, number: int
 ) -> dict[str, Array]:
     """What carries a measurement in each record (base_T_frame, N x 4 x 4, m): the tool, or frames of a still arm."""

@@ -43,6 +43,14 @@ class Simulator(Protocol):
         """Records with a known truth; the same request gives the same records."""
 
 
+@runtime_checkable
+class TruthfulSimulator(Protocol):
+    """What a simulator provides beside the rest if it says what is true of the records that it makes."""
+
+    def stood(self, request: SimulationRequest, dataset: Dataset) -> tuple[SimulationRequest, Dataset]:
+        """The request with the truth for nominal values, and the records with the commands at which the arm stood."""
+
+
 def measured_without_noise(request: SimulationRequest, commands: Dataset) -> Mapping[str, Array]:
     """What every instrument would read at these commands if the parameters' nominal values were the truth (SI)."""
     fixed = request.parameters.with_free(())

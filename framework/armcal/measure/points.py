@@ -1,7 +1,7 @@
 """Instruments that read the same of many points in one record, such as a camera of the corners of a board."""
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
@@ -105,6 +105,22 @@ class LimitedView(Protocol):
 
     def visible(self, margins: Array) -> NDArray[np.bool_]:
         """Which points can be read (P x N) with these margins (P x N): of some boards all or none."""
+
+
+@runtime_checkable
+class Rendering(Protocol):
+    """What a measurement of points in images provides beside the rest if it can draw the images."""
+
+    def rendered(self, frames: Mapping[str, Array], values: Mapping[str, Array]) -> Iterator[bytes]:
+        """An image file (PNG) of each record.
+
+        Args:
+            frames: base_T_frame of each record (N x 4 x 4, m), by the name of the frame, as in ``Proposing``.
+            values: canonical entries of its parameters, by local name.
+
+        Raises:
+            PluginError: a library is not there.
+        """
 
 
 class PointInstrument(Instrument):

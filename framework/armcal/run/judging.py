@@ -26,6 +26,7 @@ from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.outside import predicted_positions
 from armcal.diagnose.residual_structure import structure
 from armcal.diagnose.verdict import Verdict, judge
+from armcal.estimate.estimator import Estimate
 from armcal.estimate.proposing import certificates
 from armcal.estimate.validation import error_unit
 from armcal.measure.measurement import StatesAccuracy
@@ -33,7 +34,7 @@ from armcal.planning.candidates import deviations as deviations_of
 from armcal.planning.suggestion import Suggestion, suggest
 from armcal.problem.drift import residuals
 from armcal.problem.motion import Motion, recorded_position
-from armcal.problem.problem import FactorRecords
+from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.thinning import with_few_points
 from armcal.run.data_checks import gravity_findings
 from armcal.run.errors import FittedRecords, RecordErrors
@@ -92,19 +93,30 @@ def verdict_of(
 
 def _accuracies(run: FittedRecords) -> list[Finding]:
     """How well the parameters of measurements are known that are what a user wants to know."""
-    problem, estimate = run.problem, run.fitted.estimate
+    estimate = run.fitted.estimate
     if not estimate.verdict.converged or not estimate.names:
         return []
-    names, findings = estimate.parameters.coordinate_names, []
-    deviations = dict(zip(names, deviations_of(estimate.square_root_information), strict=True))
-    for name, measurement in problem.blueprint.measurements.items():
-        if isinstance(measurement, StatesAccuracy):
-            own = {n.removeprefix(f"{name}."): float(sd) for n, sd in deviations.items() if n.startswith(f"{name}.")}
-            text = measurement.accuracy(own)
-            findings += [Finding("note", f"{name}: {text}")] if text else []
-    train = run.split.train
+    problem, train = run.problem, run.split.train
     shown = certificates(problem, estimate.values, problem.subset(run.records, train), run.dataset.subset(train))
-    return [*findings, *(Finding("note", f"{name}: {text}") for name, text in shown.items())]
+    texts = [*known_accuracies(problem, estimate), *(f"{name}: {text}" for name, text in shown.items())]
+    return [Finding("note", text) for text in texts]
+
+
+def known_accuracies(problem: Problem, estimate: Estimate) -> list[str]:
+    """How well measurements' own parameters are known, a sentence each."""
+    stated = {
+        name: measurement.accuracy(own_deviations(estimate, name))
+        for name, measurement in problem.blueprint.measurements.items()
+        if isinstance(measurement, StatesAccuracy)
+    }
+    return [f"{name}: {text}" for name, text in stated.items() if text]
+
+
+def own_deviations(estimate: Estimate, instance: str) -> dict[str, float]:
+    """Standard deviations of the free coordinates of one instance by local name; infinite where undetermined."""
+    names = estimate.parameters.coordinate_names
+    deviations = zip(names, deviations_of(estimate.square_root_information), strict=True)
+    return {n.removeprefix(f"{instance}."): float(sd) for n, sd in deviations if n.startswith(f"{instance}.")}
 
 
 def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | None) -> Evidence:

@@ -16,7 +16,7 @@ from armcal.testing.board_checks import check_bench, check_device, check_link
 from armcal.testing.effect_checks import check_effect
 from armcal.testing.estimator_checks import check_estimator
 from armcal.testing.exporter_checks import check_exporter
-from armcal.testing.live_checks import check_joint_stream, check_tracker
+from armcal.testing.live_checks import check_camera, check_joint_stream, check_tracker
 from armcal.testing.manners import watched
 from armcal.testing.measurement_checks import check_measurement
 from armcal.testing.model_checks import check_model
@@ -44,6 +44,7 @@ KNOWN_CHECKS: Mapping[str, int] = MappingProxyType(
         "device": 39,
         "tracker": 18,
         "joints": 19,
+        "camera": 11,
         "bench": 13,
         "command": 2,
         "report_section": 2,
@@ -66,6 +67,7 @@ _CHECKS: Mapping[str, Callable[[Recorder, Subject], None]] = MappingProxyType(
         "simulator": check_simulator,
         "exporter": check_exporter,
         "joints": check_joint_stream,
+        "camera": check_camera,
         "bench": check_bench,
         "tracker": check_tracker,
         "link": check_link,

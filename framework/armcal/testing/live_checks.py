@@ -48,6 +48,26 @@ def check_joint_stream(record: Recorder, subject: Subject) -> None:
     _check_source(record, subject, "samples", JointSample, CHANNELS)
 
 
+def check_camera(record: Recorder, subject: Subject) -> None:
+    """That a live camera opens or refuses as a user's fault, never waits for an image, and may be closed twice."""
+    with record.needed("it builds"):
+        camera = subject.build()
+    with record.check("it may be closed before it was opened"):
+        camera.close()
+    with record.check("without a camera's measurement it refuses by an armcal error"):
+        opened = False
+        with suppress(InputError), raises_only(InputError):
+            _within(lambda: camera.open(RealClock(), {}))
+            opened = True
+        expect(not opened, "found it open, expected a refusal")
+    with record.check("gives_shots says whether images come by themselves"):
+        expect(isinstance(camera.gives_shots, bool), f"found {camera.gives_shots!r}, expected true or false")
+    with record.check("it may be closed twice, and gives nothing then"):
+        camera.close()
+        camera.close()
+        expect(_within(camera.shots) == [], "found an image after close(), expected none")
+
+
 def _check_source(record: Recorder, subject: Subject, method: str, kind: type, *opening: object) -> None:
     """Check a source whose ``method`` gives what has come, objects of ``kind``; it opens with a clock and more."""
     with record.needed("it builds"):

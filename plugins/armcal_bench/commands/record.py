@@ -24,8 +24,8 @@ from armcal_bench.bench import SECTION, Bench
 from armcal_bench.commands.common import FILE, load, on_bench
 from armcal_bench.journal_folder import Start
 from armcal_bench.recording.keys import Keys, LineKeys, NoKeys, TerminalKeys
-from armcal_bench.recording.recorder import KEYS, Message
-from armcal_bench.recording.recording_log import DATASET
+from armcal_bench.recording.recorder import KEYS, LOOK, Message
+from armcal_bench.recording.recording_log import DATASET, IMAGES
 from armcal_bench.recording.session import RecordingOptions, record
 from armcal_bench.terminal import single_keys
 
@@ -38,6 +38,11 @@ _AS_CSV = "--set 'data={type: csv}' "
 @click.option("--out", required=True, type=FILE, help="The folder to keep data and journal in.")
 @click.option("--resume", is_flag=True, help="Go on with the recording in that folder.")
 @click.option("--from", "source", metavar="SOURCE", help=f"Where joint readings come from: {KINDS}.")
+@click.option(
+    "--camera",
+    metavar="SOURCE",
+    help="Take an image of each posture: a camera's number or path, or a folder of images.",
+)
 @click.option(
     "--capture",
     type=click.Choice(["keys", "still"]),
@@ -52,13 +57,22 @@ def record_command(
     out: Path,
     resume: bool,
     source: str | None,
+    camera: str | None,
     capture: Literal["keys", "still"],
     overrides: tuple[str, ...],
 ) -> None:
-    """Record postures of CONFIG's arms while they are guided by hand; keys say when. Each is judged at once."""
+    """Record postures of CONFIG's arms while they are guided by hand; keys say when. Each is judged at once.
+
+    With a camera an image belongs to each posture, and the arm may be moved by its own controller.
+    """
     experiment = load(console, config, overrides)
-    if source is not None:
-        experiment = Experiment.of(_with_source(experiment.source, source), registry=experiment.registry)
+    sources = (("joints", "json_lines", "--from", source), ("camera", "opencv", "--camera", camera))
+    for part, usual, option, named in sources:
+        if named is not None:
+            changed = _with_source(
+                experiment.source, part, usual, ConfigText(named, Location(f"command line ({option})"))
+            )
+            experiment = Experiment.of(changed, registry=experiment.registry)
     bench = Bench.of(experiment)
 
     def show(message: Message) -> None:
@@ -72,7 +86,7 @@ def record_command(
 
     with Signals() as signals, _keys(bench, capture) as (keys, is_terminal):
         if is_terminal and not console.quiet:
-            click.echo(f"{KEYS}.", err=True)
+            click.echo(f"{KEYS}.{f' {LOOK}.' if bench.settings.camera else ''}", err=True)
         start: Start = "resume" if resume else "anew"
         options = RecordingOptions(out, start, capture, keys, lambda: signals.finish or signals.rotate, show)
         ending = record(bench, options)
@@ -80,16 +94,18 @@ def record_command(
     if ending.content["postures"] and not (console.json or console.quiet):
         data = experiment.settings.data or {}
         is_read = data.get("type", "csv") == "csv" and not data.get("columns")
-        say(f"next: armcal run {config} {'' if is_read else _AS_CSV}--data {out / DATASET} --out DIR")
+        reading = f"{'' if is_read else _AS_CSV}--data {out / DATASET}"
+        if ending.content["images"]:
+            reading = f"--set 'data={{type: images, folder: {out / IMAGES}, poses: {out / DATASET}}}'"
+        say(f"next: armcal run {config} {reading} --out DIR")
 
 
-def _with_source(source: ConfigSource, name: str) -> ConfigSource:
-    """The configuration with another source of joint readings; a stream of JSON lines where none is configured."""
+def _with_source(source: ConfigSource, part: str, usual: str, name: ConfigText) -> ConfigSource:
+    """The configuration with another source of a part of the bench; of the usual type where none is configured."""
     bench = source.data.get(SECTION)
-    joints = bench.get("joints") if isinstance(bench, dict) else None
-    section: dict[str, Any] = dict(joints) if isinstance(joints, dict) else {"type": ConfigText("json_lines")}
-    section["source"] = ConfigText(name, Location("command line (--from)"))
-    whole = {**(bench if isinstance(bench, dict) else {}), "joints": section}
+    there = bench.get(part) if isinstance(bench, dict) else None
+    section: dict[str, Any] = {**(there if isinstance(there, dict) else {"type": ConfigText(usual)}), "source": name}
+    whole = {**(bench if isinstance(bench, dict) else {}), part: section}
     return replace(source, data={**source.data, SECTION: whole})
 
 

@@ -10,14 +10,18 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from armcal.base.dataset import Dataset
+from armcal.base.units import to_unit
+from armcal.devices.camera import LiveCamera
 from armcal.errors import ArmcalError, ConfigError
 from armcal.measure.measurement import Measurement
 from armcal.run.experiment import Experiment
 from scipy.special import fdtri
 
+from armcal_bench.recording.advice import Advice, advice
 from armcal_bench.recording.knowledge import Knowledge, explained, knowledge
 from armcal_bench.recording.quick_fit import Fitted, PredictedResidual, QuickFitter
 from armcal_bench.recording.recording_log import Posture, dataset_of
+from armcal_bench.recording.window import JointKinds
 
 _CHANCE = 1e-4
 _CHANCE_LATER = 1e-5
@@ -33,21 +37,21 @@ _UNFIT = (ArmcalError, ArithmeticError, ValueError)
 class Offset:
     """How far a posture lies from where the others expect it, and how far was to be expected (root mean square).
 
-    Turns are zero for contacts that turn freely.
+    Turns are zero for contacts that turn freely; pixels are a corner's, root mean square over the image.
     """
 
     off_mm: float
     expected_mm: float
     off_deg: float = 0.0
     expected_deg: float = 0.0
+    off_px: float = 0.0
+    expected_px: float = 0.0
 
     def __str__(self) -> str:
-        if self.expected_deg == 0:
-            return f"{_short(self.off_mm)} mm (expected {_short(self.expected_mm)})"
-        turn = f"{_short(self.off_deg)} deg (expected {_short(self.expected_deg)})"
-        if self.expected_mm == 0:
-            return turn
-        return f"{_short(self.off_mm)} mm (expected {_short(self.expected_mm)}) and {turn}"
+        kinds = [("mm", self.off_mm, self.expected_mm), ("deg", self.off_deg, self.expected_deg)]
+        kinds = [*kinds, ("px", self.off_px, self.expected_px)]
+        parts = [f"{_short(off)} {unit} (expected {_short(known)})" for unit, off, known in kinds if known > 0]
+        return " and ".join(parts) or "nothing"
 
 
 @dataclass(frozen=True)
@@ -58,11 +62,13 @@ class Agreement:
         doubtful: those that disagree, by place (from 0).
         newest: of the last one; None where there is nothing to compare it with.
         values: of the last fit, to begin the next one from.
+        fitted: the last fit.
     """
 
     doubtful: Mapping[int, Offset] = field(default_factory=dict)
     newest: Offset | None = None
     values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    fitted: Fitted | None = None
 
 
 class AgreementJudge:
@@ -111,7 +117,7 @@ class AgreementJudge:
 
     def _disagrees(self, fitted: Fitted, one: int, chance: float) -> bool:
         predicted = self._predicted(fitted, one)
-        return predicted is not None and _is_beyond(predicted.distance, len(predicted.residual), fitted.freedom, chance)
+        return predicted is not None and _is_beyond(predicted.distance, predicted.numbers, fitted.freedom, chance)
 
     def _settled(self, doubtful: set[int]) -> Agreement:
         """Drop fitted postures that disagree with the others of their group, the farthest first."""
@@ -131,7 +137,7 @@ class AgreementJudge:
                 break
             doubtful, fitted = doubtful | {worst}, without
         offsets = {one: _offset(self._fitter.predicted(fitted, one)) for one in sorted(doubtful)}
-        return Agreement(offsets, values=self._fitter.free_values(fitted))
+        return Agreement(offsets, values=self._fitter.free_values(fitted), fitted=fitted)
 
 
 def _is_beyond(distance: float, numbers: int, freedom: float, chance: float) -> bool:
@@ -143,10 +149,14 @@ def _limit(numbers: int, freedom: float, chance: float) -> float:
 
 
 def _offset(predicted: PredictedResidual) -> Offset:
-    variances, lengths = np.diag(predicted.covariance), predicted.lengths
-    off, off_turn = (float(np.linalg.norm(predicted.residual[which])) for which in (lengths, ~lengths))
-    expected, expected_turn = (float(np.sqrt(variances[which].sum())) for which in (lengths, ~lengths))
-    return Offset(1000 * off, 1000 * expected, float(np.degrees(off_turn)), float(np.degrees(expected_turn)))
+    numbers = []
+    for dimension, unit in (("length", "mm"), ("angle", "deg"), ("image", "px")):
+        own = predicted.dimensions == dimension
+        points = max(np.sum(own) / 2, 1) if dimension == "image" else 1
+        off = np.sum(predicted.residual[own] ** 2) / points
+        expected = np.sum(np.diag(predicted.covariance)[own]) / points
+        numbers += [to_unit(float(np.sqrt(square)), unit) for square in (off, expected)]
+    return Offset(*map(float, numbers))
 
 
 def _short(number: float) -> str:
@@ -162,6 +172,7 @@ class Assessment:
         newest: how the last posture lies to the others; None where there is nothing to compare it with.
         doubts: postures that disagree, by name.
         known: what is determined; None if that could not be judged.
+        advice: how well an instrument's parameters are known, and what to take next.
         why_not: why not, a sentence.
     """
 
@@ -169,21 +180,23 @@ class Assessment:
     doubts: Mapping[str, Offset] = field(default_factory=dict)
     known: Knowledge | None = None
     why_not: str = ""
+    advice: Advice = field(default_factory=Advice)
 
 
-def contacts_of(experiment: Experiment) -> dict[str, Measurement]:
-    """The measurements for which a posture is all there is to measure.
+def contacts_of(experiment: Experiment, camera: LiveCamera | None) -> dict[str, Measurement]:
+    """The measurements for which a posture, and a camera's image of it, is all there is to measure.
 
     Raises:
         ConfigError: there are none.
     """
-    measurements = {name: m for name, m in experiment.system.measurements.items() if not m.channels()}
+    seen = "" if camera is None else camera.measurement
+    measurements = {n: m for n, m in experiment.system.measurements.items() if n == seen or not m.channels()}
     if not measurements:
         raise ConfigError(
             "found no measurement that joint angles alone make.",
             where=experiment.source.where(("measurements",)),
             hint="Configure what the arm touches: ball_in_socket, clamped_tool, plane_contact or closed_chain. "
-            "What a tracker measures, armcal acquire measures.",
+            "With a camera give --camera. What a tracker measures, armcal acquire measures.",
         )
     return measurements
 
@@ -191,8 +204,9 @@ def contacts_of(experiment: Experiment) -> dict[str, Measurement]:
 class Assessor:
     """Judges postures, and remembers which were in doubt and where the last fit ended."""
 
-    def __init__(self, experiment: Experiment) -> None:
-        self._experiment, self._contacts = experiment, contacts_of(experiment)
+    def __init__(self, experiment: Experiment, camera: LiveCamera | None) -> None:
+        self._experiment, self._contacts = experiment, contacts_of(experiment, camera)
+        self._joints = JointKinds.of(experiment.system.arms).dimensions
         self._doubtful: frozenset[str] = frozenset()
         self._values: Mapping[str, tuple[float, ...]] = {}
 
@@ -205,6 +219,14 @@ class Assessor:
     def anew(self, postures: Sequence[Posture]) -> Assessment:
         """Judge all together: when one was taken back, or after a break."""
         return self._assessed(postures, lambda judge: judge.anew())
+
+    def tried(self, postures: Sequence[Posture]) -> Assessment:
+        """What it would be with the last posture, of which nothing is remembered."""
+        remembered = self._doubtful, self._values
+        try:
+            return self.with_newest(postures)
+        finally:
+            self._doubtful, self._values = remembered
 
     def explained(self, postures: Sequence[Posture]) -> tuple[str, ...]:
         """Everything that is not determined yet, and why; it takes a moment."""
@@ -221,17 +243,19 @@ class Assessor:
             return Assessment()
         try:
             experiment, dataset, fitter = self._fitter(postures)
-            fitter.begin_from(self._values)
             agreement = judge(AgreementJudge(fitter, [p.place for p in postures]))
             known = knowledge(experiment, fitter.problem, fitter.records, dataset)
+            outlook = Advice()
+            if agreement.fitted is not None:
+                outlook = advice(fitter, agreement.fitted, dataset, self._joints)
         except _UNFIT as fault:  # what was captured is safe, and so is what comes
             return Assessment(why_not=str(fault))
         doubts = {postures[place].name: offset for place, offset in agreement.doubtful.items()}
         self._doubtful = frozenset(doubts)
         self._values = agreement.values or self._values
-        return Assessment(agreement.newest, doubts, known)
+        return Assessment(agreement.newest, doubts, known, advice=outlook)
 
     def _fitter(self, postures: Sequence[Posture]) -> tuple[Experiment, Dataset, QuickFitter]:
         dataset = dataset_of(postures)
         experiment = self._experiment.of_records(dataset)
-        return experiment, dataset, QuickFitter(experiment, self._contacts, dataset)
+        return experiment, dataset, QuickFitter(experiment, self._contacts, dataset, self._values)

@@ -13,6 +13,7 @@ from armcal.estimate.structure import GIVE_A_LENGTH, UNSEEN_SCALE, explain, iden
 from armcal.estimate.validation import hold_out
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.projection import factor_at_zero, projected
+from armcal.problem.visibility import as_seen
 from armcal.run.experiment import Experiment
 from armcal.run.groups import labels_of
 
@@ -122,7 +123,8 @@ def _joints_to_vary(problem: Problem, dataset: Dataset, scaled: Array, rank: int
     for channel, step in joints.items():
         try:
             channels = {**both.channels, channel: both.column(channel) + step * signs}
-            moved = projected(problem, values, problem.records(replace(both, channels=channels)))
+            seen, _ = as_seen(problem, values, replace(both, channels=channels))
+            moved = projected(problem, values, problem.records(seen))
             rows = problem.triangular_factor(values, moved) * scales
         except ArmcalError:
             continue

@@ -4,19 +4,23 @@ Weak priors about the nominal values stand in for what the postures do not deter
 yet makes the expected error large, not the answer impossible.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.errors import ProblemError
 from armcal.estimate.identifiability import InverseInformation
 from armcal.estimate.nuisance import started
 from armcal.estimate.polish import descended
+from armcal.estimate.proposing import with_proposals
+from armcal.estimate.start import Start
 from armcal.measure.measurement import Measurement
+from armcal.measure.points import Proposing
 from armcal.problem.factor_records import declared
 from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import Problem
+from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.readings import with_joint_noise
 from armcal.run.experiment import Experiment
 from numpy.typing import NDArray
@@ -29,6 +33,8 @@ _DAMPING = 1e-9
 _AT_REST = 1e-5
 """A step that lowers half the sum of squares by less than this part of it is the last."""
 _LEAST_LEFT = 1e-6
+_POSE_NUMBERS = 6
+"""Points of an image err alike, by an arm's error or a lens: they say no more of noise than the pose of the board."""
 _DECLARED_COUNTS = 2.0
 """The declared noise counts as so many numbers when the real one is estimated."""
 _LEAST_SCALE = 0.05
@@ -39,16 +45,17 @@ class PredictedResidual:
     """What a fit predicts of one posture that it did not see.
 
     Attributes:
-        residual: raw (n; m or rad).
+        residual: raw (n; SI).
         covariance: of it, parameters and noise together (n x n).
-        distance: squared, in units of it.
-        lengths: which entries are lengths (n).
+        distance: squared, in units of it, of so many ``numbers``: the entries, or fewer where these err alike.
+        dimensions: of each entry (n): ``length``, ``angle``, ``image``.
     """
 
     residual: Array
     covariance: Array
     distance: float
-    lengths: NDArray[np.bool_]
+    numbers: int
+    dimensions: NDArray[np.str_]
 
 
 @dataclass(frozen=True)
@@ -75,33 +82,38 @@ class QuickFitter:
         experiment: with the parameters that the groups of the postures bring.
         contacts: the measurements that joints alone make.
         dataset: the postures.
+        known: values of an earlier fit, by parameter, where it begins; those that are not named begin where they are.
 
     Raises:
         NotConvergedError: a posture has no elastic equilibrium.
+        ProblemError: the postures leave open what an instrument finds by itself.
     """
 
-    def __init__(self, experiment: Experiment, contacts: dict[str, Measurement], dataset: Dataset) -> None:
+    def __init__(
+        self,
+        experiment: Experiment,
+        contacts: dict[str, Measurement],
+        dataset: Dataset,
+        known: Mapping[str, tuple[float, ...]],
+    ) -> None:
         system = experiment.system
         parameters = experiment.parameters
         problem = Problem.build(system.arms, contacts, parameters, system.environment, dataset, "interpreted")
         records = problem.records(dataset)
+        problem, proposed = _placed(problem, records, dataset, known)
         self.problem = started(problem, records)
         nominal = self.problem.parameters.nominal()
         self.records = with_joint_noise(self.problem, records, nominal)
         weak_priors = {
-            block.name: replace(block, prior_sd=block.scale * (_FAR if block.nuisance else 1.0))
+            block.name: replace(block, prior_sd=block.scale * (_FAR if block.nuisance or block.name in proposed else 1))
             for block in self.problem.parameters.free
             if block.prior_sd is None
         }
         self._weak = replace(self.problem, parameters=self.problem.parameters.replaced(weak_priors))
-        self._x = np.zeros(len(self._weak.parameters.increment_scales()))
-
-    def begin_from(self, values: Mapping[str, tuple[float, ...]]) -> None:
-        """Begin the next fit from these values, by parameter; those that are not named begin where they are."""
         parameters, start = self._weak.parameters, self._weak.parameters.nominal()
         for block in parameters.free:
-            if len(values.get(block.name, ())) == block.size:
-                start[parameters.entries_of(block.name)] = values[block.name]
+            if len(known.get(block.name, ())) == block.size:
+                start[parameters.entries_of(block.name)] = known[block.name]
         self._x = parameters.local(start) / parameters.increment_scales()
 
     def free_values(self, fitted: Fitted) -> dict[str, tuple[float, ...]]:
@@ -117,11 +129,13 @@ class QuickFitter:
         self._x = descended(posed, self._x, _MOST_STEPS, _DAMPING, _AT_REST)
         values = posed.values(self._x)
         triangle = self._weak.triangular_factor(values, records)
-        spent = InverseInformation.of(triangle, parameters).spent
-        freedom = max(self._weak.equations(records) - spent, 0.0) + _DECLARED_COUNTS
+        spent, equations = InverseInformation.of(triangle, parameters).spent, self._weak.equations(records)
+        freedom = max(equations - spent, 0.0) + _DECLARED_COUNTS
         squares = 2 * self._weak.cost(values, records)
         scale = max(float(np.sqrt((squares + _DECLARED_COUNTS) / freedom)), _LEAST_SCALE)
-        return Fitted(values, InverseInformation.of(triangle / scale, parameters).root, scale, freedom, used)
+        independent = sum(self._numbers(one) for one in np.flatnonzero(used).tolist()) / max(equations, 1)
+        root = InverseInformation.of(triangle / scale, parameters).root
+        return Fitted(values, root, scale, freedom * min(independent, 1.0), used)
 
     def predicted(self, fitted: Fitted, one: int) -> PredictedResidual:
         """Of a posture that was not fitted."""
@@ -138,16 +152,27 @@ class QuickFitter:
         dimensions: list[str] = []
         for factor, record, residual, jacobian in factors:
             if record.weight[0] > 0:
-                residuals.append(residual[:, 0])
-                reaches.append(jacobian[:, :, 0] @ to_half)
-                whitenings.append(declared(factor.noise) if record.whitening is None else record.whitening[:, :, 0])
-                dimensions += factor.dimensions
+                there = np.ones(len(residual), dtype=bool) if record.present is None else record.present[:, 0]
+                own = declared(factor.noise) if record.whitening is None else record.whitening[:, :, 0]
+                residuals.append(residual[there, 0])
+                reaches.append(jacobian[there, :, 0] @ to_half)
+                whitenings.append(own[np.ix_(there, there)])
+                dimensions += list(np.array(factor.dimensions)[there])
         whitened, reach = np.concatenate(residuals), np.concatenate(reaches)
         covariance = fitted.scale**2 * np.eye(len(whitened)) + reach @ reach.T
-        distance = float(whitened @ np.linalg.solve(covariance, whitened))
+        distance, numbers = float(whitened @ np.linalg.solve(covariance, whitened)), self._numbers(one)
         back = np.linalg.inv(block_diag(*whitenings))
-        lengths = np.array(dimensions) == "length"
-        return PredictedResidual(back @ whitened, back @ covariance @ back.T, distance, lengths)
+        distance *= numbers / len(whitened)
+        return PredictedResidual(back @ whitened, back @ covariance @ back.T, distance, numbers, np.array(dimensions))
+
+    def _numbers(self, one: int) -> int:
+        """How many numbers a posture gives that err by themselves."""
+        count = 0
+        for kernel, record in zip(self._weak.kernels, self.records, strict=True):
+            if record.weight[one] > 0:
+                rows = kernel.factor.rows if record.present is None else int(record.present[:, one].sum())
+                count += rows if kernel.points is None else min(rows, _POSE_NUMBERS)
+        return count
 
     def left_out(self, fitted: Fitted) -> dict[int, tuple[float, int]]:
         """Of each fitted posture how far it lies from a fit without it, to first order: the square in units of what is
@@ -165,5 +190,29 @@ class QuickFitter:
             whitened, taken_up = (np.concatenate(part) for part in zip(*parts, strict=True))
             remaining, directions = np.linalg.eigh(np.eye(len(whitened)) - taken_up @ taken_up.T)
             squares = (directions.T @ whitened) ** 2 / np.maximum(remaining, _LEAST_LEFT)
-            distances[one] = float(squares.sum()) / fitted.scale**2, len(whitened)
+            numbers, there = self._numbers(one), max(int(np.sum(np.any(taken_up != 0, axis=1))), 1)
+            distances[one] = float(squares.sum()) / fitted.scale**2 * numbers / there, numbers
         return distances
+
+
+def _placed(
+    problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, known: Mapping[str, tuple[float, ...]]
+) -> tuple[Problem, frozenset[str]]:
+    """The problem about what instruments find by themselves of their free parameters, and the names of these."""
+    finders = [name for name, m in problem.blueprint.measurements.items() if isinstance(m, Proposing)]
+    own = [b for b in problem.parameters.free if b.prior_sd is None and b.name.partition(".")[0] in finders]
+    if not own:
+        return problem, frozenset()
+    if all(len(known.get(block.name, ())) == block.size for block in own):
+        parameters, nominal = problem.parameters, problem.parameters.nominal()
+        for block in own:
+            nominal[parameters.entries_of(block.name)] = known[block.name]
+        problem = replace(problem, parameters=parameters.with_nominal(nominal))
+    else:
+        start = with_proposals(Start(problem), records, dataset)
+        if not start.taken:
+            raise ProblemError(
+                "the images are too few to find the camera by.", hint="Take more, each turned otherwise."
+            )
+        problem = start.problem
+    return problem, frozenset(block.name for block in own)

@@ -1,26 +1,34 @@
 """Postures captured from a stream of readings, at a command or when the arm has come to rest; nothing waits here."""
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from armcal.devices.camera import LiveCamera, Shot
 from armcal.devices.clock import Clock
 from armcal.devices.joint_stream import JointSample, JointStream
 from armcal.devices.line_source import refused_lines_text
+from armcal.errors import InputError
+from armcal.io.file_set import write_over
 from armcal.measure.limits import warn_beyond_limits
 
 from armcal_bench.bench import Bench
+from armcal_bench.recording.advice import Advice
 from armcal_bench.recording.agreement import Assessment, Assessor
 from armcal_bench.recording.labels import Labels
-from armcal_bench.recording.recording_log import Posture, RecordingLog, dataset_of, write_dataset
+from armcal_bench.recording.recording_log import IMAGES, Posture, RecordingLog, dataset_of, write_dataset
 from armcal_bench.recording.window import JointKinds, Mean, SampleWindow
 
-Capture = Literal["keys", "still", "rests"]
-"""When postures are captured: at a command, when the arm has stood for a while, or at each rest of the stream."""
+Capture = Literal["keys", "still", "rests", "images"]
+"""When postures are captured: at a command, when the arm has stood for a while, at each rest of the stream, or when an
+image comes."""
 KEYS = "c or Enter captures, u takes the last one back, g NAME or a digit names what is touched, s tells more, q ends"
+LOOK = "v looks without keeping"
+_MOST_UNSEEN = 20
+"""Images without a board, and none with one: something is wrong for all of them."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +37,7 @@ class Message:
 
     Attributes:
         kind: ``captured``, ``refused``, ``undone``, ``named``, ``disagrees``, ``agrees_again``, ``known``, ``status``,
-            ``warning``, ``silent``, ``heard``, ``finished``.
+            ``warning``, ``silent``, ``heard``, ``seen``, ``next``, ``finished``.
         sentence: for people.
         content: for programs; JSON.
     """
@@ -64,6 +72,8 @@ def _doubts_changed(before: Assessment, after: Assessment, postures: Sequence[Po
         if name not in before.doubts:
             place = standing[name].place
             text = f"did it sit right in {place}, and is that its name?" if place else "was it held as the others were?"
+            if standing[name].image:
+                text = "did the camera, the board or the arm move, or the focus change?"
             sentence = f"posture {name} disagrees by {offset}: {text}"
             if name == postures[-1].name:
                 sentence += " u takes it back."
@@ -74,6 +84,27 @@ def _doubts_changed(before: Assessment, after: Assessment, postures: Sequence[Po
     return messages
 
 
+def _added(after: Advice, before: Advice) -> str:
+    """What is known now, and how much it fell by; empty where that is not known."""
+    fell = after.fell_by(before)
+    if not after.accuracy:
+        return ""
+    changed = "" if fell is None else f" (standard deviations {'fell' if fell >= 0 else 'rose'} by {abs(fell):.0%})"
+    return f"{' '.join(after.accuracy).rstrip('.')}{changed}"
+
+
+def _advised(after: Advice, before: Advice) -> list[Message]:
+    """How well an instrument's own parameters are known, and which posture to take next."""
+    messages, text = [], _added(after, before)
+    if text:
+        messages.append(Message("known", f"{text}.", {"accuracy": list(after.accuracy), "fell": after.fell_by(before)}))
+    if after.next:
+        sentence = f"next, if the way is clear: about {after.next}"
+        sentence += f", {1 - after.shrink:.0%} less uncertain." if after.shrink < 1 else "."
+        messages.append(Message("next", sentence, {"joints": dict(after.commands), "shrink": after.shrink}))
+    return messages
+
+
 class Recorder:
     """Takes readings and commands, and gives back messages about what came of them.
 
@@ -81,20 +112,32 @@ class Recorder:
         bench: what is recorded, and when a posture is one.
         stream: of the readings; it is used only for why it is silent.
         capture: what makes a posture be captured.
-        folder: for the dataset.
+        folder: for the dataset and the images.
         log: the journal.
         clock: the bench's.
+        camera: an open one that sees what the arm shows; None where postures are all there is.
     """
 
     def __init__(
-        self, bench: Bench, stream: JointStream, capture: Capture, folder: Path, log: RecordingLog, clock: Clock
+        self,
+        bench: Bench,
+        stream: JointStream,
+        capture: Capture,
+        folder: Path,
+        log: RecordingLog,
+        clock: Clock,
+        camera: LiveCamera | None = None,
     ) -> None:
         settings = bench.settings.recording
         self._experiment, self._settings = bench.experiment, settings
-        self._stream, self._capture, self._folder, self._log, self._clock = stream, capture, folder, log, clock
+        self._stream, self.capture, self._folder, self._log, self._clock = stream, capture, folder, log, clock
         self.kinds = JointKinds.of(self._experiment.system.arms)
         self.labels = Labels(self._experiment.system.measurements, settings.groups)
-        self._assessor = Assessor(self._experiment)
+        self._assessor = Assessor(self._experiment, camera)
+        self._camera, self._unseen = camera, 0
+        self._waiting: deque[tuple[Shot, float]] = deque()
+        self._looked_from: Mapping[str, float] = {}
+        """Where the arm stood when an image said nothing: not looked from again before it has moved."""
         length = settings.rest if capture == "still" else settings.window
         self._window = SampleWindow(self.kinds, length, settings.spread, settings.sliding_spread, settings.samples)
         self._heard, self._is_silent = clock.now(), False
@@ -123,31 +166,51 @@ class Recorder:
                 self._fault_at = sample.arrived
                 self._window.clear()
                 continue
-            if self._capture == "rests":
+            if self.capture == "rests":
                 messages += self._kept(Mean(sample.angles, 0.0, 1, sample.labels, sample.stamp))
                 continue
             self._window.add(sample)
-            if self._capture == "still":
+            if self.capture == "still":
                 messages += self._kept_if_elsewhere()
+        messages += self._taken_as_they_come()
         if samples and not self._fault:
             self._heard = self._clock.now()  # judging a posture takes a while, in which nobody listens
-        is_silent = self._capture != "rests" and self._silence() > self._settings.stale
+        is_silent = self.capture != "rests" and self._silence() > self._settings.stale
         if is_silent != self._is_silent:
             self._is_silent = is_silent
             heard = Message("heard", "joint readings come again.")
             messages.append(Message("silent", self._silent()) if is_silent else heard)
         return messages
 
+    def _taken_as_they_come(self) -> list[Message]:
+        """Postures of images that came by themselves; one waits until enough readings are there."""
+        if self._camera is None or not self._camera.gives_shots:
+            return []
+        self._waiting += [(shot, self._clock.now()) for shot in self._camera.shots()]
+        messages: list[Message] = []
+        while self._waiting:
+            shot, came = self._waiting[0]
+            mean = self._window.mean()
+            if isinstance(mean, str) and self._window.is_filling and self._clock.now() - came < self._settings.stale:
+                break
+            self._waiting.popleft()
+            messages += [_refused(f"{shot.seen}: {mean}")] if isinstance(mean, str) else self._kept(mean, shot)
+        return messages
+
     def command(self, text: str) -> list[Message]:
         """Something that was typed."""
         word, _, rest = text.strip().partition(" ")
-        if word in ("", "c"):
-            if self._capture == "rests":
+        if word in ("", "c", "v"):
+            if self.capture == "rests":
                 return [_refused("rests are captured by themselves, when they are over.")]
+            if self.capture == "images":
+                return [_refused("postures are captured when their images come.")]
             if self._fault or self._silence() > self._settings.stale:
                 return [_refused(self._silent())]
             mean = self._window.mean()
-            return [_refused(mean)] if isinstance(mean, str) else self._kept(mean)
+            if isinstance(mean, str):
+                return [_refused(mean)]
+            return self._looked(mean) if word == "v" else self._kept(mean)
         if word == "u":
             posture = self._log.undo()
             if posture is None:
@@ -172,7 +235,8 @@ class Recorder:
         doubts = sorted(assessment.doubts, key=int)
         sentence = f"{len(postures)} postures are recorded"
         sentence += f"; in doubt: {', '.join(doubts)}" if doubts else ""
-        return Message("finished", f"{sentence}.", {"postures": len(postures), "in_doubt": doubts})
+        content = {"postures": len(postures), "in_doubt": doubts, "images": any(p.image for p in postures)}
+        return Message("finished", f"{sentence}.", content)
 
     def _kept_if_elsewhere(self) -> list[Message]:
         """Capture an arm that has come to rest somewhere else; what hinders that is said once."""
@@ -180,7 +244,8 @@ class Recorder:
         if isinstance(mean, str):
             self._complaint = ""
             return []
-        if last is not None and self._apart(mean.angles, last.angles) < self._settings.moved:
+        before = [angles for angles in (last and last.angles, self._looked_from) if angles]
+        if any(self._apart(mean.angles, angles) < self._settings.moved for angles in before):
             return []
         messages = self._kept(mean)
         if messages[0].kind != "refused":
@@ -188,19 +253,56 @@ class Recorder:
         is_repeated, self._complaint = messages[0].sentence == self._complaint, messages[0].sentence
         return [] if is_repeated else messages
 
-    def _kept(self, mean: Mean) -> list[Message]:
+    def _looked(self, mean: Mean) -> list[Message]:
+        """What an image would add, which is not kept."""
+        if self._camera is None:
+            return [_refused("there is no camera to look by: give --camera.")]
+        shot = self._camera.shoot()
+        if shot.fault:
+            return [_refused(shot.fault)]
+        posture = self._log.next_posture(mean, self.labels.present, shot.values)
+        known = self._assessor.tried([*self._log.postures, posture])
+        text = _added(known.advice, self._assessment.advice)
+        return [Message("seen", f"{shot.seen}; with it {text}." if text else f"{shot.seen}.", {"kept": False})]
+
+    def _kept(self, mean: Mean, shot: Shot | None = None) -> list[Message]:
         labels, fault = self.labels.of(mean.labels)
         if fault:
             return [_refused(fault)]
-        posture = self._log.capture(mean.angles, mean.spread, mean.readings, labels, mean.stamp)
+        messages: list[Message] = []
+        if self._camera is not None:
+            shot = shot or self._camera.shoot()
+            if shot.fault:
+                return [self._without_board(mean, shot)]
+            messages.append(Message("seen", f"{shot.seen}.", {"kept": True}))
+        posture = self._log.next_posture(mean, labels, shot.values if shot else {})
+        if shot is not None:
+            posture = replace(posture, image=f"{posture.name:0>4}{shot.suffix}")
+            write_over({self._folder / IMAGES / posture.image: shot.content})
+        self._log.capture(posture)
         self._write()
         postures, before = self._log.postures, self._assessment
         self._assessment = self._assessor.with_newest(postures)
         if set(before.doubts) != set(self._assessment.doubts):
             self._write()
-        messages = [_captured(posture, self._assessment)]
+        messages += [_captured(posture, self._assessment), *_advised(self._assessment.advice, before.advice)]
         messages += _doubts_changed(before, self._assessment, postures)
         return messages + self._warnings(posture) + self._known()
+
+    def _without_board(self, mean: Mean, shot: Shot) -> Message:
+        """About an image that says nothing.
+
+        Raises:
+            InputError: so many did not, and none did.
+        """
+        self._looked_from = mean.angles
+        self._unseen += 1
+        if self._unseen >= _MOST_UNSEEN and self._log.last is None:
+            raise InputError(
+                f"found no board in {self._unseen} images; of the last: {shot.fault}",
+                hint="Check the board's settings (armcal board writes them), the light and the focus.",
+            )
+        return _refused(shot.fault)
 
     def _status(self) -> list[Message]:
         postures, doubts = self._log.postures, self._assessment.doubts

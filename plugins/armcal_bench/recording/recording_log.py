@@ -13,9 +13,11 @@ from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
 
 from armcal_bench.journal_folder import JOURNAL
+from armcal_bench.recording.window import Mean
 
 DATASET = "dataset.csv"
-OURS = (DATASET, JOURNAL)
+IMAGES = "images"
+OURS = (DATASET, JOURNAL, IMAGES)
 CAPTURED, UNDONE = "captured", "undone"
 """Kinds of entries."""
 
@@ -32,6 +34,8 @@ class Posture:
         at: unix seconds; of two postures the later one's is not the smaller.
         labels: the group it belongs to (a socket's name), by column.
         stamp: when it was, by the source's own clock (s), where it says so.
+        image: the name of its image's file; empty where none was taken.
+        values: what the image says, by channel (``camera.u_3``, SI).
     """
 
     name: str
@@ -41,6 +45,8 @@ class Posture:
     at: float
     labels: Mapping[str, str] = field(default_factory=dict)
     stamp: float | None = None
+    image: str = ""
+    values: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def place(self) -> str:
@@ -49,7 +55,7 @@ class Posture:
 
     def as_dict(self) -> dict[str, Any]:
         """As JSON, to be read back by ``Posture(**content)``, numbers bit for bit."""
-        return {**self.__dict__, "angles": dict(self.angles), "labels": dict(self.labels)}
+        return {**self.__dict__, "angles": dict(self.angles), "labels": dict(self.labels), "values": dict(self.values)}
 
 
 class RecordingLog:
@@ -75,15 +81,16 @@ class RecordingLog:
         """All that stand, in the order of capture."""
         return tuple(self._postures.values())
 
-    def capture(
-        self, angles: Mapping[str, float], spread: float, readings: int, labels: Mapping[str, str], stamp: float | None
-    ) -> Posture:
-        """Write a posture; it outlasts a power loss when this returns. See ``Journal.record`` for what it raises."""
+    def next_posture(self, mean: Mean, labels: Mapping[str, str], values: Mapping[str, float]) -> Posture:
+        """The posture that a capture would make now."""
         at = max(self._wall(), self.last.at if self.last else 0.0)
-        posture = Posture(str(self._count + 1), dict(angles), spread, readings, at, dict(labels), stamp)
+        name = str(self._count + 1)
+        return Posture(name, dict(mean.angles), mean.spread, mean.readings, at, dict(labels), mean.stamp, values=values)
+
+    def capture(self, posture: Posture) -> None:
+        """Write the next posture, which outlasts a power loss then; see ``Journal.record`` for what it raises."""
         self._journal.record(CAPTURED, posture.as_dict())
         self._take(posture)
-        return posture
 
     def undo(self) -> Posture | None:
         """Take the last posture back, for good; None if there is none."""
@@ -102,8 +109,12 @@ def dataset_of(postures: Sequence[Posture], doubts: Mapping[str, str] | None = N
     """The postures in the order of capture, at least one; ``doubts`` say why one is not to be trusted, by name."""
     first = postures[0]
     channels = {name: np.array([p.angles[name] for p in postures]) for name in first.angles}
+    for name in dict.fromkeys(name for p in postures for name in p.values):
+        channels[name] = np.array([p.values.get(name, np.nan) for p in postures])
     channels["time"] = np.array([p.at for p in postures])
     extra = {name: tuple(p.labels[name] for p in postures) for name in first.labels}
+    if any(p.image for p in postures):
+        extra["image"] = tuple(p.image for p in postures)
     extra["readings"] = tuple(str(p.readings) for p in postures)
     extra["doubt"] = tuple((doubts or {}).get(p.name, "") for p in postures)
     return Dataset(tuple(p.name for p in postures), channels, extra, source="recorded")
@@ -118,4 +129,5 @@ def write_dataset(folder: Path, experiment: Experiment, postures: Sequence[Postu
     if not postures:
         (folder / DATASET).unlink(missing_ok=True)
         return
-    write_csv(folder / DATASET, dataset_of(postures, doubts), experiment.request(measured=True).channels)
+    dataset = dataset_of(postures, doubts)
+    write_csv(folder / DATASET, dataset, experiment.request(measured=True).channels)

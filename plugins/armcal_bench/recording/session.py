@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from armcal.devices.camera import LiveCamera
 from armcal.devices.clock import Clock
 from armcal.devices.joint_stream import JointStream, RestStream
 from armcal.errors import ConfigError
@@ -15,7 +16,7 @@ from armcal_bench.recording.agreement import contacts_of
 from armcal_bench.recording.keys import END, Keys
 from armcal_bench.recording.labels import Labels
 from armcal_bench.recording.recorder import Capture, Message, Recorder
-from armcal_bench.recording.recording_log import OURS, RecordingLog
+from armcal_bench.recording.recording_log import IMAGES, OURS, RecordingLog
 from armcal_bench.recording.window import JointKinds
 
 _PERIOD_S = 0.02
@@ -51,27 +52,39 @@ def record(bench: Bench, options: RecordingOptions) -> Message:
         InputError: the configuration, the folder or the stream is refused.
         ArmcalError: the journal cannot be written; all postures that were said to be kept are.
     """
-    contacts_of(bench.experiment)
+    camera = bench.camera()
     channels = JointKinds.of(bench.experiment.system.arms).channels
     columns = Labels(bench.experiment.system.measurements, ()).columns
     header = {"joints": list(channels), "labels": list(columns)}
-    stream, capture = bench.joints(), options.capture
+    stream, capture = bench.joints(), _capture(options.capture, camera)
     if isinstance(stream, RestStream) and stream.gives_rests:
-        if capture == "keys":
+        if capture in ("keys", "images") or camera is not None:
             raise ConfigError(
-                "the stream gives a sample only when a rest is over, so no key can capture one.",
+                "the stream gives a sample only when a rest is over, so that no key and no image can capture one.",
                 where=bench.experiment.source.where((SECTION, "joints", "still")),
                 hint="Give --capture still, or leave still out.",
             )
         capture = "rests"
     with bench.clock() as clock:
         try:
+            if camera is not None:
+                camera.open(clock, bench.experiment.system.measurements)
+            contacts_of(bench.experiment, camera)
             stream.open(clock, channels)
             with opened_journal(options.folder, options.start, OURS, header, "recording", _SAME) as journal:
-                recorder = Recorder(bench, stream, capture, options.folder, RecordingLog(journal), clock)
+                if camera is not None:
+                    (options.folder / IMAGES).mkdir(exist_ok=True)
+                recorder = Recorder(bench, stream, capture, options.folder, RecordingLog(journal), clock, camera)
                 return _recorded(recorder, stream, options, clock)
         finally:
             stream.close()
+            if camera is not None:
+                camera.close()
+
+
+def _capture(chosen: Capture, camera: LiveCamera | None) -> Capture:
+    """A camera that gives images by itself says when."""
+    return "images" if camera is not None and camera.gives_shots else chosen
 
 
 def _recorded(recorder: Recorder, stream: JointStream, options: RecordingOptions, clock: Clock) -> Message:
@@ -90,7 +103,7 @@ def _recorded(recorder: Recorder, stream: JointStream, options: RecordingOptions
             if command.strip() == END:
                 break
             show(recorder.command(command))
-        is_over = has_ended or (options.keys.ended and options.capture == "keys")
+        is_over = has_ended or (options.keys.ended and recorder.capture == "keys")
         if options.asked_to_end() or (is_over and not typed):
             break
         clock.sleep(_PERIOD_S)

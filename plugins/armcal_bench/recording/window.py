@@ -108,13 +108,19 @@ class SampleWindow:
         """Forget all."""
         self._samples.clear()
 
+    @property
+    def is_filling(self) -> bool:
+        """Whether there are too few readings for a posture, or over too short a time."""
+        lasts = self._samples[-1][0] - self._samples[0][0] if self._samples else 0.0
+        return len(self._samples) < self._least or lasts < _LONG_ENOUGH * self._length
+
     def mean(self) -> Mean | str:
         """The posture, or why there is none: a sentence."""
         count = len(self._samples)
         if not count:
             return "no joint readings came."
         lasts = self._samples[-1][0] - self._samples[0][0]
-        if count < self._least or lasts < _LONG_ENOUGH * self._length:
+        if self.is_filling:
             return (
                 f"only {count} readings over {lasts:.2f} s are there, expected {self._least} over "
                 f"{self._length:g} s: wait, or let the source send more often."

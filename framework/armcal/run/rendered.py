@@ -1,0 +1,59 @@
+"""Images of simulated records, in place of the corners that an instrument would read in them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from armcal.base.dataset import Dataset
+from armcal.errors import ConfigError
+from armcal.estimate.estimator import Progress
+from armcal.estimate.proposing import carriers_of
+from armcal.estimate.simulation import TruthfulSimulator
+from armcal.io.file_set import write_over
+from armcal.io.folder import check_folder
+from armcal.measure.measurement import borrowed_names
+from armcal.measure.points import Rendering
+from armcal.problem.problem import Problem
+from armcal.run.experiment import Experiment
+
+
+def with_images(experiment: Experiment, dataset: Dataset, folder: Path, progress: Progress) -> Dataset:
+    """Simulated records with a file of an image each, in place of what was read of it.
+
+    Of several cameras each has a folder of its own name.
+
+    Raises:
+        ConfigError: no measurement draws images, or the simulator does not say what is true.
+        InputError: the images cannot be written.
+        PluginError: a library is not there.
+    """
+    simulator, cameras = experiment.simulator(), experiment.system.measurements
+    drawing = {name: m for name, m in cameras.items() if isinstance(m, Rendering)}
+    if not drawing or not isinstance(simulator, TruthfulSimulator):
+        part = "measurements" if not drawing else "simulation"
+        message = "none of them draws images." if not drawing else "this simulator does not say what is true."
+        hint = "Configure a measurement of type camera, and the simulator elastic_arm."
+        raise ConfigError(message, where=experiment.source.where((part,)), hint=hint)
+    true, stood = simulator.stood(experiment.simulation_request, dataset)
+    fixed = true.parameters.with_free(())
+    problem = Problem.build(true.arms, true.measurements, fixed, true.environment, stood, "interpreted")
+    records, values, files = problem.records(stood), fixed.nominal(), tuple(f"{name}.png" for name in dataset.ids)
+    for number, kernel in enumerate(problem.kernels):
+        name = kernel.factor.name
+        if name not in drawing:
+            continue
+        place = folder if len(drawing) == 1 else folder / name
+        check_folder(place, files)
+        place.mkdir(parents=True, exist_ok=True)
+        full = {b.name.removeprefix(f"{name}."): b.name for b in fixed.blocks if b.name.startswith(f"{name}.")}
+        full |= borrowed_names(drawing[name])  # of another camera's boards
+        own = {local: values[fixed.entries_of(block)] for local, block in full.items()}
+        frames = carriers_of(problem, values, problem.subset(records, np.arange(len(stood))), stood, number)
+        for done, content in enumerate(drawing[name].rendered(frames, own), start=1):
+            write_over({place / files[done - 1]: content})
+            progress("drawing", done / len(dataset))
+    channels = {c: v for c, v in dataset.channels.items() if c.partition(".")[0] not in drawing}
+    return replace(dataset, channels=channels, extra={**dataset.extra, "image": files})
