@@ -41,7 +41,11 @@ class LiveCamera(Protocol):
     gives_shots: bool
 
     def open(self, clock: Clock, measurements: Mapping[str, Measurement]) -> None:
-        """Begin, for one of these measurements.
+        """Begin.
+
+        Args:
+            clock: the bench's.
+            measurements: by instance; one of them is this camera's.
 
         Raises:
             DeviceRefusedError: there is no such camera, or it is taken.

@@ -6,6 +6,7 @@ yet makes the expected error large, not the answer impossible.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from armcal.base.dataset import Dataset
@@ -94,7 +95,7 @@ class QuickFitter:
         experiment: Experiment,
         contacts: dict[str, Measurement],
         dataset: Dataset,
-        known: Mapping[str, tuple[float, ...]],
+        known: Mapping[str, tuple[float, ...]] = MappingProxyType({}),
     ) -> None:
         system = experiment.system
         parameters = experiment.parameters

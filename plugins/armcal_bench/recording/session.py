@@ -60,7 +60,7 @@ def record(bench: Bench, options: RecordingOptions) -> Message:
     if isinstance(stream, RestStream) and stream.gives_rests:
         if capture in ("keys", "images") or camera is not None:
             raise ConfigError(
-                "the stream gives a sample only when a rest is over, so that no key and no image can capture one.",
+                "the stream gives a sample only when a rest is over, so no key can capture one, and no image is of it.",
                 where=bench.experiment.source.where((SECTION, "joints", "still")),
                 hint="Give --capture still, or leave still out.",
             )
