@@ -85,8 +85,7 @@ def judged(wrong: dict[int, float], count: int, order: list[int] | None = None) 
     values: dict[str, tuple[float, ...]] = {}
     for stop in range(1, count + 1):
         part = dataset.subset(range(stop))
-        fitter = QuickFitter(experiment.of_records(part), dict(experiment.system.measurements), part)
-        fitter.begin_from(values)
+        fitter = QuickFitter(experiment.of_records(part), dict(experiment.system.measurements), part, values)
         groups = ["/".join(each) for each in zip(part.extra["position"], part.extra["socket"], strict=True)]
         found = AgreementJudge(fitter, groups).with_newest(doubtful)
         doubtful, values = frozenset(found.doubtful), dict(found.values)
