@@ -1,7 +1,5 @@
 """Images as they come: from a camera of OpenCV, or one by one into a folder."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

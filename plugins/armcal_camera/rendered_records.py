@@ -1,7 +1,5 @@
 """Images of what a camera sees in simulated records: its boards, scaled and placed as the truth has them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol
 

@@ -1,7 +1,5 @@
 """A camera that looks at an arm, or from it, while the arm stands."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol

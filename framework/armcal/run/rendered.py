@@ -1,7 +1,5 @@
 """Images of simulated records, in place of the corners that an instrument would read in them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

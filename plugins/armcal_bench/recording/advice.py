@@ -1,9 +1,8 @@
 """How well an instrument's own parameters are known by the postures so far, and which posture to take next."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 from armcal.base.dataset import Dataset
@@ -35,7 +34,7 @@ class Advice:
     commands: Mapping[str, float] = field(default_factory=dict)
     shrink: float = 1.0
 
-    def fell_by(self, before: Advice) -> float | None:
+    def fell_by(self, before: Self) -> float | None:
         """The share by which the instruments' standard deviations fell; None while nothing can be compared."""
         ratios = [sd / before.deviations[name] for name, sd in self.deviations.items() if name in before.deviations]
         return 1 - float(np.median(ratios)) if ratios else None
