@@ -27,7 +27,7 @@ from armcal_camera.intrinsics import IntrinsicsOrFile, Lens, Pixels
 from armcal_camera.lens import DISTORTION, projected
 from armcal_camera.rendered_records import rendered_records
 
-_PIXELS_SCALE, _DISTORTION_SCALE, _SCALE_SCALE = 0.01, 0.05, 0.01
+_PIXELS_SCALE, _DISTORTION_SCALE, _SCALE_SCALE, _BEND_SCALE_M = 0.01, 0.05, 0.01, 1e-3
 _NEAREST_M, _LEAST_FACING, _FEWEST_POINTS = 0.02, 0.3, 4
 _NORMAL_95 = 1.96
 _POSITIVE = Interval(1e-6, np.inf)
@@ -90,13 +90,22 @@ def carrying_frames(mounting: str, frame: str, board_frame: str | None) -> tuple
     return carrying[0], board_frame or carrying[1]
 
 
+def bent(board: Board, place: Any, heights: Sequence[Any]) -> Any:
+    """Where a place on a board is (3x1, m) if its middle stands above its edges: a parabola along x, one along y."""
+    low, high = board.points.min(axis=0), board.points.max(axis=0)
+    middle, half = (low + high) / 2, (high - low) / 2
+    risen = [h * (1 - ((place[i] - middle[i]) / half[i]) ** 2) for i, h in enumerate(heights)]
+    return place + ca.vertcat(0, 0, sum(risen))
+
+
 class Camera(PointInstrument):
     """The measurement ``camera``: channels u_K and v_K (px) of each point K of its boards, counted over all of them.
 
     Parameters: ``camera_*`` (tool_T_camera, or base_T_camera of one that stands beside the arm), ``board_*``
     (base_T_board, or tool_T_board; ``board1_*``, ``board2_*`` where there are several; the settings ``frame`` and
-    ``board_frame`` name other frames), ``board_scale`` (printed size over stated size), ``fx``, ``fy``, ``cx``, ``cy``
-    and the distortion coefficients.
+    ``board_frame`` name other frames), ``board_scale`` (printed size over stated size), ``board_bend_x`` and
+    ``_y`` (how far the middle of a bent board is above its edges, towards z, along x and y; m), ``fx``, ``fy``, ``cx``,
+    ``cy`` and the distortion coefficients.
     """
 
     Settings = CameraSettings
@@ -127,8 +136,8 @@ class Camera(PointInstrument):
 
     @property
     def borrowed(self) -> Sequence[str]:
-        """The poses of boards, and their scale."""
-        parts = ("x", "y", "z", "rotation")
+        """The poses of boards, how they are bent, and their scale."""
+        parts = ("x", "y", "z", "rotation", "bend_x", "bend_y")
         return (*(f"{name}_{part}" for name in self.board_names for part in parts), "board_scale")
 
     def check_lender(self, lender: object) -> None:
@@ -192,7 +201,9 @@ class Camera(PointInstrument):
         own, s = [*self.settings.pose.blocks("camera")], self.settings
         poses = s.board_poses or (PoseSettings(),) * len(self.boards)
         if self.lender is None:
-            own += [block for name, pose in zip(self.board_names, poses, strict=True) for block in pose.blocks(name)]
+            for name, pose in zip(self.board_names, poses, strict=True):
+                bends = (scalar(f"{name}_bend_{axis}", "m", 0.0, _BEND_SCALE_M) for axis in "xy")
+                own += [*pose.blocks(name), *bends]
             own.append(scalar("board_scale", "1", 1.0, _SCALE_SCALE, _POSITIVE))
         given = s.intrinsics
         for name, guess in (("fx", 1.0), ("fy", 1.0), ("cx", 0.5), ("cy", 0.5)):
@@ -221,9 +232,13 @@ class Camera(PointInstrument):
 
     def _in_camera(self, arms: Mapping[str, ArmState], values: Mapping[str, Any], point: Any) -> tuple[Any, Any]:
         """A point of a board (3x1, m) and the board's normal (3x1) in the camera's frame."""
-        place, camera = point[:3] * values["board_scale"], pose_transform("camera", values)
-        poses = [pose_transform(name, values) for name in self.board_names]
-        there, normals = [pose.apply(place) for pose in poses], [pose.rotation[:, 2] for pose in poses]
+        camera, poses = pose_transform("camera", values), [pose_transform(name, values) for name in self.board_names]
+        scale, bents = values["board_scale"], zip(self.boards, self.board_names, strict=True)
+        places = [
+            scale * bent(board, point[:3], [values[f"{name}_bend_{axis}"] for axis in "xy"]) for board, name in bents
+        ]
+        there = [pose.apply(place) for pose, place in zip(poses, places, strict=True)]
+        normals = [pose.rotation[:, 2] for pose in poses]
         if len(poses) > 1:  # the point says which board is its own
             there, normals = ([sum(point[3 + i] * x for i, x in enumerate(parts))] for parts in (there, normals))
         arm = arms[self.arms[0]]

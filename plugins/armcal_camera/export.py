@@ -181,7 +181,8 @@ def _frames(camera: Instrument) -> tuple[str, str]:
 def _poses(camera: Instrument) -> dict[str, Array]:
     """The camera's pose and each board's, by what they map from and to."""
     frames = _frames(camera)
-    boards = [name.removesuffix("_x") for name in camera.numbers if name.startswith("board") and name.endswith("_x")]
+    turned = (name.removesuffix("_rotation[w]") for name in camera.numbers if name.endswith("_rotation[w]"))
+    boards = [name for name in turned if name.startswith("board")]
     poses = {f"{frames[0]}_T_camera": _pose("camera", camera.numbers)}
     return {**poses, **{f"{frames[1]}_T_{board}": _pose(board, camera.numbers) for board in boards}}
 
