@@ -1,4 +1,4 @@
-"""A board that is not flat: by how much it bends comes out of the fit, and is named where the configuration lacks it."""
+"""A board that is not flat: its bend comes out of the fit, and is named where the configuration lacks it."""
 
 from __future__ import annotations
 
