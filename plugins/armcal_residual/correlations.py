@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import casadi as ca
 import numpy as np
+from armcal.arm.pose_residual import SURROUNDINGS
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
 from pydantic import Field
@@ -15,29 +16,41 @@ from scipy.linalg import solve_triangular
 
 from armcal_residual.linear import Numbers, PartSettings, Positive
 
-Kind = Literal["angle", "length", "approach"]
+Kind = Literal["angle", "length", "approach", "payload", "temperature"]
 _JITTER = 1e-8
 
 
 class Input(Settings):
-    """A number that a process depends on: of which ``joint`` (from 1), and its length ``scale``."""
+    """A number that a process depends on: of which ``joint`` (from 1; 0: of none), and its length ``scale``."""
 
     of: Kind
-    joint: Annotated[int, Field(ge=1)]
+    joint: Annotated[int, Field(ge=0)]
     scale: Positive
+
+    def number(self, commands: Any, approaches: Any, surroundings: Mapping[str, Any]) -> Any:
+        """From commands and approaches (joints x N each) and those of the surroundings that are known; else None."""
+        if self.of in SURROUNDINGS:
+            return surroundings.get(self.of)
+        return (approaches if self.of == "approach" else commands)[self.joint - 1]
 
 
 class TermSettings(Settings):
-    """Features of a process: what they depend on, and its poses (M x inputs)."""
+    """Features of a process: what they depend on, its poses (M x inputs), and its ``share`` of the whole variance."""
 
     inputs: tuple[Input, ...]
     poses: Numbers
+    share: Positive = 1.0
 
 
 class ProcessSettings(PartSettings):
-    """A process of one term, or the sum of several."""
+    """A process of one term, or the sum of several.
+
+    ``between`` is the mean share of its variance that features left to the records that taught it, which stood between
+    its poses. These showed it, so that it is in the noise.
+    """
 
     terms: Annotated[tuple[TermSettings, ...], Field(min_length=1)]
+    between: Annotated[float, Field(ge=0, le=1)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -63,11 +76,16 @@ class Correlations:
                 constant -= weight * (pose - centre) ** 2 / 2
         return cls(tuple(inputs), middle, np.column_stack(columns), constant)
 
-    def __call__(self, commands: Any, approaches: Any) -> Any:
-        """Of expressions (M x 1), or of arrays (M x N)."""
-        symbolic, rows = isinstance(commands, ca.SX), []
-        for own, centre in zip(self.inputs, self.middle, strict=True):
-            number = (approaches if own.of == "approach" else commands)[own.joint - 1]
+    def __call__(self, commands: Any, approaches: Any, surroundings: Mapping[str, Any]) -> Any:
+        """Of expressions (M x 1), or of arrays (M x N). What is not known of the surroundings is in the middle."""
+        numbers = [own.number(commands, approaches, surroundings) for own in self.inputs]
+        middle = (centre + 0 * commands[0] for centre in self.middle)
+        return self.at([own if number is None else number for number, own in zip(numbers, middle, strict=True)])
+
+    def at(self, numbers: Sequence[Any]) -> Any:
+        """Of what the inputs are, expressions (M x 1), or arrays (M x N)."""
+        symbolic, rows = isinstance(numbers[0], ca.SX), []
+        for own, centre, number in zip(self.inputs, self.middle, numbers, strict=True):
             if own.of == "angle":
                 rows += [ca.cos(number), ca.sin(number)] if symbolic else [np.cos(number), np.sin(number)]
             else:
@@ -81,3 +99,8 @@ def roots_of(correlations: Array) -> Array:
     """R with R R' the inverse of correlations between poses (M x M): features times R have independent weights."""
     lower = np.linalg.cholesky(correlations + _JITTER * np.eye(len(correlations)))
     return np.asarray(solve_triangular(lower, np.eye(len(lower)), lower=True).T)
+
+
+def share_between(features: Array) -> float:
+    """Mean share of a process's variance that independent features (N x M) leave."""
+    return float(np.clip(1 - np.mean(np.sum(features**2, axis=1)), 0.0, 1.0))

@@ -47,7 +47,7 @@ class Fourier(LinearResidual):
         self.check()
 
     @override
-    def features(self, part: Any, commands: Any, approaches: Any) -> Any:
+    def features(self, part: Any, commands: Any, approaches: Any, surroundings: Mapping[str, Any]) -> Any:
         return _harmonics(commands[part.joint - 1], part.orders)
 
     @override

@@ -13,7 +13,7 @@ from armcal.arm.pose_residual import OF_TOOL, ModelErrors
 from armcal.base.domains import Array
 from scipy.linalg import block_diag
 
-from armcal_residual.correlations import Correlations, Input, ProcessSettings, TermSettings, roots_of
+from armcal_residual.correlations import Correlations, Input, ProcessSettings, TermSettings, roots_of, share_between
 from armcal_residual.linear import Products, Regression, packed, regressed, seen, taken_root
 
 _JOINT_LENGTHS = (1.0, 0.5, 0.25, 0.12, 0.06)
@@ -28,7 +28,8 @@ _Places = tuple[int, ...]
 class _JointProcess:
     """A process of one joint (from 0) over its angle, as features of the rows of the residuals.
 
-    ``beside`` are the rows without what the model's parameters take up.
+    ``beside`` are the rows without what the model's parameters take up; ``between`` is the mean share of the variance
+    that features leave.
     """
 
     joint: int
@@ -37,6 +38,7 @@ class _JointProcess:
     roots: Array
     rows: Array
     beside: Array
+    between: float
 
     @classmethod
     def over(cls, errors: ModelErrors, joint: int, length: float) -> _JointProcess:
@@ -47,18 +49,15 @@ class _JointProcess:
         poses = low + step * (0.5 + np.arange(count))
         inputs = (Input(of="angle", joint=joint + 1, scale=length),)
         correlations = Correlations.of(inputs, poses[None])
-        own = np.zeros((len(errors.dimensions), count))
-        own[joint] = poses
-        roots = roots_of(correlations(own, own))
-        features = correlations(errors.postures.commands, errors.postures.approaches).T @ roots
+        roots = roots_of(correlations.at([poses]))
+        features = correlations.at([command]).T @ roots
         slopes = errors.slopes[:, :, len(OF_TOOL) + joint]
         rows = -(slopes[:, :, None] * features[:, None, :]).reshape(-1, count)
-        return cls(joint, inputs, poses, roots, rows, errors.apart(rows))
+        return cls(joint, inputs, poses, roots, rows, errors.apart(rows), share_between(features))
 
-    @property
-    def term(self) -> TermSettings:
+    def term(self, share: float) -> TermSettings:
         """As settings hold it."""
-        return TermSettings(inputs=self.inputs, poses=packed(self.poses))
+        return TermSettings(inputs=self.inputs, poses=packed(self.poses), share=share)
 
 
 def of_joints(errors: ModelErrors, before: Sequence[ProcessSettings] = ()) -> tuple[list[ProcessSettings], Array]:
@@ -88,7 +87,8 @@ def _part(terms: Sequence[_JointProcess], regression: Regression, blocks: Sequen
     """The sum of a joint's processes as learned: what is known of it is more than what is known of each."""
     variances = regression.variances[list(blocks)]
     scale = float(np.sqrt(variances.sum()))
-    roots = block_diag(*(term.roots * np.sqrt(own) / scale for term, own in zip(terms, variances, strict=True)))
+    shares = [float(own / variances.sum()) for own in variances]
+    roots = block_diag(*(term.roots * np.sqrt(share) for term, share in zip(terms, shares, strict=True)))
     return ProcessSettings(
         first=len(OF_TOOL) + terms[0].joint,
         scales=(scale,),
@@ -96,7 +96,8 @@ def _part(terms: Sequence[_JointProcess], regression: Regression, blocks: Sequen
             np.concatenate([own.roots @ regression.weights[i] for own, i in zip(terms, blocks, strict=True)])
         ),
         root=packed(taken_root(roots, regression.left_of(blocks))),
-        terms=tuple(own.term for own in terms),
+        terms=tuple(own.term(share) for own, share in zip(terms, shares, strict=True)),
+        between=sum(share * own.between for own, share in zip(terms, shares, strict=True)),
     )
 
 

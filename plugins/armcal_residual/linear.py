@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import itertools
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -52,7 +52,7 @@ class LinearResidual(PoseResidual):
     """A pose residual of features with weights."""
 
     @abstractmethod
-    def features(self, part: Any, commands: Any, approaches: Any) -> Any:
+    def features(self, part: Any, commands: Any, approaches: Any, surroundings: Mapping[str, Any]) -> Any:
         """Of a part: expressions (M x 1) of expressions, or an array (M x N) of arrays."""
 
     @abstractmethod
@@ -80,15 +80,17 @@ class LinearResidual(PoseResidual):
         for part in self.parts:
             if part.first + len(part.scales) > size:
                 raise ValueError(f"found a correction of place {part.first}: it was learned on an arm with more joints")
-            features = len(self.features(part, zeros, zeros))
+            features = len(self.features(part, zeros, zeros, {}))
             unpacked(part.weights, features, len(part.scales))
             unpacked(part.root, features, None)
 
     @override
-    def correction(self, commands: Expression, approaches: Expression) -> Expression:
+    def correction(
+        self, commands: Expression, approaches: Expression, surroundings: Mapping[str, Expression]
+    ) -> Expression:
         rows = [ca.SX(0)] * (len(OF_TOOL) + len(self.joint_names))
         for part in self.parts:
-            features = self.features(part, commands, approaches)
+            features = self.features(part, commands, approaches, surroundings)
             weights = unpacked(part.weights, features.numel(), len(part.scales))
             for i, moved in enumerate(ca.vertsplit(ca.mtimes(ca.DM(weights.T), features))):
                 rows[part.first + i] += moved
@@ -117,7 +119,7 @@ class LinearResidual(PoseResidual):
             own = postures.subset(here)
             for part in self.parts:
                 rows = slice(part.first, part.first + len(part.scales))
-                total[rows, here] += of_part(part, self.features(part, own.commands, own.approaches))
+                total[rows, here] += of_part(part, self.features(part, own.commands, own.approaches, own.surroundings))
         return total
 
 

@@ -9,11 +9,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from armcal.arm.pose_residual import ModelErrors
+from armcal.arm.pose_residual import SURROUNDINGS, ModelErrors
 from armcal.base.domains import Array
 from scipy.optimize import minimize
 
-from armcal_residual.correlations import Correlations, Input, Kind, ProcessSettings, TermSettings, roots_of
+from armcal_residual.correlations import (
+    Correlations,
+    Input,
+    Kind,
+    ProcessSettings,
+    TermSettings,
+    roots_of,
+    share_between,
+)
 from armcal_residual.linear import inverted, packed, taken_root
 
 _FEWEST = 12
@@ -39,24 +47,32 @@ def of_tool(
 
     Length scales are looked for near those of processes that were learned ``before``, if some were.
     """
-    inputs, tool = _inputs(errors), errors.of_tool
-    if not tool or len(left) < _FEWEST * len(inputs):
-        return []
-    own = -np.einsum("ncr,nr->nc", np.linalg.pinv(errors.slopes[:, :, :tool]), left)
-    known = {part.first: part.terms[0].inputs for part in before}
-    processes = [_process(errors, own[:, i : i + 3], inputs, most, i, known.get(i, ())) for i in range(0, tool, 3)]
-    return [part for part in processes if part is not None]
+    pose, around, tool = *_inputs(errors), errors.of_tool
+    known = {(part.first, len(part.terms[0].inputs)): part.terms[0].inputs for part in before}
+    processes = []
+    if tool:
+        own = -np.einsum("ncr,nr->nc", np.linalg.pinv(errors.slopes[:, :, :tool]), left)
+    # What load and temperature change is beside what they do not, which holds where they are others.
+    for inputs in (pose, pose + around) if around else (pose,):
+        if not tool or len(left) < _FEWEST * len(inputs):
+            break
+        for i in range(0, tool, 3):
+            process, taught = _process(errors, own[:, i : i + 3], inputs, most, i, known.get((i, len(inputs)), ()))
+            own[:, i : i + 3] -= taught
+            processes += [] if process is None else [process]
+    return processes
 
 
-def _inputs(errors: ModelErrors) -> list[tuple[Kind, int]]:
-    """Joints that moved, and approaches that differ."""
+def _inputs(errors: ModelErrors) -> tuple[list[tuple[Kind, int]], list[tuple[Kind, int]]]:
+    """Joints that moved, and approaches that differ; and what differs around them."""
     postures, joints = errors.postures, range(len(errors.dimensions))
     moved: list[tuple[Kind, int]] = [
         ("angle" if errors.dimensions[i] == "angle" else "length", i)
         for i in joints
         if np.ptp(postures.commands[i]) > 0
     ]
-    return moved + [("approach", i) for i in joints if np.ptp(postures.approaches[i]) > 0]
+    moved += [("approach", i) for i in joints if np.ptp(postures.approaches[i]) > 0]
+    return moved, [(kind, -1) for kind in SURROUNDINGS if np.ptp(postures.surroundings.get(kind, 0)) > 0]
 
 
 def _squares(numbers: Array, inputs: Sequence[tuple[Kind, int]], to: Array | None = None) -> Array:
@@ -74,10 +90,11 @@ def _process(
     most: int,
     first: int,
     before: Sequence[Input],
-) -> ProcessSettings | None:
-    """Of three corrections of the tool (N x 3)."""
+) -> tuple[ProcessSettings | None, Array]:
+    """Of three corrections of the tool (N x 3), and what it says of them."""
     postures = errors.postures
-    raw = np.array([(postures.approaches if kind == "approach" else postures.commands)[i] for kind, i in inputs])
+    recorded = (postures.commands, postures.approaches, postures.surroundings)
+    raw = np.array([Input(of=kind, joint=i + 1, scale=1).number(*recorded) for kind, i in inputs])
     spans = np.array([1.0 if kind == "angle" else np.ptp(row) for row, (kind, _) in zip(raw, inputs, strict=True)])
     numbers, order = raw / spans[:, None], np.random.default_rng(0).permutation(len(own))
     if [(known.of, known.joint - 1) for known in before] == list(inputs):
@@ -91,24 +108,27 @@ def _process(
     best = _likeliest(likelihood, min(candidates, key=likelihood.cost))
     nothing = len(some) / 2 * float(np.sum(np.log(np.mean(own[some] ** 2, axis=0))))
     if nothing - likelihood.cost(best) < _GAIN * len(best):
-        return None
+        return None, np.zeros_like(own)
     lengths, noise = np.exp(best[:-1]), float(np.exp(best[-1]))
     kept = _poses(numbers, inputs, lengths, most, noise)
     listed = [
         Input(of=kind, joint=i + 1, scale=float(length * span))
         for (kind, i), length, span in zip(inputs, lengths, spans, strict=True)
     ]
-    features = Correlations.of(listed, raw[:, kept])(postures.commands, postures.approaches)
+    features = Correlations.of(listed, raw[:, kept]).at(raw)
     roots = roots_of(features[:, kept])
     independent = features.T @ roots
     left = np.linalg.inv(independent.T @ independent / noise**2 + np.eye(len(kept)))
-    return ProcessSettings(
+    weights = left @ (independent.T @ own / noise**2)
+    part = ProcessSettings(
         first=first,
         scales=tuple(likelihood.scales(best).tolist()),
-        weights=packed(roots @ (left @ (independent.T @ own / noise**2))),
+        weights=packed(roots @ weights),
         root=packed(taken_root(roots, left)),
         terms=(TermSettings(inputs=tuple(listed), poses=packed(raw[:, kept].T)),),
+        between=share_between(independent),
     )
+    return part, independent @ weights
 
 
 @dataclass(frozen=True)

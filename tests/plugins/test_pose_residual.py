@@ -196,6 +196,67 @@ def test_what_a_drift_could_explain_is_learned_all_the_same(tmp_path):
     assert metrics["pose_residual"]["kept"] and folds["with_mm"] < 0.5 * folds["without_mm"]
 
 
+@cache
+def expanding_run():
+    """An arm that is longer where it is warmer, of which its model knows nothing."""
+    import tempfile
+    from pathlib import Path
+
+    folder = Path(tempfile.mkdtemp())
+    head, *rows = recorded(folder, "", 300).read_text().splitlines()
+    warmth = np.random.default_rng(1).uniform(15, 30, len(rows))
+    lines = []
+    for row, celsius in zip(rows, warmth, strict=True):
+        *rest, x, y, z = row.split(",")
+        longer = [repr(float(own) * (1 + 2e-4 * (float(celsius) - 20))) for own in (x, y, z)]
+        lines.append(",".join([*rest, *longer, repr(float(celsius))]))
+    (folder / "data.csv").write_text("\n".join([head + ",temperature_C", *lines]) + "\n")
+    ran(folder, "{type: gaussian_process}", folder / "data.csv")
+    return SimpleNamespace(folder=folder, calibration=Calibration.load(folder / "run/calibration.yaml"))
+
+
+def test_errors_that_depend_on_the_temperature_are_learned_where_it_was_recorded():
+    run = expanding_run()
+    folds = json.loads((run.folder / "run/metrics.json").read_text())["pose_residual"]["folds"]
+    assert folds["without_mm"] > 0.25 and folds["with_mm"] < 1.3 * 0.05 * np.sqrt(8 / np.pi)
+    (part,) = [own for own in run.calibration.system.arms["arm"].residual.settings.learned if own.first == 0][-1:]
+    assert [own.of for own in part.terms[0].inputs][-1] == "temperature"
+
+
+def test_a_prediction_that_lacks_the_temperature_is_less_sure():
+    calibration = expanding_run().calibration
+    at = {f"arm.q{i}": np.full(2, 0.3) for i in (1, 2, 3)}
+    warm = Dataset(("a", "b"), {**at, "temperature": np.array([16.0, 29.0])})
+    read = calibration.predict(warm)[0]
+    moved = 1000 * np.linalg.norm([np.diff(read[f"tracker.{axis}"]) for axis in "xyz"])
+    length = 1000 * np.linalg.norm([read[f"tracker.{axis}"][0] for axis in "xyz"])
+    assert moved == pytest.approx(13 * 2e-4 * length, rel=0.15)
+    told, untold = (
+        max(calibration.plus_minus(own).half_widths[f"tracker.{axis}"].max() for axis in "xyz")
+        for own in (warm, Dataset(("a", "b"), at))
+    )
+    assert untold > 2 * told
+
+
+def test_compensation_and_c_code_take_the_temperature(tmp_path):
+    calibration, angles = expanding_run().calibration, np.random.default_rng(0).uniform(-1, 1, (6, 3))
+    celsius = np.linspace(16, 29, 6)
+    at = {f"arm.q{i + 1}": row for i, row in enumerate(angles.T)}
+    tools = calibration.predict(Dataset(tuple("abcdef"), {**at, "temperature": celsius}))[1][0]
+    found = calibration.compensate(tools[:, :3, 3], start=angles + 0.1, conditions={"temperature": celsius})
+    back = {f"arm.q{i + 1}": row for i, row in enumerate(found.joint_angles.T)}
+    back |= {f"arm.approach.q{i + 1}": row for i, row in enumerate(found.approach.T)}
+    reached = calibration.predict(Dataset(tuple("abcdef"), {**back, "temperature": celsius}))[1][0]
+    np.testing.assert_allclose(reached[:, :3, 3], tools[:, :3, 3], atol=1e-9)
+    if find_compiler() is not None:
+        arm = CompiledArm(request_of(calibration, None, "arm.c"), tmp_path, conditions=("temperature",))
+        record = arm.defaults()
+        record[:3], record[-1] = angles[5], celsius[5]
+        status, pose, _ = arm.forward(record)
+        assert status == 0
+        np.testing.assert_allclose(pose, tools[5, :3], atol=1e-12)
+
+
 def test_a_recalibration_holds_what_was_learned(tmp_path):
     run = learned_run("fourier")
     (tmp_path / "calibration.yaml").write_text((run.folder / "run/calibration.yaml").read_text())

@@ -208,7 +208,8 @@ class Arm:
     def _correction(self, inputs: ArmInputs) -> Expression | None:
         if self.residual is None or not self.residual.is_learned:
             return inputs.correction
-        learned = self.residual.correction(inputs.joint_angles, inputs.approach)
+        around = {"payload": inputs.load.payload_mass, **inputs.conditions}
+        learned = self.residual.correction(inputs.joint_angles, inputs.approach, around)
         return learned if inputs.correction is None else learned + inputs.correction
 
     @property
@@ -218,11 +219,13 @@ class Arm:
 
     @property
     def declared(self) -> tuple[tuple[str, Condition], ...]:
-        """The columns that its effects read of the surroundings, each with the name of the effect."""
+        """The columns that effects and pose residual read of the surroundings, each with the name of what reads it."""
+        read = [(name, effect.conditions) for name, effect in self.effects.items()]
+        read += [] if self.residual is None else [("residual", self.residual.conditions)]
         return tuple(
             (name, condition if isinstance(condition, Condition) else Condition(condition))
-            for name, effect in self.effects.items()
-            for condition in effect.conditions
+            for name, conditions in read
+            for condition in conditions
         )
 
     def _shaped(self, values: Mapping[str, Expression], inputs: ArmInputs) -> Chain:

@@ -7,9 +7,8 @@ stands at R Exp(turn), p + shift, where R and p are what the model says of it th
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -21,24 +20,33 @@ from armcal.base.settings import Settings
 
 OF_TOOL = ("shift_x", "shift_y", "shift_z", "turn_x", "turn_y", "turn_z")
 """Corrections of a tool: shifts (m) in the arm's base frame, a rotation vector (rad) in the tool's."""
+CORRECTION = "correction."
+"""Of channels of records that carry corrections: ``ARM.correction.shift_x`` and so on; see ``corrections.py``."""
+SURROUNDINGS = ("payload", "temperature")
+"""What errors may depend on beside commands and approaches, where it was recorded (kg, deg C)."""
 _Settings = Settings
 
 
 def correction_names(joint_names: Sequence[str]) -> tuple[str, ...]:
-    """Of the tool, and of each joint (rad or m), in this order."""
-    return (*OF_TOOL, *(f"joint_{name}" for name in joint_names))
+    """Of the tool, and of each joint (rad or m), in this order, as records carry them after the arm's name."""
+    return tuple(CORRECTION + name for name in (*OF_TOOL, *(f"joint_{joint}" for joint in joint_names)))
 
 
 @dataclass(frozen=True)
 class Postures:
-    """Where an arm was commanded to go: commands (rad or m) and directions of approach (-1, 0, 1), joints x N each."""
+    """Where an arm was commanded to go: commands (rad or m) and directions of approach (-1, 0, 1), joints x N each.
+
+    ``surroundings`` are those of ``SURROUNDINGS`` that are known (N each).
+    """
 
     commands: Array
     approaches: Array
+    surroundings: Mapping[str, Array] = field(default_factory=dict)
 
     def subset(self, chosen: Any) -> Postures:
         """Some of them."""
-        return Postures(self.commands[:, chosen], self.approaches[:, chosen])
+        around = {name: column[chosen] for name, column in self.surroundings.items()}
+        return Postures(self.commands[:, chosen], self.approaches[:, chosen], around)
 
 
 @dataclass(frozen=True)
@@ -73,8 +81,10 @@ class PoseResidual(ABC):
         Settings: the class of its checked settings, which hold what was learned.
         settings: its own, checked.
         joint_names: of the arm, from the base to the tip.
+        conditions: columns of the surroundings that what it has learned depends on, beside the load.
     """
 
+    conditions: Sequence[str] = ()
     Settings: ClassVar[type[_Settings]] = Settings
 
     def __init__(self, settings: Any, joint_names: Sequence[str]) -> None:
@@ -91,12 +101,15 @@ class PoseResidual(ABC):
         """The same with what records say; None where they are too few. What it has learned before is a mere start."""
 
     @abstractmethod
-    def correction(self, commands: Expression, approaches: Expression) -> Expression:
+    def correction(
+        self, commands: Expression, approaches: Expression, surroundings: Mapping[str, Expression]
+    ) -> Expression:
         """Corrections (6 + joints x 1).
 
         Args:
             commands: of all joints (joints x 1; rad or m).
             approaches: directions of approach (joints x 1; -1, 0, 1).
+            surroundings: those of ``SURROUNDINGS`` that are known (1 x 1 each).
         """
 
     @abstractmethod
@@ -105,13 +118,12 @@ class PoseResidual(ABC):
 
     def corrections(self, postures: Postures) -> Array:
         """Corrections (6 + joints x N)."""
-        return np.asarray(self._many(postures.commands, postures.approaches).full())
-
-    @cached_property
-    def _many(self) -> ca.Function:
-        commands, approaches = (ca.SX.sym(name, len(self.joint_names)) for name in ("commands", "approaches"))
-        correction = ca.densify(self.correction(commands, approaches))
-        return ca.Function("correction", [commands, approaches], [correction], {"cse": True})
+        around = postures.surroundings
+        parts = (ca.SX.sym("commands", len(self.joint_names)), ca.SX.sym("approaches", len(self.joint_names)))
+        known = {name: ca.SX.sym(name) for name in around}
+        correction = ca.densify(self.correction(*parts, known))
+        many = ca.Function("correction", [*parts, *known.values()], [correction], {"cse": True})
+        return np.asarray(many(postures.commands, postures.approaches, *(row[None] for row in around.values())).full())
 
     def __reduce__(self) -> Any:
         return type(self), (self.settings, self.joint_names)

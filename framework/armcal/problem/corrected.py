@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armcal.arm.assembly import Arm
-from armcal.arm.pose_residual import OF_TOOL, PoseResidual
+from armcal.arm.pose_residual import OF_TOOL, PoseResidual, Postures
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.problem.corrections import correction_channels, postures_of
@@ -68,7 +68,10 @@ def _arms_of(problem: Problem, measurement: str) -> Sequence[str]:
 
 
 def unexplained(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], learned: Mapping[str, PoseResidual] | None = None
+    problem: Problem,
+    values: Array,
+    records: Sequence[FactorRecords],
+    learned: Mapping[str, tuple[PoseResidual, Postures]] | None = None,
 ) -> list[Array]:
     """Covariance of residuals by what learned pose residuals do not know (N x n_r x n_r a factor; SI).
 
@@ -78,13 +81,14 @@ def unexplained(
     count = records[0].count
     total = [np.zeros((count, kernel.factor.rows, kernel.factor.rows)) for kernel in problem.kernels]
     for arm in problem.blueprint.arms.values():
-        residual = (learned or {}).get(arm.name, arm.residual)
+        residual, postures = (learned or {}).get(arm.name, (arm.residual, None))
         if residual is None or not residual.is_learned:
             continue
         slopes = problem.channel_slopes(values, records, correction_channels(arm))
         for i, (kernel, own, slope) in enumerate(zip(problem.kernels, records, slopes, strict=True)):
             known = dict(zip(kernel.factor.channels, own.record[:, : own.count], strict=True))
-            here = postures_of(arm, Dataset(("",) * own.count, known))
+            whole = Dataset(("",) * own.count, known)
+            here = postures_of(arm, whole, problem.blueprint.environment) if postures is None else postures
             spread = slope * residual.deviations(here)
             total[i] += np.einsum("rcn,scn->nrs", spread, spread)
     return total

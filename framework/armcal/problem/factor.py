@@ -22,7 +22,7 @@ from typing_extensions import override
 from armcal.arm.assembly import Arm, ArmInputs, ArmState, scoped
 from armcal.arm.environment import STATICS, Environment, Vector3, tilted
 from armcal.arm.evaluator import ElasticPass
-from armcal.arm.pose_residual import correction_names
+from armcal.arm.pose_residual import SURROUNDINGS, correction_names
 from armcal.arm.statics import Load
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, Parameters
@@ -39,9 +39,7 @@ from armcal.measure.measurement import (
 from armcal.measure.partners import OTHER
 from armcal.measure.points import LimitedView, PointMeasurement
 
-CORRECTION = "correction."
 _POINT = "point."
-"""Channels ``ARM.correction.shift_x`` and so on, of arms with a pose residual: see ``corrections.py``."""
 
 
 @dataclass(frozen=True)
@@ -182,6 +180,7 @@ class _Records:
     def __init__(self, available: frozenset[str]) -> None:
         self._available = available
         self.symbols: dict[str, Expression] = {}
+        self.kept: set[str] = set()  # what pose residuals read
 
     def has(self, channel: str) -> bool:
         return channel in self._available
@@ -193,8 +192,8 @@ class _Records:
         return self.number(channel) if channel in self._available else ca.SX(default)
 
     def used_by(self, expression: Expression) -> dict[str, Expression]:
-        """The symbols that an expression depends on."""
-        return {name: symbol for name, symbol in self.symbols.items() if ca.depends_on(expression, symbol)}
+        """The symbols that an expression depends on, or a pose residual."""
+        return {n: own for n, own in self.symbols.items() if n in self.kept or ca.depends_on(expression, own)}
 
     def vector(self, channel: str, defaults: Vector3) -> Expression:
         """Three channels ``channel_x`` to ``channel_z``."""
@@ -389,11 +388,13 @@ def _arm_states(
         which = name.removeprefix(arm.name)
         deflections.append(ca.SX.sym(f"deflection_{name}", arm.deflection_size))
         commands = [records.number(f"{arm.name}.{joint}{which}") for joint in arm.commanded]
-        approaches = [records.optional(f"{arm.name}.approach.{joint}{which}", 0.0) for joint in arm.commanded]
-        angles, approach = ca.vertcat(*arm.joint_commands(commands)), ca.vertcat(*arm.joint_approaches(approaches))
-        conditions = {channel: records.number(channel) for channel in arm.conditions if channel in available}
-        corrections = [f"{arm.name}.{CORRECTION}{own}{which}" for own in correction_names(arm.joint_names)]
-        correction = None if arm.residual is None else ca.vertcat(*map(records.number, corrections))
+        sides = [records.optional(f"{arm.name}.approach.{joint}{which}", 0.0) for joint in arm.commanded]
+        angles, approach = ca.vertcat(*arm.joint_commands(commands)), ca.vertcat(*arm.joint_approaches(sides))
+        conditions, correction = {c: records.number(c) for c in arm.conditions if c in available}, None
+        if arm.residual is not None:
+            names = correction_names(arm.joint_names)
+            correction = ca.vertcat(*[records.number(f"{arm.name}.{own}{which}") for own in names])
+            records.kept |= {c for c in records.symbols if ".approach." in c or c in SURROUNDINGS}
         inputs = ArmInputs(angles, approach, load, deflections[-1], conditions, correction)
         states[name] = replace(arm, residual=None).state(values, inputs)  # records carry what it has learned
     return records, states, deflections

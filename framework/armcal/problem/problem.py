@@ -113,7 +113,7 @@ class Problem:
     def records(self, dataset: Dataset, weights: Array | None = None) -> tuple[FactorRecords, ...]:
         """A dataset as the kernels read it; ``weights`` (N) multiply each record's squared residual."""
         plan = self.blueprint
-        dataset = with_partners(with_corrections(dataset, plan.arms), plan.measurements)
+        dataset = with_partners(with_corrections(dataset, plan.arms, plan.environment), plan.measurements)
         factors = [kernel.factor for kernel in self.kernels]
         numbers = [group_numbers(dataset, name, m, plan.groups) for name, m in plan.measurements.items()]
         masks = [factor_records.applicable(f, dataset, n) for f, n in zip(factors, numbers, strict=True)]

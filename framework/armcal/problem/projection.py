@@ -11,8 +11,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from armcal.arm.pose_residual import CORRECTION
 from armcal.base.domains import Array
-from armcal.problem.factor import CORRECTION, Factor
+from armcal.problem.factor import Factor
 from armcal.problem.grouped_kernel import GroupedKernel
 from armcal.problem.problem import FactorRecords, Problem
 

@@ -209,7 +209,9 @@ def layer_of(system: System, dataset: Dataset) -> Layer | None:
         ConfigError: see ``unlearned``.
     """
     arm = unlearned(system)
-    return None if arm is None or arm.residual is None else Layer(arm.name, arm.residual, postures_of(arm, dataset))
+    if arm is None or arm.residual is None:
+        return None
+    return Layer(arm.name, arm.residual, postures_of(arm, dataset, system.environment))
 
 
 def learned_residual(
@@ -283,7 +285,7 @@ def judged_with(task: FitTask, layer: Layer) -> JudgedFit:
         judged = judged_fit(task, fitted.solution, train, held, began)
         alike = whitened_like(task.problem, fitted, held, task.estimator)
         held_residuals = missed(predictor(task.problem, fitted), alike)
-        own = {} if learned is None else {layer.arm: learned}
+        own = {} if learned is None else {layer.arm: (learned, layer.postures.subset(task.split.holdout))}
         unknown = tuple(unexplained(task.problem, fitted.solution.values, held, own))
     except NotConvergedError:
         return failed_fit(task, began)

@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 
-from armcal.arm.pose_residual import OF_TOOL, ModelErrors, PoseResidual, Postures
+from armcal.arm.pose_residual import OF_TOOL, SURROUNDINGS, ModelErrors, PoseResidual, Postures
 from armcal.base.domains import Array
 from armcal.testing.expressions import expect_only, expect_repeated
 from armcal.testing.results import Recorder, expect
@@ -36,9 +36,10 @@ def check_residual(record: Recorder, subject: Subject) -> None:
     with record.check("what it learned makes unseen errors smaller"):
         before, after = _left(unseen, None), _left(unseen, learned)
         expect(after < 0.7 * before, f"found {after:.3g} m, without it {before:.3g} m")
-    with record.check("its expression depends on commands and approaches alone"):
+    with record.check("its expression depends on commands, approaches and surroundings alone"):
         given = [ca.SX.sym(name, len(JOINTS)) for name in ("commands", "approaches")]
-        expect_only(learned.correction(*given), given)
+        around = {name: ca.SX.sym(name) for name in SURROUNDINGS}
+        expect_only(learned.correction(given[0], given[1], around), [*given, *around.values()])
     with record.check("its deviations are finite, and larger away from what it learned"):
         near, far = (learned.deviations(own) for own in (unseen, _away(unseen)))
         expect(bool(np.isfinite(near).all() and np.isfinite(far).all()), "found deviations that are not finite")
