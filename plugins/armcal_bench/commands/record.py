@@ -66,13 +66,10 @@ def record_command(
     With a camera an image belongs to each posture, and the arm may be moved by its own controller.
     """
     experiment = load(console, config, overrides)
-    sources = (("joints", "json_lines", "--from", source), ("camera", "opencv", "--camera", camera))
-    for part, usual, option, named in sources:
-        if named is not None:
-            changed = _with_source(
-                experiment.source, part, usual, ConfigText(named, Location(f"command line ({option})"))
-            )
-            experiment = Experiment.of(changed, registry=experiment.registry)
+    changed = _with_source(experiment.source, "joints", "json_lines", "--from", source)
+    changed = _with_source(changed, "camera", "opencv", "--camera", camera)
+    if changed is not experiment.source:
+        experiment = Experiment.of(changed, registry=experiment.registry)
     bench = Bench.of(experiment)
 
     def show(message: Message) -> None:
@@ -100,8 +97,11 @@ def record_command(
         say(f"next: armcal run {config} {reading} --out DIR")
 
 
-def _with_source(source: ConfigSource, part: str, usual: str, name: ConfigText) -> ConfigSource:
-    """The configuration with another source of a part of the bench; of the usual type where none is configured."""
+def _with_source(source: ConfigSource, part: str, usual: str, option: str, named: str | None) -> ConfigSource:
+    """The configuration with the source of a part of the bench that an option names; of the usual type if of none."""
+    if named is None:
+        return source
+    name = ConfigText(named, Location(f"command line ({option})"))
     bench = source.data.get(SECTION)
     there = bench.get(part) if isinstance(bench, dict) else None
     section: dict[str, Any] = {**(there if isinstance(there, dict) else {"type": ConfigText(usual)}), "source": name}

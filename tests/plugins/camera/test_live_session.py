@@ -117,7 +117,7 @@ def test_images_of_a_folder_are_kept_judged_and_read_by_a_run(
     assert done.exit_code == 0, done.output
     written = yaml.safe_load((tmp_path / "run" / "calibration.yaml").read_text())["parameters"]
     found = {p["name"]: p["value"] for p in written}
-    assert abs(found["camera.camera_x"] - 0.042) < 0.0015 and abs(found["camera.camera_z"] - 0.055) < 0.0015
+    assert abs(found["camera.camera_x"] - 0.042) < 0.003 and abs(found["camera.camera_z"] - 0.055) < 0.003
 
 
 def test_a_camera_is_asked_at_a_key_and_looks_without_keeping(
