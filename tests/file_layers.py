@@ -7,7 +7,7 @@ import itertools
 import random
 from pathlib import Path
 
-from armcal.io.journal.lock import WriterLock
+from armcal.io.journal.files import WriterLock
 
 SECTOR = 512
 FOLDER = Path("/made-up/journal")

@@ -14,8 +14,7 @@ from armcal.errors import ConfigError, InputError, Location
 from pydantic import field_validator
 
 from armcal_export.c_check import FileNames, compiled_and_run, input_row, test_source
-from armcal_export.c_expressions import arm_functions
-from armcal_export.c_servos import servo_parts
+from armcal_export.c_expressions import arm_functions, servo_parts
 from armcal_export.c_text import c_row, filled, in_comment, quoted
 from armcal_export.reference import reference_of
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.cli.main import cli
-from armcal.run.iso_cube.cube import corners_about, points_about
+from armcal.run.iso_cube.placement import corners_about, points_about
 from click.testing import CliRunner, Result
 from scipy.spatial.transform import Rotation
 

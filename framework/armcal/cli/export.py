@@ -1,12 +1,14 @@
 """``armcal export``."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import click
 
+from armcal.base.settings import Settings
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.exporter import (
     POSES,
@@ -19,10 +21,42 @@ from armcal.calibration.exporter import (
 )
 from armcal.cli.common import FILE, Console, accept, arm, speaking
 from armcal.cli.completion import component_names
-from armcal.config.options import settings_from
-from armcal.errors import InputError, Location, PluginError
+from armcal.config.validate import validate
+from armcal.config.yaml_nodes import Node, Origin
+from armcal.config.yaml_source import Reader, as_source
+from armcal.config.yaml_tree import assignment, set_at
+from armcal.errors import ConfigError, InputError, Location, PluginError
 from armcal.io.file_set import require_new, write_new, write_over
 from armcal.io.plain_files import check_output
+
+S = TypeVar("S", bound=Settings)
+
+
+def settings_from(settings_class: type[S], texts: Sequence[str], option: str) -> S:
+    """Settings from ``key=value`` texts, whose values are YAML; a dotted key is a key of a mapping.
+
+    Args:
+        settings_class: what they must make.
+        texts: in the order given.
+        option: by which they were given, such as ``--option``, for messages.
+
+    Raises:
+        ConfigError: a text is not of that form, or the settings are refused.
+    """
+    here = Path.cwd()
+    tree = Node(Origin(option, here, numbered=False), 1, {})
+    for text in texts:
+        assigned = assignment(text, option)
+        if assigned is None:
+            keys = ", ".join(settings_class.keys())
+            raise ConfigError(
+                f"found {text!r}, expected a key, '=' and a value.",
+                where=Location(option),
+                hint=f"The keys are {keys}." if keys else "There is nothing to set.",
+            )
+        tree = set_at(tree, *assigned)
+    return validate(settings_class, as_source(tree, Path(option), Reader(here)))
+
 
 _NOTHING_MM = 1e-6
 

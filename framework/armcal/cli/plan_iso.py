@@ -11,8 +11,8 @@ from armcal.cli.common import Console
 from armcal.cli.console import columned
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
-from armcal.run.iso_cube.cube import NAMES
 from armcal.run.iso_cube.iso_plan import IsoPlan, make_iso_plan
+from armcal.run.iso_cube.placement import NAMES
 
 _MM = 1000.0
 

@@ -8,9 +8,8 @@ from types import TracebackType
 from typing import Any, Self
 
 from armcal.errors import ArmcalError, DataError, InputError, Location
-from armcal.io.journal.files import REAL_FILES, FileLayer, is_full
+from armcal.io.journal.files import REAL_FILES, FileLayer, Locking, WriterLock, is_full, lock_folder
 from armcal.io.journal.frames import payload_of
-from armcal.io.journal.lock import Locking, WriterLock, lock_folder
 from armcal.io.journal.reader import Newest, read_newest, segment_path
 from armcal.io.journal.room import JournalRoom, keep_cut
 from armcal.io.journal.segment import CHECKPOINT, HEADER, Cut, Entry, Link
