@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from armcal.errors import DataError, InputError
 from armcal_bench.acquisition.tracker_monitor import StopRequested
-from armcal_bench.servo.keys import QUIT, Keys, Lines, wishes_from
+from armcal_bench.keys import QUIT, WishKeys, WishLines, wishes_from
 from armcal_bench.servo.outputs import improved
 from armcal_bench.servo.record import NAME, Record
 from armcal_bench.servo.session import Conversation, evaluated, measure
@@ -176,7 +176,7 @@ def test_keys_of_a_real_terminal_and_its_mode_put_back():
     try:
         before = termios.tcgetattr(slave)
         with pytest.raises(RuntimeError), wishes_from(slave) as wishes:
-            assert isinstance(wishes, Keys)
+            assert isinstance(wishes, WishKeys)
             assert not termios.tcgetattr(slave)[3] & (termios.ICANON | termios.ECHO)
             os.write(master, b"\x1b[A\x1b[B\x1b[5~x\x1b[6~\rsbq")
             assert [wishes.next(1.0) for _ in range(8)] == ["+1", "-1", "+10", "-10", "ok", "skip", "back", "quit"]
@@ -200,7 +200,7 @@ def test_keys_of_a_real_terminal_and_its_mode_put_back():
 def test_lines_from_a_pipe_and_its_end():
     reader, writer = os.pipe()
     try:
-        lines = Lines(reader)
+        lines = WishLines(reader)
         assert lines.next(0.01) is None
         os.write(writer, b"+10\n\n  OK \nsk")
         assert [lines.next(1.0), lines.next(1.0), lines.next(0.01)] == ["+10", "ok", None]

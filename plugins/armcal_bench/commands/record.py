@@ -23,11 +23,10 @@ from armcal.version import JSON_SCHEMA
 from armcal_bench.bench import SECTION, Bench
 from armcal_bench.commands.common import FILE, load, on_bench
 from armcal_bench.journal_folder import Start
-from armcal_bench.recording.keys import Keys, LineKeys, NoKeys, TerminalKeys
+from armcal_bench.keys import Keys, LineKeys, NoKeys, TerminalKeys, single_keys
 from armcal_bench.recording.recorder import KEYS, LOOK, Message
 from armcal_bench.recording.recording_log import DATASET, IMAGES
 from armcal_bench.recording.session import RecordingOptions, record
-from armcal_bench.terminal import single_keys
 
 _TERMINAL = Path("/dev/tty")
 _AS_CSV = "--set 'data={type: csv}' "

@@ -23,7 +23,7 @@ from armcal_bench.acquisition.tracker_monitor import StopRequested
 from armcal_bench.commands.acquire import driven
 from armcal_bench.commands.common import FILE, Question, energise_option, load, on_bench, waits, warned
 from armcal_bench.joint_check import check_joints
-from armcal_bench.servo.keys import wishes_from
+from armcal_bench.keys import wishes_from
 from armcal_bench.servo.outcome import Outcome
 from armcal_bench.servo.outputs import improved, results, write_results, write_servo_file
 from armcal_bench.servo.record import NAME

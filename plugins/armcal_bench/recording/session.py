@@ -12,8 +12,8 @@ from armcal.errors import ConfigError
 
 from armcal_bench.bench import SECTION, Bench
 from armcal_bench.journal_folder import Start, opened_journal
+from armcal_bench.keys import END, Keys
 from armcal_bench.recording.agreement import contacts_of
-from armcal_bench.recording.keys import END, Keys
 from armcal_bench.recording.labels import Labels
 from armcal_bench.recording.recorder import Capture, Message, Recorder
 from armcal_bench.recording.recording_log import IMAGES, OURS, RecordingLog

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armcal_bench.acquisition.tracker_monitor import StopRequested
-from armcal_bench.servo.keys import QUIT, Wishes
+from armcal_bench.keys import QUIT, Wishes
 from armcal_bench.servo.mover import Mover
 from armcal_bench.servo.record import ANGLE, LEFT_OUT, Record
 

@@ -17,9 +17,9 @@ from armcal.errors import InputError, Location
 from armcal_bench.acquisition.recovery import DeviceLost
 from armcal_bench.acquisition.tracker_monitor import MotionGate, StopRequested, TrackerMonitor
 from armcal_bench.hazards import FirstMotion
+from armcal_bench.keys import Wishes
 from armcal_bench.servo.automatic import Automatic, ReportProgress
 from armcal_bench.servo.guided import Guided, next_wish
-from armcal_bench.servo.keys import Wishes
 from armcal_bench.servo.mover import Mover, ServoDevice
 from armcal_bench.servo.outcome import Outcome, outcome_of
 from armcal_bench.servo.record import BEGUN, Record, begin, check_same, stated_by
