@@ -57,6 +57,30 @@ def test_evidence_and_estimate_are_those_of_a_filter_with_the_change_among_its_s
     np.testing.assert_allclose(after.gaussian.covariance, whole.covariance[:N, :N], atol=1e-9)
 
 
+def test_the_slowest_change_that_is_named_in_a_week_is_one_that_a_week_of_exact_records_just_names() -> None:
+    """All zeros walk as stated, one moves steadily instead, and 100 records without noise show it."""
+    rates, odds, step = np.array([2.0, 1.0, 3.0]) * 1e-8, 100.0, 7 * 86400 / 99
+    change = hypothesis("joint_creeping", np.array([[0.05], [0.0], [0.0]]))
+    slow = SlowChanges([change], ProcessNoise(rates, GaussMarkovStates()), 1e-4)
+    drift = slow.slowest(7.0, odds)["joint_creeping"] * change.directions[:, 0] * step / 86400
+    belief, state, truth, noise = Gaussian(np.zeros(N), np.eye(N) * 1e-12), SlowState(), np.zeros(N), np.eye(N) * 1e-12
+    for i in range(100):
+        if i:
+            belief = Gaussian(belief.mean, belief.covariance + np.diag(rates) * step)
+            state, truth = slow.passed(state, {"time": step}), truth + drift
+        record = Linearised(truth - belief.mean, np.eye(N), noise)
+        state = slow.after(state, i, belief, record, belief.covariance + noise)
+        belief = kalman_update(belief, record, belief.mean)
+    (weighing,) = slow.weighed(state)
+    assert weighing.log_odds == pytest.approx(math.log(odds), rel=0.1)
+
+
+def test_no_stated_walk_hides_nothing() -> None:
+    change = hypothesis("joint_creeping", np.array([[0.05], [0.0], [0.0]]))
+    slow = SlowChanges([change], ProcessNoise(np.zeros(N), GaussMarkovStates()), 1e-4)
+    assert slow.slowest(7.0, 100.0) == {}
+
+
 def largest_z(session, arm: World) -> float:
     """The largest error of a joint's zero, in its own standard deviations."""
     space, belief = session.setup.space, session.state.belief

@@ -40,8 +40,11 @@ def started(
     parameters: Mapping[str, Any],
     resumed: bool,
     steps: Steps,
+    slowest: Mapping[str, float],
 ) -> dict[str, Any]:
-    """At the beginning."""
+    """At the beginning; ``slowest``: the rates (rad or m a day) of gradual changes that a week of records names."""
+    slides = {joint.joint for joint in steps.joints if joint.dimension == "length"} | set(steps.sensors)
+    rates = {name: _SIZES["length a day" if name in slides else "angle a day"] for name in slowest}
     blocks = {name: block.entry_unit for block in setup.space.parameters.free for name in block.entry_names}
     return {
         **_event("started", state),
@@ -55,6 +58,7 @@ def started(
         "joint_steps_not_followed": list(steps.unfollowed),
         "other_changes": [spoken(cause.subject) for cause in steps.causes],
         "sensor_motions": {name: list(which) for name, (_, which) in steps.sensors.items()},
+        "slowest_named_in_a_week": {name: {unit: factor * slowest[name]} for name, (unit, factor) in rates.items()},
     }
 
 

@@ -42,6 +42,8 @@ from armcal_online.tracking.tip_error import tip_error
 from armcal_online.tracking.updated import calibration_text, deviations
 from armcal_online.tracking.what_if import worth_of_record
 
+_WEEK = 7.0
+"""days"""
 _FARTHEST = 100.0
 """rad or m; a joint beyond it is a fault of the record."""
 
@@ -261,7 +263,8 @@ class Recalibrator:
 
     def started_event(self, resumed: bool) -> dict[str, Any]:
         """The first event of a process."""
-        return events.started(self.state, self.setup, self._settings, self.estimate, resumed, self.steps)
+        slowest = self._slow.slowest(_WEEK, self._settings.changes.odds)
+        return events.started(self.state, self.setup, self._settings, self.estimate, resumed, self.steps, slowest)
 
     def rolled_back_event(self, sequence: int, to: int) -> dict[str, Any]:
         """That entry ``sequence`` set the estimate back to what it was after entry ``to``, where it is now."""

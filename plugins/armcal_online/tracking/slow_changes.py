@@ -25,6 +25,7 @@ _LONGEST = 200
 """Records of a track; at half of them the next begins."""
 _FEWEST = 24
 _DAY_S = 86400.0
+_ROUNDING = 1e-6
 _WANDERS = 0.25
 """A trend may become as much faster or slower in the time that it took to be weighing."""
 
@@ -122,6 +123,27 @@ class SlowChanges:
                 if known is None or evidence + prior > known.log_odds:
                     best[change.subject] = Weighing(change, track, own, evidence + prior, size, covariance)
         return sorted(best.values(), key=lambda one: -one.log_odds)
+
+    def slowest(self, days: float, odds: float) -> dict[str, float]:
+        """The rate (rad or m a day) below which a gradual change is not named within some days, by its subject.
+
+        The walk that ``process_noise`` states, of variance q a day, makes a rate r in T days as likely as the rate
+        itself until r^2 T / 2q exceeds the log odds needed and what the prior of the rate costs. The noise of records
+        comes on top. Nothing hides a change of which no walk is stated: it is left out.
+        """
+        n, least = len(self._process_noise.rates), {}
+        needed = math.log(odds) - math.log(self._probability * 0.5 * _LONGEST / max(len(self._changes), 1))
+        for change in self._changes:
+            gained, walk = change.directions[:n], self._process_noise.rates * _DAY_S
+            gained = np.where(np.abs(gained) > _ROUNDING * np.abs(gained).max(), gained, 0.0)
+            if change.kind not in GRADUAL or not walk[gained.any(axis=1)].all():
+                continue
+            precision = days * gained.T @ (gained / np.where(walk > 0, walk, 1.0)[:, None])
+            cost = 0.5 * float(np.linalg.slogdet(np.eye(len(precision)) + precision)[1])
+            least_known = float(np.linalg.eigvalsh(precision)[0])
+            hidden = math.sqrt(2 * (needed + cost) * (1 + least_known)) / least_known
+            least[change.subject] = hidden * max(change.rates)
+        return least
 
     def is_due(self, weighing: Weighing) -> bool:
         """Whether the track of a change ends, so that it is to be decided now."""
