@@ -61,7 +61,7 @@ def reach_figure(survey: Survey, settings: CapabilitySettings) -> bytes:
 
 def quantity_figure(survey: Survey, settings: CapabilitySettings, name: str) -> bytes:
     """A quantity's mean over the postures of each cell (PNG)."""
-    quantity, cells = BY_NAME[name], survey.voxels.of(name)
+    quantity, cells = BY_NAME[name], survey.voxels.mean(name)
     low, high = np.percentile(cells, [2, 98]) if quantity.good == "high" else (0.0, np.percentile(cells, 98))
     how = {"cmap": _GOOD_LOW if quantity.good == "low" else _GOOD_HIGH, "vmin": low, "vmax": max(high, low + 1e-12)}
     unit = f", {quantity.unit}" if quantity.unit else ""

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from armcal.arm.clearance import Mask
@@ -13,8 +12,6 @@ from armcal_capability.inverse import Pointing, reach_for
 from armcal_capability.mechanics import MechanicsFunction
 from armcal_capability.quantities import BY_NAME, Postures, Weights, postures_at
 from armcal_capability.settings import AreaSettings
-
-Statistic = Literal["best", "mean", "worst"]
 
 
 @dataclass(frozen=True)
@@ -38,9 +35,9 @@ class Voxels:
         """Of the cells (cells x 3; m, base frame)."""
         return np.asarray((self.places + 0.5) * self.size)
 
-    def of(self, name: str, statistic: Statistic = "mean") -> Array:
-        """One number a cell."""
-        return np.asarray(self.values[name][("best", "mean", "worst").index(statistic)])
+    def mean(self, name: str) -> Array:
+        """Of a quantity, over the postures of each cell."""
+        return np.asarray(self.values[name][1])
 
 
 def voxels_of(postures: Postures, size: float) -> Voxels:

@@ -274,9 +274,9 @@ def test_cells_of_another_size_cover_the_same_and_keep_the_mean(lrm: Task) -> No
     fine, coarse = voxels_of(postures, 0.02), voxels_of(postures, 0.04)
     assert {tuple(p) for p in fine.places // 2} == {tuple(p) for p in coarse.places}
     for each in (fine, coarse):
-        mean = np.average(each.of("sag_mm"), weights=each.counts)
+        mean = np.average(each.mean("sag_mm"), weights=each.counts)
         assert mean == pytest.approx(postures.values["sag_mm"].mean(), rel=1e-12)
-        assert each.of("sag_mm", "best").min() == postures.values["sag_mm"].min()
+        assert each.values["sag_mm"][0].min() == postures.values["sag_mm"].min()
 
 
 def test_best_is_the_low_end_of_sag_and_the_high_end_of_manipulability() -> None:

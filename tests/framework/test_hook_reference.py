@@ -27,18 +27,18 @@ def missing(reference: Reference) -> list[str]:
         entries += [(f"{protocol.name}.", method) for method in protocol.methods]
     for before, entry in entries:
         gaps += [f"{before}{entry.name}: a docstring"] if not entry.text else []
-        gaps += [f"{before}{entry.name}: the argument {a.name}" for a in entry.arguments if not a.explained]
+        gaps += [f"{before}{entry.name}: the argument {name}" for name, explained in entry.arguments if not explained]
     return gaps
 
 
 def idle_words(reference: Reference) -> list[str]:
     """Words of the table above that explain no argument."""
     used = {
-        argument.name
+        name
         for protocol in _protocols(reference)
         for method in protocol.methods
-        for argument in method.arguments
-        if argument.explained == WORDS.get(argument.name)
+        for name, explained in method.arguments
+        if explained == WORDS.get(name)
     }
     return [word for word in WORDS if word not in used]
 

@@ -49,21 +49,13 @@ WORDS: Mapping[str, str] = MappingProxyType(
 
 
 @dataclass(frozen=True)
-class Argument:
-    """An argument, and what it is; empty if not stated."""
-
-    name: str
-    explained: str
-
-
-@dataclass(frozen=True)
 class Entry:
-    """A hook or a method: how it is called, what it does, what it raises."""
+    """A hook or a method: how it is called, what it does, what each argument is, what it raises."""
 
     name: str
     call: str
     text: str
-    arguments: tuple[Argument, ...]
+    arguments: tuple[tuple[str, str], ...]
     raises: tuple[tuple[str, str], ...] = ()
 
 
@@ -137,9 +129,7 @@ def _entry(function: Callable[..., Any], name: str = "", around: str = "", is_pr
     text, sections = _sections(inspect.cleandoc(function.__doc__ or ""))
     signature = inspect.signature(function)
     given = [p for p in signature.parameters.values() if p.name != "self"]
-    arguments = tuple(
-        Argument(p.name, _explained(p, function, sections.get("Args", {}), f"{around}\n{text}")) for p in given
-    )
+    arguments = tuple((p.name, _explained(p, function, sections.get("Args", {}), f"{around}\n{text}")) for p in given)
     call = name if is_property else f"{name}({', '.join(map(_shown, given))})"
     if signature.return_annotation not in (inspect.Signature.empty, "None"):
         call += f" -> {signature.return_annotation}"
@@ -240,7 +230,7 @@ def _markdown(entry: Entry) -> list[str]:
         arguments = "".join(f"    {part},\n" for part in re.split(r", (?=\w+: )", inner))
         call = f"{head}(\n{arguments}){after}"
     lines = ["```py", call, "```", "", *_paragraphs(entry.text)]
-    listed = [f"- `{a.name}`: {_marked(a.explained)}" for a in entry.arguments]
+    listed = [f"- `{name}`: {_marked(explained)}" for name, explained in entry.arguments]
     listed += [f"- raises `{error}`: {_marked(why)}" for error, why in entry.raises]
     return [*lines, *listed, ""] if listed else lines
 

@@ -13,27 +13,25 @@ from armcal.problem.problem import Problem
 FEW_POINTS = 12
 
 
-def with_few_points(
-    problem: Problem, records: Sequence[FactorRecords], most: int = FEW_POINTS
-) -> tuple[Problem, tuple[FactorRecords, ...]]:
+def with_few_points(problem: Problem, records: Sequence[FactorRecords]) -> tuple[Problem, tuple[FactorRecords, ...]]:
     """The problem and its records with at most so many points of each measurement, spread over all of them.
 
     The same objects where nothing is to be left out, and where a drift correlates the records.
     """
-    many = [kernel.factor.points is not None and len(kernel.factor.points) > most for kernel in problem.kernels]
+    many = [kernel.factor.points is not None and len(kernel.factor.points) > FEW_POINTS for kernel in problem.kernels]
     if not any(many) or any(record.correlation is not None for record in records):
         return problem, tuple(records)
     pairs = [
-        _thinned(kernel.factor, record, most) if thin else (kernel.factor, record)
+        _thinned(kernel.factor, record) if thin else (kernel.factor, record)
         for kernel, record, thin in zip(problem.kernels, records, many, strict=True)
     ]
     kernels = tuple(replace(kernel, factor=factor) for kernel, (factor, _) in zip(problem.kernels, pairs, strict=True))
     return replace(problem, kernels=kernels), tuple(record for _, record in pairs)
 
 
-def _thinned(factor: Factor, record: FactorRecords, most: int) -> tuple[Factor, FactorRecords]:
+def _thinned(factor: Factor, record: FactorRecords) -> tuple[Factor, FactorRecords]:
     assert factor.points is not None
-    chosen, per_point = spread_points(factor.points, most), len(factor.noise) // len(factor.points)
+    chosen, per_point = spread_points(factor.points, FEW_POINTS), len(factor.noise) // len(factor.points)
     rows = (per_point * chosen[:, None] + np.arange(per_point)).ravel()
     read = len(record.record) > factor.shared
     channels = factor.channels[: factor.shared]

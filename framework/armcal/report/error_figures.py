@@ -53,7 +53,7 @@ def distribution(result: RunResult) -> Figure | None:
     entries = [(f'<path class="curve {css}" d="M0 0h22"/>', name) for css, name, _ in curves]
 
     def draw(width: float) -> tuple[float, list[str]]:
-        top, parts = svg.legend(52, 12, width - 60, entries)
+        top, parts = svg.legend(52, width - 60, entries)
         box = Box(52, top + 2, width - 16, top + (270 if width > svg.NARROW else 220))
         low = max(float(np.percentile(values, 0.5)), high * 1e-6) * 0.8 if log else 0.0
         x = Axis(low, high * (1.15 if log else 1.03), box.left, box.right, log=log)
@@ -99,7 +99,7 @@ def in_order(result: RunResult, worst: NDArray[np.intp]) -> Figure | None:
     said = f"{plural(len(errors), 'record')}; {most} {result.errors.unit}."
 
     def draw(width: float) -> tuple[float, list[str]]:
-        start, parts = svg.legend(52, 12, width - 60, _order_legend(result, thinned))
+        start, parts = svg.legend(52, width - 60, _order_legend(result, thinned))
         box = Box(52, start + 2, width - 16, start + (270 if width > svg.NARROW else 220))
         x = Axis(0.5, len(errors) + 0.5, box.left, box.right)
         y = Axis(0, top, box.bottom, box.top)

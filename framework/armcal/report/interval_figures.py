@@ -67,7 +67,7 @@ def predicted_against_found(result: RunResult) -> Figure | None:
             entries.append(('<path class="dot train" d="M11 0h0"/>', "cross-validated"))
         if (known & holdout).any():
             entries.append((f'<path class="diamond" d="M11 0{DIAMOND}"/>', "held out"))
-        start, parts = svg.legend(52, 12, width - 60, entries)
+        start, parts = svg.legend(52, width - 60, entries)
         box = Box(52, start + 2, width - 16, start + (270 if width > svg.NARROW else 220))
         low, high = float(np.nanmin(radius[known])), float(np.nanmax(radius[known]))
         margin = max(0.05 * (high - low), 0.02 * high)
@@ -116,7 +116,7 @@ def _curve(result: RunResult, number: int, profile: Profile) -> Figure:
     entries.append(('<path class="curve before" d="M0 0h22"/>', "by the curvature"))
 
     def draw(width: float) -> tuple[float, list[str]]:
-        start, parts = svg.legend(52, 12, width - 60, entries)
+        start, parts = svg.legend(52, width - 60, entries)
         box = Box(52, start + 2, width - 16, start + 200)
         margin = 0.05 * max(float(np.ptp(places)), 1e-12)
         x = Axis(float(places.min()) - margin, float(places.max()) + margin, box.left, box.right)

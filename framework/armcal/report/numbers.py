@@ -49,10 +49,10 @@ def decimals_for(size: float, digits: int = 2) -> int:
     return min(max(digits - 1 - math.floor(math.log10(abs(size))), 0), _MOST_DECIMALS)
 
 
-def common_decimals(values: Iterable[float | None], least: int = 2, most: int = 4) -> int:
+def common_decimals(values: Iterable[float | None], most: int = 4) -> int:
     """Decimals that show two digits of the smallest of the values."""
     sizes = [abs(v) for v in values if v is not None and math.isfinite(v) and v != 0]
-    return min(max(decimals_for(min(sizes)), least), most) if sizes else 2
+    return min(max(decimals_for(min(sizes)), 2), most) if sizes else 2
 
 
 def count(number: int) -> str:

@@ -37,7 +37,7 @@ def ladder(result: StudyResult) -> Figure:
         narrow = width <= svg.NARROW
         most = 14 if narrow else 26
         left = MONO * max(len(svg.shorten(v.name, most)) for v in result.variants) + 18
-        start, parts = svg.legend(left, 12, width - left - 8, entries)
+        start, parts = svg.legend(left, width - left - 8, entries)
         bottom = start + 4 + _ROW * len(result.variants)
         beside = 0.0 if narrow or not changed else 0.4 * (width - left)
         box = Box(left, start + 4, width - beside - 14, bottom)

@@ -194,10 +194,10 @@ def frame(box: Box, x: Axis, y: Axis | None, labels: tuple[str, str], about: tup
     return parts
 
 
-def legend(x: float, y: float, width: float, entries: Sequence[tuple[str, str]]) -> tuple[float, list[str]]:
+def legend(x: float, width: float, entries: Sequence[tuple[str, str]]) -> tuple[float, list[str]]:
     """Entries (mark drawn about 0 0 within 22 px, words) in as many rows as they need; gives the next free y."""
     parts: list[str] = []
-    at = x
+    at, y = x, 12.0
     for mark, words in entries:
         length = 30 + 6.6 * len(words) + 14
         if at > x and at + length > x + width:

@@ -27,6 +27,7 @@ from armcal.run.result import RunResult
 
 _SETS = (("train", "Train"), ("holdout", "Holdout"), ("cross_validated", "Cross-validated"))
 _STATISTICS = ("mean", "rms", "p95", "max")
+_WORST = 10
 _EMPTY = ErrorSummary(None, None, None, None, 0)
 _FIGURE_SPACE, _POINT_SPACE = "\u2007", "\u2008"
 
@@ -184,11 +185,11 @@ def fixed_rows(estimate: Estimate) -> list[tuple[str, str, str]]:
     return rows
 
 
-def worst_records(result: RunResult, number: int = 10) -> NDArray[np.intp]:
+def worst_records(result: RunResult) -> NDArray[np.intp]:
     """The indices with the largest calibrated errors, the largest first; errors that are no number lead."""
     errors = result.errors.calibrated_mm
     ranked = np.where(np.isnan(errors), np.inf, errors)
-    return np.argsort(-ranked, kind="stable")[:number].astype(np.intp)
+    return np.argsort(-ranked, kind="stable")[:_WORST].astype(np.intp)
 
 
 def moved_rows(result: RunResult) -> list[tuple[str, str, str]]:
