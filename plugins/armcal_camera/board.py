@@ -252,7 +252,7 @@ _UPWARDS = ((0.0, 1.0, 0.0), (1.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 def _grid(columns: int, rows: int, step: float) -> Array:
     """Points of a grid, row by row (N x 3)."""
     x, y = np.meshgrid(np.arange(columns), np.arange(rows))
-    return step * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    return np.stack([step * x.ravel(), step * y.ravel(), np.zeros(x.size)], axis=1)
 
 
 def tag_modules(family: str, border_bits: int = 1) -> int:

@@ -21,7 +21,7 @@ from armcal.measure.points import PointInstrument, Proposal, spread_points
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from armcal_camera.board import Board, BoardOrFile, require_distinct
+from armcal_camera.board import Board, BoardOrFile, Chessboard, require_distinct
 from armcal_camera.first_guess import Setup, certified_place, first_guess
 from armcal_camera.intrinsics import IntrinsicsOrFile, Lens, Pixels
 from armcal_camera.lens import DISTORTION, projected
@@ -268,7 +268,7 @@ class Camera(PointInstrument):
         visible, start = margins > 0, 0
         for board, used in zip(self.boards, self.used, strict=True):
             own = visible[start : start + len(used)]
-            enough = own.all(axis=0) if board.type == "chessboard" else own.sum(axis=0) >= _FEWEST_POINTS
+            enough = own.all(axis=0) if isinstance(board, Chessboard) else own.sum(axis=0) >= _FEWEST_POINTS
             visible[start : start + len(used)] = own & enough
             start += len(used)
         return np.asarray(visible)

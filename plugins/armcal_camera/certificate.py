@@ -77,7 +77,11 @@ def certificate(a: Array, b: Array, start: HandEye, other: tuple[Array, Array]) 
     """
     apart = _misfits(a, b, start.x, start.y, np.ones(2))
     weights = 1 / np.maximum([np.sqrt(np.mean(part**2)) for part in apart], _LEAST)
-    solved = least_squares(lambda moved: np.concatenate(_misfits(a, b, *_moved(start, moved), weights)), np.zeros(12))
+
+    def off(step: Array) -> Array:
+        return np.concatenate(_misfits(a, b, *_moved(start, step), weights))
+
+    solved = least_squares(off, np.zeros(12))
     x, y = _moved(start, solved.x)
     best = float(2 * solved.cost)
     compared = sum(float(np.sum(part**2)) for part in _misfits(a, b, *other, weights))

@@ -139,11 +139,10 @@ def _tags(image: Grey, reduced: Grey, board: Board, nothing: Detection) -> Detec
     if off > _ASTRAY:
         text = f"the tags stand elsewhere than on the {board.kind}"
         return replace(nothing, fault=f"{text}: check its columns, rows, spacing and first_id")
-    known, pixels = known.reshape(-1, 2), pixels.reshape(-1, 2)
-    points = board.points[:, :2]
-    away = np.linalg.norm(points[:, None] - known[None], axis=2).min(axis=1)
+    corners_known, points = known.reshape(-1, 2), board.points[:, :2]
+    away = np.linalg.norm(points[:, None] - corners_known[None], axis=2).min(axis=1)
     near = np.flatnonzero(away < (0.99 * board.step if isinstance(board, Charuco) else 1e-9))
-    rough, scale = local_map(known, pixels, points[near])
+    rough, scale = local_map(corners_known, pixels.reshape(-1, 2), points[near])
     fit = refine(image, rough, scale, board.reach)
     corners = nothing.corners.copy()
     corners[near] = fit.corners

@@ -9,6 +9,7 @@ import tempfile
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from armcal.base.config_text import as_json
@@ -34,7 +35,7 @@ def kept_detection(key: str, board: Board) -> Detection | None:
         stored = json.loads(path.read_text(encoding="utf-8"))
         corners = np.array(stored.pop("corners"), dtype=float).reshape(-1, 2)
         size = stored.pop("found_size")
-        numbers = {name: np.nan if value is None else value for name, value in stored.items()}
+        numbers: dict[str, Any] = {name: np.nan if value is None else value for name, value in stored.items()}
         if corners.shape == (len(board.points), 2):
             os.utime(path)
             return Detection(corners, found_size=None if size is None else tuple(size), **numbers)

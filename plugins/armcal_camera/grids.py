@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from armcal.base.domains import Array
 
+from armcal_camera.images import Grey
 from armcal_camera.refinement import Refined, refine
 
 _REACH = 0.7
@@ -12,7 +13,7 @@ _FULL_CROSSING = 0.75
 _MOST = 0.8
 
 
-def refined_grid(image: Array, grid: Array) -> Refined:
+def refined_grid(image: Array | Grey, grid: Array) -> Refined:
     """A grid of corners (R x C x 2, px), each fitted to the image; in the order of the grid's rows."""
     scale = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=3)
     return refine(image, grid.reshape(-1, 2), scale.reshape(-1, 2, 2), _REACH)
@@ -56,7 +57,7 @@ def _alternating(crossing: Array) -> float:
     return float(np.nansum(crossing * (-1.0) ** (rows + columns)))
 
 
-def grown(image: Array, grid: Array, crossing: Array) -> tuple[int, int]:
+def grown(image: Array | Grey, grid: Array, crossing: Array) -> tuple[int, int]:
     """Columns and rows of the whole pattern of which a grid of corners is a part, as far as the image shows it."""
     usual = float(np.nanmedian(np.abs(crossing)))
     for side in range(4):

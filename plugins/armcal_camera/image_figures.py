@@ -95,9 +95,9 @@ def _marks(seen: Array, predicted: Array, enlarged: float) -> list[str]:
     tips = predicted + enlarged * (seen - predicted)
     style = '<g style="stroke:{};stroke-width:{};stroke-linecap:round">{}</g>'
     return [
-        style.format(_COLOURS["arrow"], 1.4, svg.segments(*predicted, *tips, "")),
-        style.format(_COLOURS["predicted"], 1.2, svg.marks(*predicted, _CROSS, "")),
-        style.format(_COLOURS["seen"], 3, svg.dots(*seen, "")),
+        style.format(_COLOURS["arrow"], 1.4, svg.segments(predicted[0], predicted[1], tips[0], tips[1], "")),
+        style.format(_COLOURS["predicted"], 1.2, svg.marks(predicted[0], predicted[1], _CROSS, "")),
+        style.format(_COLOURS["seen"], 3, svg.dots(seen[0], seen[1], "")),
     ]
 
 

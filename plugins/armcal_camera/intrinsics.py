@@ -39,7 +39,7 @@ class _Loader(yaml.SafeLoader):
     """Takes OpenCV's matrices for mappings."""
 
 
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", yaml.SafeLoader.construct_yaml_map)
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", yaml.SafeLoader.construct_yaml_map)  # type: ignore[type-var]
 
 
 def read_intrinsics(path: str | Path) -> IntrinsicsSettings:

@@ -63,5 +63,5 @@ def normalised(lens: str, image: Array, focal: Array, centre: Array, distortion:
         return np.asarray(seen * np.tan(np.clip(angle, 0.0, 1.5)) / np.maximum(turned, 1e-12))
     here = seen.copy()
     for _ in range(_STEPS):
-        here = here + (seen - np.array(pinhole(*here, distortion)))
+        here = np.asarray(here + (seen - np.array(pinhole(here[0], here[1], distortion))))
     return here

@@ -15,6 +15,8 @@ import numpy as np
 from armcal.base.domains import Array
 from scipy.special import erf
 
+from armcal_camera.images import Grey
+
 _AT_ONCE = 8  # corners: their pixels stay in the processor's cache
 _LARGEST = 20
 _SMALLEST = 3
@@ -53,7 +55,7 @@ class _Patches:
     weight: Array
 
 
-def refine(image: Array, corners: Array, scale: Array, reach: float) -> Refined:
+def refine(image: Array | Grey, corners: Array, scale: Array, reach: float) -> Refined:
     """Fit the edges at each corner.
 
     Args:
@@ -70,7 +72,7 @@ def refine(image: Array, corners: Array, scale: Array, reach: float) -> Refined:
     return Refined(*(np.concatenate([getattr(part, name) for part in parts]) for name in _FIELDS))
 
 
-def _refined(image: Array, corners: Array, scale: Array, reach: float) -> Refined:
+def _refined(image: Array | Grey, corners: Array, scale: Array, reach: float) -> Refined:
     middles = np.rint(corners).astype(int)
     patches = _patches(image, middles, scale, reach)
     along = np.arctan2(scale[:, 1, :], scale[:, 0, :])
@@ -84,7 +86,7 @@ def _refined(image: Array, corners: Array, scale: Array, reach: float) -> Refine
     return Refined(places, np.exp(parameters[:, 4]) / math.sqrt(2), np.where(bad, np.nan, grey[:, 3]))
 
 
-def _patches(image: Array, middles: Array, scale: Array, reach: float) -> _Patches:
+def _patches(image: Array | Grey, middles: Array, scale: Array, reach: float) -> _Patches:
     """The pixels within ``reach`` of each corner on the board; those outside the image have no weight."""
     widest = float(np.linalg.norm(scale, axis=1).max(initial=1.0)) * reach
     half = int(min(max(widest, _SMALLEST), _LARGEST))
@@ -153,4 +155,4 @@ def _at(patches: _Patches, parameters: Array) -> tuple[Array, Array, Array]:
         -second * (c2 * dx + s2 * dy),
         -width * (first * d[0] + second * d[1]),
     ]
-    return grey, misfit, np.concatenate([np.stack(slopes, axis=2), basis], axis=2)
+    return np.asarray(grey, float), misfit, np.concatenate([np.stack(slopes, axis=2), basis], axis=2)

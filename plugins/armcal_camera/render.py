@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from armcal.base.domains import Array
+from numpy.typing import NDArray
 
 from armcal_camera.board import Board
 from armcal_camera.images import Grey
@@ -40,7 +41,8 @@ class Lens:
 
     def project(self, points: Array) -> Array:
         """Pixels (N x 2) of points in the camera's frame (N x 3, m; z along the line of sight)."""
-        return self._distorted(points[:, :2] / points[:, 2:]) * np.array(self.focal) + np.array(self.centre)
+        ahead = self._distorted(points[:, :2] / points[:, 2:])
+        return np.asarray(ahead * np.array(self.focal) + np.array(self.centre))
 
     def rays(self, pixels: Array) -> Array:
         """x/z and y/z of the rays to pixels (N x 2), by fixed-point iteration."""
@@ -128,7 +130,7 @@ def render(placed: Sequence[tuple[Board, Array]], lens: Lens, size: tuple[int, i
     image = image * (1 + exposure.light * (np.arange(size[0]) / size[0] - 0.5))
     if exposure.noise:
         image = image + np.random.default_rng(exposure.seed).normal(0.0, exposure.noise, image.shape)
-    return np.rint(image).clip(0, 255).astype(np.uint8)
+    return np.asarray(np.rint(image).clip(0, 255), np.uint8)
 
 
 def _fine_rays(lens: Lens, size: tuple[int, int]) -> Array:
@@ -153,7 +155,7 @@ def _texels_per_metre(board: Board, lens: Lens, pose: Array) -> float:
     return min(2 * max(lens.focal) / nearest, _MOST_TEXELS / (max(board.extent) + board.step))
 
 
-def _darkness(board: Board, start: Array, texels: float) -> Array:
+def _darkness(board: Board, start: Array, texels: float) -> NDArray[np.float32]:
     """How much of each texel is dark (H x W)."""
     width, height = (math.ceil((extent + board.step) * texels) for extent in board.extent)
     texture = np.zeros((height, width), np.float32)

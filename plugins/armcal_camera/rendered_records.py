@@ -5,6 +5,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from armcal.base.domains import Array
+from armcal.errors import ConfigError
 from scipy.spatial.transform import Rotation
 
 from armcal_camera.board import Board
@@ -18,16 +19,28 @@ _USUAL = Exposure(blur=0.7, noise=2.0, light=0.1)
 class _Seeing(Protocol):
     """What is needed of the measurement ``camera``."""
 
-    settings: Any
-    boards: Sequence[Board]
-    board_names: Sequence[str]
-    camera_frame: str
-    board_frame: str
-    image: tuple[float, float] | None
+    @property
+    def settings(self) -> Any: ...
+    @property
+    def boards(self) -> Sequence[Board]: ...
+    @property
+    def board_names(self) -> Sequence[str]: ...
+    @property
+    def camera_frame(self) -> str: ...
+    @property
+    def board_frame(self) -> str: ...
+    @property
+    def image(self) -> tuple[float, float] | None: ...
 
 
 def rendered_records(camera: _Seeing, frames: Mapping[str, Array], values: Mapping[str, Array]) -> Iterator[bytes]:
-    """The image file of each record; see ``Rendering``."""
+    """The image file of each record; see ``Rendering``.
+
+    Raises:
+        ConfigError: the truth has a bent board, which cannot be drawn.
+    """
+    if any(float(values[f"{name}_bend_{axis}"][0]) for name in camera.board_names for axis in "xy"):
+        raise ConfigError("found a board that is bent, expected flat ones: images are drawn of these alone.")
     kpx = 1000.0
     focal, centre = ([kpx * float(values[name][0]) for name in names] for names in (("fx", "fy"), ("cx", "cy")))
     size = [kpx * x for x in camera.image] if camera.image else [2 * x for x in centre]
