@@ -17,7 +17,7 @@ from armcal.base.pose_settings import PoseSettings
 from armcal.base.se3 import identity
 from armcal.measure.instrument import InstrumentSettings
 from armcal.measure.measurement import Channel
-from armcal.measure.points import PointInstrument, Proposal, spread_points
+from armcal.measure.points import PointInstrument, Proposal, Reading, spread_points
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
@@ -293,25 +293,13 @@ class Camera(PointInstrument):
         """An image of each record, blurred and with noise as an ordinary camera has them."""
         return rendered_records(self, frames, values)
 
-    def propose(
-        self,
-        frames: Mapping[str, Array],
-        read: Mapping[str, Array],
-        values: Mapping[str, Array],
-        free: frozenset[str],
-    ) -> Proposal:
+    def propose(self, reading: Reading) -> Proposal:
         """Where a fit may start, from the images alone; see ``Proposing``."""
-        return first_guess(self._setup, frames, read, values, free)
+        return first_guess(self._setup, reading)
 
-    def certificate(
-        self,
-        frames: Mapping[str, Array],
-        read: Mapping[str, Array],
-        values: Mapping[str, Array],
-        free: frozenset[str],
-    ) -> str:
+    def certificate(self, reading: Reading) -> str:
         """Whether no other place of the camera fits the poses of the board better; see ``Certifying``."""
-        return certified_place(self._setup, frames, read, values, free) if self.settings.certificate else ""
+        return certified_place(self._setup, reading) if self.settings.certificate else ""
 
     @property
     def _setup(self) -> Setup:

@@ -9,7 +9,7 @@ import numpy as np
 from armcal.base.domains import Array
 from armcal.base.pose_settings import quaternion_of
 from armcal.base.quaternions import rotation_matrix
-from armcal.measure.points import Proposal
+from armcal.measure.points import Proposal, Reading
 
 from armcal_camera.certificate import sentence
 from armcal_camera.hand_eye import hand_eye, open_motion
@@ -49,27 +49,20 @@ class _View:
     image: Array
 
 
-def first_guess(
-    setup: Setup,
-    frames: Mapping[str, Array],
-    read: Mapping[str, Array],
-    values: Mapping[str, Array],
-    free: frozenset[str],
-) -> Proposal:
+def first_guess(setup: Setup, reading: Reading) -> Proposal:
     """Free parameters of a camera from what it saw; the others are held. See ``Proposing.propose``.
 
     With A the frame of the camera as seen from that of the boards, A camera_pose = board_pose camera_T_board^-1 in
     every record: one equation wherever camera and boards are. Boards whose place is held or another camera's do where
     the motion leaves it open.
     """
-    own = dict(values)
-    views = _views(setup, read, float(own["board_scale"][0]))
+    own, free = dict(reading.values), reading.free
+    views = _views(setup, reading)
     if free & set(_INTRINSICS) and not setup.is_stated:
         own |= _intrinsics(views, free)
     poses = _poses(setup, views, own)
     proposed = {name: own[name] for name in _INTRINSICS if name in free}
-    camera_frame, board_frame = setup.frames
-    moved = np.linalg.inv(frames[board_frame]) @ frames[camera_frame]
+    (camera_frame, board_frame), moved = setup.frames, _moved(setup, reading)
     known = [not free & set(_place(name)) for name in setup.names]
     is_open = _still(camera_frame) if camera_frame == board_frame else open_motion(moved, camera_frame)
     if is_open is not None and not any(own_poses for own_poses, held in zip(poses, known, strict=True) if held):
@@ -102,25 +95,25 @@ def _places(
     return proposed
 
 
-def certified_place(
-    setup: Setup,
-    frames: Mapping[str, Array],
-    read: Mapping[str, Array],
-    values: Mapping[str, Array],
-    free: frozenset[str],
-) -> str:
+def certified_place(setup: Setup, reading: Reading) -> str:
     """Whether another place of the camera fits the poses of the board seen most better; empty without a question."""
-    camera_frame, board_frame = setup.frames
-    if camera_frame == board_frame or not _placed("camera", free):
+    values = reading.values
+    if setup.frames[0] == setup.frames[1] or not _placed("camera", reading.free):
         return ""
-    views = _views(setup, read, float(values["board_scale"][0]))
-    name, poses = max(zip(setup.names, _poses(setup, views, values), strict=True), key=lambda board: len(board[1]))
-    moved = (np.linalg.inv(frames[board_frame]) @ frames[camera_frame])[list(poses)]
+    boards = zip(setup.names, _poses(setup, _views(setup, reading), values), strict=True)
+    name, poses = max(boards, key=lambda board: len(board[1]))
+    moved = _moved(setup, reading)[list(poses)]
     seen = np.linalg.inv(np.array(list(poses.values())).reshape(-1, 4, 4))
     solved = hand_eye(moved, seen)
     if solved is None:
         return "that no other place of the camera is better could not be shown: the motions leave it open."
     return sentence(moved[solved.kept], seen[solved.kept], solved, (_matrix("camera", values), _matrix(name, values)))
+
+
+def _moved(setup: Setup, reading: Reading) -> Array:
+    """The frame of the camera as seen from that of the boards in each record (N x 4 x 4, m)."""
+    camera_frame, board_frame = setup.frames
+    return np.asarray(np.linalg.inv(reading.frames[board_frame]) @ reading.frames[camera_frame])
 
 
 def _place(name: str) -> tuple[str, ...]:
@@ -140,10 +133,11 @@ def _still(frame: str) -> tuple[str, str]:
     )
 
 
-def _views(setup: Setup, read: Mapping[str, Array], scale: float) -> list[_View]:
+def _views(setup: Setup, reading: Reading) -> list[_View]:
     """Every board in every record of which enough points are there."""
     total = sum(map(len, setup.points))
-    image = np.array(list(read.values())).reshape(total, 2, -1)
+    scale = float(reading.values["board_scale"][0])
+    image = np.array(list(reading.channels.values())).reshape(total, 2, -1)
     views, start = [], 0
     for number, board in enumerate(setup.points):
         part, points = image[start : start + len(board)], scale * board[:, :2]

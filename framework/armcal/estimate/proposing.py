@@ -17,7 +17,7 @@ from armcal.base.parameters import ParameterBlock
 from armcal.errors import Location, ProblemError
 from armcal.estimate.start import BETTER, Start
 from armcal.measure.measurement import Carried, borrowed_names
-from armcal.measure.points import Certifying, Proposing
+from armcal.measure.points import Certifying, Proposing, Reading
 from armcal.problem.problem import FactorRecords, Problem
 
 _TOOL_ROWS = 12
@@ -47,7 +47,7 @@ def _with_proposal(
     parameters, nominal = problem.parameters, problem.parameters.nominal()
     before = start.vectors[0] if start.vectors else nominal
     own = _own(problem, name)
-    proposal = measurement.propose(*_read(problem, nominal, before, records, dataset, number))
+    proposal = measurement.propose(_reading(problem, nominal, before, records, dataset, number))
     if any(own[local].prior_sd is None for local in proposal.undetermined):
         hint = f"{proposal.close} Or give priors, or hold {', '.join(proposal.undetermined)}."
         raise ProblemError(f"{name}: {proposal.open}", where=Location(dataset.source or None), hint=hint)
@@ -82,8 +82,8 @@ def certificates(problem: Problem, values: Array, records: Sequence[FactorRecord
     for number, kernel in enumerate(problem.kernels):
         measurement = problem.blueprint.measurements[kernel.factor.name]
         if isinstance(measurement, Certifying):
-            read = _read(problem, values, values, records, dataset, number)
-            sentences[kernel.factor.name] = measurement.certificate(*read)
+            reading = _reading(problem, values, values, records, dataset, number)
+            sentences[kernel.factor.name] = measurement.certificate(reading)
     return {name: text for name, text in sentences.items() if text}
 
 
@@ -93,18 +93,15 @@ def _own(problem: Problem, name: str) -> dict[str, ParameterBlock]:
     return {b.name.removeprefix(f"{name}."): b for b in blocks if b.name.startswith(f"{name}.")}
 
 
-def _read(
+def _reading(
     problem: Problem, own_values: Array, values: Array, records: Sequence[FactorRecords], dataset: Dataset, number: int
-) -> tuple[dict[str, Array], dict[str, Array], dict[str, Array], frozenset[str]]:
-    """What a measurement needs to find its parameters without a fit; see ``Proposing.propose``.
-
-    Arm and borrowed parameters are at ``values``, its own at ``own_values``.
-    """
+) -> Reading:
+    """What a measurement read; arm and borrowed parameters are at ``values``, its own at ``own_values``."""
     name, parameters = problem.kernels[number].factor.name, problem.parameters
     own, lent = _own(problem, name), borrowed_names(problem.blueprint.measurements[name])
     borrowed = {local: values[parameters.entries_of(full)] for local, full in lent.items()}
     seen = np.flatnonzero(records[number].measured)
-    return (
+    return Reading(
         carriers_of(problem, values, problem.subset(records, seen), dataset.subset(seen), number),
         {c.removeprefix(f"{name}."): dataset.column(c)[seen] for c in problem.kernels[number].factor.output_channels},
         {**{local: own_values[parameters.entries_of(block.name)] for local, block in own.items()}, **borrowed},

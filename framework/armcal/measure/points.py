@@ -34,43 +34,38 @@ class Proposal:
     undetermined: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class Reading:
+    """What a measurement read in N records, and where its arm was.
+
+    Attributes:
+        frames: base_T_tool of each record (N x 4 x 4, m) as ``tool``, and ``base``; for one that is ``Carried``, the
+            poses of its carriers.
+        channels: each channel (N; NaN where it is missing), by local name.
+        values: canonical entries of all its parameters, by local name.
+        free: local names of those that may move.
+    """
+
+    frames: Mapping[str, Array]
+    channels: Mapping[str, Array]
+    values: Mapping[str, Array]
+    free: frozenset[str]
+
+
 @runtime_checkable
 class Proposing(Protocol):
     """What a measurement provides beside the rest if it finds its own parameters without a fit: a hand-eye pose."""
 
-    def propose(
-        self,
-        frames: Mapping[str, Array],
-        read: Mapping[str, Array],
-        values: Mapping[str, Array],
-        free: frozenset[str],
-    ) -> Proposal:
-        """Its parameters from what it read, those that are free.
-
-        Args:
-            frames: base_T_tool of each record (N x 4 x 4, m), of the nominal arm, as ``tool``; for one that is
-                ``Carried``, the poses of its carriers, and ``base``.
-            read: each channel (N; NaN where it is missing), by local name.
-            values: canonical entries of all its parameters, by local name.
-            free: local names of those that may move.
-        """
+    def propose(self, reading: Reading) -> Proposal:
+        """Its parameters from what it read, those that are free."""
 
 
 @runtime_checkable
 class Certifying(Protocol):
     """What a measurement provides beside the rest if it can show that no other answer is better."""
 
-    def certificate(
-        self,
-        frames: Mapping[str, Array],
-        read: Mapping[str, Array],
-        values: Mapping[str, Array],
-        free: frozenset[str],
-    ) -> str:
-        """Whether its parameters are the best there are, as a sentence; empty if there is nothing to show.
-
-        The arguments are those of ``Proposing.propose``, at the estimate.
-        """
+    def certificate(self, reading: Reading) -> str:
+        """Whether its parameters are the best there are, as a sentence; empty if there is nothing to show."""
 
 
 @runtime_checkable

@@ -14,7 +14,7 @@ from armcal.base.pose_settings import quaternion_of
 from armcal.estimate.estimator import Estimate
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Stopwatch, prepare
+from armcal.run.pipeline import Stopwatch, _Means, prepare
 from armcal.run.pipeline import _fitted as fitted_of
 from scipy.spatial.transform import Rotation
 
@@ -88,7 +88,7 @@ def estimated(experiment: Experiment) -> Estimate:
     """The fit from where the images have the start."""
     ready = prepare(experiment, Stopwatch())
     assert ready.start.taken
-    return fitted_of(experiment, ready, lambda *_: None, None, Stopwatch()).estimate
+    return fitted_of(_Means(experiment, lambda *_: None, None, Stopwatch()), ready).estimate
 
 
 def assert_found(estimate: Estimate, **poses: Array) -> None:

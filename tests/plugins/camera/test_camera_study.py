@@ -10,7 +10,7 @@ import pytest
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.problem.problem import Problem
-from armcal.run.pipeline import Stopwatch, prepare
+from armcal.run.pipeline import Stopwatch, _Means, prepare
 from armcal.run.pipeline import _fitted as fitted_of
 
 DEMO = Path(__file__).resolve().parents[3] / "configs" / "camera" / "demo.yaml"
@@ -25,7 +25,7 @@ def test_intervals_cover_and_the_tool_is_found(monkeypatch: pytest.MonkeyPatch) 
         dataset = experiment.simulator().simulate(experiment.simulation_request)
         monkeypatch.setattr(type(experiment), "read", lambda *_, made=dataset: made)
         ready = prepare(experiment, Stopwatch())
-        estimate = fitted_of(experiment, ready, lambda *_: None, None, Stopwatch()).estimate
+        estimate = fitted_of(_Means(experiment, lambda *_: None, None, Stopwatch()), ready).estimate
         monkeypatch.undo()
         source = load_config(DEMO.parent / "truth.yaml")
         truth = with_values(experiment.parameters, source.data, source, ())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from armcal.base.domains import Array
+from armcal.measure.points import Reading
 from armcal_camera.first_guess import Setup, first_guess
 from armcal_camera.hand_eye import hand_eye, open_motion
 from armcal_camera.lens import DISTORTION
@@ -112,8 +113,7 @@ def test_a_small_board_beside_a_large_one_has_its_pose_found() -> None:
     lens = {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0, "board_scale": 1.0, **dict.fromkeys(DISTORTION["pinhole"], 0.0)}
     values = {**place, **turns, **{name: np.array([value]) for name, value in lens.items()}}
     read = {f"{axis}_{k}": image[:, k, j] for k in range(58) for j, axis in enumerate("uv")}
-    proposal = first_guess(
-        setup, {"tool": tools, "base": np.tile(np.eye(4), (8, 1, 1))}, read, values, frozenset({*place, *turns})
-    )
+    frames = {"tool": tools, "base": np.tile(np.eye(4), (8, 1, 1))}
+    proposal = first_guess(setup, Reading(frames, read, values, frozenset({*place, *turns})))
     for name, expected in (("camera", x), ("board1", y), ("board2", y @ tag)):
         assert np.allclose([proposal.values[f"{name}_{a}"][0] for a in "xyz"], expected[:3, 3], atol=1e-5), name
