@@ -78,6 +78,31 @@ def test_a_run_states_them_in_every_table_and_file(folder: Path) -> None:
     assert len(set(cells)) == 1 and cells[0] == 9, "as many cells as headings"
 
 
+def test_a_prediction_says_how_far_position_and_orientation_may_be_off(folder: Path) -> None:
+    """Judged on another recording: nine of ten within their angle, 19 of 20 within their radius."""
+    fresh = armcal("simulate", folder / "arm.yaml", "--set", "simulation.seed=9", "--out", folder / "fresh.csv")
+    ran = armcal("run", folder / "arm.yaml", "--out", folder / "sure")
+    words = ["--poses", folder / "fresh.csv", "--out", folder / "tips.csv"]
+    done = armcal("predict", folder / "sure" / "calibration.yaml", *words)
+    assert (fresh.exit_code, ran.exit_code, done.exit_code) == (0, 0, 0), done.output
+    assert re.search(r"mm in all \(95 %\), 0\.\d+ deg \(90 %\)", done.stdout)
+    measured, predicted = (list(csv.DictReader((folder / name).open())) for name in ("fresh.csv", "tips.csv"))
+
+    def numbers(rows: list[dict[str, str]], *columns: str) -> np.ndarray:
+        return np.array([[float(row[column]) for column in columns] for row in rows])
+
+    off = np.linalg.norm(numbers(measured, "x_mm", "y_mm", "z_mm") - numbers(predicted, "x_mm", "y_mm", "z_mm"), axis=1)
+    along = np.sum(numbers(measured, "qw", "qx", "qy", "qz") * numbers(predicted, "qw", "qx", "qy", "qz"), axis=1)
+    turned = 2 * np.degrees(np.arccos(np.minimum(np.abs(along), 1)))
+    held = [
+        np.mean(off <= numbers(predicted, "radius95_mm")[:, 0]),
+        np.mean(turned <= numbers(predicted, "turn90_deg")[:, 0]),
+    ]
+    assert 0.85 <= held[0] <= 1 and 0.78 <= held[1] <= 0.99  # three standard errors of 60 records
+    told = json.loads((folder / "sure" / "metrics.json").read_text())["prediction_intervals"]["same_recording"]
+    assert told["half_width_90_mm"] == pytest.approx(0.1 * 1.645, rel=0.25) and told["holdout"]["records"] == 15
+
+
 def test_a_study_states_them_by_variant(folder: Path) -> None:
     done = armcal("study", folder / "study.yaml", "--out", folder / "study")
     assert done.exit_code == 0, done.output

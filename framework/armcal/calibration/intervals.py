@@ -21,7 +21,7 @@ from armcal.base.settings import Settings
 from armcal.config.system import System
 from armcal.diagnose.coverage import Recording, Stretch, level_name
 from armcal.errors import DataError, Location
-from armcal.estimate.prediction import LEVELS, STATED, KnownDrift, Predictor, Spread, is_position
+from armcal.estimate.prediction import LEVELS, POSITION, STATED, TURN, KnownDrift, Predictor, Spread, is_position
 from armcal.estimate.validation import Indices
 from armcal.estimate.variance import Axes, Component, VarianceComponents, apply_components
 from armcal.problem.drift import Chain, chain, with_drift
@@ -91,6 +91,7 @@ class PlusMinus:
         half_widths: of 90 % intervals, stretched as cross-validation found (N each).
         radii: of each position measurement by name: of a ball about the prediction that holds 95 % (N each; m).
         covariances: of each position measurement by name, stretched as half widths are (N x 3 x 3 each; m^2).
+        turns: of each pose measurement by name: angles that 90 % of the orientations lie within (N each; rad).
     """
 
     shift: dict[str, Array]
@@ -98,6 +99,7 @@ class PlusMinus:
     half_widths: dict[str, Array]
     radii: dict[str, Array]
     covariances: dict[str, Array] = field(default_factory=dict)
+    turns: dict[str, Array] = field(default_factory=dict)
 
 
 def stretch_records(stretches: Mapping[Recording, Stretch]) -> dict[Literal["same", "new"], StretchRecord]:
@@ -302,18 +304,23 @@ def _joined(
         known = [part.of_readings(place) for part in parts]
         if not channels or any(own is None for own in known):
             continue
-        rows, radius = np.full((3, len(channels), count), np.nan), np.full(count, np.nan)
+        rows, radius, turn = (np.full((*size, count), np.nan) for size in ((3, len(channels)), (), ()))
         covariance = np.full((count, len(channels), len(channels)), np.nan)
         for part, (shift, spread) in zip(parts, filter(None, known), strict=True):
             own = stretches.get(part.recording)
             stretch = own.coordinates[level_name(STATED)] if own else 1.0
             rows[:, :, part.places] = shift, spread.deviations, stretch * spread.half_widths(STATED)
             covariance[part.places] = stretch**2 * spread.covariance
-            radius[part.places] = spread.radius() * (own.radius if own and own.radius is not None else 1.0)
+            if is_position(kernel):
+                factor = own.radius if own and own.radius is not None else 1.0
+                radius[part.places] = spread.of(POSITION).radius() * factor
+                turn[part.places] = stretch * part.spreads[place].of(TURN).radius(STATED) if len(channels) > 3 else 0
         for i, channel in enumerate(channels):
             plus_minus.shift[channel], plus_minus.deviations[channel], plus_minus.half_widths[channel] = rows[:, i]
         if is_position(kernel):
-            plus_minus.radii[name], plus_minus.covariances[name] = radius, covariance
+            plus_minus.radii[name], plus_minus.covariances[name] = radius, covariance[:, :3, :3]
+        if is_position(kernel) and len(channels) > len(POSITION):
+            plus_minus.turns[name] = turn
     return plus_minus
 
 

@@ -91,6 +91,9 @@ def _show(
         half = [plus_minus.half_widths[f"{name}.{axis}"] for name in plus_minus.radii for axis in "xyz"]
         typical["half_width_90_mm"] = float(np.median(np.concatenate(half))) * 1000
         typical["radius_95_mm"] = float(np.median(np.concatenate(list(plus_minus.radii.values())))) * 1000
+    if plus_minus is not None and plus_minus.turns:
+        turns = np.concatenate(list(plus_minus.turns.values()))
+        typical["turn_90_deg"] = float(np.rad2deg(np.median(turns)))
     console.result(
         {
             "poses": len(commands),
@@ -108,6 +111,7 @@ def _show(
         text = (
             f"{typical['half_width_90_mm']:.2f} mm a coordinate (90 %), {typical['radius_95_mm']:.2f} mm in all (95 %)"
         )
+        text += f", {typical['turn_90_deg']:.2g} deg (90 %)" if "turn_90_deg" in typical else ""
     elif text:
         text += " (90 %)"
     if text:
@@ -193,6 +197,8 @@ def _half_widths(
                 medians[column] = float(np.nanmedian(widths))
     for name, radius in plus_minus.radii.items():
         columns["radius95_mm" if len(plus_minus.radii) == 1 else f"{name}.radius95_mm"] = _texts(to_unit(radius, "mm"))
+    for name, turn in plus_minus.turns.items():
+        columns["turn90_deg" if len(plus_minus.turns) == 1 else f"{name}.turn90_deg"] = _texts(to_unit(turn, "deg"))
     return columns, medians
 
 

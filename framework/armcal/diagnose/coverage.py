@@ -26,6 +26,7 @@ from armcal.estimate.blocks import automatic_block_length, standard_error_of_mea
 from armcal.estimate.estimator import Estimator
 from armcal.estimate.prediction import (
     LEVELS,
+    POSITION,
     RADIUS_LEVEL,
     STATED,
     KnownDrift,
@@ -180,7 +181,7 @@ def scored(problem: Problem, residuals: Residuals, spreads: Sequence[Spread]) ->
     """Residuals in units of what is predicted for them; nan where there are none."""
     errors = [residual / spread.deviations for residual, spread in zip(residuals, spreads, strict=True)]
     reaches = [
-        np.linalg.norm(residual, axis=0) / spread.radius()
+        np.linalg.norm(residual[: len(POSITION)], axis=0) / spread.of(POSITION).radius()
         for kernel, residual, spread in zip(problem.kernels, residuals, spreads, strict=True)
         if is_position(kernel)
     ]

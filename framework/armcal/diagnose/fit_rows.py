@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from armcal.base.domains import Array
 from armcal.estimate.estimator import Estimate
+from armcal.estimate.prediction import POSITION, is_position
 from armcal.problem.problem import FactorRecords, Problem
 
 
@@ -31,6 +32,7 @@ class FitRows:
     by_record: NDArray[np.intp]
     whitening: tuple[Array, ...]
     points: tuple[Array, ...]
+    positions: tuple[bool, ...]
 
     @classmethod
     def of(cls, problem: Problem, records: Sequence[FactorRecords], estimate: Estimate) -> FitRows:
@@ -67,6 +69,7 @@ class FitRows:
             numbers.T,
             tuple(_whitening(k.factor.noise, record) for k, record in zip(problem.kernels, records, strict=True)),
             tuple(record.points_of(k.factor).astype(float) for k, record in zip(problem.kernels, records, strict=True)),
+            tuple(is_position(kernel) for kernel in problem.kernels),
         )
 
     def columns(self, raw: Sequence[Array]) -> Array:
@@ -83,16 +86,17 @@ class FitRows:
         return float(np.mean(self.errors(residual)))
 
     def errors(self, residual: Array) -> Array:
-        """The length of each record's (N, m)."""
+        """The length of each record's (N, m); of a pose's, that of its position."""
         squares, place, count = [], 0, len(self.by_record)
-        for whitening, points in zip(self.whitening, self.points, strict=True):
+        for whitening, points, position in zip(self.whitening, self.points, self.positions, strict=True):
             size = len(whitening)
             own = residual[place : place + size * count].reshape(size, count)
             counted = np.flatnonzero(np.abs(np.linalg.det(np.moveaxis(whitening, 2, 0))) > 0)
             raw = np.zeros_like(own)
             inverse = np.linalg.inv(np.moveaxis(whitening[:, :, counted], 2, 0))
             raw[:, counted] = np.einsum("nrs,sn->rn", inverse, own[:, counted])
-            squares.append(np.sum(raw**2, axis=0) / np.maximum(points, 1))
+            own = raw[: len(POSITION)] if position else raw
+            squares.append(np.sum(own**2, axis=0) / np.maximum(points, 1))
             place += size * count
         return np.asarray(np.sqrt(np.mean(squares, axis=0)))
 

@@ -30,7 +30,8 @@ LEVELS = (0.5, 0.9, 0.95)
 STATED = 0.9
 """The level of a plus-minus."""
 RADIUS_LEVEL = 0.95
-_POSITION = ["x", "y", "z"]
+POSITION, TURN = range(3), range(3, 6)
+"""Rows of the residual of a position, and of a pose."""
 _LEAST_LEFT = 1e-3
 """Of the information on a direction that a record alone gives: without it next to nothing would be known."""
 _MOST_COMPARED = 2000
@@ -49,6 +50,10 @@ class Spread:
 
     covariance: Array
     freedom: float
+
+    def of(self, rows: range) -> Spread:
+        """Of some of the numbers."""
+        return replace(self, covariance=self.covariance[:, rows.start : rows.stop, rows.start : rows.stop])
 
     @cached_property
     def deviations(self) -> Array:
@@ -279,9 +284,8 @@ class Predictor:
 
 
 def is_position(kernel: Kernel) -> bool:
-    """Whether a factor's residual is measured minus predicted position."""
-    channels = [channel.rpartition(".")[2] for channel in kernel.factor.output_channels]
-    return channels == _POSITION and kernel.factor.rows == len(_POSITION)
+    """Whether a factor's residual begins with measured minus predicted position (or pose)."""
+    return bool(kernel.factor.position_channels) and kernel.factor.rows in (len(POSITION), 2 * len(POSITION))
 
 
 def _without_itself(noise: Array, known: Array, factor_records: FactorRecords) -> Array:

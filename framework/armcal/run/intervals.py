@@ -25,7 +25,7 @@ from armcal.diagnose.coverage import (
 )
 from armcal.diagnose.noise_findings import Finding
 from armcal.estimate.estimator import Estimator
-from armcal.estimate.prediction import LEVELS, STATED, Predictor, Spread, is_position
+from armcal.estimate.prediction import LEVELS, POSITION, STATED, Predictor, Spread, is_position
 from armcal.estimate.validation import CrossValidation, Indices, Split
 from armcal.estimate.weighing import WeighedFit
 from armcal.problem.problem import FactorRecords, Problem
@@ -118,7 +118,10 @@ def interval_result(
     if by.drifts:
         spreads["new"] = by.in_new_recording(alike)
     places = [i for i, kernel in enumerate(problem.kernels) if is_position(kernel)]
-    typical = {name: _typical([spread[i] for i in places], stretches.get(name)) for name, spread in spreads.items()}
+    typical = {
+        name: _typical([spread[i].of(POSITION) for i in places], stretches.get(name))
+        for name, spread in spreads.items()
+    }
     return IntervalResult(
         stretches,
         shares,
