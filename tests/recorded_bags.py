@@ -139,8 +139,13 @@ class Tour:
         return sent
 
 
-def made_tour(folder: Path, rests: int = 30, joint_hz: float = 100.0, seen_hz: float = 60.0, seed: int = 5) -> Tour:
-    """A tour through random poses: 0.9 s of rest, then motions of 0.6 to 1.2 s; the true arm is that of ``TRUTH``."""
+def made_tour(
+    folder: Path, rests: int = 30, joint_hz: float = 100.0, seen_hz: float = 60.0, seed: int = 5, play_deg: float = 0.0
+) -> Tour:
+    """A tour through random poses: 0.9 s of rest, then motions of 0.6 to 1.2 s; the true arm is that of ``TRUTH``.
+
+    ``play_deg``: by how much each joint turns, after it turned back, before what it carries follows.
+    """
     (folder / "truth.yaml").write_text("".join(f"{name}: {value}\n" for name, value in TRUTH.items()))
     config = folder / "arm.yaml"
     config.write_text(CONFIG)
@@ -161,13 +166,21 @@ def made_tour(folder: Path, rests: int = 30, joint_hz: float = 100.0, seen_hz: f
     joints = joints_at(times) + random.normal(0.0, 2e-5, (len(times), len(NAMES)))
     seen_at = np.arange(BEGIN_S + 0.0021, ends[-1], 1 / seen_hz)
     experiment = Experiment.load(config, (f"simulation.seed={seed}",))
-    seen = simulated(experiment, joints_at(seen_at))
+    seen = simulated(experiment, with_play(joints_at(seen_at), np.radians(play_deg) / 2))
     exact = Dataset(tuple(map(str, range(rests))), dict(zip(CHANNELS, poses.T, strict=True)))
     request = replace(experiment.simulation_request, poses=exact)
     write_csv(
         folder / "rests.csv", experiment.simulator().simulate(request), experiment.request(measured=True).channels
     )
     return Tour(config, (times, joints), (seen_at, seen), np.column_stack([begins, ends]))
+
+
+def with_play(joints: Array, half: float) -> Array:
+    """What follows joints (N x n; rad) that have so much play to either side."""
+    followed = joints.copy()
+    for i in range(1, len(joints)):
+        followed[i] = np.clip(followed[i - 1], joints[i] - half, joints[i] + half)
+    return followed
 
 
 def simulated(experiment: Experiment, joints: Array) -> Array:

@@ -21,6 +21,8 @@ MOST_FRAMES = 100_000
 _START_FRAMES = 5
 _FEWEST = 10
 _MOST_PERCENT = 105.0
+_RADIANS_MOVED = 0.5
+"""An arm whose joints all stay within pi, and that moves by so much: in degrees it would hardly move at all."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,7 @@ def read_motion(recording: Recording, units: Units, file: MotorFile | None) -> M
         where = Location(str(recording.folder))
         raise DataError(f"found {taken} frames, expected at least {_FEWEST}.", where=where, hint="Record more.")
     episode, frame, action, state = (np.concatenate(parts) for parts in zip(*columns, strict=True))
+    require_degrees(recording, units, state.min(axis=0), state.max(axis=0))
     gaps = np.flatnonzero((np.diff(episode) != 0) | (np.diff(frame) != 1)) + 1
     scale = np.array(factors)
     for start, end in pairwise([0, *gaps.tolist(), len(episode)]):
@@ -114,6 +117,17 @@ def require_percent(frames: Frames, recording: Recording, units: Units) -> None:
         text = f"found {frames.vectors[STATE][row, column]:.1f} of {recording.motors[column]}, expected percent."
         hint = "Its numbers are degrees: leave --units percent out."
         raise DataError(text, where=Location(str(frames.file), field=STATE), hint=hint)
+
+
+def require_degrees(recording: Recording, units: Units, lowest: Array, highest: Array) -> None:
+    """Raise DataError if states that should be degrees look like radians, by their ends (motors)."""
+    turning = [i for i, name in enumerate(recording.motors) if not is_gripper(name)]
+    low, high = lowest[turning], highest[turning]
+    widest = float(np.max(high - low, initial=0.0))
+    if units == "degrees" and widest > _RADIANS_MOVED and np.max(np.abs([low, high])) <= np.pi:
+        text = f"found {low.min():.2f} to {high.max():.2f} in all joints, expected degrees: they look like radians."
+        hint = "Multiply joint states and actions by 57.29578, as LeRobot records degrees or percent."
+        raise DataError(text, where=Location(str(recording.folder), field=STATE), hint=hint)
 
 
 def require_motors(file: MotorFile, motors: Sequence[str]) -> None:

@@ -157,8 +157,8 @@ def open_recording(folder: Path) -> Recording:
         text = f"found codebase_version {version[:20]!r}, expected v2.1 or v3.0."
         raise DataError(text, where=where, hint="Convert it with LeRobot's own scripts.")
     fps, frames = (info.get(key) for key in ("fps", "total_frames"))
-    if not (isinstance(fps, int | float) and 1 <= fps <= 10_000 and isinstance(frames, int) and 0 <= frames < 1 << 53):
-        text = "found no fps and total_frames, expected numbers (fps from 1)."
+    if not (isinstance(fps, int | float) and 1 <= fps <= 10_000 and isinstance(frames, int) and 1 <= frames < 1 << 53):
+        text = f"found fps {fps!r} and total_frames {frames!r}, expected numbers from 1."
         raise DataError(text, where=where, hint="Take it whole from where it was recorded.")
     names = _vector_names(info, where)
     files = tuple(sorted((folder / "data").glob("chunk-*/*.parquet")))

@@ -17,7 +17,7 @@ from armcal.measure.rests import StillSettings, rests
 
 from armcal_lerobot.calibration_file import MotorFile
 from armcal_lerobot.gripper import Follows, require_single
-from armcal_lerobot.motion import require_percent, unit_of
+from armcal_lerobot.motion import require_degrees, require_percent, unit_of
 from armcal_lerobot.motors import Units, is_gripper
 from armcal_lerobot.recordings import ACTION, STATE, Frames, Recording
 from armcal_lerobot.tracking import sides
@@ -61,8 +61,11 @@ def records_of(
     factors = np.array([unit_of(name, units, file)[0] for name in recording.motors])
     still = StillSettings.si(window=window_s, spread=spread_deg * _DEG)
     records = []
+    lowest, highest = np.full(len(factors), np.inf), np.full(len(factors), -np.inf)
     for frames in _episodes(recording):
         require_percent(frames, recording, units)
+        lowest = np.minimum(lowest, frames.vectors[STATE].min(axis=0))
+        highest = np.maximum(highest, frames.vectors[STATE].max(axis=0))
         shown = frames.vectors[STATE if angles == "state" else ACTION] * factors
         moved = np.column_stack([sides(column)[0] for column in (frames.vectors[ACTION] * factors).T])
         turning = [i for i, name in enumerate(recording.motors) if not is_gripper(name)]
@@ -73,6 +76,7 @@ def records_of(
                     int(frames.episode[0]), int(frames.frame[middle]), shown[part].mean(axis=0), moved[rest.stop - 1]
                 )
             )
+    require_degrees(recording, units, lowest, highest)
     if not records:
         text = f"found no {window_s:g} s in which no motor moved by more than {spread_deg:g} deg."
         raise DataError(text, where=Location(str(recording.folder)), hint="Give another --window-s or --spread-deg.")

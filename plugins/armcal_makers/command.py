@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from codecs import BOM_UTF8
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,7 +115,9 @@ def _urdf(arm: MakersArm, placed: Placed | None) -> bytes:
     if placed is None:
         chain = rigid(arm.frames, arm.nominal.joints, arm.nominal.family.limits)
         return (note + urdf_text(chain, arm.nominal.name)).encode()
-    in_ascii = placed.content.lstrip().startswith(b"<")  # of other encodings the comment is left out
+    in_ascii = (
+        placed.content.removeprefix(BOM_UTF8).lstrip().startswith(b"<")
+    )  # of other encodings the comment is left out
     return placed.content + note.encode() if in_ascii else placed.content
 
 

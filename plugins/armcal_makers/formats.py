@@ -154,9 +154,12 @@ def _with(deltas: dict[str, Array], nominal: Nominal) -> Array:
 
 
 def _deltas(text: str, path: Path) -> dict[str, Array]:
-    parser = configparser.ConfigParser(strict=False, interpolation=None, inline_comment_prefixes=("#", ";"))
+    parser = configparser.ConfigParser(interpolation=None, inline_comment_prefixes=("#", ";"))
     try:
         parser.read_string(text)
+    except (configparser.DuplicateOptionError, configparser.DuplicateSectionError) as twice:
+        what = getattr(twice, "option", twice.section)
+        refuse(path, f"found {what} a second time, expected it once.", "Remove one of them.", twice.lineno, what)
     except configparser.Error as fault:
         line = getattr(fault, "lineno", None)
         refuse(path, f"it cannot be read ({type(fault).__name__}).", "Copy the file from the robot again.", line)

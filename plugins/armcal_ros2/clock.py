@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 from armcal.base.domains import Array
+from scipy.interpolate import CubicSpline
 from scipy.special import stdtrit
 
 from armcal_ros2.joints import JointRest
@@ -23,6 +25,8 @@ _FINE_STEPS = 15
 _LEAST_MOTION_M = 0.02
 _MOST_MOTIONS, _FEWEST_MOTIONS, _FEWEST_SAMPLES = 80, 5, 12
 _LONGEST_MOTION_S = 20.0
+_PLAY = np.deg2rad(3.0)
+"""More than joints have play: until each has turned by so much, the tool comes late, whatever the clocks say."""
 _WORST_MISFIT = 0.02
 """Of the variance of the measured path."""
 _WIDEST_S = 0.02
@@ -48,23 +52,29 @@ class ClockOffset:
 
 @dataclass(frozen=True)
 class _Motion:
-    """Times (s) and places (m) of the nominal tool in a motion, and when it begins and ends."""
+    """Times (s) and places (m) of the nominal tool in a motion, and from when to when it is compared."""
 
     times: Array
     places: Array
     begin: float
     end: float
 
-    def misfit(self, seen_at: Array, seen: Array, offset: float) -> float:
-        """The part of the variance of the measured path that the delayed nominal one leaves; NaN if it is not seen."""
-        first, last = np.searchsorted(seen_at, (self.begin + offset, self.end + offset))
+    @cached_property
+    def _spline(self) -> CubicSpline:
+        """Chords between thinned states would come late where the tool slows down."""
+        return CubicSpline(self.times, self.places)
+
+    def misfit(self, seen_at: Array, seen: Array, offset: float, near: float) -> float:
+        """The part of the variance of the measured path that the delayed nominal one leaves; NaN if it is not seen.
+
+        ``near``: an offset (s) that chooses the measured samples; offsets that are compared finely must share them.
+        """
+        first, last = np.searchsorted(seen_at, (self.begin + near, self.end + near))
         if last - first < _FEWEST_SAMPLES:
             return float("nan")
         at, path = seen_at[first:last] - offset, seen[first:last]
-        columns = [np.interp(at, self.times, self.places[:, axis]) for axis in range(3)]
-        design = np.column_stack([np.ones(len(at)), *columns])
-        design[:, 1:] -= design[:, 1:].mean(axis=0)
-        path = path - path.mean(axis=0)
+        design = self._spline(np.clip(at, self.times[0], self.times[-1]))
+        design, path = design - design.mean(axis=0), path - path.mean(axis=0)
         left = path - design @ np.linalg.lstsq(design, path, rcond=1e-3)[0]
         return float((left**2).sum() / max((path**2).sum(), 1e-12))
 
@@ -90,7 +100,7 @@ def estimated_offset(
         text = f"found {len(motions)} motions of more than {1000 * _LEAST_MOTION_M:g} mm between rests"
         return f"{text}, at least {_FEWEST_MOTIONS} needed"
     steps = guess + np.arange(-_SEARCHED_S, _SEARCHED_S + _COARSE_S / 2, _COARSE_S)
-    costs = np.array([[motion.misfit(*seen, offset) for offset in steps] for motion in motions])
+    costs = np.array([[motion.misfit(*seen, offset, offset) for offset in steps] for motion in motions])
     seen_there = np.isfinite(costs).all(axis=1)
     if seen_there.sum() < _FEWEST_MOTIONS:
         return f"the measurement saw {seen_there.sum()} motions of {len(motions)}, at least {_FEWEST_MOTIONS} needed"
@@ -132,16 +142,20 @@ def _motions(rests: Sequence[JointRest], path: tuple[Array, Array], tool: Callab
         first, last = np.searchsorted(times, (begin, end))
         if last - first < _FEWEST_SAMPLES or end - begin > _LONGEST_MOTION_S:
             continue
+        turned = np.abs(joints[first:last] - joints[first])
+        start = first + int(np.argmax(np.all((turned > _PLAY) | (turned[-1] <= _PLAY), axis=1)))
+        if last - start < _FEWEST_SAMPLES:
+            continue
         places = tool(joints[first:last])
-        if np.linalg.norm(places[-1] - places[0]) > _LEAST_MOTION_M:
-            motions.append(_Motion(times[first:last], places, begin, end))
+        if np.linalg.norm(places[-1] - places[start - first]) > _LEAST_MOTION_M:
+            motions.append(_Motion(times[first:last], places, times[start], end))
     return motions
 
 
 def _finest(motion: _Motion, seen: tuple[Array, Array], near: float) -> float:
     """The offset at which a motion fits best (s), the vertex of a parabola through the best three; NaN at an edge."""
     offsets = near + _FINE_S * np.arange(-_FINE_STEPS, _FINE_STEPS + 1)
-    costs = np.array([motion.misfit(*seen, offset) for offset in offsets])
+    costs = np.array([motion.misfit(*seen, offset, near) for offset in offsets])
     if not np.isfinite(costs).all() or (best := int(np.argmin(costs))) in (0, len(costs) - 1):
         return float("nan")
     before, here, after = costs[best - 1 : best + 2]

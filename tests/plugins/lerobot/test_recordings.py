@@ -114,8 +114,9 @@ def test_a_missing_episode_is_named(tmp_path: Path) -> None:
     ("changed", "text"),
     [
         ({"codebase_version": "v1.6"}, "expected v2.1 or v3.0"),
-        ({"fps": "30"}, "no fps"),
-        ({"total_frames": 10**30}, "no fps and total_frames"),
+        ({"fps": "30"}, "found fps '30' and total_frames"),
+        ({"total_frames": 10**30}, "and total_frames 1000"),
+        ({"total_frames": 0}, "and total_frames 0, expected numbers from 1"),
         ({"features": []}, "no features"),
         ({"features": {"action": 3, "observation.state": [1]}}, "found no feature observation.state"),
         ({"features": {"observation.state": {"dtype": "float32", "shape": ["x"]}}}, "found no feature observation"),

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 
 pytest.importorskip("pyarrow")
 from armcal_lerobot.command import lerobot
+from armcal_lerobot.motion import read_motion
 from armcal_lerobot.recordings import open_recording
 from armcal_lerobot.rest_records import records_of
 
@@ -114,5 +115,10 @@ def test_wrong_joints_and_units_are_refused(tmp_path: Path) -> None:
     for joint, message in (("elbow_flx=-elbow_flex", "no motor 'elbow_flx'"), ("elbow_flex=shoulder_pan", "twice")):
         with pytest.raises(InputError, match=message):
             called(data, "--out", tmp_path / "rests.csv", "--joint", joint)
+    radians = write_dataset(tmp_path / "radians", [(np.radians(a), np.radians(s)) for a, s in with_rests(1)])
+    with pytest.raises(DataError, match="they look like radians"):
+        called(radians, "--out", tmp_path / "rests.csv")
+    with pytest.raises(DataError, match="they look like radians"):
+        read_motion(open_recording(radians), "degrees", None)
     with pytest.raises(DataError, match="expected percent"):
         called(data, "--out", tmp_path / "rests.csv", "--units", "percent", "--calibration", file)

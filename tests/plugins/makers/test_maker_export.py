@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from codecs import BOM_UTF8
 from dataclasses import replace
 from pathlib import Path
 
@@ -119,6 +120,19 @@ def test_a_makers_file_goes_into_its_own_urdf_and_back(tmp_path):
     (tmp_path / "k.yaml").write_text(UR5E_YAML)
     arguments = ("maker", tmp_path / "k.yaml", "--urdf", tmp_path / "cell.urdf", "--tip")
     assert armcal(*arguments, "base_link_inertia", "--out", tmp_path / "new.urdf").exit_code == 2
+    marked = tmp_path / "marked.urdf"
+    marked.write_bytes(BOM_UTF8 + full_urdf().encode())
+    with_mark = (
+        "maker",
+        tmp_path / "k.yaml",
+        "--urdf",
+        marked,
+        "--tip",
+        "gripper",
+        "--out",
+        tmp_path / "of_marked.urdf",
+    )
+    assert armcal(*with_mark).exit_code == 0 and b"calib_" in (tmp_path / "of_marked.urdf").read_bytes()
     ran = armcal(*arguments, "gripper", "--out", tmp_path / "new.urdf")
     assert ran.exit_code == 0, ran.output
     assert without_origins((tmp_path / "new.urdf").read_text()) == without_origins(full_urdf())

@@ -146,6 +146,7 @@ WRONG = {
     "conf length": (UR5_CONF.replace(", 0]", "]"), "ur5", "expected [six numbers]"),
     "conf degrees": (SMALL_DEGREES, "ur10", "expected at most 0.1 rad"),
     "conf not calibrated": (UR5_CONF.replace("status = 2", "status = 1"), "ur5", "expected 2"),
+    "conf key twice": (UR5_CONF + "delta_a = [0, 0, 0, 0, 0, 0]\n", "ur5", "found delta_a a second time"),
     "conf no values": ("[mounting]\ndelta_theta\n", "ur5", "cannot be read"),
 }
 

@@ -34,6 +34,13 @@ def test_an_offset_is_found_within_its_interval(tour: bags.Tour, ahead_ms: float
     assert abs(offset - ahead_ms) < 2 * half_width
 
 
+def test_play_of_the_joints_is_not_taken_for_a_clock(tmp_path: Path) -> None:
+    """A tool that follows only after 2 deg of play comes late where each motion begins, and not where it ends."""
+    tour = bags.made_tour(tmp_path, rests=16, play_deg=2.0)
+    offset, half_width = estimated(tour, bags.write_bag(tmp_path / "bag", tour.sent(0.037)))
+    assert abs(offset - 37) < 1 and half_width < 1
+
+
 def test_clocks_that_drift_apart_are_named(tour: bags.Tour) -> None:
     at, seen = tour.seen
     fast = replace(tour, seen=(at + 0.002 * (at - at[0]), seen))

@@ -34,8 +34,11 @@ LIMITS = {
     "wrist_flex": (-72, 72),
     "wrist_roll": (-82, 82),
 }
-NARROWER = [f"plan.limits.{joint}=[{low} deg, {high} deg]" for joint, (low, high) in LIMITS.items()]
-"""The bench judges limits by shafts, which are up to 7 deg on for the same angle once zeros are written back."""
+NARROWER = (
+    *(f"plan.limits.{joint}=[{low} deg, {high} deg]" for joint, (low, high) in LIMITS.items()),
+    *(f"plan.clearance.rules.{rule}.at_least_mm=50" for rule in range(3)),
+)
+"""The bench judges limits and clearance by shafts, up to 7 deg on for the same angle once zeros are written back."""
 pytestmark = pytest.mark.slow
 
 
@@ -60,9 +63,9 @@ class Loop:
         with (self.folder / name).open() as stream:
             return np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in csv.DictReader(stream)])
 
-    def values(self, run: str) -> dict[str, float]:
+    def values(self, run: str, key: str = "value") -> dict[str, float]:
         text = yaml.safe_load((self.folder / run / "calibration.yaml").read_text())
-        return {p["name"]: p["value"] for p in text["parameters"]}
+        return {p["name"]: p[key] for p in text["parameters"]}
 
     def nominal_error_mm(self, run: str) -> float:
         metrics = json.loads((self.folder / run / "metrics.json").read_text())
@@ -109,13 +112,14 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loop]:
     config = shutil.copytree(CONFIGS, folder / "so101") / "bench.yaml"
     port = free_port()
     ports = (f"bench.tracker.port={port}", f"bench.simulator.tracker.port={port}")
-    desk, bench = Terminal(folder), Terminal(folder, (*ports, *overrides_for(folder / "bench", "device")))
+    there = (*ports, *overrides_for(folder / "bench", "device"))
+    desk, bench, careful = Terminal(folder), Terminal(folder, there), Terminal(folder, (*there, *NARROWER))
     desk("plan", config, "--poses", str(POSES), "--out", folder / "plan.csv")
     fresh = Terminal(folder, ("plan.seed=5", "plan.starts=1", "plan.goal=A", *NARROWER))
     fresh("plan", config, "--poses", str(FRESH), "--out", folder / "fresh.csv")
 
-    def acquire(plan: str, out: str, code: int = 0) -> str:
-        return bench("acquire", config, "--plan", folder / plan, "--out", folder / out, "--yes", code=code)
+    def acquire(plan: str, out: str, by: Terminal = bench, code: int = 0) -> str:
+        return by("acquire", config, "--plan", folder / plan, "--out", folder / out, "--yes", code=code)
 
     def doubt() -> str:
         words = ("acquire", config, "--plan", folder / "plan.csv", "--dry-run", "--json")
@@ -138,7 +142,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loop]:
         plans = json.loads(bench(*home))["offsets"]
         unchecked.append(doubt())
         bench("servo", config, "--check", "--yes")
-        acquire("fresh.csv", "homed")
+        acquire("fresh.csv", "homed", by=careful)
         state = clock.ask({"state": True})
         clock.close()
     desk("run", config, "--data", folder / "homed" / "dataset.csv", "--out", folder / "afterwards")
@@ -210,8 +214,11 @@ def test_no_arm_was_driven_whose_wiring_was_not_checked(loop: Loop) -> None:
 
 def test_the_zeros_are_in_the_servos_afterwards(loop: Loop) -> None:
     """The calibrated arm without its zeros predicts fresh poses; LeRobot's file would get the same offsets."""
-    values = loop.values("afterwards")
-    assert max(abs(math.degrees(values[f"arm.zeros.offset{i}"])) for i in range(1, 6)) < 0.2
+    names = [f"arm.zeros.offset{i}" for i in range(1, 6)]
+    left, doubt = (np.array([loop.values("afterwards", key)[name] for name in names]) for key in ("value", "sd"))
+    before = np.array([loop.values("calibrated", "sd")[name] for name in names])
+    assert (np.abs(left) < 3 * np.hypot(doubt, before)).all(), np.degrees([left, doubt, before])
+    assert np.degrees(np.abs(left)).max() < 0.5, "of 4 to 7 deg before"
     errors = np.linalg.norm(loop.positions("homed.csv") - loop.positions("homed/dataset.csv"), axis=1)
     assert len(errors) == FRESH and errors.max() < 3
     assert loop.nominal_error_mm("afterwards") < loop.nominal_error_mm("calibrated") / 2, "springs and lengths are left"
