@@ -96,18 +96,11 @@ def _process(
     recorded = (postures.commands, postures.approaches, postures.surroundings)
     raw = np.array([Input(of=kind, joint=i + 1, scale=1).number(*recorded) for kind, i in inputs])
     spans = np.array([1.0 if kind == "angle" else np.ptp(row) for row, (kind, _) in zip(raw, inputs, strict=True)])
-    numbers, order = raw / spans[:, None], np.random.default_rng(0).permutation(len(own))
+    numbers, near = raw / spans[:, None], list[Array]()
     if [(known.of, known.joint - 1) for known in before] == list(inputs):
-        candidates = [np.log(np.append([known.scale for known in before] / spans, _FIRST_NOISE))]
-    else:
-        starts = [np.log(np.append(np.full(len(inputs), length), _FIRST_NOISE)) for length in _STARTS]
-        some = order[:_FIRST]
-        candidates = [_likeliest(_Likelihood(_squares(numbers[:, some], inputs), own[some]), start) for start in starts]
-    some = order[:_SECOND]
-    likelihood = _Likelihood(_squares(numbers[:, some], inputs), own[some])
-    best = _likeliest(likelihood, min(candidates, key=likelihood.cost))
-    nothing = len(some) / 2 * float(np.sum(np.log(np.mean(own[some] ** 2, axis=0))))
-    if nothing - likelihood.cost(best) < _GAIN * len(best):
+        near = [np.log(np.append([known.scale for known in before] / spans, _FIRST_NOISE))]
+    likelihood, best = _sought(numbers, own, inputs, near)
+    if likelihood.nothing - likelihood.cost(best) < _GAIN * len(best):
         return None, np.zeros_like(own)
     lengths, noise = np.exp(best[:-1]), float(np.exp(best[-1]))
     kept = _poses(numbers, inputs, lengths, most, noise)
@@ -131,12 +124,34 @@ def _process(
     return part, independent @ weights
 
 
+def _sought(
+    numbers: Array, own: Array, inputs: Sequence[tuple[Kind, int]], near: Sequence[Array]
+) -> tuple[_Likelihood, Array]:
+    """The likelihood of some of the records, and where it is largest, from what is near, or else from fixed starts."""
+    order = np.random.default_rng(0).permutation(len(own))
+
+    def of_first(count: int) -> _Likelihood:
+        some = order[:count]
+        return _Likelihood(_squares(numbers[:, some], inputs), own[some])
+
+    if not near:
+        starts = [np.log(np.append(np.full(len(inputs), length), _FIRST_NOISE)) for length in _STARTS]
+        near = [_likeliest(of_first(_FIRST), start) for start in starts]
+    likelihood = of_first(_SECOND)
+    return likelihood, _likeliest(likelihood, min(near, key=likelihood.cost))
+
+
 @dataclass(frozen=True)
 class _Likelihood:
     """Negative logarithm of the marginal likelihood, each output's scale at its best, and the gradient."""
 
     squares: Array
     errors: Array
+
+    @property
+    def nothing(self) -> float:
+        """Its cost where there is noise alone."""
+        return len(self.errors) / 2 * float(np.sum(np.log(np.mean(self.errors**2, axis=0))))
 
     def cost(self, at: Array) -> float:
         """At logarithms of length scales and of the noise."""
