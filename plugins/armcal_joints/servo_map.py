@@ -39,6 +39,10 @@ class ServoMap(JointEffect):
             blocks.append(scalar(f"offset{joint}", "rad", 0.0, OFFSET_SCALE_RAD))
         return tuple(blocks)
 
+    def zeros(self) -> dict[str, int]:
+        """The offsets."""
+        return {f"offset{joint}": joint for joint in self.joints}
+
     def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:
         """Gain error times command, plus the offset (rad)."""
         joint, commanded = command.joint, command.commanded

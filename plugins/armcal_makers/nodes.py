@@ -96,7 +96,8 @@ def read_section(text: str, path: Path) -> Section:
         aliases = [e for e in yaml.parse(text, yaml.SafeLoader) if isinstance(e, yaml.AliasEvent)]
         if aliases:  # nested ones make billions of a few lines
             text = f"found the alias *{aliases[0].anchor}, expected a number."
-            refuse(path, text, AGAIN, aliases[0].start_mark.line + 1)
+            mark = aliases[0].start_mark
+            refuse(path, text, AGAIN, None if mark is None else mark.line + 1)
         root = yaml.compose(text, yaml.SafeLoader)
     except (yaml.YAMLError, RecursionError) as fault:
         mark = getattr(fault, "problem_mark", None)

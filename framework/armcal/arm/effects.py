@@ -111,6 +111,10 @@ class JointEffect:
         """What the effect adds to a joint's commanded displacement (rad or m); it is asked of every joint."""
         return 0
 
+    def zeros(self) -> Mapping[str, int]:
+        """Which parameters (local names, rad) are the zero of a joint, and the number of that joint."""
+        return {}
+
     def springs(self, values: Mapping[str, Expression]) -> Sequence[Spring]:
         """The effect's elastic deflections."""
         return ()

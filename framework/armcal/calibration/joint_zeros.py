@@ -11,7 +11,6 @@ from armcal.errors import InputError, Location
 from armcal.plugins import PluginRegistry
 
 _MODEL_ZERO = re.compile(r"(theta|offset)(\d+)")
-_SERVO_MAP = "servo_map"
 
 
 @dataclass(frozen=True)
@@ -25,8 +24,8 @@ class Zero:
 def zeros_of(path: Path, arm: str | None, registry: PluginRegistry) -> tuple[dict[str, Zero], dict[str, str]]:
     """The zeros that a calibration found, by joint; and joints without one, with the reason.
 
-    A zero is the offset of a ``servo_map`` as it stands, and what a model's own ``theta`` or ``offset`` differs from
-    its drawing.
+    A zero is what a joint effect states as one (``JointEffect.zeros``), as it stands, and what a model's own ``theta``
+    or ``offset`` differs from its drawing.
 
     Raises:
         ConfigError: the calibration is refused.
@@ -37,19 +36,14 @@ def zeros_of(path: Path, arm: str | None, registry: PluginRegistry) -> tuple[dic
     if arm not in arms and (arm is not None or len(arms) > 1):
         raise InputError(f"found the arms {', '.join(arms)}.", where=where, hint="Choose one with --arm-name NAME.")
     chosen = arms[arm or next(iter(arms))]
-    described = loaded.system.description["arms"][chosen.name].get("effects") or {}
-    maps = {name for name, effect in described.items() if effect.get("type") == _SERVO_MAP}
+    stated = {f"{chosen.name}.{n}.{p}": j for n, effect in chosen.effects.items() for p, j in effect.zeros().items()}
     zeros: dict[str, Zero] = {}
     reasons = dict.fromkeys(chosen.commanded, "its zero was not free")
     for entry in loaded.record.parameters:
-        _, part, local = (*entry.name.split(".", 2), "", "")[:3]
-        match = _MODEL_ZERO.fullmatch(local)
-        owned = entry.name.startswith(f"{chosen.name}.") and match and entry.unit == "rad"
-        if not owned or match is None or not (part in maps or part == chosen.model_name):
-            continue
-        joint = chosen.joint_names[int(match[2]) - 1]
-        if joint in chosen.commanded:
-            _take(zeros, reasons, joint, entry, part in maps)
+        match = _MODEL_ZERO.fullmatch(entry.name.removeprefix(f"{chosen.name}.{chosen.model_name}."))
+        number = stated.get(entry.name, int(match[2]) if match and entry.unit == "rad" else 0)
+        if number and (joint := chosen.joint_names[number - 1]) in chosen.commanded:
+            _take(zeros, reasons, joint, entry, entry.name in stated)
     if not zeros:
         hint = "Free them in parameters.free (arm.EFFECT.offset*, of an effect servo_map), and run again."
         raise InputError("found no calibrated zero of a joint.", where=where, hint=hint)
