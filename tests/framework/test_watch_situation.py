@@ -148,6 +148,9 @@ def test_hours_that_are_off_while_nominal_are_found_and_an_outlier_is_none() -> 
     for at, verdict in ((900.0, "rejected"), (1000.0, "ignored")):
         hours.take({"at": START + 3600 * 9 + 1800 + at, "off_mm": 40.0, "level": "nominal", "verdict": verdict})
     assert over_time(hours, None)["off"] == []
+    for verdict, off in (("rejected", 900.0), ("accepted", 1.0)):  # one wrong record of two
+        hours.take({"at": START + 3600 * 11, "off_mm": off, "level": "nominal", "verdict": verdict})
+    assert over_time(hours, None)["off"] == []
     assert over_time(Hours(), None)["limit_mm"] is None
 
 

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import median
+from statistics import median, median_low
 from typing import Any
 
 from armcal_online.watch.events import LEVELS, number, rounded, text
@@ -51,8 +51,8 @@ class Hour:
 
     @property
     def median(self) -> float:
-        """Of the readings; outliers hardly move it."""
-        return median(self.sizes) if self._median is None else self._median
+        """Of the readings, the smaller of two in the middle: one outlier of two records shows no arm that is off."""
+        return median_low(self.sizes) if self._median is None else self._median
 
     @property
     def row(self) -> dict[str, Any]:
