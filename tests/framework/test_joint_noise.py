@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import contact_oracle as co
 import numpy as np
 import oracle
 import pytest
+from armcal.base.dataset import Dataset
+from armcal.calibration.intervals import PredictionRecord, Uncertainty
 from armcal.estimate.estimator import estimate
 from armcal.estimate.nuisance import started
 from armcal.problem.readings import with_joint_noise
@@ -16,9 +19,12 @@ from armcal_ipopt.estimator import IpoptEstimator
 from armcal_tracker.position import TipPosition, TipPositionSettings
 from chain_oracle import ChainSpec, Row
 from contact_oracle import BALL, LEFT, RIGHT, SPOTS, ball, near
+from made_calibrations import made_calibration
 
 JOINT_SD, SEAT_SD = 1e-3, 2e-4
 SLIDING = ChainSpec((Row(a=0.3, alpha=0.3), Row(kind="prismatic", alpha=co.HALF, theta=0.2, d=0.1), Row(a=0.2, d=0.05)))
+
+DEMO = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "demo.yaml"
 
 
 def noisy_arm(chain=LEFT, name="left", sd=JOINT_SD):
@@ -232,3 +238,24 @@ def test_a_hundred_seeds_lie_in_their_intervals_as_often_as_they_say():
     assert 0.92 <= share <= 0.98
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(1.0, abs=0.1)
     assert np.abs(errors.mean(axis=0)).max() < 0.45, "an estimate is off by more than chance"
+
+
+def test_intervals_of_predictions_have_what_the_joints_noise_makes_of_the_tip() -> None:
+    """By differences of the predicted tip: servos that are off by 0.1 deg move it, however many poses were fitted."""
+    plain, noisy = (made_calibration(DEMO, stated) for stated in ((), ("arms.arm.joint_noise_deg=0.1",)))
+    random, step, sd = np.random.default_rng(3), 1e-5, np.deg2rad(0.1)
+    channels = {f"arm.q{i}": random.uniform(-0.8, 0.8, 4) for i in range(1, 7)}
+    commands = Dataset(tuple("abcd"), channels)
+    added = np.zeros((3, 4))
+    for name in channels:
+        ahead, behind = (replace(commands, channels={**channels, name: channels[name] + s}) for s in (step, -step))
+        tips = [np.array([plain.predict(c)[0][f"tracker.{a}"] for a in "xyz"]) for c in (ahead, behind)]
+        added += ((tips[0] - tips[1]) / (2 * step) * sd) ** 2
+    variances = []
+    for calibration in (plain, noisy):
+        parameters = calibration.parameters.with_free(["arm.mdh.base_x"])
+        known = PredictionRecord(entries=("arm.mdh.base_x",), covariance=((1e-8,),))
+        uncertainty = Uncertainty(calibration.system, parameters, parameters.nominal(), known, 1.0, 1e6)
+        deviations = uncertainty.plus_minus(commands).deviations
+        variances.append(np.array([deviations[f"tracker.{axis}"] for axis in "xyz"]) ** 2)
+    np.testing.assert_allclose(variances[1] - variances[0], added, rtol=1e-4)

@@ -26,7 +26,7 @@ from armcal.estimate.validation import Indices
 from armcal.estimate.variance import Axes, Component, VarianceComponents, apply_components
 from armcal.problem.drift import Chain, chain, with_drift
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.readings import reading_slopes
+from armcal.problem.readings import reading_slopes, with_joint_noise
 
 _AT_ONCE = 1000
 """Records whose slopes are in memory together."""
@@ -182,7 +182,7 @@ class Uncertainty:
 
     def _apart(self, problem: Problem, commands: Dataset, places: Indices) -> _Part:
         """Where nothing is told of a drift."""
-        records = problem.records(commands)
+        records = with_joint_noise(problem, problem.records(commands), self.values)
         spreads = self._predictor(problem, None).in_new_recording(self._whitened(problem, records))
         recording: Recording = "same" if self.record.recording is None else "new"
         still = tuple(np.zeros_like(spread.deviations) for spread in spreads)
@@ -213,7 +213,8 @@ class Uncertainty:
         return known_drift
 
     def _drifted(self, problem: Problem, dataset: Dataset, along: Chain | None) -> tuple[FactorRecords, ...]:
-        return with_drift(problem, problem.records(dataset), dataset, self.parameters.nominal(), along)
+        records = with_joint_noise(problem, problem.records(dataset), self.values)
+        return with_drift(problem, records, dataset, self.parameters.nominal(), along)
 
     def _with_predictions(self, commands: Dataset) -> tuple[Problem, Dataset]:
         """The commands with what instruments read there: residuals may depend on readings in any way."""
