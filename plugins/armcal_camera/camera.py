@@ -16,7 +16,7 @@ from armcal.base.pose_blocks import pose_transform
 from armcal.base.pose_settings import PoseSettings
 from armcal.base.se3 import identity
 from armcal.measure.instrument import InstrumentSettings
-from armcal.measure.measurement import Channel
+from armcal.measure.measurement import Channel, Mistake
 from armcal.measure.points import PointInstrument, Proposal, Reading, spread_points
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
@@ -288,6 +288,17 @@ class Camera(PointInstrument):
             self.camera_frame, f"on {self.camera_frame}"
         )
         return f"its place {where} is known to {1000 * mm:.2g} mm and {np.rad2deg(deg):.2g} deg (95 %)."
+
+    def mistakes(self) -> Sequence[Mistake]:
+        """A camera that was bumped, a lens that focuses by itself."""
+        place = tuple(f"camera_{part}" for part in ("x", "y", "z", "rotation"))
+        moved = "the camera, or the board, was moved there"
+        again = "repeat some of the first poses now, fasten what moved, and calibrate the records after it apart"
+        focus = "the recorded order: the focal length changes (autofocus, zoom, warming)"
+        return (
+            Mistake("bump", moved, again, place, "once"),
+            Mistake("focus", focus, "turn autofocus off, and repeat the first poses", ("fx", "fy"), "slowly", True),
+        )
 
     def rendered(self, frames: Mapping[str, Array], values: Mapping[str, Array]) -> Iterator[bytes]:
         """An image of each record, blurred and with noise as an ordinary camera has them."""

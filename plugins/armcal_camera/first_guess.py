@@ -14,6 +14,7 @@ from armcal.measure.points import Proposal, Reading
 from armcal_camera.certificate import sentence
 from armcal_camera.hand_eye import hand_eye, open_motion
 from armcal_camera.lens import DISTORTION, normalised
+from armcal_camera.mixed_up import require_board_axes, require_one_board
 from armcal_camera.views import FEWEST_POINTS, board_pose, homography, intrinsics
 
 _INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -55,14 +56,20 @@ def first_guess(setup: Setup, reading: Reading) -> Proposal:
     With A the frame of the camera as seen from that of the boards, A camera_pose = board_pose camera_T_board^-1 in
     every record: one equation wherever camera and boards are. Boards whose place is held or another camera's do where
     the motion leaves it open.
+
+    Raises:
+        ProblemError: the images cannot be of what is stated.
     """
     own, free = dict(reading.values), reading.free
     views = _views(setup, reading)
+    require_board_axes([(v.points, v.image) for v in views if len(v.points) == len(setup.points[v.board])])
     if free & set(_INTRINSICS) and not setup.is_stated:
         own |= _intrinsics(views, free)
     poses = _poses(setup, views, own)
     proposed = {name: own[name] for name in _INTRINSICS if name in free}
     (camera_frame, board_frame), moved = setup.frames, _moved(setup, reading)
+    for own_poses in poses if camera_frame != board_frame else ():
+        require_one_board(moved[list(own_poses)], np.array(list(own_poses.values())))
     known = [not free & set(_place(name)) for name in setup.names]
     is_open = _still(camera_frame) if camera_frame == board_frame else open_motion(moved, camera_frame)
     if is_open is not None and not any(own_poses for own_poses, held in zip(poses, known, strict=True) if held):

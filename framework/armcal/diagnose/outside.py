@@ -8,7 +8,9 @@ import numpy as np
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.base.parameters import ParameterBlock
 from armcal.diagnose.dependences import Dependence, Records
+from armcal.measure.measurement import NamesMistakes
 from armcal.problem.motion import Motion, recorded_order
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -16,14 +18,24 @@ _AXES = ("x", "y", "z")
 _MOST_STEPS, _MOST_SLIPS = 40, 12
 """Places at which something may have jumped are looked at: of all that is measured, and of each joint."""
 _FEWEST_APART = 4
+_STEP = 1e-4
+"""Of a typical change, in differences."""
 _LOAD_PARTS = (slice(0, 3), slice(3, 4), slice(4, 8))
 """Of the loads that motion knows slopes by: turns of gravity, its size, mass and place of a payload."""
 _STEP_MEASURE = "repeat some of the first poses now, and look at what was touched at that time"
 
 
-def outside(problem: Problem, motion: Motion, dataset: Dataset, positions: Sequence[Array]) -> Iterator[Dependence]:
-    """Everything of it that these records could show; ``positions`` are what instruments should read."""
+def outside(
+    problem: Problem,
+    motion: Motion,
+    dataset: Dataset,
+    positions: Sequence[Array],
+    values: Array,
+    records: Sequence[FactorRecords],
+) -> Iterator[Dependence]:
+    """Everything that these records could show at a fit's values; ``positions`` are what instruments should read."""
     here = Records(dataset, motion)
+    yield from _of_mistakes(here, problem, values, records)
     if motion.by_load:
         by_load = [slope.transpose(0, 2, 1) for slope in motion.by_load]  # n_r x N x (gravity's turn, size, load)
         level, weigh = "level the base, or measure its tilt with a spirit level", "weigh what hangs on the tool"
@@ -102,6 +114,54 @@ def _of_steps(here: Records, problem: Problem) -> Iterator[Dependence]:
             along = here.along(channel, (rank >= place).astype(float)[:, None])
             words = f"whether a record was measured before or after {ids[place]}: {shown} slips there"
             yield Dependence("slip", shown, arm, words, "", _STEP_MEASURE, along, ("slip",), si)
+
+
+def _of_mistakes(
+    here: Records, problem: Problem, values: Array, records: Sequence[FactorRecords]
+) -> Iterator[Dependence]:
+    """What instruments say may have gone wrong with them."""
+    order, many = recorded_order(here.dataset), len(problem.blueprint.measurements) > 1
+    ranked = np.argsort(order, kind="stable")
+    rank = np.argsort(ranked, kind="stable")
+    for name, measurement in problem.blueprint.measurements.items():
+        for one in measurement.mistakes() if isinstance(measurement, NamesMistakes) else ():
+            blocks = [problem.parameters[f"{name}.{local}"] for local in one.parameters]
+            if not all(block.free for block in blocks):
+                continue
+            moves = _moves(problem, values, records, blocks, one.together)
+            subject, words = (name if many else ""), f"{name}: {one.words}" if many else one.words
+            labels, unit = (("change",), "1") if one.together and one.course != "once" else ((), "")
+            if np.ptp(order) > 0 and one.course == "slowly":
+                course = tuple(move * (rank / max(len(rank) - 1, 1) - 0.5)[:, None] for move in moves)
+                yield Dependence(one.kind, subject, "", words, "", one.measure, course, labels, unit)
+            elif np.ptp(order) > 0:
+                for place in _places(len(rank), _MOST_SLIPS):
+                    jump = tuple(move * (rank >= place)[:, None] for move in moves)
+                    at = f"whether a record was measured before or after {here.dataset.ids[ranked[place]]}: {words}"
+                    yield Dependence(one.kind, subject, "", at, "", one.measure, jump)
+
+
+def _moves(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], blocks: Sequence[ParameterBlock], together: bool
+) -> tuple[Array, ...]:
+    """How raw residuals move with each increment of parameters, by central differences (n_r x N x k a factor).
+
+    ``together``: with all of them by the same share (one column).
+    """
+    steps = []
+    for block in blocks:
+        place = problem.parameters.entries_of(block.name)
+        size = _STEP * block.domain.increment_scale(block.scale)
+        for unit in np.eye(block.domain.dof):
+            parts = []
+            for sign in (1.0, -1.0):
+                there = values.copy()
+                there[place] = block.domain.retract(values[place], sign * size * unit)
+                parts.append(problem.residuals(there, records))
+            share = float(values[place][0]) if together else 1.0
+            steps.append([share * (one - other) / (2 * size) for one, other in zip(*parts, strict=True)])
+    columns = [np.stack(parts, axis=2) for parts in zip(*steps, strict=True)]
+    return tuple(part.sum(axis=2, keepdims=True) for part in columns) if together else tuple(columns)
 
 
 def _places(count: int, most: int) -> list[int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 from armcal.arm.assembly import ArmState
 from armcal.base.parameters import ParameterBlock
@@ -155,6 +155,35 @@ class StatesAccuracy(Protocol):
         Args:
             deviations: standard deviations of free coordinates by local name (``camera_x``, ``camera_rotation<rx>``).
         """
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """Something that may have gone wrong with an instrument.
+
+    Attributes:
+        kind: in a word, ``focus``.
+        words: what residuals then depend on, as the end of a sentence.
+        measure: which measurement would show it, and what to do about it.
+        parameters: local names of what changes; it is looked for where all are free.
+        course: how it changes over the recording.
+        together: whether all change by the same share, and not each by itself.
+    """
+
+    kind: str
+    words: str
+    measure: str
+    parameters: tuple[str, ...]
+    course: Literal["slowly", "once"]
+    together: bool = False
+
+
+@runtime_checkable
+class NamesMistakes(Protocol):
+    """What a measurement may provide beside the rest if it knows what often goes wrong with it."""
+
+    def mistakes(self) -> Sequence[Mistake]:
+        """Each of them is looked for in the residuals of a fit."""
 
 
 def borrowed_names(measurement: Measurement) -> dict[str, str]:

@@ -1,0 +1,93 @@
+"""Images that cannot be of what is stated: corners in another order, joints in another order, two boards for one.
+
+The turn between two poses and the shift along its axis are the same seen from the hand and from the camera, wherever
+the camera sits: pairs of images show what does not belong together before anything is fitted.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from armcal.base.domains import Array
+from armcal.errors import ProblemError
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from armcal_camera.views import homography
+
+_BENT, _STRAIGHT = 0.05, 0.01
+"""Of the size of a board's image: corners of another board, and of this one through an ordinary lens."""
+_FEWEST = 8
+_TURN_RAD, _SHIFT_M = np.radians(10.0), 0.05
+"""What the errors of a nominal arm and of a first guess of the lens may make of pairs."""
+_OTHER_RAD, _OTHER_SHARE = np.radians(5.0), 0.15
+"""Turns that differ by so much, and by such a share of what the hand turns, are not the same."""
+_LEAST_ACROSS, _TIMES_WITHIN = 0.15, 5.0
+
+
+def require_board_axes(views: Sequence[tuple[Array, Array]]) -> None:
+    """Refuse corners that lie as if columns and rows were exchanged; views are whole boards and their images.
+
+    Raises:
+        ProblemError: most lie so.
+    """
+    as_stated, exchanged = [], []
+    for points, image in views:
+        order = np.lexsort((points[:, 1], points[:, 0]))  # column by column
+        size = float(np.max(np.ptp(image, axis=0)))
+        as_stated.append(_off(points, image) / size)
+        exchanged.append(_off(points[order], image) / size)
+    if views and np.median(as_stated) > _BENT and np.median(exchanged) < _STRAIGHT:
+        raise ProblemError(
+            "the corners of the board lie as if its columns and rows were exchanged.",
+            hint="Exchange columns and rows of the board's settings, or count its corners row by row.",
+        )
+
+
+def require_one_board(moved: Array, seen: Array) -> None:
+    """Refuse poses of the hand (N x 4 x 4) and camera_T_board (N x 4 x 4) of which pairs contradict each other.
+
+    Raises:
+        ProblemError: some images show another board, or hand and images do not match.
+    """
+    if len(moved) < _FEWEST:
+        return
+    (turns, shifts), (other_turns, other_shifts) = _pairs(moved), _pairs(np.linalg.inv(seen))
+    off, slid = abs(turns - other_turns), abs(shifts - other_shifts)
+    agree, apart = (off < _TURN_RAD) & ((slid < _SHIFT_M) | np.isnan(slid)), ~np.eye(len(moved), dtype=bool)
+    first = np.linalg.eigh(agree - np.mean(agree[apart]))[1][:, -1] > 0
+    groups = sorted((np.flatnonzero(which) for which in (first, ~first)), key=len)
+    if len(groups[0]) >= 3 and _is_split(agree, *groups):
+        raise ProblemError(
+            f"{len(groups[0])} of {len(moved)} images show a board that stands elsewhere than in the others: "
+            "two boards, or one that was moved.",
+            hint="Leave the images of one of them out, or state both (boards: [...]); they must not look alike.",
+        )
+    if np.median(off[apart]) > max(_OTHER_RAD, _OTHER_SHARE * np.median(turns[apart])):
+        raise ProblemError(
+            "the hand does not turn between images as the board is seen to turn: typically "
+            f"{np.degrees(np.median(off[apart])):.0f} deg off.",
+            hint="Check the order and signs of the joints and their unit, and which image belongs to which pose.",
+        )
+
+
+def _is_split(agree: NDArray[np.bool_], first: NDArray[np.intp], second: NDArray[np.intp]) -> bool:
+    """Whether pairs agree within two groups and not across."""
+    across = np.mean(~agree[np.ix_(first, second)])
+    within = max(np.mean(~agree[np.ix_(group, group)]) for group in (first, second))
+    return bool(across > max(_LEAST_ACROSS, _TIMES_WITHIN * within))
+
+
+def _pairs(poses: Array) -> tuple[Array, Array]:
+    """Of the motion between any two poses how far it turns (rad) and shifts along its axis (m; nan without a turn)."""
+    between = np.linalg.inv(poses)[:, None] @ poses[None]
+    vectors = Rotation.from_matrix(between[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*between.shape[:2], 3)
+    turns = np.linalg.norm(vectors, axis=2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shifts = np.abs(np.sum(vectors * between[..., :3, 3], axis=2) / np.where(turns > _TURN_RAD, turns, np.nan))
+    return turns, shifts
+
+
+def _off(points: Array, image: Array) -> float:
+    """How far corners lie from the best homography (root mean square)."""
+    shown = np.c_[points[:, :2], np.ones(len(points))] @ homography(points[:, :2], image).T
+    return float(np.sqrt(np.mean(np.sum((shown[:, :2] / shown[:, 2:] - image) ** 2, axis=1))))

@@ -1,0 +1,109 @@
+"""What goes wrong with a camera at a bench, planted one by one, and the sentence that names it; clean records none."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from armcal.base.dataset import Dataset
+from armcal.errors import ProblemError
+from armcal.measure.csv_writer import write_csv
+from armcal.run.experiment import Experiment
+from armcal.run.pipeline import Stopwatch, assemble, calibrate
+from camera.simulated_views import ARM, MIDDLE, base_T, numbers
+from scipy.spatial.transform import Rotation
+
+DEMO = ARM.with_name("demo.yaml")
+JOINTS = [f"arm.q{i}" for i in range(1, 7)]
+SENTENCES = {
+    "swapped": "the corners of the board lie as if its columns and rows were exchanged",
+    "second": "images show a board that stands elsewhere than in the others: two boards, or one that was moved",
+    "rolled": "the hand does not turn between images as the board is seen to turn",
+    "bumped": "the camera, or the board, was moved there",
+    "focus": "the recorded order: the focal length changes (autofocus, zoom, warming)",
+}
+
+
+class Bench:
+    """A six-joint arm with a camera, in hand or beside it, and its simulated records."""
+
+    def __init__(self, folder: Path, mounting: str, count: int) -> None:
+        self._folder = folder
+        self.truth = yaml.safe_load(ARM.with_name("truth.yaml").read_text())
+        self._content = {**yaml.safe_load(ARM.read_text()), **yaml.safe_load(DEMO.read_text())}
+        self._content.pop("extends")
+        poses = self._content["simulation"]["poses"]
+        poses["count"] = count
+        if mounting == "eye_to_hand":
+            self._content["measurements"]["camera"]["mounting"] = mounting
+            spans = zip(np.rad2deg(MIDDLE), (12, 12, 15, 20, 20, 60), strict=True)
+            poses["levels"] = {f"q{i}": [f"{q - s} deg", f"{q + s} deg"] for i, (q, s) in enumerate(spans, start=1)}
+            tool, board, camera = base_T("tool"), np.eye(4), np.eye(4)
+            board[:3, 3] = -0.1, -0.06, 0.04
+            camera[:3, :3] = tool[:3, :3] @ Rotation.from_euler("xyz", [188, -6, 4], degrees=True).as_matrix()
+            camera[:3, 3] = tool[:3, 3] + 0.59 * tool[:3, 2]
+            self.truth |= {**numbers("camera.camera", camera), **numbers("camera.board", board)}
+        self.clean = self.simulated(self.truth)
+
+    def simulated(self, truth: dict[str, object], poses: Dataset | None = None) -> Dataset:
+        experiment = self.experiment(truth)
+        if poses is not None:
+            kept = {name: values for name, values in poses.channels.items() if not name.startswith("camera.")}
+            poses = replace(poses, channels=kept)
+        return experiment.simulator().simulate(replace(experiment.simulation_request, poses=poses))
+
+    def experiment(self, truth: dict[str, object] | None = None) -> Experiment:
+        (self._folder / "truth.yaml").write_text(yaml.safe_dump(truth or self.truth))
+        (self._folder / "config.yaml").write_text(yaml.safe_dump(self._content))
+        return Experiment.load(self._folder / "config.yaml")
+
+    def recorded(self, dataset: Dataset) -> Experiment:
+        experiment = self.experiment()
+        write_csv(self._folder / "demo.csv", dataset, experiment.request(measured=True).channels)
+        return experiment
+
+    def planted(self, mistake: str) -> Dataset:
+        clean, channels, order = self.clean, dict(self.clean.channels), np.arange(len(self.clean))
+        if mistake == "swapped":  # a detector that counts the corners column by column
+            for k in range(54):
+                for axis in "uv":
+                    channels[f"camera.{axis}_{k % 9 * 6 + k // 9}"] = clean.channels[f"camera.{axis}_{k}"]
+        if mistake == "rolled":
+            channels |= {JOINTS[(i + 1) % 6]: clean.channels[name] for i, name in enumerate(JOINTS)}
+        if mistake in ("second", "bumped"):
+            own, part, by, which = {
+                "second": ("board", "x", 0.1, order % 2 == 0),
+                "bumped": ("camera", "x", 0.004, order >= 25),
+            }[mistake]
+            name = f"camera.{own}_{part}"
+            place, unit = str(self.truth[name]).split()
+            moved = float(place) + by * (1000 if unit == "mm" else 1)
+            other = self.simulated({**self.truth, name: f"{moved} {unit}"}, clean).channels
+            channels |= {k: np.where(which, other[k], v) for k, v in channels.items() if k.startswith("camera.")}
+        if mistake == "focus":
+            for axis, centre in (("u", 0.633), ("v", 0.487)):
+                for k in range(54):
+                    own = channels[f"camera.{axis}_{k}"]
+                    channels[f"camera.{axis}_{k}"] = centre + (own - centre) * (1 + 0.006 * order / len(order))
+        return replace(clean, channels=channels)
+
+
+@pytest.mark.parametrize("mistake", ["swapped", "second", "rolled"])
+@pytest.mark.parametrize("mounting", ["eye_in_hand", pytest.param("eye_to_hand", marks=pytest.mark.slow)])
+def test_what_does_not_belong_together_is_refused_by_name(tmp_path: Path, mounting: str, mistake: str) -> None:
+    bench = Bench(tmp_path, mounting, 40)
+    with pytest.raises(ProblemError) as refusal:
+        assemble(bench.recorded(bench.planted(mistake)), Stopwatch())
+    assert SENTENCES[mistake] in str(refusal.value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mistake", ["clean", "bumped", "focus"])
+@pytest.mark.parametrize("mounting", ["eye_in_hand", "eye_to_hand"])
+def test_what_changed_meanwhile_is_named_by_the_verdict(tmp_path: Path, mounting: str, mistake: str) -> None:
+    bench = Bench(tmp_path, mounting, 60)
+    verdict = calibrate(bench.recorded(bench.planted(mistake))).verdict
+    text = " ".join(finding.text for finding in verdict.findings)
+    for name, sentence in SENTENCES.items():
+        assert (sentence in text) == (name == mistake)
