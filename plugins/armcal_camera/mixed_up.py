@@ -51,7 +51,7 @@ def require_one_board(moved: Array, seen: Array) -> None:
     """
     if len(moved) < _FEWEST:
         return
-    (turns, shifts), (other_turns, other_shifts) = _pairs(moved), _pairs(np.linalg.inv(seen))
+    (turns, shifts), (other_turns, other_shifts) = _pairs(moved), _pairs(np.asarray(np.linalg.inv(seen), dtype=float))
     off, slid = abs(turns - other_turns), abs(shifts - other_shifts)
     agree, apart = (off < _TURN_RAD) & ((slid < _SHIFT_M) | np.isnan(slid)), ~np.eye(len(moved), dtype=bool)
     first = np.linalg.eigh(agree - np.mean(agree[apart]))[1][:, -1] > 0
@@ -72,9 +72,9 @@ def require_one_board(moved: Array, seen: Array) -> None:
 
 def _is_split(agree: NDArray[np.bool_], first: NDArray[np.intp], second: NDArray[np.intp]) -> bool:
     """Whether pairs agree within two groups and not across."""
-    across = np.mean(~agree[np.ix_(first, second)])
-    within = max(np.mean(~agree[np.ix_(group, group)]) for group in (first, second))
-    return bool(across > max(_LEAST_ACROSS, _TIMES_WITHIN * within))
+    across = float(np.mean(~agree[np.ix_(first, second)]))
+    within = max(float(np.mean(~agree[np.ix_(group, group)])) for group in (first, second))
+    return across > max(_LEAST_ACROSS, _TIMES_WITHIN * within)
 
 
 def _pairs(poses: Array) -> tuple[Array, Array]:

@@ -84,6 +84,7 @@ def begun(started: list[Recording], arm: GuidedArm, shots: Shots, out: Path, sou
     return going
 
 
+@pytest.mark.slow
 def test_images_of_a_folder_are_kept_judged_and_read_by_a_run(
     tmp_path: Path, shots: Shots, arm: GuidedArm, started: list[Recording]
 ) -> None:
@@ -166,6 +167,7 @@ def test_no_such_camera(tmp_path: Path, shots: Shots, source: str, sentence: str
     assert done.exit_code == 2 and sentence in done.output.replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_no_board_in_twenty_images(tmp_path: Path, shots: Shots, arm: GuidedArm) -> None:
     incoming = tmp_path / "incoming"
     incoming.mkdir()

@@ -11,8 +11,9 @@ from armcal.errors import ProblemError
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, assemble, calibrate
-from camera.simulated_views import ARM, MIDDLE, base_T, numbers
 from scipy.spatial.transform import Rotation
+
+from tests.plugins.camera.simulated_views import ARM, MIDDLE, base_T, numbers
 
 DEMO = ARM.with_name("demo.yaml")
 JOINTS = [f"arm.q{i}" for i in range(1, 7)]
