@@ -68,10 +68,10 @@ def first_guess(setup: Setup, reading: Reading) -> Proposal:
     poses = _poses(setup, views, own)
     proposed = {name: own[name] for name in _INTRINSICS if name in free}
     (camera_frame, board_frame), moved = setup.frames, _moved(setup, reading)
-    for own_poses in poses if camera_frame != board_frame else ():
-        require_one_board(moved[list(own_poses)], np.array(list(own_poses.values())))
     known = [not free & set(_place(name)) for name in setup.names]
     is_open = _still(camera_frame) if camera_frame == board_frame else open_motion(moved, camera_frame)
+    for own_poses in poses if is_open is None else ():
+        require_one_board(moved[list(own_poses)], np.array(list(own_poses.values())))
     if is_open is not None and not any(own_poses for own_poses, held in zip(poses, known, strict=True) if held):
         return Proposal(proposed, *is_open, tuple(name for name in _place("camera") if name in free))
     boards = [board for board in zip(setup.names, poses, known, strict=True) if board[1]]
