@@ -17,7 +17,22 @@ from armcal.estimate.validation import folds, hold_out
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from click.testing import CliRunner
-from planted_mistakes import DEMO, MISTAKES, Mistake, PlantedArm, outcome
+from planted_mistakes import (
+    DEMO,
+    MISTAKES,
+    Maker,
+    Mistake,
+    PlantedArm,
+    axes,
+    outcome,
+    placed,
+    reordered,
+    scaled_angles,
+    tips,
+    turned,
+    with_tips,
+)
+from scipy.spatial.transform import Rotation
 
 PRINTED = PlantedArm("printed", DEMO, "arm.mdh.base_*", 0.42)
 BY_NAME = {mistake.name: mistake for mistake in MISTAKES}
@@ -166,3 +181,49 @@ def test_no_clean_recording_is_graded_bad(tmp_path: Path) -> None:
     for arm, seed in runs:
         found = outcome(arm, arm.recording(seed), tmp_path, QUICK)
         assert found.grade in ("good", "warning"), f"{arm.name}, seed {seed}: {found.said}"
+
+
+def ruler(seed: int) -> Dataset:
+    """Thirty of the printed arm's positions in a frame of nobody's choice, with 2 mm of noise."""
+    random, whole = np.random.default_rng(seed), PRINTED.recording(seed)
+    few = replace(whole.subset(np.sort(random.choice(len(whole), 30, replace=False))), rows=())
+    turn, shift = Rotation.random(random_state=random).as_matrix(), random.normal(scale=2, size=(3, 1))
+    return with_tips(few, turn @ (tips(few) + random.normal(scale=0.002, size=(3, 30))) + shift)
+
+
+def _exchanged(i: int) -> Maker:
+    return reordered(lambda n: [*range(i), i + 1, i, *range(i + 2, n)])
+
+
+LEFT = "a left-handed frame"
+OF_POINT = (
+    *((axes(np.diag(signs)), LEFT) for signs in ((-1, 1, 1), (1, -1, 1), (1, 1, -1))),
+    (axes([[0, 1, 0], [1, 0, 0], [0, 0, 1]]), LEFT),
+    (placed(lambda p, random: np.roll(p, 1, axis=1)), "positions of the row after"),
+    (placed(lambda p, random: np.roll(p, -1, axis=1)), "positions of the row before"),
+    *(
+        (placed(lambda p, random, f=f: p * f), f"positions {1 / f:.3g} times")
+        for f in (0.001, 1000, 1 / 25.4, 25.4, 0.1)
+    ),
+    (scaled_angles(np.pi / 180), "joint angles 57.3 times"),
+    (scaled_angles(180 / np.pi), "more than two turns. If the unit is wrong"),
+    *((turned(i), f"the sign of q{i} reversed") for i in range(1, 6)),
+    *((_exchanged(i), f"q{i + 1} and q{i + 2} exchanged") for i in range(5)),
+    (reordered(lambda n: list(range(n))[::-1]), "taken for ("),
+    (reordered(lambda n: [*range(1, n), 0]), "taken for ("),
+)
+
+
+@pytest.mark.slow
+def test_mistakes_in_thirty_ruler_measurements_are_named_and_never_usable(tmp_path: Path) -> None:
+    free = ["arm.mdh.base_*", "arm.mdh.theta[1-5]", "arm.mdh.d5", "tracker.target_?"]
+    settings = (f"parameters.free={json.dumps(free)}", "measurements.tracker.noise_mm=2")
+    hobby, named, tried = replace(PRINTED, overrides=settings), 0, 0
+    for seed in range(2):
+        clean = ruler(seed)
+        assert outcome(hobby, clean, tmp_path, QUICK).grade != "refused"  # bad where springs leave 3 % of the reach
+        for make, words in OF_POINT:
+            found = outcome(hobby, make(hobby, clean, np.random.default_rng(seed)), tmp_path, QUICK)
+            assert found.grade not in ("good", "warning"), f"seed {seed}, {words}: {found}"
+            named, tried = named + (words in found.said), tried + 1
+    assert named >= 0.9 * tried
