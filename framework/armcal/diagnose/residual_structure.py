@@ -141,10 +141,8 @@ def structure(
     fit, basis, block = _fit_of(rows, len(dataset), np.diff(position) == 1)
     motion = motion.subset(chosen)
     place = next((own for own in read if len(own)), np.zeros((0, len(dataset))))
-    causes = [
-        *dependences(problem, motion, dataset),
-        *outside(problem, motion, dataset, read, estimate.values, records),
-    ]
+    others = outside(problem, motion, dataset, read, estimate.values, records)
+    causes = [*dependences(problem, motion, dataset), *others]
     columns = [rows.columns(one.columns) for one in causes]
     kernels = pose_kernels(problem, dataset), time_kernels(len(dataset))
     contest = Contest(causes, columns, fit.residual, basis, rows.by_record, fit.block * _FOLDS // fit.blocks, *kernels)
