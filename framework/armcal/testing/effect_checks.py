@@ -168,7 +168,8 @@ def _shape(effect: JointEffect, conditions: Mapping[str, Expression], values: Ma
     links = [se3.translation_along("x", ca.SX.sym(f"l{i}")) for i in range(len(JOINTS) + 1)]
     joints = tuple(Joint(name, link) for name, link in zip(JOINTS, links, strict=False))
     shaped = effect.shaped(Chain(se3.identity(), joints, Attachment(len(JOINTS), links[-1])), conditions, values)
-    return stacked([shaped.tool.joint_T_frame.matrix(), *(j.parent_T_joint.matrix() for j in shaped.joints)])
+    moved = [ca.SX(joint.offset) for joint in shaped.joints]
+    return stacked([shaped.tool.joint_T_frame.matrix(), *(j.parent_T_joint.matrix() for j in shaped.joints), *moved])
 
 
 def _arm_of(effect: JointEffect) -> Arm:
