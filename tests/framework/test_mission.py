@@ -308,8 +308,19 @@ def test_a_simulator_without_a_truth_over_time_is_refused(tmp_path: Path) -> Non
     )
     for name in ("mission_arm.yaml", "arm.yaml", "mission_truth.yaml"):
         (tmp_path / name).write_text((CONFIG.parent / name).read_text(encoding="utf-8"))
-    result = armcal("mission", str(other), "--out", str(tmp_path / "out"))
-    assert result.exit_code == 2 and "no truth over time" in result.output and "type: mission" in result.output
+    for more in ((), ("--surprise", "1")):
+        result = armcal("mission", str(other), "--out", str(tmp_path / "out"), *more)
+        assert result.exit_code == 2 and "no truth over time" in result.output and "type: mission" in result.output
+
+
+def test_a_surprise_minds_no_configured_event_after_the_last_day() -> None:
+    with pytest.raises(ConfigError, match="before the mission ends after 2 days"):
+        MissionPlan.load(CONFIG, (*SHORT, "simulation.days=2"))
+    drawn, registry = {}, plan().experiment.registry
+    for events in (EVENTS, "[]"):
+        overrides = (*SHORT, "simulation.days=2", f"simulation.events={events}")
+        drawn[events] = MissionPlan.surprised(CONFIG, 7, overrides, registry).planted
+    assert drawn[EVENTS] == drawn["[]"] and all(event["day"] < 2 for event in drawn["[]"]["events"])
 
 
 def test_a_mission_goes_to_no_folder_with_other_files(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -60,9 +61,8 @@ def mission(console: Console, config: Path, out: Path, seed: int | None, overrid
     watch = Stopwatch()
     kept = click.get_current_context().with_resource(reserved(out, OURS))
     registry = console.registry()
-    plan = MissionPlan.load(config, overrides, registry)
-    if seed is not None:
-        plan = plan.surprised(seed, overrides)
+    planned = partial(MissionPlan.load, config) if seed is None else partial(MissionPlan.surprised, config, seed)
+    plan = planned(overrides, registry)
     kept.place({})
     with console.progress() as progress:
         result = run_mission(plan, out, loop_session(registry), registry, progress, watch)

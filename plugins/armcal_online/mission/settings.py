@@ -75,17 +75,19 @@ class MissionPlan:
     recalibrate: RecalibrateSettings
     planted: Mapping[str, Any] = field(default_factory=dict)
 
-    def surprised(self, seed: int, overrides: Sequence[str] = ()) -> MissionPlan:
-        """The same mission with what its simulator draws from a seed; ``overrides`` as it was loaded with.
+    @classmethod
+    def surprised(cls, path: Path, seed: int, overrides: Sequence[str], registry: PluginRegistry) -> MissionPlan:
+        """Read a mission, with what its simulator draws from a seed in place of the configured events.
 
         Raises:
-            ConfigError: what is drawn does not fit the configuration.
+            ConfigError: as ``load``, or what is drawn does not fit the configuration.
         """
-        drawn = self.simulator.planted(self.experiment.simulation_request, seed)
+        stated = load_config(path, overrides).data.get("simulation")
+        none = ("simulation.events=[]",) if isinstance(stated, Mapping) and "events" in stated else ()
+        bare = cls.load(path, (*overrides, *none), registry)
+        drawn = bare.simulator.planted(bare.experiment.simulation_request, seed)
         texts = [f"simulation.{key}={_one_line(value)}" for key, value in drawn.items()]
-        source = self.experiment.source
-        loaded = MissionPlan.load(source.path, (*overrides, *texts), self.experiment.registry)
-        return replace(loaded, planted=drawn)
+        return replace(cls.load(path, (*overrides, *texts), registry), planted=drawn)
 
     @classmethod
     def load(cls, path: Path, overrides: Sequence[str] = (), registry: PluginRegistry | None = None) -> MissionPlan:
