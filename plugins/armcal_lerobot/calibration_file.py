@@ -1,7 +1,5 @@
 """LeRobot's motor calibration JSON: read and checked, and written with all that did not change as it was."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping

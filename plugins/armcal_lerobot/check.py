@@ -1,7 +1,5 @@
 """What a calibration file says of an arm, as numbers, tables and sections of a configuration."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

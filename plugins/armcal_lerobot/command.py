@@ -1,7 +1,5 @@
 """``armcal lerobot``: what motor calibration files and data sets say of an arm, and calibrated zeros back into them."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import asdict
 from functools import partial

@@ -1,7 +1,5 @@
 """What a data set says of leader and follower, or two data sets of two arms: named faults, and mm at the gripper."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What was commanded and what was reached, frame by frame, in stretches without a gap."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

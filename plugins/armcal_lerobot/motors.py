@@ -5,8 +5,6 @@ bits. In degrees LeRobot's zero is the middle of the range, and 4095 counts are 
 -100 to 100 (of a gripper 0 to 100).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,5 @@
 """Where an arm stood at rest in a data set, as records to calibrate from, and a camera's images of these moments."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

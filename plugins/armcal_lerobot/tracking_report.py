@@ -1,7 +1,5 @@
 """The comparison of leader and follower as numbers, tables and a page."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Calibrated zeros as numbers of LeRobot's file: homing offsets moved, ranges kept within the joints' ends."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from glob import escape

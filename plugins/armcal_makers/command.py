@@ -1,7 +1,5 @@
 """``armcal maker``: a maker's calibration against the nominal arm, and as a URDF."""
 
-from __future__ import annotations
-
 from codecs import BOM_UTF8
 from collections.abc import Mapping
 from dataclasses import dataclass

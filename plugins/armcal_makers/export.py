@@ -1,7 +1,5 @@
 """The exporters ``ur_calibration`` and ``xarm_kinematics``: calibrated arms in the files of their makers' drivers."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar

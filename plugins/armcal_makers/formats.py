@@ -1,7 +1,5 @@
 """Makers' calibration files: the kinematics YAML of ur_calibration and xarm_ros2, and a UR's own calibration.conf."""
 
-from __future__ import annotations
-
 import configparser
 import math
 import re

@@ -1,7 +1,5 @@
 """Arms as makers write them: a fixed transform before each joint, which turns about its frame's z axis."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Nominal arms, as their makers publish them [UrDh, XarmKinematics]."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A recording: a folder of files, or one file."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping

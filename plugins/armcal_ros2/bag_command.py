@@ -1,7 +1,5 @@
 """``armcal bag``: what a recording holds, and images taken out of it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

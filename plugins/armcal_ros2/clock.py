@@ -4,8 +4,6 @@ In each motion the measured path is that of the nominal tool, delayed, up to an 
 and target are and most of what the nominal arm is wrong by. Each motion gives an offset, their scatter the interval.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property

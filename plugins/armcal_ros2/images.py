@@ -1,7 +1,5 @@
 """Images of the rests of a recording, as files that the reader ``images`` reads, with the joints beside them."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

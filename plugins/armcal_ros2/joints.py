@@ -1,7 +1,5 @@
 """Joint states of a recording: where joints stood still, and how they came there."""
 
-from __future__ import annotations
-
 import math
 from array import array
 from bisect import bisect_right

@@ -1,7 +1,5 @@
 """The library ``rosbags``, which knows ROS 2's messages, and the decompressors that come with it."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import io

@@ -3,8 +3,6 @@
 Every record states its length, and messages that nobody asked for are passed over without being read. [MCAP]
 """
 
-from __future__ import annotations
-
 import os
 import struct
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """What a recording holds: messages of topics, as bytes."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 MAX_BYTES = 1 << 44

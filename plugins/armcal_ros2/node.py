@@ -1,7 +1,5 @@
 """The exporter ``ros2-node``: a file for those who have ROS 2, between its topics and armcal's sockets."""
 
-from __future__ import annotations
-
 import ast
 import json
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The reader ``rosbag2``: records from a recording of ROS 2, one a rest of the arm."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """SQLite files of ``rosbag2``, row by row as they were written: a damaged file gives what comes before the damage."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import closing

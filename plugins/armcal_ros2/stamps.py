@@ -1,7 +1,5 @@
 """When a message was measured: its header's stamp, or when the recorder received it; and stamps that cannot be."""
 
-from __future__ import annotations
-
 from array import array
 from collections import Counter
 from collections.abc import Mapping

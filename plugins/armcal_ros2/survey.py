@@ -1,7 +1,5 @@
 """What a recording holds: topics, frames, joints and their rests, and the data section that would read it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A bus of servos on a serial port: instructions and answers, time-outs, repeats, and what went wrong on the way."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping

@@ -1,7 +1,5 @@
 """What servos hold in their EEPROM, read and compared with the configuration. Nothing is written."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

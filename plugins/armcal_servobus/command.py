@@ -1,7 +1,5 @@
 """``armcal bus``: find servos on a serial bus, check them against a configuration, set their homing offsets."""
 
-from __future__ import annotations
-
 import math
 import sys
 import time

@@ -1,7 +1,5 @@
 """The bus of a configuration, for the commands that take one."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace

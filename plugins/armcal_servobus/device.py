@@ -1,7 +1,5 @@
 """The device ``servobus``: joints by name, on servos that share a serial bus and know where they stand."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar

@@ -1,7 +1,5 @@
 """``armcal bus find``."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, get_args
 

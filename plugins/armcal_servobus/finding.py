@@ -1,7 +1,5 @@
 """Who is on a bus: baud rates tried, ids, models; two servos with one id are seen by how they answer together."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Whether servos are well: alarms, temperature, voltage, load, torque. Named with the joint, and what to do."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import NoReturn

@@ -1,7 +1,5 @@
 """``armcal bus home``: homing offsets, after a question."""
 
-from __future__ import annotations
-
 import math
 import sys
 from datetime import datetime

@@ -1,7 +1,5 @@
 """Homing offsets: which ones make servos report the stated angles where the arm stands, and how they are written."""
 
-from __future__ import annotations
-
 import json
 import math
 import time

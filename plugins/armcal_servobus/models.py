@@ -1,7 +1,5 @@
 """What servos have in their registers, by model; from the makers' tables. [FeetechSTS] [Dynamixel1] [Dynamixel2]"""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """How instructions and answers are framed on the bus. [FeetechSTS] [Dynamixel1] [Dynamixel2]"""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum

@@ -1,7 +1,5 @@
 """The servos of joints, by name: what they read, and goals, torque and speed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 

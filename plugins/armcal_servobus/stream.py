@@ -1,7 +1,5 @@
 """The joint stream ``servobus``: the servos of an arm that is guided by hand say where they stand."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
