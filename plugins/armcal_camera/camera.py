@@ -140,6 +140,11 @@ class Camera(PointInstrument):
         parts = ("x", "y", "z", "rotation", "bend_x", "bend_y")
         return (*(f"{name}_{part}" for name in self.board_names for part in parts), "board_scale")
 
+    @property
+    def scale(self) -> str:
+        """The parameter on which all lengths depend."""
+        return "" if self.lender else "board_scale"
+
     def check_lender(self, lender: object) -> None:
         """Refuse one that does not see the same boards, has them elsewhere or cannot place them (ValueError)."""
         if not isinstance(lender, Camera) or lender.boards != self.boards:

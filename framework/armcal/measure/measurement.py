@@ -157,6 +157,15 @@ class StatesAccuracy(Protocol):
         """
 
 
+@runtime_checkable
+class HasScale(Protocol):
+    """What a measurement may provide beside the rest if all lengths that it shows depend on a parameter of its own."""
+
+    @property
+    def scale(self) -> str:
+        """That parameter's local name, a share (``board_scale``); empty if it is another measurement's."""
+
+
 @dataclass(frozen=True)
 class Mistake:
     """Something that may have gone wrong with an instrument.

@@ -7,6 +7,7 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.config.system import System
+from armcal.diagnose import held_scale
 from armcal.diagnose.coverage import predictor
 from armcal.diagnose.evidence import Evidence, priors_alone, unseen_poses
 from armcal.diagnose.evidence_findings import worse_than_nominal
@@ -150,6 +151,8 @@ def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array
     looked_at = thinned(train, MOST_RECORDS)
     figure = figure_of(problem, estimate, problem.subset(run.records, looked_at))
     own = thinned(np.arange(len(train)), MOST_RECORDS)
+    few = thinned(own, held_scale.MOST_RECORDS)
+    scales = held_scale.held_scales(problem, estimate, problem.subset(acting, few))
     problem, acting = with_few_points(problem, problem.subset(acting, own))
     rows = FitRows.of(problem, acting, estimate)
     dataset = run.dataset.subset(looked_at)
@@ -161,6 +164,7 @@ def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array
         *size_findings(figure),
         *displacement_findings(figure),
         *limit_findings(figure, scale_deviation(problem, rows, read, estimate.noise_scale)),
+        *held_scale.held_scale_findings(scales, figure),
     ]
 
 

@@ -1,5 +1,6 @@
 """What goes wrong with a camera at a bench, planted one by one, and the sentence that names it; clean records none."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import yaml
 from armcal.base.dataset import Dataset
 from armcal.errors import ProblemError
 from armcal.measure.csv_writer import write_csv
+from armcal.planning.candidates import deviations
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, assemble, calibrate
 from scipy.spatial.transform import Rotation
@@ -108,3 +110,30 @@ def test_what_changed_meanwhile_is_named_by_the_verdict(tmp_path: Path, mounting
     text = " ".join(finding.text for finding in verdict.findings)
     for name, sentence in SENTENCES.items():
         assert (sentence in text) == (name == mistake)
+
+
+def scale_held(*changes: str) -> tuple[str, str]:
+    """The grade and text of what the verdict says of the board's size."""
+    verdict = calibrate(Experiment.load(DEMO, ["validation={holdout: 0.25}", *changes])).verdict
+    (said,) = [(f.grade, f.text) for f in verdict.findings if "board_scale" in f.text]
+    return said
+
+
+def test_a_square_of_another_size_contradicts_the_priors_of_lengths() -> None:
+    grade, text = scale_held("measurements.camera.board.square_mm=25.5")
+    assert grade == "warning" and "although records and priors put it -2 +- 0.81 %" in text
+
+
+@pytest.mark.slow
+def test_where_nothing_is_wrong_with_the_square_the_verdict_says_what_would_not_show() -> None:
+    """The first-order statement is what a fit with the scale free finds."""
+    grade, text = scale_held()
+    assert grade == "note" and "An error of up to 1.7 % would not show" in text
+    free = yaml.safe_load(DEMO.read_text())["parameters"]["free"]
+    named = f"parameters.free={yaml.safe_dump([*free, 'camera.board_scale'], default_flow_style=True)}"
+    estimate = calibrate(Experiment.load(DEMO, ["validation={holdout: 0.25}", named])).estimate
+    place = estimate.parameters.coordinate_names.index("camera.board_scale")
+    off = float(estimate.values[estimate.parameters.entries_of("camera.board_scale")][0]) - 1
+    sd = deviations(estimate.square_root_information)[place]
+    said = [float(number) for number in re.findall(r"put it (\S+) \+- (\S+) %", text)[0]]
+    assert said == pytest.approx([100 * off, 100 * sd], rel=0.02, abs=0.005)
