@@ -12,7 +12,7 @@ from armcal.errors import Location
 from armcal.io.plain_files import input_bytes, refuse, text_of
 
 from armcal_makers.frames import KEYS, at_zero, between, dh_frames, placed, pose, tips
-from armcal_makers.nodes import AGAIN, Scalar, Section, read_section
+from armcal_makers.nodes import AGAIN, Entry, read_section
 from armcal_makers.nominal import UR, Nominal, nearest, nominal_arms, ur_rows
 
 MAX_BYTES = 1 << 18
@@ -96,12 +96,12 @@ def has_offsets(text: str, path: Path) -> bool:
     if _SECTION.search(text):
         return False
     root = read_section(text, path)
-    return "kinematics" not in root.entries and all(isinstance(entry, Scalar) for entry in root.entries.values())
+    return "kinematics" not in root.entries and all(entry.text is not None for entry in root.entries.values())
 
 
-def _of_yaml(root: Section, path: Path, robot: str | None, arms: dict[str, Nominal]) -> MakersArm:
+def _of_yaml(root: Entry, path: Path, robot: str | None, arms: dict[str, Nominal]) -> MakersArm:
     kinematics = root.section("kinematics")
-    keys = [key for key, entry in kinematics.entries.items() if isinstance(entry, Section)]
+    keys = [key for key, entry in kinematics.entries.items() if entry.entries]
     known = [arm for arm in arms.values() if set(arm.keys) == set(keys)]
     if not known:
         expected = f"{', '.join(arms['ur5e'].keys)} (UR), or joint1 to joint5, joint6 or joint7 (xArm)"
@@ -115,7 +115,7 @@ def _of_yaml(root: Section, path: Path, robot: str | None, arms: dict[str, Nomin
     return MakersArm(nominal, frames, UR.format, _hash(kinematics), moving)
 
 
-def _six(section: Section) -> list[float]:
+def _six(section: Entry) -> list[float]:
     numbers = section.numbers(KEYS)
     for key, value in zip(KEYS, numbers, strict=True):
         if key in "xyz" and abs(value) > _LONGEST_M:
@@ -125,13 +125,13 @@ def _six(section: Section) -> list[float]:
     return numbers
 
 
-def _hash(kinematics: Section) -> str:
+def _hash(kinematics: Entry) -> str:
     entry = kinematics.entries.get("hash")
-    if not (isinstance(entry, Scalar) and HASH.fullmatch(entry.text)):
-        text = repr(entry.text[:40]) if isinstance(entry, Scalar) else "no hash"
+    text = entry.text if entry else None
+    if text is None or not HASH.fullmatch(text):
         hint = "Without it the driver cannot tell whose calibration it is. Extract the file from the robot again."
-        kinematics.refuse(f"found {text}, expected hash: calib_ and a number.", hint)
-    return entry.text
+        kinematics.refuse(f"found {repr(text[:40]) if text else 'no hash'}, expected hash: calib_ and a number.", hint)
+    return text
 
 
 def _of_conf(text: str, path: Path, robot: str | None, arms: dict[str, Nominal]) -> MakersArm:

@@ -3,37 +3,38 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
-import yaml
-from armcal.errors import DataError, Location
+from armcal.config.yaml_nodes import Node, Origin, read_nodes
+from armcal.config.yaml_tree import entries_of
+from armcal.errors import DataError
 from armcal.io.plain_files import refuse
 
-DEEPEST = 4
 AGAIN = "Extract the file from the robot again."
 
 
 @dataclass(frozen=True)
-class Node:
-    """Something in a file: where it stands."""
+class Entry:
+    """Something in a file, and the keys that it stands under."""
 
-    path: Path
-    line: int
-    field: str
+    node: Node
+    keys: tuple[str, ...] = ()
 
     def refuse(self, message: str, hint: str = AGAIN) -> NoReturn:
         """Raise a DataError here."""
-        refuse(self.path, message, hint, self.line, self.field or None)
+        raise DataError(message, where=self.node.origin.at(self.node.line, self.keys), hint=hint)
 
+    @property
+    def text(self) -> str | None:
+        """A text; None of keys or a list."""
+        return self.node.value if isinstance(self.node.value, str) else None
 
-@dataclass(frozen=True)
-class Scalar(Node):
-    """A text."""
-
-    text: str
+    @property
+    def entries(self) -> dict[str, Entry]:
+        """What stands under its keys; nothing of a text or a list."""
+        return {key: Entry(node, (*self.keys, key)) for key, node in entries_of(self.node).items()}
 
     @property
     def number(self) -> float:
@@ -43,36 +44,25 @@ class Scalar(Node):
             DataError: it is none.
         """
         try:
-            value = float(self.text)
+            value = math.nan if self.text is None else float(self.text)
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            self.refuse(f"found {self.text[:40]!r}, expected a number.")
+            shown = "a list or keys" if self.text is None else repr(self.text[:40])
+            self.refuse(f"found {shown}, expected a number.")
         return value
 
-
-@dataclass(frozen=True)
-class Section(Node):
-    """Keys with what they hold."""
-
-    entries: Mapping[str, Section | Scalar]
-
-    @property
-    def number(self) -> float:
-        """None: keys stand where a number should; raises DataError."""
-        self.refuse("found keys, expected a number.")
-
-    def section(self, key: str) -> Section:
+    def section(self, key: str) -> Entry:
         """The section under a key.
 
         Raises:
             DataError: there is none.
         """
-        entry = self.entries.get(key)
-        if not isinstance(entry, Section):
-            keys = ", ".join(list(self.entries)[:12]) or "nothing"
-            self.refuse(f"found {keys}, expected {key}: and numbers under it.", "Check which file this is.")
-        return entry
+        entries = self.entries
+        if key not in entries or not entries[key].entries:
+            own = ", ".join(list(entries)[:12]) or "nothing"
+            self.refuse(f"found {own}, expected {key}: and numbers under it.", "Check which file this is.")
+        return entries[key]
 
     def numbers(self, keys: tuple[str, ...]) -> list[float]:
         """The numbers of exactly these keys.
@@ -80,47 +70,20 @@ class Section(Node):
         Raises:
             DataError: one is missing, too many, or not a number.
         """
-        if set(self.entries) != set(keys):
-            own = ", ".join(self.entries) or "nothing"
-            self.refuse(f"found {own}, expected {', '.join(keys)}.")
-        return [self.entries[key].number for key in keys]
+        entries = self.entries
+        if set(entries) != set(keys):
+            self.refuse(f"found {', '.join(entries) or 'nothing'}, expected {', '.join(keys)}.")
+        return [entries[key].number for key in keys]
 
 
-def read_section(text: str, path: Path) -> Section:
-    """A YAML text as keys and scalars.
+def read_section(text: str, path: Path) -> Entry:
+    """A YAML text as keys and texts.
 
     Raises:
-        DataError: it is empty, is not YAML, or has lists.
+        InputError: it is empty or no plain YAML.
     """
-    try:
-        aliases = [e for e in yaml.parse(text, yaml.SafeLoader) if isinstance(e, yaml.AliasEvent)]
-        if aliases:  # nested ones make billions of a few lines
-            text = f"found the alias *{aliases[0].anchor}, expected a number."
-            mark = aliases[0].start_mark
-            refuse(path, text, AGAIN, None if mark is None else mark.line + 1)
-        root = yaml.compose(text, yaml.SafeLoader)
-    except (yaml.YAMLError, RecursionError) as fault:
-        mark = getattr(fault, "problem_mark", None)
-        reason = f"it is not YAML ({getattr(fault, 'problem', None) or type(fault).__name__})."
-        where = Location(str(path), line=None if mark is None else mark.line + 1)
-        raise DataError(reason, where=where, hint=AGAIN) from fault
-    if not isinstance(root, yaml.MappingNode) or not root.value:
+    root = read_nodes(text, Origin(str(path), path.parent), plain=str)
+    if root is None or not entries_of(root):
         hint = "Give the kinematics YAML of ur_calibration or xarm_ros2, or calibration.conf of a UR."
         refuse(path, "it holds no keys, expected a maker's calibration.", hint)
-    return _section(root, path, "", 1)
-
-
-def _section(node: yaml.MappingNode, path: Path, field: str, depth: int) -> Section:
-    entries: dict[str, Section | Scalar] = {}
-    for key, value in node.value:
-        name = str(key.value)
-        here = Node(path, key.start_mark.line + 1, f"{field}.{name}".lstrip("."))
-        if name in entries:
-            here.refuse("found this key a second time.", "Remove one of them.")
-        if isinstance(value, yaml.MappingNode) and depth < DEEPEST:
-            entries[name] = _section(value, path, here.field, depth + 1)
-        elif isinstance(value, yaml.ScalarNode):
-            entries[name] = Scalar(here.path, here.line, here.field, value.value)
-        else:
-            here.refuse("found a list or deeper keys, expected a number.", "Check which file this is.")
-    return Section(path, node.start_mark.line + 1, field, entries)
+    return Entry(root)

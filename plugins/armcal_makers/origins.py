@@ -24,7 +24,7 @@ from armcal.scaffold.urdf_source import urdf_model
 from scipy.spatial.transform import Rotation
 
 from armcal_makers.frames import KEYS, differences, pose, six_of
-from armcal_makers.nodes import Scalar, Section
+from armcal_makers.nodes import Entry
 
 _FRAME = ("x", "y", "z", "a", "b", "c")
 _MOST = 1.0
@@ -87,7 +87,7 @@ class OwnUrdf:
             raise DataError(reason, where=Location(str(where)), hint="Give the maker's own URDF, and its --tip.")
         return self._placed(frames, ())
 
-    def with_offsets(self, root: Section) -> Placed:
+    def with_offsets(self, root: Entry) -> Placed:
         """With the offsets of a file.
 
         Raises:
@@ -108,7 +108,7 @@ class OwnUrdf:
         if not used:
             names = ", ".join(list(offsets)[:6])
             reason = f"found offsets of {names}, none of a joint between the root and the tip of {self.path.name}."
-            raise DataError(reason, where=Location(str(root.path)), hint="Give the URDF they were found with.")
+            raise DataError(reason, where=Location(root.node.origin.label), hint="Give the URDF they were found with.")
         return self._placed(frames, tuple(sorted(set(offsets) - used)))
 
     def _placed(self, frames: Mapping[str, Array], unused: tuple[str, ...]) -> Placed:
@@ -125,7 +125,7 @@ class OwnUrdf:
         return Placed(content, joints, unused, tools)
 
 
-def _offset(entry: Section | Scalar) -> float:
+def _offset(entry: Entry) -> float:
     if abs(entry.number) > _MOST:
         entry.refuse(f"found {entry.number:g}, expected m or rad.", "Check its unit: it looks like mm or degrees.")
     return entry.number

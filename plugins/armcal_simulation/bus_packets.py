@@ -3,6 +3,7 @@
 [FeetechSTS] [Dynamixel1] [Dynamixel2]
 """
 
+import re
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -30,9 +31,25 @@ class Framing(Protocol):
 
     address_size: int
     """Bytes of an address, and of a count of bytes."""
+    head: re.Pattern[bytes]
+    """What stands before the id, which the length follows."""
 
     def split(self, data: bytes) -> tuple[list[bytes], bytes]:
-        """Whole packets, with whatever stood before them, and the beginning of one that is not whole yet."""
+        """Whole packets, without whatever stood before them, and the beginning of one that is not whole yet."""
+        packets, begin, size = [], 0, self.address_size
+        while match := self.head.search(data, begin):
+            behind = match.end() + 1 + size
+            if len(data) < behind:
+                break
+            length = int.from_bytes(data[behind - size : behind], "little")
+            if length <= size:  # no packet is so short: a damaged one
+                begin = match.end()
+                continue
+            if len(data) < behind + length:
+                break
+            begin = behind + length
+            packets.append(data[match.start() : begin])
+        return packets, data[begin:]
 
     def instruction(self, packet: bytes) -> Instruction:
         """Read a packet that ``split`` gave."""
@@ -41,28 +58,11 @@ class Framing(Protocol):
         """A servo's answer."""
 
 
-class Protocol1:
+class Protocol1(Framing):
     """``FF FF id length code params check``: Feetech's, and Dynamixel's first."""
 
     address_size = 1
-
-    def split(self, data: bytes) -> tuple[list[bytes], bytes]:
-        """See ``Framing``."""
-        packets, begin = [], 0
-        while (at := data.find(b"\xff\xff", begin)) >= 0:
-            while data[at + 2 : at + 3] == b"\xff":
-                at += 1
-            if len(data) < at + 4:
-                break
-            end = at + 4 + data[at + 3]
-            if data[at + 3] < 2:  # no packet is so short: a damaged one
-                begin = at + 1
-                continue
-            if len(data) < end:
-                break
-            packets.append(data[at:end])
-            begin = end
-        return packets, data[begin:]
+    head = re.compile(rb"\xff\xff(?!\xff)")
 
     def instruction(self, packet: bytes) -> Instruction:
         """See ``Framing``."""
@@ -74,26 +74,11 @@ class Protocol1:
         return b"\xff\xff" + body + bytes((_check_sum(body),))
 
 
-class Protocol2:
+class Protocol2(Framing):
     """``FF FF FD 00 id length code params crc``; ``FF FF FD`` further on is followed by another FD."""
 
     address_size = 2
-
-    def split(self, data: bytes) -> tuple[list[bytes], bytes]:
-        """See ``Framing``."""
-        packets, begin = [], 0
-        while (at := data.find(b"\xff\xff\xfd\x00", begin)) >= 0:
-            if len(data) < at + 7:
-                break
-            end = at + 7 + int.from_bytes(data[at + 5 : at + 7], "little")
-            if end < at + 10:
-                begin = at + 4
-                continue
-            if len(data) < end:
-                break
-            packets.append(data[at:end])
-            begin = end
-        return packets, data[begin:]
+    head = re.compile(rb"\xff\xff\xfd\x00")
 
     def instruction(self, packet: bytes) -> Instruction:
         """See ``Framing``."""

@@ -7,6 +7,7 @@ anything is built and no tag can construct an object.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -73,8 +74,10 @@ class Node:
     height: int = 0
 
 
-def read_nodes(text: str, origin: Origin, loader: Any = LOADER) -> Node | None:
-    """Parse one YAML document strictly; None if it holds nothing.
+def read_nodes(
+    text: str, origin: Origin, loader: Any = LOADER, plain: Callable[[str], Scalar] = read_plain
+) -> Node | None:
+    """Parse one YAML document strictly; None if it holds nothing. ``plain`` reads a value without quotes.
 
     Raises:
         ConfigError: with line, field and mend: invalid YAML, tab indentation, duplicate or unclear keys,
@@ -92,7 +95,7 @@ def read_nodes(text: str, origin: Origin, loader: Any = LOADER) -> Node | None:
             where=origin.at(text.count("\n", 0, match.start()) + 1),
             hint="Replace the tab by spaces.",
         )
-    builder = _Builder(origin)
+    builder = _Builder(origin, plain)
     try:
         for event in yaml.parse(text, Loader=loader):
             builder.take(event)
@@ -127,9 +130,9 @@ class _Open:
 class _Builder:
     """Builds nodes out of events, one at a time, with a stack of its own."""
 
-    def __init__(self, origin: Origin) -> None:
+    def __init__(self, origin: Origin, plain: Callable[[str], Scalar]) -> None:
         self.root: Node | None = None
-        self._origin = origin
+        self._origin, self._plain = origin, plain
         self._stack: list[_Open] = []
         self._anchors: dict[str, Node | None] = {}  # None: still open
         self._documents = 0
@@ -176,7 +179,7 @@ class _Builder:
             self._key(parent, event.value, is_plain, line)
             return
         try:
-            value: Scalar = read_plain(event.value) if is_plain else event.value
+            value: Scalar = self._plain(event.value) if is_plain else event.value
         except ScalarError as fault:
             self.refuse(f"{fault}.", fault.hint, line)
         node = Node(self._origin, line, value)
