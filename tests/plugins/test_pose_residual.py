@@ -257,6 +257,62 @@ def test_compensation_and_c_code_take_the_temperature(tmp_path):
         np.testing.assert_allclose(pose, tools[5, :3], atol=1e-12)
 
 
+@cache
+def loaded_run():
+    """An arm that is stiff in its model, and whose tool sinks under its load."""
+    import tempfile
+    from pathlib import Path
+
+    folder = Path(tempfile.mkdtemp())
+    head, *rows = recorded(folder, "", 300).read_text().splitlines()
+    lines = []
+    for row, grams in zip(rows, np.random.default_rng(1).uniform(0, 1500, len(rows)), strict=True):
+        *rest, x, y, z = row.split(",")
+        sunk = float(z) - sag_mm(np.array([float(x), float(y)]), grams / 1000)
+        lines.append(",".join([*rest, x, y, repr(float(sunk)), repr(float(grams))]))
+    (folder / "data.csv").write_text("\n".join([head + ",payload_g", *lines]) + "\n")
+    ran(folder, "{type: gaussian_process}", folder / "data.csv", "--set", "validation.folds=2")
+    return SimpleNamespace(folder=folder, calibration=Calibration.load(folder / "run/calibration.yaml"))
+
+
+def sag_mm(beside_mm, load_kg):
+    return 1.2 * load_kg * np.sum(beside_mm**2) / 450**2
+
+
+def test_errors_that_depend_on_the_load_are_learned_and_hold_on_unseen_records():
+    run = loaded_run()
+    metrics = json.loads((run.folder / "run/metrics.json").read_text())
+    folds, unseen = metrics["pose_residual"]["folds"], metrics["error_mm"]["calibrated"]["holdout"]["mean"]
+    assert metrics["pose_residual"]["kept"] and folds["without_mm"] > 0.35 and unseen < 0.4 * folds["without_mm"]
+    part = [own for own in run.calibration.system.arms["arm"].residual.settings.learned if own.first == 0][-1]
+    assert [own.of for own in part.terms[0].inputs][-1] == "payload"
+
+
+def test_compensation_and_c_code_take_the_load(tmp_path):
+    calibration, angles = loaded_run().calibration, np.random.default_rng(0).uniform(-0.9, 0.9, (2, 3))
+    at = {f"arm.q{i + 1}": row for i, row in enumerate(angles.T)}
+    tools = {
+        load: calibration.predict(Dataset(("a", "b"), {**at, "payload": np.full(2, load)}))[1][0] for load in (0.2, 1.3)
+    }
+    sunk = 1000 * (tools[0.2] - tools[1.3])[:, 2, 3]
+    read = calibration.predict(Dataset(("a", "b"), {**at, "payload": np.full(2, 0.2)}))[0]
+    beside = 1000 * np.stack([read["tracker.x"], read["tracker.y"]])
+    np.testing.assert_allclose(sunk, [sag_mm(own, 1.1) for own in beside.T], atol=0.1)
+    found = calibration.compensate(tools[1.3][:, :3, 3], start=angles + 0.1, payload=np.full(2, 1.3))
+    back = {f"arm.q{i + 1}": row for i, row in enumerate(found.joint_angles.T)}
+    back |= {f"arm.approach.q{i + 1}": row for i, row in enumerate(found.approach.T)}
+    reached = calibration.predict(Dataset(("a", "b"), {**back, "payload": np.full(2, 1.3)}))[1][0]
+    np.testing.assert_allclose(reached[:, :3, 3], tools[1.3][:, :3, 3], atol=1e-9)
+    if find_compiler() is not None:
+        request = request_of(calibration, None, "arm.c")
+        arm, names = CompiledArm(request, tmp_path), request.expression(()).channels
+        record = arm.defaults()
+        record[:3], record[names.index("payload")] = angles[1], 1.3
+        status, pose, _ = arm.forward(record)
+        assert status == 0
+        np.testing.assert_allclose(pose, tools[1.3][1, :3], atol=1e-12)
+
+
 def test_a_recalibration_holds_what_was_learned(tmp_path):
     run = learned_run("fourier")
     (tmp_path / "calibration.yaml").write_text((run.folder / "run/calibration.yaml").read_text())
