@@ -47,6 +47,7 @@ class GaussianProcess(LinearResidual):
         }
         around = {own.of for part in settings.learned for term in part.terms for own in term.inputs}
         self.conditions = tuple(name for name in SURROUNDINGS if name in around - {"payload"})
+        self.knows_load = "payload" in around
         self.check()
 
     @override

@@ -11,6 +11,7 @@ from armcal.arm.pose_residual import ModelErrors, Postures
 from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.exporter import request_of
+from armcal.errors import DataError
 from armcal.functions.compiler import find_compiler
 from armcal.run.experiment import Experiment
 from armcal.testing import assert_contract
@@ -271,7 +272,15 @@ def loaded_run():
         sunk = float(z) - sag_mm(np.array([float(x), float(y)]), grams / 1000)
         lines.append(",".join([*rest, x, y, repr(float(sunk)), repr(float(grams))]))
     (folder / "data.csv").write_text("\n".join([head + ",payload_g", *lines]) + "\n")
-    ran(folder, "{type: gaussian_process}", folder / "data.csv", "--set", "validation.folds=2")
+    ran(
+        folder,
+        "{type: gaussian_process}",
+        folder / "data.csv",
+        "--set",
+        "validation.folds=2",
+        "--set",
+        "statics.payload_g=null",
+    )
     return SimpleNamespace(folder=folder, calibration=Calibration.load(folder / "run/calibration.yaml"))
 
 
@@ -286,8 +295,11 @@ def test_errors_that_depend_on_the_load_are_learned_and_hold_on_unseen_records()
     assert metrics["pose_residual"]["kept"] and folds["without_mm"] > 0.35 and unseen < 0.4 * folds["without_mm"]
     part = [own for own in run.calibration.system.arms["arm"].residual.settings.learned if own.first == 0][-1]
     assert [own.of for own in part.terms[0].inputs][-1] == "payload"
+    with pytest.raises(DataError, match="learned what loads do and its payload is not stated"):
+        run.calibration.forward(np.zeros(3))
 
 
+@pytest.mark.slow
 def test_compensation_and_c_code_take_the_load(tmp_path):
     calibration, angles = loaded_run().calibration, np.random.default_rng(0).uniform(-0.9, 0.9, (2, 3))
     at = {f"arm.q{i + 1}": row for i, row in enumerate(angles.T)}

@@ -82,9 +82,11 @@ class PoseResidual(ABC):
         settings: its own, checked.
         joint_names: of the arm, from the base to the tip.
         conditions: columns of the surroundings that what it has learned depends on, beside the load.
+        knows_load: whether it depends on the load.
     """
 
     conditions: Sequence[str] = ()
+    knows_load: bool = False
     Settings: ClassVar[type[_Settings]] = Settings
 
     def __init__(self, settings: Any, joint_names: Sequence[str]) -> None:

@@ -181,15 +181,17 @@ class Calibration:
         return predict(self.system, self.parameters, commands)
 
     def require_payload(self, stated: bool, source: str | None = None) -> None:
-        """An elastic arm needs to know what hangs on its tool, if not from the calibration then from the records.
+        """An arm that is elastic, or has learned of loads, needs to know its own: from calibration or records.
 
         Raises:
             DataError: neither says.
         """
-        elastic = any(arm.deflection_size for arm in self.system.arms.values())
-        if elastic and self.system.statics.payload is None and not stated:
+        arms = self.system.arms.values()
+        elastic = any(arm.deflection_size for arm in arms)
+        moved = elastic or any(arm.residual is not None and arm.residual.knows_load for arm in arms)
+        if moved and self.system.statics.payload is None and not stated:
             raise DataError(
-                "the arm is elastic and its payload is not stated.",
+                f"the arm {'is elastic' if elastic else 'has learned what loads do'} and its payload is not stated.",
                 where=Location(source or None),
                 hint="Add a column payload_g; the calibration was made with one.",
             )
