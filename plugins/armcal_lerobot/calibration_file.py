@@ -67,18 +67,27 @@ def read_motors(path: Path) -> MotorFile:
     Raises:
         DataError: it is no such file, or a number in it is one that a servo cannot have; with motor and field.
     """
-    text = text_of(input_bytes(path, _MAX_BYTES, "a LeRobot calibration file (JSON)"), path, "Save it as UTF-8 text.")
-    try:
-        content = json.loads(text, object_pairs_hook=lambda pairs: _unique(path, pairs))
-    except (ValueError, RecursionError) as fault:
-        where = Location(str(path), line=getattr(fault, "lineno", None))
-        hint = "Take the file that lerobot-calibrate wrote, whole."
-        raise DataError(f"it is not JSON ({getattr(fault, 'msg', fault)}).", where=where, hint=hint) from fault
+    hint = "Take the file that lerobot-calibrate wrote, whole."
+    text, content = read_json(path, _MAX_BYTES, "a LeRobot calibration file (JSON)", hint)
     if not isinstance(content, dict) or not content:
         _refuse(path, "", f"found {_kind(content)}, expected {_EXPECTED}.", "Give LeRobot's calibration file.")
     motors = {name: _motor(path, name, entry) for name, entry in content.items()}
     _require_own_ids(path, motors)
     return MotorFile(path, text, motors)
+
+
+def read_json(path: Path, most: int, expected: str, hint: str) -> tuple[str, Any]:
+    """The text of a file of at most so many bytes, and what it holds.
+
+    Raises:
+        DataError: it cannot be read, is not JSON, or has a key twice.
+    """
+    text = text_of(input_bytes(path, most, expected), path, "Save it as UTF-8 text.")
+    try:
+        return text, json.loads(text, object_pairs_hook=lambda pairs: _unique(path, pairs))
+    except (ValueError, RecursionError) as fault:
+        where = Location(str(path), line=getattr(fault, "lineno", None))
+        raise DataError(f"it is not JSON ({getattr(fault, 'msg', fault)}).", where=where, hint=hint) from fault
 
 
 def _motor(path: Path, name: str, entry: Any) -> Motor:

@@ -19,7 +19,7 @@ from armcal_lerobot.calibration_file import MotorFile
 from armcal_lerobot.comparison import poses_of
 from armcal_lerobot.gripper import Gripper, require_single, wiring_of
 from armcal_lerobot.motion import read_motion, require_motors
-from armcal_lerobot.motors import Motor, Units, is_gripper, teeth_of, zero_shift_deg
+from armcal_lerobot.motors import Motor, Units, is_gripper, teeth_of, teeth_text, zero_shift_deg
 from armcal_lerobot.recordings import open_recording
 
 _MOST_UNSWEPT_DEG = 6.0
@@ -82,8 +82,7 @@ def show_check(console: Console, content: Mapping[str, Any]) -> None:
         console.line(f"mm at the gripper: in a typical pose, and at most; poses {content['poses']}")
     for name, motor in motors.items():
         if motor.get("teeth"):
-            teeth = "one tooth" if abs(motor["teeth"]) == 1 else f"{abs(motor['teeth'])} teeth"
-            console.line(f"{name}: {motor['zero_moved_deg']:+.1f} deg are {teeth} of a horn (14.4 deg each).")
+            console.line(f"{name}: {motor['zero_moved_deg']:+.1f} deg are {teeth_text(motor['teeth'])}.")
     if has_two and has_mm:
         typical, most = content["moved_mm"]["typical_mm"], content["moved_mm"]["largest_mm"]
         console.line(

@@ -9,21 +9,13 @@ from scipy.stats import t as student
 
 from armcal_lerobot.gripper import Cost, Gripper
 from armcal_lerobot.motion import Motion
-from armcal_lerobot.motors import teeth_of
+from armcal_lerobot.motors import teeth_of, teeth_text
 from armcal_lerobot.tracking import SLOW_A_SECOND, Figure, Torque, Tracking, delayed
 
 _FEWEST_STARTS = 3
 _SAME_GAIN = 0.03
 _STEADY_START = 5.0
 _MOST_POSES = 5000
-
-
-@dataclass(frozen=True)
-class GripperError:
-    """How far the gripper is from where it was commanded: at rest (None if it never rests), and of all frames."""
-
-    at_rest: Cost | None
-    moving: Cost
 
 
 @dataclass(frozen=True)
@@ -53,8 +45,11 @@ def gravity_of(gripper: Gripper, motors: Sequence[str]) -> Torque | None:
     return torque
 
 
-def gripper_error(motion: Motion, trackings: Sequence[Tracking], gripper: Gripper) -> GripperError:
-    """The gripper's error by commands and states; at rest the command is taken as late as the motors follow it."""
+def gripper_error(motion: Motion, trackings: Sequence[Tracking], gripper: Gripper) -> tuple[Cost | None, Cost]:
+    """How far the gripper is from where it was commanded: at rest (None if it never rests), and of all frames.
+
+    At rest the command is taken as late as the motors follow it.
+    """
     delays = [t.delay_s.value for t in trackings if t.delay_s]
     frames = float(np.median(delays)) * motion.fps if delays else 0.0
     moving, rest = [], []
@@ -67,7 +62,7 @@ def gripper_error(motion: Motion, trackings: Sequence[Tracking], gripper: Grippe
         if slow.any():
             held = _poses(gripper, motion, late[slow])
             rest.append(np.linalg.norm(gripper.positions(held) - gripper.positions(state[:, slow]), axis=0))
-    return GripperError(Cost.of(np.concatenate(rest)) if rest else None, Cost.of(np.concatenate(moving)))
+    return Cost.of(np.concatenate(rest)) if rest else None, Cost.of(np.concatenate(moving))
 
 
 def poses_of(motion: Motion, gripper: Gripper) -> Array:
@@ -136,7 +131,7 @@ def shift_findings(moved: Sequence[Shift], one: Motion, two: Motion) -> list[str
         if abs(first + second) < abs(apart) / 5 and abs(first) > 10:
             texts.append(f"{shift.motor} is inverted in one of them: it begins at {first:+.1f} and {second:+.1f}.")
         elif teeth:
-            texts.append(f"{shift.motor} begins {apart:+.1f} deg elsewhere: {_teeth(teeth)}.")
+            texts.append(f"{shift.motor} begins {apart:+.1f} deg elsewhere: {teeth_text(teeth)} would explain that.")
         elif abs(apart) > 1.0:
             texts.append(
                 f"{shift.motor} begins {apart:+.1f} {shift.unit} elsewhere: its zero differs, or where it was put."
@@ -162,13 +157,10 @@ def _of_motor(t: Tracking) -> list[str]:
         )
     teeth = teeth_of(t.offset.value) if t.offset and t.unit == "deg" else 0
     if teeth and t.offset:
-        texts.append(f"{t.motor} stands {t.offset.value:+.1f} deg from its command: {_teeth(teeth)}.")
+        texts.append(
+            f"{t.motor} stands {t.offset.value:+.1f} deg from its command: {teeth_text(teeth)} would explain that."
+        )
     return texts
-
-
-def _teeth(teeth: int) -> str:
-    count = "one tooth" if abs(teeth) == 1 else f"{abs(teeth)} teeth"
-    return f"a horn that sits {count} (14.4 deg each) off explains that"
 
 
 def _poses(gripper: Gripper, motion: Motion, values: Array) -> Array:

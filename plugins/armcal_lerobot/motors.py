@@ -81,6 +81,11 @@ def teeth_of(degrees: float, within_deg: float = 2.0) -> int:
     return teeth if teeth and abs(degrees - teeth * TOOTH_DEG) <= within_deg else 0
 
 
+def teeth_text(teeth: int) -> str:
+    """So many teeth of a horn, either way."""
+    return f"{'one tooth' if abs(teeth) == 1 else f'{abs(teeth)} teeth'} of a horn ({TOOTH_DEG:g} deg each)"
+
+
 def remount(offset: float) -> str:
     """What to do about a homing offset (counts) that the servo cannot store."""
     degrees = offset * 360 / COUNTS_A_TURN

@@ -18,6 +18,8 @@ from armcal.extras import library
 from armcal.io.plain_files import input_bytes, text_of
 from numpy.typing import NDArray
 
+from armcal_lerobot.calibration_file import read_json
+
 STATE, ACTION = "observation.state", "action"
 _NUMBERS = ("timestamp", "episode_index", "frame_index")
 _VECTOR_TYPES = ("float32", "float64", "int64", "int32")
@@ -151,7 +153,9 @@ def open_recording(folder: Path) -> Recording:
     if not folder.is_dir():
         hint = "Give the folder that holds meta and data."
         raise DataError("it is no folder, expected a LeRobot data set.", where=Location(str(folder)), hint=hint)
-    info = _json(Path(str(where.file)))
+    _, info = read_json(folder / "meta" / "info.json", _MAX_META, "a LeRobot data set's meta/info.json", _RECORD_AGAIN)
+    if not isinstance(info, dict):
+        raise DataError("found no object.", where=where, hint=_RECORD_AGAIN)
     version = str(info.get("codebase_version", ""))
     if not version.startswith(_KNOWN):
         text = f"found codebase_version {version[:20]!r}, expected v2.1 or v3.0."
@@ -301,18 +305,6 @@ def _require_finite(values: Array, file: Path, name: str, done: int) -> None:
     if bad.any():
         text = "found a number that is not finite."
         _refuse(file, name, text, "Leave that episode out.", done + int(np.argmax(bad)) + 1)
-
-
-def _json(path: Path) -> dict[str, Any]:
-    text = text_of(input_bytes(path, _MAX_META, "a LeRobot data set's meta/info.json"), path, "Save it as UTF-8 text.")
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as fault:
-        where = Location(str(path), line=getattr(fault, "lineno", None))
-        raise DataError(f"it is not JSON ({getattr(fault, 'msg', fault)}).", where=where, hint=_RECORD_AGAIN) from fault
-    if not isinstance(content, dict):
-        raise DataError("found no object.", where=Location(str(path)), hint=_RECORD_AGAIN)
-    return content
 
 
 def _info(folder: Path) -> Location:

@@ -72,11 +72,8 @@ def _content(motion: Motion, followed: Sequence[Tracking], gripper: Gripper | No
     }
     if gripper is None:
         return content
-    angles, error = poses_of(motion, gripper), gripper_error(motion, followed, gripper)
-    content["gripper_mm"] = {
-        "at_rest": asdict(error.at_rest) if error.at_rest else None,
-        "moving": asdict(error.moving),
-    }
+    angles, (at_rest, moving) = poses_of(motion, gripper), gripper_error(motion, followed, gripper)
+    content["gripper_mm"] = {"at_rest": asdict(at_rest) if at_rest else None, "moving": asdict(moving)}
     for key in ("offset", "backlash"):
         figures = {t.motor: figure.value for t in followed if t.unit == "deg" and (figure := getattr(t, key))}
         for name, cost in costs_at(gripper, angles, figures).items():

@@ -128,7 +128,7 @@ def test_faults_of_a_motor_are_named(tmp_path: Path) -> None:
     planted = {"elbow_flex": Planted(offset=-28.8), "wrist_roll": Planted(gain=-1.0), "wrist_flex": Planted(gain=0.8)}
     findings = findings_of(trackings(motion_of(tmp_path / "set", episodes(planted, count=4, frames=600))))
     assert len(findings) == 3
-    assert "elbow_flex stands -28.8 deg from its command: a horn that sits 2 teeth" in findings[0]
+    assert "elbow_flex stands -28.8 deg from its command: 2 teeth of a horn" in findings[0]
     assert "wrist_flex moves 0.800 times as far" in findings[1] and "wrist_roll is inverted" in findings[2]
 
 
@@ -171,7 +171,7 @@ def moved(made: list, motor: str, offset: float, factor: float = 1.0) -> list:
 @pytest.mark.parametrize(
     ("offset", "factor", "text"),
     [
-        (14.4, 1, "elbow_flex begins .14.. deg elsewhere: a horn that sits one tooth"),
+        (14.4, 1, "elbow_flex begins .14.. deg elsewhere: one tooth of a horn"),
         (6.0, 1, r"elbow_flex begins \+(5.9|6.0|6.1) deg elsewhere: its zero differs"),
         (0, -1, "elbow_flex is inverted in one of them"),
     ],
@@ -193,11 +193,11 @@ def test_mm_at_the_gripper(tmp_path: Path, gripper: Gripper) -> None:
         state[:, 0] += 2.0
         made.append((action, state))
     motion = motion_of(tmp_path / "set", made)
-    error = gripper_error(motion, trackings(motion), gripper)
+    at_rest, moving = gripper_error(motion, trackings(motion), gripper)
     angles = gripper.angles({name: made[0][0][:, i] for i, name in enumerate(MOTORS)})
     radius = np.linalg.norm(gripper.positions(angles)[:2], axis=0)
-    assert error.at_rest and error.at_rest.largest_mm < 1000 * np.radians(2.0) * 0.39
-    assert error.moving.typical_mm == pytest.approx(1000 * np.radians(2.0) * np.median(radius), rel=0.2)
+    assert at_rest and at_rest.largest_mm < 1000 * np.radians(2.0) * 0.39
+    assert moving.typical_mm == pytest.approx(1000 * np.radians(2.0) * np.median(radius), rel=0.2)
 
 
 def test_the_page_stands_alone(planted_motion: Motion, gripper: Gripper) -> None:
