@@ -82,6 +82,19 @@ def test_a_later_decision_that_means_less_does_not_say_go_on() -> None:
     assert now["do"] == ASK and now["since"]["id"] == "r10" and now["last_good"] == GOOD
 
 
+def test_trouble_began_with_its_first_record_whatever_the_last_decision_is_about() -> None:
+    later = decision(30, "model_no_longer_fits", "lost", ASK, last_good={"sequence": 25})
+    begun = (*LOST[:11], decision(11, "joint_slipped", "watch", "Go on."), level(11, "nominal", "watch"))
+    now = seen(*begun, later, level(30, "watch", "lost")).situation("x", {})
+    assert "model_no_longer_fits" in now["what"] and now["since"]["id"] == "r10" and now["last_good"] == GOOD
+
+
+def test_a_later_decision_about_earlier_records_says_that_trouble_began_with_them() -> None:
+    earlier = {"since": 5, "since_id": "r5", "since_at": START + 4500, "last_good": {"sequence": 4}}
+    now = seen(*LOST, decision(14, "model_no_longer_fits", "lost", ASK, **earlier)).situation("x", {})
+    assert now["since"]["id"] == "r5" and now["last_good"] == {"sequence": 4} and now["rollback"].endswith(" 4")
+
+
 def test_of_two_changes_at_once_both_are_said() -> None:
     both = [decision(11, "joint_slipped", "watch", "Go on."), decision(11, "sensor_moved", "watch", "Measure anew.")]
     now = seen(*LOST[:11], *both, level(11, "nominal", "watch", "Go on.")).situation("x", {})

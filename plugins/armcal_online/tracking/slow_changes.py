@@ -159,8 +159,8 @@ class SlowChanges:
             return replace(state, tracks=()), after
         directions = self._in_a_second[:n, weighing.columns]
         rate = directions @ weighing.size
-        # What moves unforeseen may turn, and others of its kind move too: none of them stays known exactly.
-        alike = np.repeat([c.kind == weighing.change.kind for c in self._changes], np.diff(self._ends))
+        # What moves unforeseen may turn, and others move too, of whichever kind: none of them stays known exactly.
+        alike = np.repeat([c.kind in GRADUAL for c in self._changes], np.diff(self._ends))
         moved = np.linalg.norm(self._in_a_second[:n, alike], axis=1) * np.linalg.norm(weighing.size)
         wander = _WANDERS**2 * moved**2 * weighing.track.seconds
         before = (state.trend, state.wander) if state.trend is not None and state.wander is not None else (0.0, 0.0)

@@ -24,7 +24,7 @@ class Trouble:
     """Decisions and levels since the level was last nominal; bounded.
 
     Attributes:
-        first: the event with which it began.
+        first: the event that names its earliest record.
         over: the change to nominal with which the last one ended.
         decision: the last decision that meant trouble, also after it.
     """
@@ -42,7 +42,7 @@ class Trouble:
             self.first, self.over = None, message
             self._events.clear()
         if level in LEVELS[1:]:
-            self.first = self.first or message
+            self.first = message if self.first is None else min(self.first, message, key=_first_record)
             self._events.append(message)
             self.decision = message if message["event"] == "decision" else self.decision
 
@@ -108,12 +108,17 @@ def situation(
         known["off_before_mm"] = cause.get("tip_error_mm")
     elif trouble.decision is not None:
         known["earlier"] = trouble.decision["sentence"]
-    start = cause or first or trouble.over
+    start = first or trouble.over
     if start is not None:
-        since = {"sequence": start.get("since", start.get("sequence"))}
+        since = {"sequence": _first_record(start)}
         named = {"id": start.get("since_id"), "at": start.get("since_at", start.get("at"))}
         known["since"] = since | {key: value for key, value in named.items() if value is not None}
     return known
+
+
+def _first_record(message: Message) -> int:
+    """The number of the first record that an event is about; 0 where it names none."""
+    return int(message.get("since", message.get("sequence")) or 0)
 
 
 def _what(decision: Message) -> str:
