@@ -175,7 +175,7 @@ class Mistake:
         words: what residuals then depend on, as the end of a sentence.
         measure: which measurement would show it, and what to do about it.
         parameters: local names of what changes; it is looked for where all are free.
-        course: how it changes over the recording.
+        course: how it changes over the recording; ``always`` is no change, and looked for where all are fixed instead.
         together: whether all change by the same share, and not each by itself.
     """
 
@@ -183,7 +183,7 @@ class Mistake:
     words: str
     measure: str
     parameters: tuple[str, ...]
-    course: Literal["slowly", "once"]
+    course: Literal["slowly", "once", "always"]
     together: bool = False
 
 

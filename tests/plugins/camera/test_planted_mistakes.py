@@ -25,6 +25,7 @@ SENTENCES = {
     "rolled": "the hand does not turn between images as the board is seen to turn",
     "bumped": "the camera, or the board, was moved there",
     "focus": "the recorded order: the focal length changes (autofocus, zoom, warming)",
+    "bent": "the bend of board, which is not flat (camera.board_bend_x",
 }
 
 
@@ -84,6 +85,8 @@ class Bench:
             moved = float(place) + by * (1000 if unit == "mm" else 1)
             other = self.simulated({**self.truth, name: f"{moved} {unit}"}, clean).channels
             channels |= {k: np.where(which, other[k], v) for k, v in channels.items() if k.startswith("camera.")}
+        if mistake == "bent":
+            return self.simulated({**self.truth, "camera.board_bend_x": "1 mm"}, clean)
         if mistake == "focus":
             for axis, centre in (("u", 0.633), ("v", 0.487)):
                 for k in range(54):
@@ -102,9 +105,9 @@ def test_what_does_not_belong_together_is_refused_by_name(tmp_path: Path, mounti
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mistake", ["clean", "bumped", "focus"])
+@pytest.mark.parametrize("mistake", ["clean", "bumped", "focus", "bent"])
 @pytest.mark.parametrize("mounting", ["eye_in_hand", "eye_to_hand"])
-def test_what_changed_meanwhile_is_named_by_the_verdict(tmp_path: Path, mounting: str, mistake: str) -> None:
+def test_what_changed_meanwhile_or_is_bent_is_named_by_the_verdict(tmp_path: Path, mounting: str, mistake: str) -> None:
     bench = Bench(tmp_path, mounting, 60)
     verdict = calibrate(bench.recorded(bench.planted(mistake))).verdict
     text = " ".join(finding.text for finding in verdict.findings)
