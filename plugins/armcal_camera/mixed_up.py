@@ -21,7 +21,9 @@ _TURN_RAD, _SHIFT_M = np.radians(10.0), 0.05
 """What the errors of a nominal arm and of a first guess of the lens may make of pairs."""
 _OTHER_RAD, _OTHER_SHARE = np.radians(5.0), 0.15
 """Turns that differ by so much, and by such a share of what the hand turns, are not the same."""
-_LEAST_ACROSS, _TIMES_WITHIN = 0.15, 5.0
+_LEAST_ACROSS, _TIMES_WITHIN, _CLEARLY = 0.15, 5.0, 4.0
+"""Of pairs across two groups: the share that contradicts, by that within; and by how much they are further off. Errors
+of a nominal arm alone, up to 2 deg a joint, made groups that are 2.8 times further apart than within."""
 
 
 def require_board_axes(views: Sequence[tuple[Array, Array]]) -> None:
@@ -56,7 +58,8 @@ def require_one_board(moved: Array, seen: Array) -> None:
     agree, apart = (off < _TURN_RAD) & ((slid < _SHIFT_M) | np.isnan(slid)), ~np.eye(len(moved), dtype=bool)
     first = np.linalg.eigh(agree - np.mean(agree[apart]))[1][:, -1] > 0
     groups = sorted((np.flatnonzero(which) for which in (first, ~first)), key=len)
-    if len(groups[0]) >= 3 and _is_split(agree, *groups):
+    further = max(_times_further(off, *groups), _times_further(slid, *groups)) if len(groups[0]) >= 3 else 0.0
+    if further > _CLEARLY and _is_split(agree, *groups):
         raise ProblemError(
             f"{len(groups[0])} of {len(moved)} images show a board that stands elsewhere than in the others: "
             "two boards, or one that was moved.",
@@ -75,6 +78,13 @@ def _is_split(agree: NDArray[np.bool_], first: NDArray[np.intp], second: NDArray
     across = float(np.mean(~agree[np.ix_(first, second)]))
     within = max(float(np.mean(~agree[np.ix_(group, group)])) for group in (first, second))
     return across > max(_LEAST_ACROSS, _TIMES_WITHIN * within)
+
+
+def _times_further(off: Array, first: NDArray[np.intp], second: NDArray[np.intp]) -> float:
+    """How many times further pairs across two groups are off than those within."""
+    apart = np.where(np.eye(len(off), dtype=bool), np.nan, off)
+    within = max(float(np.nanmedian(apart[np.ix_(group, group)])) for group in (first, second))
+    return float(np.nanmedian(apart[np.ix_(first, second)])) / max(within, 1e-9)
 
 
 def _pairs(poses: Array) -> tuple[Array, Array]:

@@ -77,7 +77,7 @@ class Bench:
             channels |= {JOINTS[(i + 1) % 6]: clean.channels[name] for i, name in enumerate(JOINTS)}
         if mistake in ("second", "bumped"):
             own, part, by, which = {
-                "second": ("board", "x", 0.1, order % 2 == 0),
+                "second": ("board", "x", 0.15, order % 2 == 0),
                 "bumped": ("camera", "x", 0.004, order >= 25),
             }[mistake]
             name = f"camera.{own}_{part}"
@@ -102,6 +102,15 @@ def test_what_does_not_belong_together_is_refused_by_name(tmp_path: Path, mounti
     with pytest.raises(ProblemError) as refusal:
         assemble(bench.recorded(bench.planted(mistake)), Stopwatch())
     assert SENTENCES[mistake] in str(refusal.value)
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 20))])
+@pytest.mark.parametrize("mounting", ["eye_in_hand", pytest.param("eye_to_hand", marks=pytest.mark.slow)])
+def test_the_errors_of_a_poor_arm_are_no_second_board(tmp_path: Path, mounting: str, seed: int) -> None:
+    bench, random = Bench(tmp_path, mounting, 40), np.random.default_rng(seed)
+    off = {f"arm.mdh.theta{i}": f"{random.uniform(-2, 2)} deg" for i in range(2, 6)}
+    poor = bench.simulated({**bench.truth, **off})
+    assemble(bench.recorded(poor), Stopwatch())
 
 
 @pytest.mark.slow
