@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from armcal.devices.clock import RealClock
-from armcal_simulation.dtrack_sender import datagram
+from armcal_simulation.bench.dtrack_sender import datagram
 from armcal_tracker.dtrack import DTrackSettings, DTrackTracker
 
 from benchmarks.report import Row

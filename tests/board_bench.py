@@ -13,10 +13,10 @@ import numpy as np
 from armcal.config.servo_file import BoardSettings, ServoFile, ServoSettings, servo_file_text
 from armcal.devices.faults import DeviceError
 from armcal.devices.link import LinkIdentity
-from armcal_simulation.firmata_board import FirmataBoard
-from armcal_simulation.framed_board import BoardIdentity, FramedBoard
-from armcal_simulation.i2c_bus import I2cBus
-from armcal_simulation.pca9685_model import Pca9685Model
+from armcal_simulation.boards.firmata_board import FirmataBoard
+from armcal_simulation.boards.framed_board import BoardIdentity, FramedBoard
+from armcal_simulation.boards.i2c_bus import I2cBus
+from armcal_simulation.boards.pca9685_model import Pca9685Model
 
 LRM_PULSES_US = {
     "q1": (620, 1540, 2460),

@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from armcal_simulation.i2c_bus import I2cBus
-from armcal_simulation.pca9685_model import Pca9685Model
-from armcal_simulation.serial_line import SerialLine, delimited
-from armcal_simulation.servo_bench import BoardFirmware
+from armcal_simulation.bench.serial_line import SerialLine, delimited
+from armcal_simulation.boards.i2c_bus import I2cBus
+from armcal_simulation.boards.pca9685_model import Pca9685Model
+from armcal_simulation.boards.servo_bench import BoardFirmware
 
 ADDRESS = 0x40
 TICK = 122 / 25e6

@@ -5,10 +5,10 @@ from __future__ import annotations
 import termios
 
 import numpy as np
-from armcal_simulation.bus_motor import BusMotor, BusMotorSettings
-from armcal_simulation.bus_registers import TABLES
-from armcal_simulation.bus_servo import BusServo
-from armcal_simulation.servo_bus import ServoBus
+from armcal_simulation.bus.motor import BusMotor, BusMotorSettings
+from armcal_simulation.bus.registers import TABLES
+from armcal_simulation.bus.servo import BusServo
+from armcal_simulation.bus.servo_bus import ServoBus
 
 BAUD = 1_000_000
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from armcal.devices.faults import DeviceRefusedError
 from armcal.devices.tracker import REPEATED, TrackerFrame
-from armcal_simulation.dtrack_sender import DTrackSender, DTrackSenderSettings, angles_deg, datagram
+from armcal_simulation.bench.dtrack_sender import DTrackSender, DTrackSenderSettings, angles_deg, datagram
 from armcal_tracker.dtrack import DTrackSettings, DTrackTracker
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation

@@ -173,6 +173,6 @@ def test_a_silent_board_is_lost(board):
 
 
 def test_another_protocol_is_refused(board, monkeypatch):
-    monkeypatch.setattr("armcal_simulation.firmata_board.PROTOCOL", (1, 0))
+    monkeypatch.setattr("armcal_simulation.boards.firmata_board.PROTOCOL", (1, 0))
     with pytest.raises(DeviceRefusedError, match=r"version 1\.0"):
         link_to(board).open(board.clock)

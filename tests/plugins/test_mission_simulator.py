@@ -11,9 +11,9 @@ import pytest
 from armcal.errors import ConfigError
 from armcal.estimate.simulation import DAY_S, Mission, MissionSimulator, SimulationRequest, measured_without_noise
 from armcal.run.experiment import Experiment
-from armcal_simulation.mission import Stands
-from armcal_simulation.mission_settings import MissionSettings, TiltSettings, parsed_creep
-from armcal_simulation.mission_surprise import Joint, befallen, probing_poses, random_plan
+from armcal_simulation.mission.random_plan import Joint, befallen, probing_poses, random_plan
+from armcal_simulation.mission.settings import MissionSettings, TiltSettings, parsed_creep
+from armcal_simulation.mission.simulator import Stands
 from armcal_simulation.readings import approach_of, at_truth
 from scipy.spatial.transform import Rotation
 

@@ -24,10 +24,10 @@ from armcal.devices.framed.frames import Frame, FrameDecoder, encoded
 from armcal.devices.simulated import BenchRequest
 from armcal.run.experiment import Experiment
 from armcal.run.plan_clearance import clearance_check
-from armcal_simulation.bench_parts import ServoBenchSettings
-from armcal_simulation.bench_world import BenchWorld
-from armcal_simulation.clock_server import ClockServer
-from armcal_simulation.servo_bench import ServoBench, pulse_bench
+from armcal_simulation.bench.clock_server import ClockServer
+from armcal_simulation.bench.parts import ServoBenchSettings
+from armcal_simulation.bench.world import BenchWorld
+from armcal_simulation.boards.servo_bench import ServoBench, pulse_bench
 from click.testing import CliRunner
 from servo_bench_parts import ADDRESS, read_all
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from armcal_simulation.firmata_board import FirmataBoard
+from armcal_simulation.boards.firmata_board import FirmataBoard
 from servo_bench_parts import ADDRESS, BoardAtPty, board_at_pty, is_raw
 
 CONFIG = bytes([0xF0, 0x78, 0x00, 0x00, 0xF7])

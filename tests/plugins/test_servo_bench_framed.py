@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armcal_simulation.framed_board import BoardIdentity, FramedBoard
+from armcal_simulation.boards.framed_board import BoardIdentity, FramedBoard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from servo_bench_parts import ADDRESS, BoardAtPty, board_at_pty

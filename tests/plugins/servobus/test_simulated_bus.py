@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armcal_simulation.bus_packets import crc16
-from armcal_simulation.serial_line import SerialLine
+from armcal_simulation.bench.serial_line import SerialLine
+from armcal_simulation.bus.packets import crc16
 from servo_bus_parts import BAUD, BusOnDesk, at_baud, packet
 
 UNLOCK = ("lock", 0)

@@ -15,8 +15,8 @@ from armcal.devices.simulated import BenchRequest
 from armcal.errors import ArmcalError
 from armcal.run.experiment import Experiment
 from armcal_bench.bench import Bench
-from armcal_simulation.bench_world import BenchWorld
-from armcal_simulation.bus_bench import BusBench, bus_world
+from armcal_simulation.bench.world import BenchWorld
+from armcal_simulation.bus.bus_bench import BusBench, bus_world
 from bench_runs import free_port
 from click.testing import CliRunner
 from servo_bench_parts import read_all

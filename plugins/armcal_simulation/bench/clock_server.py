@@ -35,7 +35,15 @@ class ClockServer:
         self._path, self._answer = path, answer
         self._clients: dict[int, tuple[socket.socket, bytearray]] = {}
         self._watched: Port | None = None
-        _remove_dead(path)
+        if path.exists():
+            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+                try:
+                    probe.connect(str(path))
+                except OSError:  # nobody listens: it was left by a bench that was killed
+                    path.unlink(missing_ok=True)
+                else:
+                    text, hint = "another simulated bench is running here.", "Stop it first, or give another folder."
+                    raise InputError(text, where=Location(str(path)), hint=hint)
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._poll = select.epoll()
         self._bound = False
@@ -121,20 +129,3 @@ class ClockServer:
         with contextlib.suppress(OSError):
             self._poll.unregister(number)
         client.close()
-
-
-def _remove_dead(path: Path) -> None:
-    """A socket that nobody listens on is what is left of a bench that was killed."""
-    if not path.exists():
-        return
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        try:
-            probe.connect(str(path))
-        except OSError:
-            path.unlink(missing_ok=True)
-            return
-    raise InputError(
-        "another simulated bench is running here.",
-        where=Location(str(path)),
-        hint="Stop it first, or give another folder.",
-    )

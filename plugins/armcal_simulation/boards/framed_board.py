@@ -23,9 +23,9 @@ from armcal.devices.framed.messages import (
     packed_head,
 )
 
-from armcal_simulation.board_guard import BoardGuard
-from armcal_simulation.i2c_bus import BusStuckError, I2cBus
-from armcal_simulation.pca9685_model import LED0
+from armcal_simulation.boards.guard import BoardGuard
+from armcal_simulation.boards.i2c_bus import BusStuckError, I2cBus
+from armcal_simulation.boards.pca9685_model import LED0
 
 FIRMWARE = "armcal board 1"
 _HEAD_SIZE = 5

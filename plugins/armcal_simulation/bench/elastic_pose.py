@@ -44,8 +44,22 @@ class ElasticPose:
                 f"effects of {arm.name} ask for {', '.join(arm.conditions)}, which a bench does not simulate.",
                 hint="Name them under bench.simulator.without_effects.",
             )
-        self._evaluator, size = _evaluator(tracked)
-        self._state = np.zeros((size, 1))
+        # From commands and approaches to the body's pose (3x4, column by column).
+        values = {block.name: ca.SX(list(block.nominal)) for block in tracked.parameters.blocks}
+        count = len(arm.commanded)
+        record, deflection = ca.SX.sym("record", 2 * count), ca.SX.sym("deflection", arm.deflection_size)
+        inputs = ArmInputs(
+            ca.vertcat(*arm.joint_commands(ca.vertsplit(record[:count]))),
+            ca.vertcat(*arm.joint_approaches(ca.vertsplit(record[count:]))),
+            tilted(tracked.environment.load, scoped(values, f"{STATICS}.")),
+            deflection,
+        )
+        state = arm.state(values, inputs)
+        position, rotation = _body(tracked, state, values)
+        after = ca.densify(state.next_deflection)
+        elastic = ElasticPass(record=record, state=deflection, next_state=after, springs=arm.spring_names)
+        self._evaluator = Evaluator(elastic, ca.horzcat(rotation, position))
+        self._state = np.zeros((arm.deflection_size, 1))
 
     def __call__(self, joint_angles: Array, approaches: Array) -> Array:
         """The pose (4x4, m) at joint angles (joints, rad) that were reached from these sides (-1, 0, 1).
@@ -76,26 +90,6 @@ def without_effects(arm: Arm, names: tuple[str, ...]) -> Arm:
             hint=f"Its effects are {', '.join(arm.effects) or 'none'}.",
         )
     return replace(arm, effects={name: effect for name, effect in arm.effects.items() if name not in names})
-
-
-def _evaluator(tracked: TrackedArm) -> tuple[Evaluator, int]:
-    """From commands and approaches to the body's pose (3x4, column by column); and how many deflections there are."""
-    arm = tracked.arm
-    values = {block.name: ca.SX(list(block.nominal)) for block in tracked.parameters.blocks}
-    count = len(arm.commanded)
-    record, deflection = ca.SX.sym("record", 2 * count), ca.SX.sym("deflection", arm.deflection_size)
-    inputs = ArmInputs(
-        ca.vertcat(*arm.joint_commands(ca.vertsplit(record[:count]))),
-        ca.vertcat(*arm.joint_approaches(ca.vertsplit(record[count:]))),
-        tilted(tracked.environment.load, scoped(values, f"{STATICS}.")),
-        deflection,
-    )
-    state = arm.state(values, inputs)
-    position, rotation = _body(tracked, state, values)
-    elastic = ElasticPass(
-        record=record, state=deflection, next_state=ca.densify(state.next_deflection), springs=arm.spring_names
-    )
-    return Evaluator(elastic, ca.horzcat(rotation, position)), arm.deflection_size
 
 
 def _body(

@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from armcal_simulation.bus_motor import BusMotor
-from armcal_simulation.bus_packets import ACTION, FACTORY_RESET, PING, READ, REBOOT, REG_WRITE, WRITE
-from armcal_simulation.bus_registers import Register, ServoTable
+from armcal_simulation.bus.motor import BusMotor
+from armcal_simulation.bus.packets import ACTION, FACTORY_RESET, PING, READ, REBOOT, REG_WRITE, WRITE
+from armcal_simulation.bus.registers import Register, ServoTable
 
 UNDERVOLTAGE, ANGLE_LIMIT, OVERHEAT, RANGE, CHECKSUM, OVERLOAD, INSTRUCTION = 1, 2, 4, 8, 16, 32, 64
 """Bits of a status byte; the first, third and sixth also of protocol 2's hardware error status."""
@@ -275,11 +275,7 @@ class BusServo:
             self.motor.energise(on=False)
 
     def _read(self, address: int, count: int) -> bytes:
-        self._refresh()
-        return bytes(self._memory[address : address + count]).ljust(count, b"\0")
-
-    def _refresh(self) -> None:
-        """Put what the servo measures into its registers."""
+        """Bytes of its registers, once what it measures stands there."""
         motor, table = self.motor, self.table
         noise = motor.settings.encoder_noise_counts * self._random.standard_normal()
         position = round(self.exact_position + noise)
@@ -303,6 +299,7 @@ class BusServo:
         for name, value in values.items():
             if name in table.by_name:
                 self._put(name, value)
+        return bytes(self._memory[address : address + count]).ljust(count, b"\0")
 
     def _celsius(self) -> float:
         return _AIR_C + self.motor.settings.rise_K * self.heat()

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from functools import reduce
 from operator import and_
 
-from armcal_simulation.pca9685_model import Pca9685Model
+from armcal_simulation.boards.pca9685_model import Pca9685Model
 
 ADDRESS_ONLY = -1
 """In the place of a byte's index: the address itself is not acknowledged."""

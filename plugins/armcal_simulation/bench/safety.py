@@ -11,8 +11,8 @@ import numpy as np
 from armcal.arm.clearance import ClearanceCheck
 from armcal.base.settings import Angle, Duration, Length, Settings
 
-from armcal_simulation.pca9685_model import COUNTS, Commit
-from armcal_simulation.servo_model import JointServo, Positive
+from armcal_simulation.bench.servo_model import JointServo, Positive
+from armcal_simulation.boards.pca9685_model import COUNTS, Commit
 
 SPEED_SLACK = 1.05
 _TICK_S = 0.02

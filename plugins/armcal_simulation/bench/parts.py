@@ -17,11 +17,11 @@ from armcal.run.experiment import Experiment
 from armcal.run.plan_clearance import clearance_check
 from pydantic import Field, model_validator
 
-from armcal_simulation.bench_physics import BenchPhysics, Seen, Torques
-from armcal_simulation.dtrack_sender import DTrackSenderSettings
-from armcal_simulation.elastic_pose import ElasticPose, TrackedArm, without_effects
-from armcal_simulation.safety import Bounds, SafetySettings
-from armcal_simulation.servo_model import JointServo, ServoJointSettings
+from armcal_simulation.bench.dtrack_sender import DTrackSenderSettings
+from armcal_simulation.bench.elastic_pose import ElasticPose, TrackedArm, without_effects
+from armcal_simulation.bench.physics import BenchPhysics, Seen, Torques
+from armcal_simulation.bench.safety import Bounds, SafetySettings
+from armcal_simulation.bench.servo_model import JointServo, ServoJointSettings
 
 ALL = "all"
 """In the place of a joint's name: settings of all joints, beneath each joint's own."""
@@ -133,7 +133,7 @@ def tracked_arm(settings: BenchTruthSettings, experiment: Experiment) -> Tracked
     return TrackedArm(arm, name, measurements[name], parameters, experiment.system.environment)
 
 
-def physics(
+def physics_of(
     settings: BenchTruthSettings, tracked: TrackedArm, servos: Mapping[str, JointServo], seen: Seen
 ) -> BenchPhysics:
     """Servos under the arm's weight, hanging as they fell, and the pose they give the arm.
@@ -153,7 +153,7 @@ def physics(
     return BenchPhysics(servos, Torques(function), ElasticPose(tracked), 1 / settings.tracker.rate_hz, seen)
 
 
-def bounds(experiment: Experiment, pulses: Mapping[str, tuple[float, float]]) -> Bounds:
+def bounds_of(experiment: Experiment, pulses: Mapping[str, tuple[float, float]]) -> Bounds:
     """What the plan allows, and what the servos bear (pulses, s)."""
     plan = experiment.settings.plan
     if plan is None:

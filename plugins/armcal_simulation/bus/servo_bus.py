@@ -6,7 +6,7 @@ from operator import and_
 
 import numpy as np
 
-from armcal_simulation.bus_packets import (
+from armcal_simulation.bus.packets import (
     BROADCAST,
     BULK_READ,
     FRAMINGS,
@@ -17,7 +17,7 @@ from armcal_simulation.bus_packets import (
     Instruction,
     ProtocolName,
 )
-from armcal_simulation.bus_servo import BAD_CRC, CHECKSUM, BusServo
+from armcal_simulation.bus.servo import BAD_CRC, CHECKSUM, BusServo
 
 LOOK_S = 0.1
 """How often servos look at their temperature, voltage and load."""
@@ -103,14 +103,15 @@ class ServoBus:
         for servo in self.servos:
             servo.pass_time(seconds)
 
-    def _hearing(self) -> list[BusServo]:
-        baud = self._baud()
-        return [s for s in self.servos if s not in self.absent and abs(s.baud - baud) <= _BAUD_TOLERANCE * s.baud]
-
     def _take(self, instruction: Instruction) -> None:
-        servos = sorted(self._hearing(), key=lambda servo: servo.id)
+        baud = self._baud()
+        plugged = [servo for servo in self.servos if servo not in self.absent]
+        hearing = [servo for servo in plugged if abs(servo.baud - baud) <= _BAUD_TOLERANCE * servo.baud]
+        servos = sorted(hearing, key=lambda servo: servo.id)
         if instruction.damaged:
-            self._report_damage([servo for servo in servos if servo.id == instruction.servo])
+            if self.protocol != "feetech":  # Dynamixels say that a packet came damaged
+                error = BAD_CRC if self._sizes == 2 else CHECKSUM
+                self._answer([(s, (s.status(error), b"")) for s in servos if s.id == instruction.servo])
         elif instruction.code == SYNC_WRITE:
             self._sync_write(servos, instruction.params)
         elif instruction.code == SYNC_READ or (instruction.code == BULK_READ and self._sizes == 2):
@@ -127,12 +128,6 @@ class ServoBus:
             meant = [servo for servo in servos if servo.id == instruction.servo]
             answers = [(s, s.execute(instruction.code, instruction.params)) for s in meant]
             self._answer([pair for pair in answers if pair[0].answers(instruction.code)], instruction.servo)
-
-    def _report_damage(self, servos: list[BusServo]) -> None:
-        """Dynamixels say that a packet came damaged; Feetech's say nothing."""
-        if self.protocol != "feetech":
-            error = BAD_CRC if self._sizes == 2 else CHECKSUM
-            self._answer([(servo, (servo.status(error), b"")) for servo in servos])
 
     def _sync_write(self, servos: list[BusServo], params: bytes) -> None:
         size = self._sizes

@@ -9,8 +9,8 @@ from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
 from armcal.functions.interpreted import BoundFunction
 
-from armcal_simulation.elastic_pose import ElasticPose
-from armcal_simulation.servo_model import JointServo, ServoHeat
+from armcal_simulation.bench.elastic_pose import ElasticPose
+from armcal_simulation.bench.servo_model import JointServo, ServoHeat
 
 FALL_STEP_S = 0.02
 """How often the torque on a servo that gives way is looked up."""

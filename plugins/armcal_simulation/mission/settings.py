@@ -6,7 +6,7 @@ from typing import Annotated, Self
 from armcal.base.settings import Angle, Duration, InputPath, Length, Settings, Temperature
 from pydantic import Field, field_validator, model_validator
 
-from armcal_simulation.mission_events import Day, Event, parsed_creep
+from armcal_simulation.mission.events import Day, Event, parsed_creep
 from armcal_simulation.readings import OutlierSettings
 
 Fraction = Annotated[float, Field(ge=0, le=1)]

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -102,65 +102,36 @@ class Dice:
         return [float(f"{x:.2g}") for x in direction / np.linalg.norm(direction) * abs(self.size(low, high))]
 
 
-def _offset(dice: Dice, joint: Joint, low: float, high: float) -> str:
-    """A change of an offset, by its dimension: so many deg, or as many mm."""
-    return f"{dice.size(low, high):g} {'deg' if joint.dimension == 'angle' else 'mm'}"
+_KINDS = ("slip", "swap", "bend", "creep", "play", "payload", "bump", "bias", "climate")
 
 
-def _slip(dice: Dice, joint: Joint) -> dict[str, Any] | None:
-    if not joint.offset or joint.dimension != "angle":
-        return None
-    return {"kind": "slip", "joint": joint.name, "parameter": joint.offset, "angle_deg": dice.size(1, 15)}
-
-
-def _swap(dice: Dice, joint: Joint) -> dict[str, Any] | None:
-    changes = {joint.offset: _offset(dice, joint, 1, 10)} if joint.offset else {}
-    return {"kind": "swap", "joint": joint.name, "changes": changes} if changes else None
-
-
-def _bend(dice: Dice, joint: Joint) -> dict[str, Any] | None:
-    sizes = {"a": f"{dice.size(1, 8):g} mm", "alpha": f"{dice.size(0.5, 4):g} deg"}
-    changes = {name: sizes[kind] for kind, name in joint.link.items()}
-    return {"kind": "bend", "joint": joint.name, "changes": changes} if changes else None
-
-
-def _creep(dice: Dice, joint: Joint) -> dict[str, Any] | None:
-    change = f"{_offset(dice, joint, 0.05, 0.6)} in 1 d"
-    return {"kind": "creep", "joint": joint.name, "parameter": joint.offset, "change": change} if joint.offset else None
-
-
-def _play(dice: Dice, joint: Joint) -> dict[str, Any] | None:
-    change = f"{abs(dice.size(0.02, 0.2)):g} {'deg' if joint.dimension == 'angle' else 'mm'} in 1 d"
-    return {"kind": "play", "joint": joint.name, "parameter": joint.play, "change": change} if joint.play else None
-
-
-def _payload(dice: Dice, joint: Joint) -> dict[str, Any] | None:
-    return {"kind": "payload", "mass_g": abs(dice.size(50, 300)), "lever_mm": dice.vector(10, 80)}
-
-
-def _bump(dice: Dice, joint: Joint) -> dict[str, Any] | None:
-    return {"kind": "bump", "shift_mm": dice.vector(2, 20), "turn_deg": dice.vector(0.1, 1.0)}
-
-
-def _bias(dice: Dice, joint: Joint) -> dict[str, Any] | None:
-    return {"kind": "bias", "per_day_mm": dice.vector(0.1, 1.0)}
-
-
-def _climate(dice: Dice, joint: Joint) -> dict[str, Any] | None:
-    return {"kind": "climate", "mean_C": float(dice.random.integers(-60, 30)), "swing_C": abs(dice.size(10, 60))}
-
-
-_KINDS: tuple[Callable[[Dice, Joint], dict[str, Any] | None], ...] = (
-    _slip,
-    _swap,
-    _bend,
-    _creep,
-    _play,
-    _payload,
-    _bump,
-    _bias,
-    _climate,
-)
+def _event(kind: str, dice: Dice, joint: Joint) -> dict[str, Any] | None:
+    """What befalls a joint, or the payload, the camera or the weather; None where this joint cannot have it."""
+    own, unit = {"kind": kind, "joint": joint.name}, "deg" if joint.dimension == "angle" else "mm"
+    match kind:
+        case "slip" if joint.offset and joint.dimension == "angle":
+            return {**own, "parameter": joint.offset, "angle_deg": dice.size(1, 15)}
+        case "swap" if joint.offset:
+            return {**own, "changes": {joint.offset: f"{dice.size(1, 10):g} {unit}"}}
+        case "bend":
+            sizes = {"a": f"{dice.size(1, 8):g} mm", "alpha": f"{dice.size(0.5, 4):g} deg"}
+            changes = {name: sizes[part] for part, name in joint.link.items()}
+            return {**own, "changes": changes} if changes else None
+        case "creep":
+            change = f"{dice.size(0.05, 0.6):g} {unit} in 1 d"
+            return {**own, "parameter": joint.offset, "change": change} if joint.offset else None
+        case "play":
+            change = f"{abs(dice.size(0.02, 0.2)):g} {unit} in 1 d"
+            return {**own, "parameter": joint.play, "change": change} if joint.play else None
+        case "payload":
+            return {"kind": kind, "mass_g": abs(dice.size(50, 300)), "lever_mm": dice.vector(10, 80)}
+        case "bump":
+            return {"kind": kind, "shift_mm": dice.vector(2, 20), "turn_deg": dice.vector(0.1, 1.0)}
+        case "bias":
+            return {"kind": kind, "per_day_mm": dice.vector(0.1, 1.0)}
+        case "climate":
+            return {"kind": kind, "mean_C": float(dice.random.integers(-60, 30)), "swing_C": abs(dice.size(10, 60))}
+    return None
 
 
 def random_plan(joints: Sequence[Joint], days: float, bends: bool, seed: int) -> dict[str, Any]:
@@ -197,7 +168,7 @@ def _drawn(dice: Dice, joints: Sequence[Joint], bends: bool, count: int) -> list
     drawn: list[dict[str, Any]] = []
     while len(drawn) < count:
         kind = _KINDS[dice.random.integers(len(_KINDS))]
-        event = kind(dice, joints[dice.random.integers(len(joints))])
+        event = _event(kind, dice, joints[dice.random.integers(len(joints))])
         if event is None or (event["kind"] == "payload" and not bends):
             continue
         if all(event.get("joint", event["kind"]) != other.get("joint", other["kind"]) for other in drawn):

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -13,16 +12,15 @@ from armcal.testing import EXAMPLE_TRUTH
 from pydantic import Field, field_validator, model_validator
 from typing_extensions import override
 
-from armcal_simulation import bench_parts
-from armcal_simulation.bench_faults import FaultRequest
-from armcal_simulation.bench_parts import ALL, BenchTruthSettings, merged
-from armcal_simulation.bench_world import BenchWorld, serve_world
-from armcal_simulation.bus_motor import BusMotor, BusMotorSettings
-from armcal_simulation.bus_registers import SPLINE_TEETH, TABLES, ServoTable
-from armcal_simulation.bus_servo import BusServo
-from armcal_simulation.pca9685_model import Commit
-from armcal_simulation.safety import SafetySettings
-from armcal_simulation.servo_bus import ServoBus
+from armcal_simulation.bench.faults import FaultRequest
+from armcal_simulation.bench.parts import ALL, BenchTruthSettings, bounds_of, merged, tracked_arm
+from armcal_simulation.bench.safety import SafetySettings
+from armcal_simulation.bench.world import BenchWorld, serve_world
+from armcal_simulation.boards.pca9685_model import Commit
+from armcal_simulation.bus.motor import BusMotor, BusMotorSettings
+from armcal_simulation.bus.registers import SPLINE_TEETH, TABLES, ServoTable
+from armcal_simulation.bus.servo import BusServo
+from armcal_simulation.bus.servo_bus import ServoBus
 
 _TURN = 2 * math.pi
 _BURNING = 0.95
@@ -96,21 +94,15 @@ class BusBenchSettings(BenchTruthSettings):
         raise ConfigError(f"bench.simulator: found {baud} baud, expected one of {rates} for {servo.model}.")
 
 
-@dataclass(frozen=True)
-class _BusJoint:
-    servo: BusServo
-    motor: BusMotor
-
-
 class BusElectronics:
     """Servos on their bus: the electronics of a ``bus_bench``. Motors are judged by the set points they follow."""
 
-    def __init__(self, world: BenchWorld, bus: ServoBus, joints: Mapping[str, _BusJoint]) -> None:
+    def __init__(self, world: BenchWorld, bus: ServoBus, servos: Mapping[str, BusServo]) -> None:
         self.split = bus.split
-        self._world, self._bus, self._joints = world, bus, dict(joints)
-        self._setpoints: dict[str, float | None] = dict.fromkeys(joints)
-        for joint, part in joints.items():
-            part.servo.heat = lambda heat=world.physics.heat[joint]: heat.winding  # type: ignore[misc]
+        self._world, self._bus, self._servos = world, bus, dict(servos)
+        self._setpoints: dict[str, float | None] = dict.fromkeys(servos)
+        for joint, servo in servos.items():
+            servo.heat = lambda heat=world.physics.heat[joint]: heat.winding  # type: ignore[misc]
 
     def boot(self) -> None:
         """See ``Electronics``."""
@@ -135,30 +127,30 @@ class BusElectronics:
 
     def moved(self) -> None:
         """Judge what the motors were sent to since the last look."""
-        for joint, part in self._joints.items():
-            before, now = self._setpoints[joint], part.motor.setpoint
+        for joint, servo in self._servos.items():
+            before, now = self._setpoints[joint], servo.motor.setpoint
             if before != now:
                 self._setpoints[joint] = now
-                commit = Commit(self._world.now, part.servo.id, before, now)
+                commit = Commit(self._world.now, servo.id, before, now)
                 self._world.safety.committed(joint, commit, _TURN, self._world.physics.torques[joint])
 
     def fail(self, fault: FaultRequest) -> None:
         """See ``Electronics``."""
-        for joint, part in self._joints.items():
+        for joint, servo in self._servos.items():
             if fault.joint not in (None, joint):
                 continue
             if fault.kind in ("brown_out", "reset"):
-                part.servo.power_cycle()
+                servo.power_cycle()
             elif fault.kind == "disconnect":
-                self._bus.absent.add(part.servo)
+                self._bus.absent.add(servo)
             elif fault.kind == "connect":
-                self._bus.absent.discard(part.servo)
+                self._bus.absent.discard(servo)
             elif fault.kind == "jam":
-                part.motor.stops = (part.motor.shaft, part.motor.shaft)
+                servo.motor.stops = (servo.motor.shaft, servo.motor.shaft)
             elif fault.kind == "free":
-                part.motor.stops = part.motor.settings.travel
+                servo.motor.stops = servo.motor.settings.travel
             elif fault.kind == "put":
-                part.motor.put(fault.angle)
+                servo.motor.put(fault.angle)
             elif fault.kind == "heat":
                 self._world.physics.heat[joint].winding = _BURNING
         self.moved()
@@ -168,14 +160,14 @@ class BusElectronics:
         """See ``Electronics``."""
         servos = {
             joint: {
-                "id": part.servo.id,
-                "position": part.servo.exact_position,
-                "homing_offset": part.servo.offset,
-                "status": part.servo.status(),
-                "connected": part.servo not in self._bus.absent,
-                "shaft_rad": part.motor.shaft,
+                "id": servo.id,
+                "position": servo.exact_position,
+                "homing_offset": servo.offset,
+                "status": servo.status(),
+                "connected": servo not in self._bus.absent,
+                "shaft_rad": servo.motor.shaft,
             }
-            for joint, part in self._joints.items()
+            for joint, servo in self._servos.items()
         }
         return {"bus": servos, "volts": self._bus.volts()}
 
@@ -205,27 +197,25 @@ def bus_world(settings: BusBenchSettings, request: BenchRequest) -> BenchWorld:
     Raises:
         ConfigError: the settings do not fit the experiment.
     """
-    tracked = bench_parts.tracked_arm(settings, request.experiment)
+    tracked = tracked_arm(settings, request.experiment)
     names = list(tracked.arm.commanded)
     if fault := unknown_joint([joint for joint in (*settings.joints, *settings.start) if joint != ALL], names):
         raise ConfigError(f"bench.simulator: {fault}.")
     if missing := sorted(set(names) - set(settings.joints)):
         raise ConfigError(f"bench.simulator: found no servo for {', '.join(missing)}.", hint="Give each joint its id.")
     random = np.random.default_rng([settings.seed, 2])
-    joints = {joint: _bus_joint(settings, joint, random) for joint in names}
+    servos = {joint: _bus_servo(settings, joint, random) for joint in names}
 
     def electronics(world: BenchWorld) -> BusElectronics:
-        supply = settings.supply_V, settings.supply_ohm
-        servos = [part.servo for part in joints.values()]
-        bus = ServoBus(world.clock, servos, world.send, world.baud, random, echo=settings.echo, supply=supply)
-        return BusElectronics(world, bus, joints)
+        supply, chain = (settings.supply_V, settings.supply_ohm), list(servos.values())
+        bus = ServoBus(world.clock, chain, world.send, world.baud, random, echo=settings.echo, supply=supply)
+        return BusElectronics(world, bus, servos)
 
-    motors = {joint: part.motor for joint, part in joints.items()}
-    bounds = bench_parts.bounds(request.experiment, {})
-    return BenchWorld(settings, tracked, motors, bounds, request.folder, electronics)
+    motors = {joint: servo.motor for joint, servo in servos.items()}
+    return BenchWorld(settings, tracked, motors, bounds_of(request.experiment, {}), request.folder, electronics)
 
 
-def _bus_joint(settings: BusBenchSettings, joint: str, random: np.random.Generator) -> _BusJoint:
+def _bus_servo(settings: BusBenchSettings, joint: str, random: np.random.Generator) -> BusServo:
     """A servo with its EEPROM, and its motor, which stands where the arm is put at the start."""
     stated = settings.servo_of(joint)
     table = stated.table
@@ -238,4 +228,4 @@ def _bus_joint(settings: BusBenchSettings, joint: str, random: np.random.Generat
     teeth = stated.direction * stated.horn_teeth * _TURN / SPLINE_TEETH / table.count
     zero = stated.zero_count + sign * stated.homing_offset + teeth
     motor = BusMotor(stated, settings.start.get(joint, 0.0))
-    return _BusJoint(BusServo(table, motor, zero, stated.direction, random, eeprom), motor)
+    return BusServo(table, motor, zero, stated.direction, random, eeprom)

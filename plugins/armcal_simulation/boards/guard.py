@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 from armcal.devices.framed.messages import Guard, GuardedChannel
 
-from armcal_simulation.i2c_bus import BusStuckError, I2cBus
-from armcal_simulation.pca9685_model import COUNTS, FULL, LED0
+from armcal_simulation.boards.i2c_bus import BusStuckError, I2cBus
+from armcal_simulation.boards.pca9685_model import COUNTS, FULL, LED0
 
 TICK_S = 0.02
 _RATE_UNIT = 16

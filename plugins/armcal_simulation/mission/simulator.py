@@ -15,10 +15,10 @@ from armcal.testing import EXAMPLE_TRUTH
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from armcal_simulation.mission_changes import MovingTruth, moving_truth, scheduled
-from armcal_simulation.mission_events import PayloadSettings, PlaySettings
-from armcal_simulation.mission_settings import LossSettings, MissionSettings, RecordSettings, TiltSettings, began_at
-from armcal_simulation.mission_surprise import befallen, probing_poses, random_plan
+from armcal_simulation.mission.changes import MovingTruth, moving_truth, scheduled
+from armcal_simulation.mission.events import PayloadSettings, PlaySettings
+from armcal_simulation.mission.random_plan import befallen, probing_poses, random_plan
+from armcal_simulation.mission.settings import LossSettings, MissionSettings, RecordSettings, TiltSettings, began_at
 from armcal_simulation.readings import (
     approach_of,
     at_truth,

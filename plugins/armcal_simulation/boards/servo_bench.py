@@ -12,39 +12,25 @@ from armcal.run.experiment import Experiment
 from armcal.testing import EXAMPLE_TRUTH
 from typing_extensions import override
 
-from armcal_simulation import bench_parts
-from armcal_simulation.bench_faults import FaultRequest
-from armcal_simulation.bench_parts import ServoBenchSettings
-from armcal_simulation.bench_world import BenchWorld, serve_world
-from armcal_simulation.firmata_board import FirmataBoard
-from armcal_simulation.framed_board import BoardIdentity, FramedBoard
-from armcal_simulation.i2c_bus import I2cBus
-from armcal_simulation.pca9685_model import Commit, Pca9685Model
-from armcal_simulation.serial_line import delimited
-from armcal_simulation.servo_model import ServoModel
+from armcal_simulation.bench.faults import FaultRequest
+from armcal_simulation.bench.parts import ServoBenchSettings, bounds_of, tracked_arm, true_servos
+from armcal_simulation.bench.serial_line import delimited
+from armcal_simulation.bench.servo_model import ServoModel
+from armcal_simulation.bench.world import BenchWorld, Firmware, serve_world
+from armcal_simulation.boards.firmata_board import FirmataBoard
+from armcal_simulation.boards.framed_board import BoardIdentity, FramedBoard
+from armcal_simulation.boards.i2c_bus import I2cBus
+from armcal_simulation.boards.pca9685_model import Commit, Pca9685Model
 
 EXAMPLE_SERVOS = Path(__file__).with_name("example_servos.yaml")
 _EEPROM = "eeprom.json"
 _SHOWN_VIOLATIONS = 20
 
 
-class BoardFirmware(Protocol):
-    """A board's program: it answers the serial line at once, and may have timers."""
+class BoardFirmware(Firmware, Protocol):
+    """A board's program; ``delimiter`` ends a message of its protocol."""
 
     delimiter: int
-    """The byte that ends a message of its protocol."""
-
-    def boot(self) -> None:
-        """Start anew: power-up, or a reset."""
-
-    def receive(self, data: bytes) -> None:
-        """Bytes from the host."""
-
-    def next_event(self) -> float:
-        """When a timer is due (s)."""
-
-    def run_timers(self) -> None:
-        """Do what is due now."""
 
 
 class PulseBoards:
@@ -143,21 +129,18 @@ def pulse_bench(settings: ServoBenchSettings, experiment: Experiment, folder: Pa
     Raises:
         ConfigError: the settings do not fit the experiment.
     """
-    tracked = bench_parts.tracked_arm(settings, experiment)
-    file = bench_parts.true_servos(settings, tracked.arm)
+    tracked = tracked_arm(settings, experiment)
+    file = true_servos(settings, tracked.arm)
     models = {
         joint: ServoModel(settings.servo_of(joint), file.servos[joint].table, settings.start.get(joint, 0.0))
         for joint in tracked.arm.commanded
     }
     pulses = {joint: servo.pulse_range for joint, servo in file.servos.items()}
-    return BenchWorld(
-        settings,
-        tracked,
-        models,
-        bench_parts.bounds(experiment, pulses),
-        folder,
-        lambda world: PulseBoards(world, settings, models, file, folder),
-    )
+
+    def electronics(world: BenchWorld) -> PulseBoards:
+        return PulseBoards(world, settings, models, file, folder)
+
+    return BenchWorld(settings, tracked, models, bounds_of(experiment, pulses), folder, electronics)
 
 
 class ServoBench(SimulatedBench):

@@ -103,12 +103,17 @@ class JointServo:
 
     def advance(self, seconds: float, torque: float) -> bool:
         """Let time pass under a torque of its load (N m, turning towards larger angles); whether it moved."""
-        slips = self._slip(seconds, torque)
+        slips = bool(self._creep and self.powered and torque)
+        if slips:  # the horn, on the gear
+            self._slipped += self._creep * torque * seconds
+            self.angle = self._horn + self._slipped
         if self.rests(torque):
             return slips
         before = self._gear
         if self.holds(torque):
-            self._drive(seconds, torque)
+            error, step = (self.target or 0.0) - before, self._speed * seconds
+            self._driving = abs(error) > step
+            self._gear += math.copysign(step, error) if self._driving else error
         else:
             step = self._fall_speed * seconds
             low, high = self.stops
@@ -121,21 +126,6 @@ class JointServo:
         self._horn = min(max(self._horn, self._gear - half), self._gear + half)
         self.angle = self._horn + self._slipped
         return bool(moved) or slips
-
-    def _drive(self, seconds: float, torque: float) -> None:
-        """Turn the gear towards the target."""
-        error = (self.target or 0.0) - self._gear
-        step = self._speed * seconds
-        self._driving = abs(error) > step
-        self._gear += math.copysign(step, error) if self._driving else error
-
-    def _slip(self, seconds: float, torque: float) -> bool:
-        """Let the horn slip on the gear; whether it did."""
-        if not self._creep or not self.powered or not torque:
-            return False
-        self._slipped += self._creep * torque * seconds
-        self.angle = self._horn + self._slipped
-        return True
 
     def holds(self, torque: float) -> bool:
         """Whether it is strong enough for a torque (N m), as it is powered now."""

@@ -7,7 +7,7 @@ import contextlib
 import math
 from collections.abc import Callable
 
-from armcal_simulation.i2c_bus import BusStuckError, I2cBus
+from armcal_simulation.boards.i2c_bus import BusStuckError, I2cBus
 
 START_SYSEX, END_SYSEX, VERSION = 0xF0, 0xF7, 0xF9
 STRING, I2C_REQUEST, I2C_REPLY, I2C_CONFIG, FIRMWARE = 0x71, 0x76, 0x77, 0x78, 0x79

@@ -12,26 +12,22 @@ from armcal.base.domains import Array
 from armcal.devices.simulated import BOARD, CLOCK, LOG
 from armcal.io.signals import Signals
 
-from armcal_simulation import bench_parts
-from armcal_simulation.bench_faults import FaultCalendar, FaultRequest
-from armcal_simulation.bench_parts import BenchTruthSettings
-from armcal_simulation.clock_server import ClockServer
-from armcal_simulation.dtrack_sender import DTrackSender
-from armcal_simulation.elastic_pose import TrackedArm
-from armcal_simulation.safety import Bounds, Safety, appended_to
-from armcal_simulation.serial_line import LINE_FAULTS, SerialLine, Split
-from armcal_simulation.servo_model import JointServo
+from armcal_simulation.bench.clock_server import ClockServer
+from armcal_simulation.bench.dtrack_sender import DTrackSender
+from armcal_simulation.bench.elastic_pose import TrackedArm
+from armcal_simulation.bench.faults import FaultCalendar, FaultRequest
+from armcal_simulation.bench.parts import BenchTruthSettings, physics_of
+from armcal_simulation.bench.safety import Bounds, Safety, appended_to
+from armcal_simulation.bench.serial_line import LINE_FAULTS, SerialLine, Split
+from armcal_simulation.bench.servo_model import JointServo
 
 WALL_AT_START = 1893456000.0
 """2030-01-01, 0:00 UTC: no bench is there at two times, and results are the same whenever they are made."""
 LONGEST_ADVANCE_S = 86400.0
 
 
-class Electronics(Protocol):
-    """What stands between the host's serial line and the motors: it answers at once, and may have timers."""
-
-    split: Split
-    """Messages on the line."""
+class Firmware(Protocol):
+    """What a host talks to: it answers the serial line at once, and may have timers."""
 
     def boot(self) -> None:
         """Start anew: power-up, or a reset."""
@@ -44,6 +40,13 @@ class Electronics(Protocol):
 
     def run_timers(self) -> None:
         """Do what is due now."""
+
+
+class Electronics(Firmware, Protocol):
+    """What stands between the host's serial line and the motors."""
+
+    split: Split
+    """Messages on the line."""
 
     def moved(self) -> None:
         """Time has passed for the motors."""
@@ -84,7 +87,7 @@ class BenchWorld:
         self._settings = settings
         self._sender = DTrackSender(settings.tracker, settings.tracker.host, settings.tracker.port, settings.seed)
         self._world_T_base = settings.world_T_base.matrix
-        self.physics = bench_parts.physics(settings, tracked, servos, self._track)
+        self.physics = physics_of(settings, tracked, servos, self._track)
         self.safety = Safety(settings.safety, bounds, self.physics.servos, appended_to(folder / LOG))
         self.physics.on_failure = self.safety.failed
         self._faults = FaultCalendar(self.clock, self._fail)

@@ -10,7 +10,7 @@ from typing import Annotated
 from pydantic import Field
 from typing_extensions import override
 
-from armcal_simulation.servo_model import JointServo, Positive, ServoJointSettings
+from armcal_simulation.bench.servo_model import JointServo, Positive, ServoJointSettings
 
 _NEAR = 1e-9
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
-from armcal_simulation.bus_packets import ProtocolName
+from armcal_simulation.bus.packets import ProtocolName
 
 Area = Literal["eeprom", "ram", "read"]
 _RPM = 2 * math.pi / 60

@@ -15,12 +15,13 @@ from armcal.errors import ConfigError
 from armcal.estimate.simulation import DAY_S, MissionEvent
 from scipy.spatial.transform import Rotation
 
-from armcal_simulation.mission_events import (
+from armcal_simulation.mission.events import (
     BendSettings,
     BiasSettings,
     BumpSettings,
     ClimateSettings,
     CreepSettings,
+    Event,
     PayloadSettings,
     PlaySettings,
     SlipSettings,
@@ -28,27 +29,21 @@ from armcal_simulation.mission_events import (
     TiltedSettings,
     parsed_creep,
 )
-from armcal_simulation.mission_settings import MissionSettings, TemperatureSettings
+from armcal_simulation.mission.settings import MissionSettings, TemperatureSettings
 
 _WALK_STEP_S = 3600.0
 
 
 @dataclass(frozen=True)
 class Path:
-    """A parameter's change over time: by entry, straight lines between known moments (s; SI)."""
+    """A parameter's change over time: by entry, straight lines between known moments (s; SI).
+
+    A moment that stands there twice is a jump, from then on.
+    """
 
     entry: int
     times: Array
     changes: Array
-
-
-@dataclass(frozen=True)
-class Step:
-    """A parameter's jump: by entry, from a moment on (s; SI)."""
-
-    entry: int
-    time: float
-    change: float
 
 
 @dataclass(frozen=True)
@@ -66,13 +61,9 @@ class MovingTruth:
 
     parameters: Parameters
     paths: tuple[Path, ...]
-    steps: tuple[Step, ...]
     warmings: tuple[Warming, ...]
     temperature: TemperatureSettings
-    bumps: tuple[BumpSettings, ...] = ()
-    biases: tuple[BiasSettings, ...] = ()
-    payloads: tuple[PayloadSettings, ...] = ()
-    climates: tuple[ClimateSettings, ...] = ()
+    events: tuple[Event, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -82,7 +73,7 @@ class MovingTruth:
     @property
     def moving(self) -> tuple[str, ...]:
         """Those that change, in the order of all."""
-        entries = {change.entry for change in (*self.paths, *self.steps, *self.warmings)}
+        entries = {change.entry for change in (*self.paths, *self.warmings)}
         return tuple(self.names[i] for i in sorted(entries))
 
     def values_at(self, times: Array) -> Array:
@@ -90,8 +81,6 @@ class MovingTruth:
         values = np.tile(self.parameters.nominal(), (len(times), 1))
         for path in self.paths:
             values[:, path.entry] += np.interp(times, path.times, path.changes)
-        for step in self.steps:
-            values[:, step.entry] += np.where(times >= step.time, step.change, 0.0)
         warmth = self.temperature_at(times)
         for warming in self.warmings:
             values[:, warming.entry] += warming.per_kelvin * (warmth - warming.reference)
@@ -100,12 +89,12 @@ class MovingTruth:
     def camera_T_base_at(self, times: Array) -> Array:  # noqa: N802
         """Where what is measured in the base frame is seen (N x 4 x 4, m)."""
         poses = np.tile(np.eye(4), (len(times), 1, 1))
-        for bump in self.bumps:
+        for bump in (event for event in self.events if isinstance(event, BumpSettings)):
             moved = np.eye(4)
             moved[:3, :3], moved[:3, 3] = Rotation.from_rotvec(bump.turn).as_matrix(), bump.shift
             after = times >= bump.day * DAY_S
             poses[after] = moved @ poses[after]
-        for bias in self.biases:
+        for bias in (event for event in self.events if isinstance(event, BiasSettings)):
             days = np.clip(times / DAY_S, bias.day, math.inf if bias.until is None else bias.until) - bias.day
             poses[:, :3, 3] += days[:, None] * np.array(bias.per_day)
         return poses
@@ -114,7 +103,7 @@ class MovingTruth:
         """N, degrees Celsius."""
         sine, since_warmest = self.temperature, times - self.temperature.warmest * 3600.0
         mean, swing = np.full(len(times), sine.mean), np.full(len(times), sine.swing)
-        for climate in self.climates:
+        for climate in (event for event in self.events if isinstance(event, ClimateSettings)):
             after = times >= climate.day * DAY_S
             mean[after], swing[after] = climate.mean, climate.swing
         return mean + swing * np.cos(2 * np.pi * since_warmest / sine.period)
@@ -122,7 +111,7 @@ class MovingTruth:
     def payload_at(self, times: Array) -> Array:
         """Mass (kg) and centre in the tool frame (m) of all that hangs there, N x 4."""
         mass, moment = np.zeros(len(times)), np.zeros((len(times), 3))
-        for payload in self.payloads:
+        for payload in (event for event in self.events if isinstance(event, PayloadSettings)):
             last = math.inf if payload.until is None else payload.until
             there = (times >= payload.day * DAY_S) & (times < last * DAY_S)
             mass += there * payload.mass
@@ -141,18 +130,9 @@ def moving_truth(parameters: Parameters, settings: MissionSettings, random: np.r
         for glob, thermal in settings.thermal.items()
         for name in parameters.select([glob])
     ]
-    events = sorted(settings.events, key=lambda event: event.day)
-    return MovingTruth(
-        parameters,
-        (*_paths(parameters, settings, random), *_growths(parameters, settings)),
-        tuple(_steps(parameters, settings)),
-        tuple(warmings),
-        settings.temperature,
-        tuple(event for event in events if isinstance(event, BumpSettings)),
-        tuple(event for event in events if isinstance(event, BiasSettings)),
-        tuple(event for event in events if isinstance(event, PayloadSettings)),
-        tuple(event for event in events if isinstance(event, ClimateSettings)),
-    )
+    events = tuple(sorted(settings.events, key=lambda event: event.day))
+    paths = (*_creeping(parameters, settings, random), *_of_events(parameters, settings))
+    return MovingTruth(parameters, paths, tuple(warmings), settings.temperature, events)
 
 
 def scheduled(settings: MissionSettings, joints: Sequence[str]) -> tuple[MissionEvent, ...]:
@@ -171,7 +151,7 @@ def scheduled(settings: MissionSettings, joints: Sequence[str]) -> tuple[Mission
     return tuple(sorted(events, key=lambda event: event.time))
 
 
-def _paths(parameters: Parameters, settings: MissionSettings, random: np.random.Generator) -> Iterator[Path]:
+def _creeping(parameters: Parameters, settings: MissionSettings, random: np.random.Generator) -> Iterator[Path]:
     end = settings.days * DAY_S
     for glob, text in settings.creep.items():
         for name in parameters.select([glob]):
@@ -185,9 +165,10 @@ def _paths(parameters: Parameters, settings: MissionSettings, random: np.random.
             yield Path(entry, times, np.concatenate([[0.0], np.cumsum(steps)]))
 
 
-def _growths(parameters: Parameters, settings: MissionSettings) -> Iterator[Path]:
-    """Creep and play that begin on a day."""
+def _of_events(parameters: Parameters, settings: MissionSettings) -> Iterator[Path]:
+    """Creep and play that begin on a day, and jumps."""
     for event in settings.events:
+        begin, jumps = event.day * DAY_S, dict[str, float]()
         if isinstance(event, CreepSettings | PlaySettings):
             amount, over, _ = _creep(parameters, event.parameter, event.change)
             if isinstance(event, PlaySettings) and not amount > 0:
@@ -195,10 +176,22 @@ def _growths(parameters: Parameters, settings: MissionSettings) -> Iterator[Path
                     f"simulation.events: found play that changes by {event.change}, expected one that grows.",
                     hint="Write an amount above zero, such as 0.3 deg in 10 d.",
                 )
-            begin = event.day * DAY_S
             end = (settings.days if event.until is None else event.until) * DAY_S
             times, changes = np.array([begin, end]), np.array([0.0, amount * (end - begin) / over])
             yield Path(_entry(parameters, event.parameter), times, changes)
+        elif isinstance(event, SlipSettings):
+            block = parameters[parameters.select([event.parameter])[0]]
+            if block.unit != "rad":
+                raise ConfigError(
+                    f"simulation.events: {block.name} is no angle.", hint="Give the joint's offset, such as theta3."
+                )
+            jumps = {event.parameter: event.turned}
+        elif isinstance(event, TiltedSettings):
+            jumps = {block.name: turn for block, turn in zip(gravity_tilt(), event.turn, strict=True)}
+        elif isinstance(event, SwapSettings | BendSettings):
+            jumps = {name: _amount(parameters, name, change) for name, change in event.changes.items()}
+        for name, change in jumps.items():
+            yield Path(_entry(parameters, name), np.array([begin, begin]), np.array([0.0, change]))
 
 
 def _creep(parameters: Parameters, name: str, text: str) -> tuple[float, float, bool]:
@@ -208,23 +201,6 @@ def _creep(parameters: Parameters, name: str, text: str) -> tuple[float, float, 
     with contextlib.suppress(ValueError):  # without a unit: the plain number that dimensionless parameters have
         written = float(written)
     return _amount(parameters, name, written), over, walks
-
-
-def _steps(parameters: Parameters, settings: MissionSettings) -> Iterator[Step]:
-    for event in settings.events:
-        if isinstance(event, SlipSettings):
-            block = parameters[parameters.select([event.parameter])[0]]
-            if block.unit != "rad":
-                raise ConfigError(
-                    f"simulation.events: {block.name} is no angle.", hint="Give the joint's offset, such as theta3."
-                )
-            yield Step(_entry(parameters, event.parameter), event.day * DAY_S, event.turned)
-        elif isinstance(event, TiltedSettings):
-            for block, turn in zip(gravity_tilt(), event.turn, strict=True):
-                yield Step(_entry(parameters, block.name), event.day * DAY_S, turn)
-        elif isinstance(event, SwapSettings | BendSettings):
-            for name, change in event.changes.items():
-                yield Step(_entry(parameters, name), event.day * DAY_S, _amount(parameters, name, change))
 
 
 def _entry(parameters: Parameters, name: str) -> int:

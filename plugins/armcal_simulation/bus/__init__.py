@@ -1,0 +1,1 @@
+"""Smart servos on a serial bus."""

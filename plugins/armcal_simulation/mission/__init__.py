@@ -1,0 +1,1 @@
+"""A rover's arm over some days, and what befalls it."""
