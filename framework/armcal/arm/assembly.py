@@ -1,7 +1,5 @@
 """An arm: a model, its effects and its masses, put together under one instance name."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

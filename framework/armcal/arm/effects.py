@@ -1,7 +1,5 @@
 """Joint effects: what stands between the commanded and the real displacement of a joint."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal

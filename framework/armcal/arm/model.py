@@ -1,7 +1,5 @@
 """Arm models: the chain of joints that a model describes, and the pose of every frame of it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol

@@ -3,8 +3,6 @@
 The board counts ticks of an oscillator, divided by ``prescale + 1``, and takes a whole number of them. [PCA9685]
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

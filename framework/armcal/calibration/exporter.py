@@ -1,7 +1,5 @@
 """Exporters: calibrated arms in the formats of other programs, and how far what a format leaves out matters."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """Live joint readings of arms that are guided by hand."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable

@@ -1,7 +1,5 @@
 """Links to a servo board: one small interface, whatever carries the bytes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable

@@ -1,7 +1,5 @@
 """Simulated benches: what stands in for board, arm and tracker when a measuring run is rehearsed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol

@@ -3,8 +3,6 @@
 Circular blocks: the last records have the first as neighbours, so that every record is drawn as often. [Politis1992]
 """
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

@@ -6,8 +6,6 @@ the spread counts it. ``parametric`` simulates the measured values by the fitted
 the model were true.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial

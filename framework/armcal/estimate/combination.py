@@ -1,7 +1,5 @@
 """A direction in parameter space, in words."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

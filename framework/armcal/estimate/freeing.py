@@ -4,8 +4,6 @@ One after another, the one whose score is largest for its spread [Rao1948] is fr
 find among so many is no gain: levels are divided by their number.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

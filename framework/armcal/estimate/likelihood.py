@@ -7,8 +7,6 @@ P = D - D J (J' D J + prior)^-1 J' D [Patterson1971]:
     slope_c = 1/2 (y' P V_c P y - tr P V_c),    average information_cd = 1/2 y' P V_c P V_d P y    [Gilmour1995]
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

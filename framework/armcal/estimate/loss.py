@@ -6,8 +6,6 @@ of a location in m dimensions would keep 95 % of the efficiency of least squares
 customary 1.345 (Huber) and 2.385 (Cauchy) [Holland1977].
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal

@@ -1,7 +1,5 @@
 """Parameters of single groups: where they start, which of them records determine, and what records not fitted give."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A basis of a null space whose vectors name few parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import combinations
 from math import comb

@@ -5,8 +5,6 @@ then the Gauss-Markov states (drifts, a correlated model error) in their standar
 keeps its small eigenvalues when angles stand beside compliances. [BarShalom2001]
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

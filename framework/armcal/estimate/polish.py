@@ -6,8 +6,6 @@ these steps an answer depends on the problem alone. Where a short search leaves 
 apart, a long one does too.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Sequence

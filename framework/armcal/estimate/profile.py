@@ -7,8 +7,6 @@ noise found, less where priors hold the parameter, since they weigh as they were
 [Chandler2007]). Nothing is assumed of how residuals bend, so an interval may be lopsided, end at a bound, or not end.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal

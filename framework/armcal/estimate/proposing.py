@@ -1,7 +1,5 @@
 """Starts that measurements find by themselves, from what they read: a camera's intrinsics and hand-eye pose."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

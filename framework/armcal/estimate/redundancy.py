@@ -5,8 +5,6 @@ of the information of records and priors, J whitened) and w the record's weight 
 residual is s^2 (I - (2 w - 1) H): I - H for one that took part, I + H for one that was set aside [Rousseeuw1987].
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -9,8 +9,6 @@ A few residuals do not determine a covariance of many rows: it is taken together
 residuals, as the mean of an inverse Wishart distribution whose weight is the likeliest for these residuals [Chen1979].
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

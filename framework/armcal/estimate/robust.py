@@ -5,8 +5,6 @@ its bounds and its priors. The loss of record i is s^2 rho(u_i / s): u_i is the 
 its instrument's scale. Small residuals cost what they cost in least squares, and priors weigh as they were stated.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal

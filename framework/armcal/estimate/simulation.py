@@ -1,7 +1,5 @@
 """Simulators: datasets, or whole missions with a truth over time, through the same model that is calibrated."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, runtime_checkable

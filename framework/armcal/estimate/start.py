@@ -1,7 +1,5 @@
 """Where a fit starts: the base and the target as the records have them, where the configuration has them elsewhere."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

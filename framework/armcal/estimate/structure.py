@@ -4,8 +4,6 @@ A model is analytic, so its rank is the same almost everywhere; random poses at 
 it with probability one, and what is undetermined there is a gauge.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace

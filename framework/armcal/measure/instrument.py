@@ -1,7 +1,5 @@
 """What instruments share: each of their readings is what the arm and the instrument say, plus noise."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar

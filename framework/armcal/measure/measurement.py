@@ -1,7 +1,5 @@
 """Measurements: factor types. Each says what one record constrains, as a residual in physical units."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable

@@ -1,7 +1,5 @@
 """Measurements between two records: each record that names another one carries the other's joints as well."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Protocol, runtime_checkable

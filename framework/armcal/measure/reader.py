@@ -1,7 +1,5 @@
 """Readers and simulators: where datasets come from."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

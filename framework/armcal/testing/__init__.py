@@ -1,7 +1,5 @@
 """What a plugin must keep to, as checks: ``assert_contract`` in a plugin's own tests, or ``armcal plugins check``."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
