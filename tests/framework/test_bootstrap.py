@@ -12,8 +12,13 @@ import pytest
 from armcal.cli.main import cli
 from armcal.diagnose.comparison import Change, change, simplest_good
 from armcal.errors import NotConvergedError, ProblemError
-from armcal.estimate.blocks import automatic_block_length, draw_weights, standard_error_of_mean
-from armcal.estimate.bootstrap import BootstrapSettings, bootstrap
+from armcal.estimate.bootstrap import (
+    BootstrapSettings,
+    automatic_block_length,
+    bootstrap,
+    draw_weights,
+    standard_error_of_mean,
+)
 from armcal.estimate.estimator import Solution, SolverVerdict, estimate
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.io.parallel import Workers

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armcal.base.domains import Array
-from armcal.estimate.blocks import BlockLength, automatic_block_length, standard_error_of_mean
+from armcal.estimate.bootstrap import BlockLength, automatic_block_length, standard_error_of_mean
 
 MOST_LISTED = 10
 

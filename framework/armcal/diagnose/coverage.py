@@ -22,7 +22,7 @@ from scipy.special import ndtri
 from armcal.base.domains import Array
 from armcal.diagnose.noise_findings import Finding
 from armcal.errors import NotConvergedError
-from armcal.estimate.blocks import automatic_block_length, standard_error_of_mean
+from armcal.estimate.bootstrap import automatic_block_length, standard_error_of_mean
 from armcal.estimate.estimator import Estimator
 from armcal.estimate.prediction import (
     LEVELS,

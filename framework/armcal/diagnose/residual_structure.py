@@ -26,7 +26,7 @@ from armcal.diagnose.outside import outside, predicted_positions
 from armcal.diagnose.predictable import Predictable, predictable
 from armcal.diagnose.score_tests import FamilyTest, Fit, family_test, linear_fit, own_basis
 from armcal.diagnose.smooth import TimeOrPose, left_out, pose_kernels, smooth, time_kernels
-from armcal.estimate.blocks import automatic_block_length
+from armcal.estimate.bootstrap import automatic_block_length
 from armcal.estimate.estimator import Estimate
 from armcal.problem.motion import Motion
 from armcal.problem.problem import FactorRecords, Problem

@@ -6,25 +6,92 @@ the spread counts it. ``parametric`` simulates the measured values by the fitted
 the model were true.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from pydantic import Field
 
 from armcal.base.domains import Array
 from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError, ProblemError
-from armcal.estimate.blocks import automatic_block_length, draw_weights
 from armcal.estimate.estimator import CONFIDENCE, Estimate, Estimator, Progress, no_progress
 from armcal.io.parallel import Executor, Sequential
 from armcal.problem.factor_records import noise_roots
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.projection import predicted_records
 from armcal.problem.readings import disturbed_records, reading_slopes
+
+BlockLength = int | Literal["auto"]
+_SIGNIFICANT = 2.0
+_FEW = 8
+"""Series shorter than this do not determine their own correlation."""
+
+
+def automatic_block_length(series: Array) -> int:
+    """The block length for a series (..., N), the longest of its rows'. [Politis2004] [Patton2009]
+
+    Autocovariances count up to twice the lag behind which they are noise, by a flat-top window.
+    """
+    rows = np.atleast_2d(series)
+    return max((_row_length(row[np.isfinite(row)]) for row in rows), default=1)
+
+
+def _row_length(row: Array) -> int:
+    count = len(row)
+    centred = row - row.mean() if count else row
+    if count < _FEW or not np.any(np.abs(centred) > 0):
+        return 1
+    window = max(5, math.ceil(math.sqrt(math.log10(count))))
+    most_lag = min(math.ceil(math.sqrt(count)) + window, count - 1)
+    covariance = np.array([centred[lag:] @ centred[: count - lag] / count for lag in range(most_lag + 1)])
+    # The lag behind which a window of them is no larger than chance; the last larger one if there is none.
+    large = np.abs(covariance[1:] / covariance[0]) >= _SIGNIFICANT * math.sqrt(math.log10(count) / count)
+    quiet = np.flatnonzero(~sliding_window_view(large, window).any(axis=1))
+    last = int(quiet[0]) if len(quiet) else int(np.flatnonzero(large).max(initial=0)) + 1
+    reach = min(2 * max(last, 1), most_lag)
+    lags = np.arange(1, reach + 1)
+    flat_top = np.minimum(1.0, 2 * (1 - lags / reach))
+    weighted = flat_top * covariance[1 : reach + 1]
+    spectrum = covariance[0] + 2 * weighted.sum()
+    slope = 2 * (lags @ weighted)
+    if spectrum <= 0:
+        return 1
+    length = (1.5 * (slope / spectrum) ** 2 * count) ** (1 / 3)
+    most = min(3 * math.sqrt(count), count / 3)
+    return int(np.clip(round(length), 1, max(1, math.floor(most))))
+
+
+def standard_error_of_mean(series: Array, block: int) -> float:
+    """The standard deviation of the mean of a series (N) over its resamples in circular blocks, in closed form.
+
+    That of one block's mean, times the square root of block length over N; corrected so that blocks of one record
+    give the usual standard error of independent ones.
+    """
+    count = len(series)
+    if count < 2:
+        return float("nan")
+    length = min(block, count)
+    if length == count:
+        return float("nan")
+    around = np.concatenate([series, series[: length - 1]])
+    sums = np.cumsum(np.concatenate([[0.0], around]))
+    means = (sums[length:] - sums[:-length]) / length
+    return float(np.sqrt(np.var(means) * length / count) * np.sqrt(count / (count - length)))
+
+
+def draw_weights(count: int, block: int, random: np.random.Generator) -> Array:
+    """How often each record is drawn (N, summing to N): circular blocks, the last one cut to fit."""
+    length = min(block, count)
+    starts = random.integers(0, count, -(-count // length))
+    drawn: NDArray[np.intp] = (starts[:, None] + np.arange(length)[None, :]).ravel()[:count] % count
+    return np.bincount(drawn, minlength=count).astype(float)
+
 
 _FEWEST = 20
 """Refits that have to converge for an interval to be stated."""
@@ -96,7 +163,13 @@ def bootstrap(
     poses = np.arange(count) if poses is None else poses
     parametric = settings.method == "parametric"
     if parametric:
-        _require_measured(problem, records, estimate.values)
+        slopes = reading_slopes(problem, estimate.values, predicted_records(problem, estimate.values, records))
+        for kernel, record, slope in zip(problem.kernels, records, slopes, strict=True):
+            if slope is None or record.correlation is not None:
+                raise ProblemError(
+                    f"{kernel.factor.name} has no measured values of its own noise to simulate.",
+                    hint="Use uncertainty.method: blocks.",
+                )
         block = 1
     elif settings.blocks == "auto":  # the longest that any residual component asks for
         block = max(automatic_block_length(rows) for rows in problem.whitened_residuals(estimate.values, records))
@@ -142,13 +215,3 @@ def _refit(
     except NotConvergedError:
         return None
     return solution.values if solution.verdict.converged else None
-
-
-def _require_measured(problem: Problem, records: Sequence[FactorRecords], values: Array) -> None:
-    slopes = reading_slopes(problem, values, predicted_records(problem, values, records))
-    for kernel, record, slope in zip(problem.kernels, records, slopes, strict=True):
-        if slope is None or record.correlation is not None:
-            raise ProblemError(
-                f"{kernel.factor.name} has no measured values of its own noise to simulate.",
-                hint="Use uncertainty.method: blocks.",
-            )

@@ -99,7 +99,9 @@ class _Search:
         """A parameter beside those taken, one of ``count``; None if the records do not determine it."""
         beside = np.array(taken, dtype=np.intp)
         slopes, bends = self.model.gradient, self.model.hessian
-        inverse = _inverse(bends[np.ix_(beside, beside)])
+        size = np.sqrt(np.maximum(np.diag(bends)[beside], 1e-300))
+        units, inside = np.outer(size, size), bends[np.ix_(beside, beside)]
+        inverse = np.linalg.pinv(inside / units, rcond=_RANK, hermitian=True) / units  # where they are determined
         across = bends[np.ix_(own, beside)] @ inverse
         spread = bends[np.ix_(own, own)] - across @ bends[np.ix_(beside, own)]
         score = slopes[own] - across @ slopes[beside]
@@ -116,9 +118,3 @@ class _Search:
         p_value = float(fdtrc(len(own), spare, gain / max(variance, 1e-300) / len(own)))
         change = -np.linalg.solve(spread, score)
         return Candidate(name, sd * self.scales[own], change * self.scales[own], min(1.0, count * p_value))
-
-
-def _inverse(bends: Array) -> Array:
-    """Of the directions that are determined."""
-    size = np.sqrt(np.maximum(np.diag(bends), 1e-300))
-    return np.asarray(np.linalg.pinv(bends / np.outer(size, size), rcond=_RANK, hermitian=True) / np.outer(size, size))

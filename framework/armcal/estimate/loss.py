@@ -68,19 +68,15 @@ class Loss:
 @lru_cache(maxsize=32)
 def tuned(name: LossName, dimension: int) -> Loss:
     """A loss that keeps 95 % efficiency in so many dimensions."""
-    low, high = 1e-2, 100.0
+    low, high, grid = 1e-2, 100.0, norm_grid()
     for _ in range(60):
         middle = np.sqrt(low * high)
-        low, high = (middle, high) if _efficiency(Loss(name, middle, dimension)) < EFFICIENCY else (low, middle)
+        loss = Loss(name, middle, dimension)
+        spread = loss.gaussian_mean((loss.weight(grid) * grid) ** 2) / dimension
+        along, across = loss.stiffness(grid)
+        slope = loss.gaussian_mean(along + (dimension - 1) * across) / dimension
+        low, high = (middle, high) if slope**2 / spread < EFFICIENCY else (low, middle)
     return Loss(name, float(np.sqrt(low * high)), dimension)
-
-
-def _efficiency(loss: Loss) -> float:
-    """Of the location estimate, against the mean, for Gaussian residuals."""
-    grid, m = norm_grid(), loss.dimension
-    spread = loss.gaussian_mean((loss.weight(grid) * grid) ** 2) / m
-    along, across = loss.stiffness(grid)
-    return (loss.gaussian_mean(along + (m - 1) * across) / m) ** 2 / spread
 
 
 def norm_grid() -> Array:

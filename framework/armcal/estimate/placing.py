@@ -125,12 +125,19 @@ def placings(problem: Problem, records: Sequence[FactorRecords], sighting: Sight
         NotConvergedError: a record has no elastic equilibrium at the nominal values.
     """
     poses = problem.subset(records, sighting.thinned(_POSES).chosen)[sighting.kernel]
-    here = tools_of(problem, problem.parameters.nominal(), poses, sighting.kernel)
+    nominal = problem.parameters.nominal()
+    here = tools_of(problem, nominal, poses, sighting.kernel)
     size, motions, held = max(spread_of(here.places), 1e-9), list[_Motion](), list[_Motion]()
     for block in problem.parameters.free:
         if block.nuisance or block.unit not in ("m", "rad", "1"):
             continue
-        moves = list(_moves(problem, poses, sighting.kernel, block, here))
+        place, moves = problem.parameters.entries_of(block.name), list[Tools]()
+        step = _STEP * block.domain.increment_scale(block.scale)
+        for unit in np.eye(block.domain.dof):
+            moved = nominal.copy()
+            moved[place] = block.domain.retract(np.array(block.nominal), step * unit)
+            there = tools_of(problem, moved, poses, sighting.kernel)
+            moves.append(Tools((there.places - here.places) / step, (there.rotations - here.rotations) / step))
         for of_base, twist_of in ((True, _base_twist), (False, _tool_twist)):
             twists = [twist for twist in (twist_of(here, move, size) for move in moves) if twist is not None]
             along = of_base or sighting.turned is not None or all(map(_shifts_only, twists))
@@ -138,17 +145,6 @@ def placings(problem: Problem, records: Sequence[FactorRecords], sighting: Sight
                 (motions if block.prior_sd is None else held).append(_Motion(block.name, of_base, tuple(twists)))
                 break
     return Placing.of(motions), Placing.of([*motions, *held])
-
-
-def _moves(problem: Problem, poses: FactorRecords, kernel: int, block: ParameterBlock, here: Tools) -> Iterator[Tools]:
-    """How tools move with each increment of a block, by differences."""
-    place, base = problem.parameters.entries_of(block.name), np.array(block.nominal)
-    step = _STEP * block.domain.increment_scale(block.scale)
-    for unit in np.eye(block.domain.dof):
-        values = problem.parameters.nominal()
-        values[place] = block.domain.retract(base, step * unit)
-        there = tools_of(problem, values, poses, kernel)
-        yield Tools((there.places - here.places) / step, (there.rotations - here.rotations) / step)
 
 
 def _base_twist(here: Tools, move: Tools, size: float) -> Array | None:

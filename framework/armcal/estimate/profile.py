@@ -9,6 +9,7 @@ noise found, less where priors hold the parameter, since they weigh as they were
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -79,17 +80,6 @@ class Profile:
         }
 
 
-@dataclass(frozen=True)
-class ProfileTask:
-    """One parameter of a fit; small enough to send to another process."""
-
-    problem: Problem
-    estimator: Estimator
-    records: tuple[FactorRecords, ...]
-    estimate: Estimate
-    name: str
-
-
 def profiles(
     problem: Problem,
     fitted: WeighedFit,
@@ -106,10 +96,8 @@ def profiles(
     records = fitted.records
     if isinstance(estimator, Weighing):
         estimator, records = estimator.inner, problem.weighted(records, fitted.weights)
-    names = profiled(problem, patterns)
-    tasks = [ProfileTask(problem, estimator, records, fitted.estimate, name) for name in names]
-    done = (executor or Sequential()).map(profile, tasks, lambda share: progress("profile likelihood", share))
-    return tuple(done)
+    one, names = partial(_profile, problem, estimator, records, fitted.estimate), profiled(problem, patterns)
+    return tuple((executor or Sequential()).map(one, names, lambda share: progress("profile likelihood", share)))
 
 
 def profiled(problem: Problem, patterns: Sequence[str]) -> tuple[str, ...]:
@@ -131,15 +119,17 @@ def profiled(problem: Problem, patterns: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in parameters.select(patterns) if name in numbers)
 
 
-def profile(task: ProfileTask) -> Profile:
+def _profile(
+    problem: Problem, estimator: Estimator, records: tuple[FactorRecords, ...], estimate: Estimate, name: str
+) -> Profile:
     """Pin, fit again, look outward on both sides."""
-    search = _Search(task)
+    search = _Search(problem, estimator, records, estimate, name)
     lower, lower_end = search.end(-1.0)
     upper, upper_end = search.end(1.0)
     places = np.array(sorted(search.rises))
     rises = np.array([search.rises[place] for place in places])
     return Profile(
-        task.name,
+        name,
         search.value,
         search.deviation,
         lower,
@@ -156,23 +146,29 @@ def profile(task: ProfileTask) -> Profile:
 class _Search:
     """Pinned fits of one parameter, and where their cost passes the quantile."""
 
-    def __init__(self, task: ProfileTask) -> None:
-        self._task, parameters = task, task.problem.parameters
-        self._place = parameters.entries_of(task.name).start
-        own = task.estimate.names.index(task.name)
-        self.value = float(task.estimate.values[self._place])
-        self.deviation = float(task.estimate.deviations[own])
-        self.quantile = float(fdtri(1, max(task.estimate.degrees_of_freedom, 1), CONFIDENCE))
-        block = parameters[task.name]
+    def __init__(
+        self, problem: Problem, estimator: Estimator, records: tuple[FactorRecords, ...], estimate: Estimate, name: str
+    ) -> None:
+        self._problem, self._estimator, self._records, self._name = problem, estimator, records, name
+        self._place = problem.parameters.entries_of(name).start
+        own, block = estimate.names.index(name), problem.parameters[name]
+        self.value = float(estimate.values[self._place])
+        self.deviation = float(estimate.deviations[own])
+        self.quantile = float(fdtri(1, max(estimate.degrees_of_freedom, 1), CONFIDENCE))
         known = np.isfinite(self.deviation) and self.deviation > 0
         self._step = self.deviation if known else block.scale
         domain = block.domain
         self._bounds = (domain.lower, domain.upper) if isinstance(domain, Interval) else (-np.inf, np.inf)
-        self._cost = _cost(task.problem, task.records, task.estimate.values)
-        self._unit = _unit(task, own) if known else max(task.estimate.noise_scale**2, 1e-30)
-        self._fits = {self.value: task.estimate.values}
+        self._cost = self._cost_of(estimate.values)
+        self._unit = _unit(problem, records, estimate, own) if known else max(estimate.noise_scale**2, 1e-30)
+        self._fits = {self.value: estimate.values}
         self.rises = {self.value: 0.0}
         self.failed = 0
+
+    def _cost_of(self, values: Array) -> float:
+        """Of residuals and priors."""
+        posed = PosedProblem(self._problem, self._records)
+        return posed.cost(posed.x(values))
 
     def end(self, sign: float) -> tuple[float, End]:
         """The lower (-1) or upper (+1) end."""
@@ -223,44 +219,34 @@ class _Search:
     def _rise(self, place: float) -> float | None:
         """Twice the adjusted rise of the cost with the parameter pinned; None if the fit failed."""
         if place not in self.rises:
-            task = self._task
             nearest = min(self._fits, key=lambda known: abs(known - place))
             start = self._fits[nearest].copy()
             start[self._place] = place
-            # The same compiled functions, one parameter held; its own prior is a constant, which ``_cost`` counts.
-            parameters = task.problem.parameters
+            # The same compiled functions, one parameter held; its own prior is a constant, which ``_cost_of`` counts.
+            parameters = self._problem.parameters
             nominal = parameters.nominal()
             nominal[self._place] = place
-            free = {block.name for block in parameters.free} - {task.name}
-            problem = replace(task.problem, parameters=parameters.with_nominal(nominal).with_free(free))
+            free = {block.name for block in parameters.free} - {self._name}
+            problem = replace(self._problem, parameters=parameters.with_nominal(nominal).with_free(free))
             try:
-                solution = task.estimator.solve(problem, task.records, start)
+                solution = self._estimator.solve(problem, self._records, start)
                 converged = solution.verdict.converged
             except NotConvergedError:
                 converged = False
             if not converged:
                 self.failed += 1
                 return None
-            cost = _cost(task.problem, task.records, solution.values)
+            cost = self._cost_of(solution.values)
             self._fits[place] = solution.values
             self.rises[place] = min(2 * (cost - self._cost) / self._unit, _MOST_RISE)
         return self.rises[place]
 
 
-def _cost(problem: Problem, records: Sequence[FactorRecords], values: Array) -> float:
-    """Of residuals and priors."""
-    posed = PosedProblem(problem, records)
-    return posed.cost(posed.x(values))
-
-
-def _unit(task: ProfileTask, own: int) -> float:
+def _unit(problem: Problem, records: Sequence[FactorRecords], estimate: Estimate, own: int) -> float:
     """What the rise is divided by: variance of the estimate over that by the curvature of the cost alone."""
-    parameters = task.problem.parameters
-    triangle = factor_at_zero(task.problem, task.estimate.values, task.records)
-    chain = parameters.entries_jacobian(task.estimate.values)
-    scales = parameters.scales()
-    prior = np.sqrt(parameters.prior_information())
-    stacked = np.vstack([triangle * scales, np.diag(prior * scales)])
-    row = chain[own] * scales
+    parameters = problem.parameters
+    triangle, scales = factor_at_zero(problem, estimate.values, records), parameters.scales()
+    stacked = np.vstack([triangle * scales, np.diag(np.sqrt(parameters.prior_information()) * scales)])
+    row = parameters.entries_jacobian(estimate.values)[own] * scales
     by_curvature = float(np.sum((np.linalg.pinv(stacked).T @ row) ** 2))
-    return float(task.estimate.covariance[own, own]) / by_curvature
+    return float(estimate.covariance[own, own]) / by_curvature

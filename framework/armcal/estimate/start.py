@@ -1,15 +1,25 @@
-"""Where a fit starts: the base and the target as the records have them, where the configuration has them elsewhere."""
+"""Where a fit starts: the base and the target as the records have them, where the configuration has them elsewhere.
+
+Measurements may propose a start of their own from what they read: a camera's intrinsics and hand-eye pose.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from armcal.arm.effects import JointCommand
+from armcal.arm.model import forward
+from armcal.arm.statics import BASE_FRAME, TOOL_FRAME
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.errors import NotConvergedError
+from armcal.base.parameters import ParameterBlock
+from armcal.errors import Location, NotConvergedError, ProblemError
 from armcal.estimate.placing import Placing, placings
+from armcal.measure.measurement import Carried, borrowed_names
+from armcal.measure.points import Certifying, Proposing, Reading
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.rigid_alignment import Alignment, Tools, alignments, hand_eye, undetermined
 from armcal.problem.sighting import Sighting, sighting_of, tools_of
@@ -70,7 +80,12 @@ def aligned_start(problem: Problem, records: Sequence[FactorRecords], dataset: D
     nominal = problem.parameters.nominal()
     as_configured = Start(problem)
     try:
-        sighting = _sighting(problem, records, dataset)
+        # Of the measurement with most records; none where several arms share a frame.
+        arms = {name for measurement in problem.blueprint.measurements.values() for name in measurement.arms}
+        if len(arms) != 1 or not problem.increments:
+            return as_configured
+        seen = [sighting_of(problem, records, dataset, i, MOST_RECORDS) for i in range(len(problem.kernels))]
+        sighting = max((s for s in seen if s is not None), key=lambda s: len(s.chosen), default=None)
         if sighting is None:
             return as_configured
         placing, held = placings(problem, records, sighting)
@@ -82,16 +97,6 @@ def aligned_start(problem: Problem, records: Sequence[FactorRecords], dataset: D
         return _chosen(problem, records, sighting, tools, chosen, ranked) if ranked else as_configured
     except NotConvergedError:
         return as_configured
-
-
-def _sighting(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> Sighting | None:
-    """Of the measurement with most records; None where several arms share a frame, or none is seen."""
-    arms = {name for measurement in problem.blueprint.measurements.values() for name in measurement.arms}
-    if len(arms) != 1 or not problem.increments:
-        return None
-    numbers = range(len(problem.kernels))
-    seen = [sighting_of(problem, records, dataset, number, MOST_RECORDS) for number in numbers]
-    return max((s for s in seen if s is not None), key=lambda s: len(s.chosen), default=None)
 
 
 def _chosen(
@@ -114,9 +119,9 @@ def _chosen(
     best, start = reached[order[0]], replace(start, vectors=tuple(reached[i] for i in order))
     if min(left) * BETTER > configured:
         return start
-    beyond = _beyond_priors(problem, best)
-    if beyond:
-        return replace(start, vectors=(), warnings=(_disagreement(beyond, configured, min(left)),))
+    disagreement = _disagreement(problem, best, configured, min(left))
+    if disagreement:
+        return replace(start, vectors=(), warnings=(disagreement,))
     nominal, parameters = problem.parameters.nominal(), problem.parameters
     for name in (name for name in placing.names if parameters[name].prior_sd is None):
         nominal[parameters.entries_of(name)] = best[parameters.entries_of(name)]
@@ -133,18 +138,14 @@ def shown_by(alignment: Alignment, tools: Tools, sighting: Sighting) -> Tools:
     return Tools(alignment.moved(tools), turned)
 
 
-def _beyond_priors(problem: Problem, values: Array) -> list[tuple[str, float]]:
-    """Parameters that are farther from their nominal values than their priors allow, in standard deviations."""
+def _disagreement(problem: Problem, values: Array, configured: float, left: float) -> str:
+    """Which parameters are farther from their nominal values than their priors allow; empty if none is."""
     parameters = problem.parameters
     moved = parameters.coordinates(parameters.local(values))
-    deviations = np.array([b.prior_sd or np.inf for b in parameters.free for _ in range(b.domain.dof)])
-    times = np.abs(moved) / deviations
-    return [(parameters.coordinate_names[i], float(times[i])) for i in np.argsort(-times) if times[i] > BEYOND]
-
-
-def _disagreement(beyond: Sequence[tuple[str, float]], configured: float, left: float) -> str:
-    named = ", ".join(f"{name} ({times:.0f} standard deviations)" for name, times in beyond[:3])
-    return (
+    times = np.abs(moved) / np.array([b.prior_sd or np.inf for b in parameters.free for _ in range(b.domain.dof)])
+    beyond = [(parameters.coordinate_names[i], times[i]) for i in np.argsort(-times)[:3] if times[i] > BEYOND]
+    named = ", ".join(f"{name} ({times:.0f} standard deviations)" for name, times in beyond)
+    return named and (
         f"The records place the arm's base or the target elsewhere than the configuration does: {named} from its "
         f"prior. There the nominal arm would be typically {left * _MM:.3g} mm off, where the configuration has it "
         f"{configured * _MM:.3g} mm off. The fit starts from the configuration. Correct the values or the frame of the "
@@ -157,3 +158,123 @@ def pose_words(alignment: Alignment) -> str:
     x, y, z = alignment.shift * _MM
     roll, pitch, yaw = Rotation.from_matrix(alignment.turn).as_euler("xyz", degrees=True)
     return f"({x:.1f}, {y:.1f}, {z:.1f}) mm, roll, pitch, yaw ({roll:.2f}, {pitch:.2f}, {yaw:.2f}) deg"
+
+
+_TOOL_ROWS = 12
+
+
+def with_proposals(start: Start, records: Sequence[FactorRecords], dataset: Dataset) -> Start:
+    """The start with what measurements propose, where it is much nearer than the configuration.
+
+    A parameter with a prior keeps its nominal value, and starts where it was proposed.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at the nominal values.
+        ProblemError: the records leave free parameters open that nothing else holds.
+    """
+    measurements = [start.problem.blueprint.measurements[kernel.factor.name] for kernel in start.problem.kernels]
+    lenders_first = sorted(enumerate(measurements), key=lambda numbered: bool(borrowed_names(numbered[1])))
+    for number, measurement in lenders_first:
+        if isinstance(measurement, Proposing):
+            start = _with_proposal(start, records, dataset, number, measurement)
+    return start
+
+
+def _with_proposal(
+    start: Start, records: Sequence[FactorRecords], dataset: Dataset, number: int, measurement: Proposing
+) -> Start:
+    problem, name = start.problem, start.problem.kernels[number].factor.name
+    parameters, nominal = problem.parameters, problem.parameters.nominal()
+    before = start.vectors[0] if start.vectors else nominal
+    own = _own(problem, name)
+    proposal = measurement.propose(_reading(problem, nominal, before, records, dataset, number))
+    if any(own[local].prior_sd is None for local in proposal.undetermined):
+        hint = f"{proposal.close} Or give priors, or hold {', '.join(proposal.undetermined)}."
+        raise ProblemError(f"{name}: {proposal.open}", where=Location(dataset.source or None), hint=hint)
+    if not proposal.values:
+        return start
+    vector, moved = before.copy(), nominal.copy()
+    for local, value in proposal.values.items():
+        place = parameters.entries_of(own[local].name)
+        vector[place] = value
+        if own[local].prior_sd is None:
+            moved[place] = value
+    configured, left = (_typical(problem, values, records, number) for values in (nominal, vector))
+    if left * BETTER > configured:
+        return start
+    names = (*start.names, *(own[local].name for local in proposal.values))
+    placed, vectors = replace(problem, parameters=parameters.with_nominal(moved)), (vector, *start.vectors)
+    return replace(
+        start, problem=placed, names=names, vectors=vectors, configured=configured, left=left, taken=True
+    )
+
+
+def certificates(problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset) -> dict[str, str]:
+    """What measurements show of whether another answer could be better, sentences by their names."""
+    sentences = {}
+    for number, kernel in enumerate(problem.kernels):
+        measurement = problem.blueprint.measurements[kernel.factor.name]
+        if isinstance(measurement, Certifying):
+            reading = _reading(problem, values, values, records, dataset, number)
+            sentences[kernel.factor.name] = measurement.certificate(reading)
+    return {name: text for name, text in sentences.items() if text}
+
+
+def _own(problem: Problem, name: str) -> dict[str, ParameterBlock]:
+    """Parameters of a measurement by local name."""
+    blocks = problem.parameters.blocks
+    return {b.name.removeprefix(f"{name}."): b for b in blocks if b.name.startswith(f"{name}.")}
+
+
+def _reading(
+    problem: Problem, own_values: Array, values: Array, records: Sequence[FactorRecords], dataset: Dataset, number: int
+) -> Reading:
+    """What a measurement read; arm and borrowed parameters are at ``values``, its own at ``own_values``."""
+    name, parameters = problem.kernels[number].factor.name, problem.parameters
+    own, lent = _own(problem, name), borrowed_names(problem.blueprint.measurements[name])
+    borrowed = {local: values[parameters.entries_of(full)] for local, full in lent.items()}
+    seen = np.flatnonzero(records[number].measured)
+    return Reading(
+        carriers_of(problem, values, problem.subset(records, seen), dataset.subset(seen), number),
+        {c.removeprefix(f"{name}."): dataset.column(c)[seen] for c in problem.kernels[number].factor.output_channels},
+        {**{local: own_values[parameters.entries_of(block.name)] for local, block in own.items()}, **borrowed},
+        frozenset(local for local, block in own.items() if block.free),
+    )
+
+
+def carriers_of(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset, number: int
+) -> dict[str, Array]:
+    """What carries a measurement in each record (base_T_frame, N x 4 x 4, m): the tool, or frames of a still arm."""
+    factor = problem.kernels[number].factor
+    measurement, still = problem.blueprint.measurements[factor.name], np.tile(np.eye(4), (len(dataset), 1, 1))
+    frames = {BASE_FRAME: still}
+    for name in set(measurement.carriers.values()) if isinstance(measurement, Carried) else {TOOL_FRAME}:
+        if name == TOOL_FRAME:
+            shown = problem.grouped[number].predict(values, records[number])[len(factor.output_channels) :]
+            rows = shown[:_TOOL_ROWS, : len(dataset)].reshape(4, 3, -1)
+            frames[name] = np.concatenate([rows.transpose(2, 1, 0), still[:, 3:]], axis=1)
+        else:
+            frames[name] = _frame(problem, values, dataset, measurement.arms[0], name)
+    return frames
+
+
+def _frame(problem: Problem, values: Array, dataset: Dataset, of: str, name: str) -> Array:
+    """A frame of a still arm in each record (base_T_frame, N x 4 x 4, m)."""
+    arm, parameters = problem.blueprint.arms[of], problem.parameters
+    stated = {name: ca.SX(values[parameters.entries_of(name)]) for name in parameters.names}
+    chain, symbols = arm.chain(stated), ca.SX.sym("commands", len(arm.commanded))
+    joint_commands = [JointCommand(i, q, ca.SX(0)) for i, q in enumerate(arm.joint_commands(ca.vertsplit(symbols)))]
+    moved = [joint.offset + arm.displacement(stated, q) for joint, q in zip(chain.joints, joint_commands, strict=True)]
+    pose = ca.densify(forward(chain, moved, {}).named[name].matrix())
+    commands = dataset.stacked([f"{arm.name}.{joint}" for joint in arm.commanded])
+    shown = ca.Function("carrier", [symbols], [pose]).map(len(dataset))(commands).full()
+    return np.asarray(shown.reshape(4, -1, 4).transpose(1, 0, 2))
+
+
+def _typical(problem: Problem, values: Array, records: Sequence[FactorRecords], number: int) -> float:
+    """The median error of what one measurement read, of the records in which it did."""
+    points = records[number].points_of(problem.kernels[number].factor) * records[number].measured
+    squares = np.sum(problem.residuals(values, records)[number] ** 2, axis=0)[points > 0]
+    errors = np.sqrt(squares / points[points > 0])
+    return float(np.median(np.where(np.isfinite(errors), errors, np.inf))) if len(errors) else np.inf

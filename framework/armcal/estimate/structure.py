@@ -87,8 +87,16 @@ def explain(
     nested: tuple[Array, ...] = ()
     with suppress(NotConvergedError):
         if all(record.count for record in records):
-            gauge, here = nested = _nested(problem, values, records, null)
-            causes = ["gauge"] * len(gauge)
+            poses, parameters = random_records(problem, records), problem.parameters
+            at = _scaled(problem, values, poses)
+            here = null_rows(at @ null.T, 1e3 * RANK_TOLERANCE * _largest(at)) @ null  # no poses show these here
+            away = _scaled(problem, nearby(parameters, values), poses)
+            count = len(null_rows(away, RANK_TOLERANCE * _largest(away)))
+            near = _scaled(problem, nearby(parameters, values, _HARDLY_AWAY), poses)
+            anywhere = np.linalg.svd(near)[2][len(near.T) - count :]
+            turn, cosines, _ = np.linalg.svd(here @ anywhere.T)
+            gauge = turn.T[: int(np.sum(cosines > np.sqrt(1 - _WITHIN**2)))] @ here
+            nested, causes = (gauge, here), ["gauge"] * len(gauge)
             causes += ["values"] * (len(here) - len(gauge))
             causes += ["poses"] * (len(null) - len(here))
     vectors = sparse_basis(null, nested, _WITHIN)
@@ -136,19 +144,6 @@ def random_records(problem: Problem, records: Sequence[FactorRecords], seed: int
         weight = (np.arange(record.shape[1]) < count).astype(float)
         result.append(replace(drawn, record=record, weight=weight, state=np.zeros_like(drawn.state)))
     return tuple(result)
-
-
-def _nested(problem: Problem, values: Array, records: Sequence[FactorRecords], null: Array) -> tuple[Array, Array]:
-    """Of the undetermined directions, those no poses show near these values, and those no poses show at them."""
-    poses, parameters = random_records(problem, records), problem.parameters
-    at = _scaled(problem, values, poses)
-    here = null_rows(at @ null.T, 1e3 * RANK_TOLERANCE * _largest(at)) @ null
-    away = _scaled(problem, nearby(parameters, values), poses)
-    count = len(null_rows(away, RANK_TOLERANCE * _largest(away)))
-    near = _scaled(problem, nearby(parameters, values, _HARDLY_AWAY), poses)
-    anywhere = np.linalg.svd(near)[2][len(near.T) - count :]
-    turn, cosines, _ = np.linalg.svd(here @ anywhere.T)
-    return turn.T[: int(np.sum(cosines > np.sqrt(1 - _WITHIN**2)))] @ here, here
 
 
 def _scaled(problem: Problem, values: Array, poses: Sequence[FactorRecords]) -> Array:

@@ -28,7 +28,7 @@ from armcal.diagnose.outside import predicted_positions
 from armcal.diagnose.residual_structure import structure
 from armcal.diagnose.verdict import Verdict, judge
 from armcal.estimate.estimator import Estimate
-from armcal.estimate.proposing import certificates
+from armcal.estimate.start import certificates
 from armcal.estimate.validation import error_unit
 from armcal.measure.measurement import StatesAccuracy
 from armcal.planning.candidates import deviations as deviations_of

@@ -10,9 +10,8 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.errors import ConfigError, DataError, Location
 from armcal.estimate.estimator import Progress, no_progress
-from armcal.estimate.proposing import with_proposals
 from armcal.estimate.simulation import SimulationRequest, with_channels
-from armcal.estimate.start import aligned_start
+from armcal.estimate.start import aligned_start, with_proposals
 from armcal.estimate.structure import require_solvable
 from armcal.estimate.validation import (
     Indices,

@@ -18,8 +18,7 @@ from armcal.estimate.estimator import Progress, no_progress, spread
 from armcal.estimate.nuisance import restricted, started
 from armcal.estimate.polish import hopeless, typical_off
 from armcal.estimate.profile import Profile, profiled, profiles
-from armcal.estimate.proposing import with_proposals
-from armcal.estimate.start import FAR, Start, aligned_start
+from armcal.estimate.start import FAR, Start, aligned_start, with_proposals
 from armcal.estimate.structure import require_solvable
 from armcal.estimate.validation import (
     CrossValidation,

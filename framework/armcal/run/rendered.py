@@ -8,8 +8,8 @@ import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.errors import ConfigError
 from armcal.estimate.estimator import Progress
-from armcal.estimate.proposing import carriers_of
 from armcal.estimate.simulation import TruthfulSimulator
+from armcal.estimate.start import carriers_of
 from armcal.io.file_set import write_over
 from armcal.io.folder import check_folder
 from armcal.measure.measurement import borrowed_names

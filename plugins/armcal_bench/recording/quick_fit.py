@@ -15,8 +15,7 @@ from armcal.errors import ProblemError
 from armcal.estimate.identifiability import InverseInformation
 from armcal.estimate.nuisance import started
 from armcal.estimate.polish import descended
-from armcal.estimate.proposing import with_proposals
-from armcal.estimate.start import Start
+from armcal.estimate.start import Start, with_proposals
 from armcal.measure.measurement import Measurement
 from armcal.measure.points import Proposing
 from armcal.problem.factor_records import declared

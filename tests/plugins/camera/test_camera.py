@@ -14,8 +14,7 @@ from armcal.base.domains import Array
 from armcal.calibration.calibration import Calibration
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, ProblemError
-from armcal.estimate.proposing import with_proposals
-from armcal.estimate.start import Start
+from armcal.estimate.start import Start, with_proposals
 from armcal.estimate.validation import record_errors
 from armcal.problem.factor import build_factor
 from armcal.problem.problem import Problem
