@@ -16,8 +16,8 @@ from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.estimate.simulation import SimulationRequest, measured_with_noise
 from armcal.measure.points import LimitedView
+from armcal.problem.many_points import as_seen
 from armcal.problem.problem import Problem
-from armcal.problem.visibility import as_seen
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 

@@ -19,6 +19,7 @@ import pytest
 from armcal.errors import NotConvergedError
 from armcal.functions import c_source, compiler
 from armcal.problem import kernel
+from armcal.problem.backend import Interpreter
 from armcal.problem.factor import Factor
 from armcal.problem.grouped_kernel import BLOCK_RECORDS
 from armcal.problem.kernel import build_kernel, kernel_source
@@ -161,7 +162,7 @@ def test_every_operation_gives_the_interpreters_number_for_parameters_and_record
     for _ in range(5):
         at, given = random.uniform(0.1, 0.9, 2), random.uniform(0.1, 0.9, (2, 40))
         found = evaluated(built.backend, factor, at, given)
-        expected = evaluated(kernel.Interpreter(factor), factor, at, given)
+        expected = evaluated(Interpreter(factor), factor, at, given)
         for a, b in zip(found, expected, strict=True):
             np.testing.assert_allclose(a, b, rtol=AGREEMENT, atol=AGREEMENT)
 
@@ -175,9 +176,7 @@ def test_any_constant_can_be_written_in_c(constant):
     factor = made_up_factor(residual, values, record)
     built = compiled_kernel(factor)
     record = np.linspace(-2, 2, 8)[None, :]
-    found, expected = (
-        evaluated(b, factor, np.array([0.5]), record)[0] for b in (built.backend, kernel.Interpreter(factor))
-    )
+    found, expected = (evaluated(b, factor, np.array([0.5]), record)[0] for b in (built.backend, Interpreter(factor)))
     np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(np.signbit(found), np.signbit(expected))
 
@@ -192,7 +191,7 @@ def test_special_numbers_pass_through_as_in_the_interpreter():
     built = compiled_kernel(factor)
     special = np.array([0.0, -0.0, np.inf, -np.inf, np.nan, 1.0, -1.0, 1e-310])
     given = np.stack([np.repeat(special, 8), np.tile(special, 8)])
-    found, expected = (evaluated(b, factor, np.ones(1), given)[0] for b in (built.backend, kernel.Interpreter(factor)))
+    found, expected = (evaluated(b, factor, np.ones(1), given)[0] for b in (built.backend, Interpreter(factor)))
     np.testing.assert_array_equal(found, expected)
 
 
@@ -201,7 +200,7 @@ def test_an_operation_without_a_c_form_leaves_the_interpreter_and_no_litter():
     values, record = ca.SX.sym("u", 1), ca.SX.sym("x", 1)
     factor = made_up_factor([ca.hypot(record[0], 1.0) * values[0]], values, record)
     with pytest.raises(c_source.UnsupportedExpressionError):
-        kernel_source(factor, factor.pass_function(), factor.linearise_function())
+        kernel_source(factor)
     before = set(compiler.cache_directory().glob(".build-*"))
     built = build_kernel(factor, 1, "compiled")
     assert built.backend.name == "interpreted"
@@ -223,7 +222,7 @@ def test_random_expressions_give_the_interpreters_numbers():
         built = compiled_kernel(factor)
         at, given = random.normal(size=3), random.normal(size=(3, 24))
         found = evaluated(built.backend, factor, at, given)
-        expected = evaluated(kernel.Interpreter(factor), factor, at, given)
+        expected = evaluated(Interpreter(factor), factor, at, given)
         for a, b in zip(found, expected, strict=True):
             np.testing.assert_allclose(a, b, rtol=0, atol=AGREEMENT * max(1.0, np.abs(b).max()))
 

@@ -19,8 +19,8 @@ from armcal.base.domains import Array
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.score_tests import family_test, linear_fit
 from armcal.estimate.estimator import Estimate
+from armcal.problem.many_points import with_few_points
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.thinning import with_few_points
 
 LEVEL = 0.05
 MATTERS = 1.1

@@ -6,7 +6,7 @@ target's if it moves each by the same motion in its own axes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from armcal.base import domains
 from armcal.base.domains import Array
-from armcal.base.parameters import ParameterBlock, Parameters
+from armcal.base.parameters import Parameters
 from armcal.errors import NotConvergedError
 from armcal.estimate.polish import descended
 from armcal.problem.posed import PosedProblem

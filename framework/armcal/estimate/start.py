@@ -204,9 +204,7 @@ def _with_proposal(
         return start
     names = (*start.names, *(own[local].name for local in proposal.values))
     placed, vectors = replace(problem, parameters=parameters.with_nominal(moved)), (vector, *start.vectors)
-    return replace(
-        start, problem=placed, names=names, vectors=vectors, configured=configured, left=left, taken=True
-    )
+    return replace(start, problem=placed, names=names, vectors=vectors, configured=configured, left=left, taken=True)
 
 
 def certificates(problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset) -> dict[str, str]:

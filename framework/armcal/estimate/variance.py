@@ -21,8 +21,8 @@ from armcal.estimate.estimator import CONFIDENCE, degrees_of_freedom
 from armcal.estimate.identifiability import correlated_pairs
 from armcal.estimate.likelihood import Term, maximise
 from armcal.problem.factor_records import by_covariance, noise_roots, transformed, whitening_of
+from armcal.problem.many_points import with_few_points
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.thinning import with_few_points
 
 Axes = Literal["together", "apart"]
 

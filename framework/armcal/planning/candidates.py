@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
+from armcal.problem.many_points import as_seen
 from armcal.problem.problem import Problem, triangular
 from armcal.problem.projection import as_predicted
-from armcal.problem.visibility import as_seen
 
 Indices = NDArray[np.intp]
 RIDGE = 1e-9

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -110,10 +111,12 @@ class Factor(ElasticPass):
     def _inputs(self) -> list[Expression]:
         return [self.values, self.record, self.state]
 
+    @cached_property
     def pass_function(self) -> ca.Function:
         """(values, record, state) -> (next state, residual)."""
         return ca.Function("single_pass", self._inputs, [self.next_state, ca.densify(self.residual)], {"cse": True})
 
+    @cached_property
     def linearise_function(self) -> ca.Function:
         """(values, record, state) -> (next state, residual, Jacobian transposed), in equilibrium to second order."""
         residual, jacobian = self.residual, ca.jacobian(self.residual, self.values)
@@ -223,7 +226,7 @@ def build_factor(
     tools = ca.vertcat(*[ca.vec(states[a].base_T_tool.matrix()[:3, :]) for a in measurement.arms])
     nuisance_names, nuisance_starts = _nuisance_starts(groups, states, local)
     used = records.used_by(ca.vertcat(reading.everything, next_state, tools, nuisance_starts))
-    own = {arm_name: arms[arm_name.removesuffix(OTHER)] for arm_name in measurement.arms}
+    own = [(arm_name, arms[arm_name.removesuffix(OTHER)]) for arm_name in measurement.arms]
     factor = Factor(
         name=name,
         channels=tuple(used),
@@ -242,15 +245,10 @@ def build_factor(
         nuisance_starts=nuisance_starts,
         nuisance_names=nuisance_names,
         mean_weight=groups.mean_weight if groups else 1.0,
-        springs=tuple(spring for arm in own.values() for spring in arm.spring_names),
-        joints=_joints(own),
+        springs=tuple(spring for _, arm in own for spring in arm.spring_names),
+        joints=tuple((f"{a.name}.{j}{n.removeprefix(a.name)}", d) for n, a in own for j, d in a.commanded.items()),
     )
     return factor if reading.points is None else _of_points(factor, measurement, reading.points)
-
-
-def _joints(arms: Mapping[str, Arm]) -> tuple[tuple[str, str], ...]:
-    """Channels of commanded joints, each with ``angle`` or ``length``, of arms by their names in a measurement."""
-    return tuple((f"{a.name}.{j}{n.removeprefix(a.name)}", d) for n, a in arms.items() for j, d in a.commanded.items())
 
 
 def _free_and_fixed(parameters: Parameters) -> tuple[Expression, dict[str, Expression]]:

@@ -13,7 +13,8 @@ import numpy as np
 from armcal.arm.equilibrium import MOST_DEFLECTION
 from armcal.base.domains import Array
 from armcal.functions.c_source import LANES
-from armcal.problem.kernel import Compiled, Kernel
+from armcal.problem.backend import Compiled
+from armcal.problem.kernel import Kernel
 
 
 class OneRecord:
@@ -29,8 +30,18 @@ class OneRecord:
         self._state = np.zeros((factor.state.numel(), width))
         self._residual = np.zeros((self._sizes[0], width))
         self._jacobian = np.zeros((self._sizes[0] * self._sizes[1], width))
-        arrays = self._values, self._record, self._state, self._residual, self._jacobian
-        self._evaluate = _linearised(kernel, arrays)
+        arrays, backend = (self._values, self._record, self._state, self._residual, self._jacobian), kernel.backend
+        # Evaluates these buffers again and again, and gives how many records did not settle.
+        self._evaluate: Callable[[], int] = partial(backend.linearise, *arrays)
+
+        def over_points() -> int:
+            kernel.linearise(*arrays)
+            return 0
+
+        if kernel.points is not None:
+            self._evaluate = over_points
+        elif isinstance(backend, Compiled):
+            self._evaluate = backend.prepared(*arrays)
 
     def linearise(self, values: Array, record: Array) -> tuple[Array, Array]:
         """Residual (n_r) and its Jacobian by the kernel's values (n_r x n_v), in equilibrium.
@@ -67,16 +78,3 @@ class OneRecord:
             residuals[done] = self._residual.T[: len(part)]
             jacobians[done] = self._jacobian.T[: len(part)].reshape(-1, *self._sizes)
         return residuals, jacobians
-
-
-def _linearised(kernel: Kernel, arrays: tuple[Array, Array, Array, Array, Array]) -> Callable[[], int]:
-    """What evaluates a kernel in these buffers, again and again, and gives how many records did not settle."""
-    if kernel.points is not None:
-        return partial(_over_points, kernel, arrays)
-    backend = kernel.backend
-    return backend.prepared(*arrays) if isinstance(backend, Compiled) else partial(backend.linearise, *arrays)
-
-
-def _over_points(kernel: Kernel, arrays: tuple[Array, Array, Array, Array, Array]) -> int:
-    kernel.linearise(*arrays)
-    return 0

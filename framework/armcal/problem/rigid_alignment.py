@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from armcal.base.domains import Array
-from armcal.problem.tool_motion import rigid_fit, spread_of
+from armcal.problem.tool_motion import nearest_turn, rigid_fit, spread_of
 
 FEWEST = 8
 """Records: with fewer, nine numbers explain anything."""
@@ -115,7 +115,9 @@ def undetermined(tools: Tools, alignment: Alignment, basis: Array) -> tuple[str,
     slopes[:, :, :3] /= max(size, _SINGULAR)
     _, sizes, directions = np.linalg.svd(slopes.reshape(-1, slopes.shape[2]), full_matrices=False)
     words = [f"the base {how} {axis}" for how in ("about", "along") for axis in "xyz"]
-    words += [f"the target along {_axis_words(column)}" for column in basis.T]
+    for column in basis.T:
+        axis, numbers = int(np.argmax(np.abs(column))), ", ".join(f"{x:.2g}" for x in column)
+        words.append(f"the target along {'xyz'[axis] if np.abs(column[axis]) > 1 - _UNSEEN else f'({numbers})'}")
     parts = [
         [word for word, part in zip(words, np.abs(direction), strict=True) if part > _PART * np.abs(direction).max()]
         for direction in directions[sizes < _UNSEEN * sizes.max()]
@@ -137,12 +139,6 @@ def hand_eye(rotations: Array, turned: Array) -> tuple[Array, Array]:
     return nearest_turn(np.einsum("nij,kj,nlk->il", turned, mounted, rotations)), mounted
 
 
-def nearest_turn(matrix: Array) -> Array:
-    """The rotation nearest to a matrix (3 x 3). [Umeyama1991]"""
-    left, _, right = np.linalg.svd(matrix)
-    return np.asarray(left @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))]) @ right)
-
-
 def _starts(tools: Tools, measured: Array, basis: Array, turned: Array | None) -> Iterator[tuple[Array, Array | None]]:
     """Offsets of the target (3, m), and turns of the base where they are known; the first as configured."""
     yield np.zeros(3), None
@@ -150,19 +146,15 @@ def _starts(tools: Tools, measured: Array, basis: Array, turned: Array | None) -
         yield np.zeros(3), hand_eye(tools.rotations, turned)[0]
     if not basis.shape[1]:
         return
-    yield _relaxed(tools, measured, basis)
-    random = np.random.default_rng(_SEED)
-    for _ in range(_STARTS):
-        yield basis @ random.normal(scale=0.5 * spread_of(measured), size=basis.shape[1]), None
-
-
-def _relaxed(tools: Tools, measured: Array, basis: Array) -> tuple[Array, Array]:
-    """Offset and turn of the linear problem m = M p + N vec(R) + b: M is near B, N[i, 3 j + k] near B[i, j] o[k]."""
+    # Of the linear problem m = M p + N vec(R) + b: M is near B, N[i, 3 j + k] near B[i, j] o[k].
     columns = np.vstack([tools.places, tools.rotations.reshape(-1, 9).T])
     columns = columns - columns.mean(axis=1, keepdims=True)
     solved = np.linalg.lstsq(columns.T, (measured - measured.mean(axis=1, keepdims=True)).T, rcond=1e-6)[0].T
     turn = nearest_turn(solved[:, :3])
-    return basis @ (basis.T @ np.einsum("ijk,ij->k", solved[:, 3:].reshape(3, 3, 3), turn) / 3), turn
+    yield basis @ (basis.T @ np.einsum("ijk,ij->k", solved[:, 3:].reshape(3, 3, 3), turn) / 3), turn
+    random = np.random.default_rng(_SEED)
+    for _ in range(_STARTS):
+        yield basis @ random.normal(scale=0.5 * spread_of(measured), size=basis.shape[1]), None
 
 
 def _started(tools: Tools, measured: Array, offset: Array, turn: Array | None) -> Alignment:
@@ -208,11 +200,3 @@ def _slopes(tools: Tools, alignment: Alignment, basis: Array) -> tuple[Array, Ar
     slopes[:, :, 3:6] = np.eye(3)
     slopes[:, :, 6:] = alignment.turn @ tools.rotations @ basis
     return slopes, shown
-
-
-def _axis_words(direction: Array) -> str:
-    """An axis by its name, another direction by its numbers."""
-    axis = int(np.argmax(np.abs(direction)))
-    if np.abs(direction[axis]) > 1 - _UNSEEN:
-        return "xyz"[axis]
-    return f"({', '.join(f'{x:.2g}' for x in direction)})"

@@ -78,15 +78,10 @@ def sighting_of(
     measured, shown = dataset.stacked(channels)[:, chosen], problem.predict(values, some)[number][:3]
     if not np.allclose(problem.residuals(values, some)[number][:3], measured - shown, atol=_SAME_M):
         return None
-    return Sighting(number, chosen, measured, _turned(factor.name, factor.output_channels, dataset, chosen))
-
-
-def _turned(name: str, outputs: Sequence[str], dataset: Dataset, chosen: NDArray[np.intp]) -> Array | None:
-    """Measured rotations (n x 3 x 3), where the measurement reads a quaternion."""
-    channels = [f"{name}.{part}" for part in _QUATERNION]
-    if not set(channels) <= set(outputs) or not all(map(dataset.has, channels)):
-        return None
-    return _rotations(dataset.stacked(channels)[:, chosen])
+    quaternion = [f"{factor.name}.{part}" for part in _QUATERNION]
+    reads_turn = set(quaternion) <= set(factor.output_channels) and all(map(dataset.has, quaternion))
+    turned = _rotations(dataset.stacked(quaternion)[:, chosen]) if reads_turn else None
+    return Sighting(number, chosen, measured, turned)
 
 
 def tools_of(problem: Problem, values: Array, record: FactorRecords, number: int) -> Tools:

@@ -53,6 +53,11 @@ def spread_of(points: Array) -> float:
 def rigid_fit(points: Array, others: Array) -> tuple[Array, Array]:
     """The turn R (3 x 3) and the shift t (3) that bring points (3 x N) nearest to others. [Umeyama1991]"""
     middle, other = points.mean(axis=1), others.mean(axis=1)
-    left, _, right = np.linalg.svd((others - other[:, None]) @ (points - middle[:, None]).T)
-    turn = left @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))]) @ right
+    turn = nearest_turn((others - other[:, None]) @ (points - middle[:, None]).T)
     return turn, other - turn @ middle
+
+
+def nearest_turn(matrix: Array) -> Array:
+    """The rotation nearest to a matrix (3 x 3). [Umeyama1991]"""
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))]) @ right)

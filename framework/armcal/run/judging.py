@@ -34,9 +34,9 @@ from armcal.measure.measurement import StatesAccuracy
 from armcal.planning.candidates import deviations as deviations_of
 from armcal.planning.suggestion import Suggestion, suggest
 from armcal.problem.drift import residuals
+from armcal.problem.many_points import with_few_points
 from armcal.problem.motion import Motion, recorded_position
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.thinning import with_few_points
 from armcal.run.data_checks import gravity_findings
 from armcal.run.errors import FittedRecords, RecordErrors
 from armcal.run.intervals import IntervalResult

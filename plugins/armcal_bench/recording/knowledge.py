@@ -11,9 +11,9 @@ from armcal.estimate.identifiability import numerical_rank
 from armcal.estimate.nuisance import restricted
 from armcal.estimate.structure import GIVE_A_LENGTH, UNSEEN_SCALE, explain, identify_from, scale_is_unseen
 from armcal.estimate.validation import hold_out
+from armcal.problem.many_points import as_seen
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.projection import factor_at_zero, projected
-from armcal.problem.visibility import as_seen
 from armcal.run.experiment import Experiment
 from armcal.run.groups import labels_of
 

@@ -16,8 +16,9 @@ from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.se3 import Expression
 from armcal.measure.measurement import Channel, Measurement
+from armcal.problem.backend import Interpreter
 from armcal.problem.factor import build_factor
-from armcal.problem.kernel import AS_IT_STANDS, Interpreter, Kernel
+from armcal.problem.kernel import AS_IT_STANDS, Kernel
 from scipy.spatial.transform import Rotation
 from typing_extensions import override
 

@@ -11,8 +11,9 @@ from armcal.errors import DataError, Location, NotConvergedError
 from armcal.estimate.placing import placings
 from armcal.estimate.start import BETTER, FAR, pose_words
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.rigid_alignment import FEWEST, Alignment, Tools, alignments, nearest_turn, undetermined
+from armcal.problem.rigid_alignment import FEWEST, Alignment, Tools, alignments, undetermined
 from armcal.problem.sighting import Sighting, sighting_of, tools_of
+from armcal.problem.tool_motion import nearest_turn
 from armcal.report.numbers import plural
 from armcal.run.data_checks import check_reach
 from scipy.spatial.transform import Rotation

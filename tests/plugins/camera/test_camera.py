@@ -17,9 +17,8 @@ from armcal.errors import ConfigError, ProblemError
 from armcal.estimate.start import Start, with_proposals
 from armcal.estimate.validation import record_errors
 from armcal.problem.factor import build_factor
+from armcal.problem.many_points import as_seen, with_few_points
 from armcal.problem.problem import Problem
-from armcal.problem.thinning import with_few_points
-from armcal.problem.visibility import as_seen
 from armcal.run.experiment import Experiment
 from armcal_camera.lens import normalised, pinhole, projected
 from armcal_simulation.readings import measured_while_moving
@@ -107,7 +106,7 @@ def test_points_evaluate_as_one_long_expression(experiment: Experiment, dataset:
     )
     order = [kernel.factor.channels.index(channel) for channel in unrolled.channels]
     free = values[list(problem.parameters.free_entries)]
-    function = unrolled.linearise_function()
+    function = unrolled.linearise_function
     (residual,), (jacobian,) = problem.residuals(values, records), problem.jacobians(values, records)
     noise = np.array(kernel.factor.noise)
     for i in few:
