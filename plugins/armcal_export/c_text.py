@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from importlib import resources
 
 import casadi as ca
-from armcal.base.shown import shown
+from armcal.base.config_text import shown
 from armcal.errors import ConfigError
 from armcal.functions.c_source import LIBRARY, TWO_ARGUMENTS, operations
 

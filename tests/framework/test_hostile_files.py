@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from armcal.base.shown import shown
+from armcal.base.config_text import shown
 from armcal.cli.main import cli
 from armcal_export.c_text import in_comment
 from armcal_export.ros2_text import read_ros2, ros2_text

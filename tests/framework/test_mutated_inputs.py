@@ -12,7 +12,7 @@ from pathlib import Path
 from types import FrameType
 
 import pytest
-from armcal.base.shown import shown
+from armcal.base.config_text import shown
 from armcal.cli.main import cli
 from click.testing import CliRunner
 from made_calibrations import written

@@ -192,7 +192,11 @@ class Arm:
         displacements = [
             joint.offset + along[i] + self.displacement(values, commands[i]) for i, joint in enumerate(chain.joints)
         ]
-        correction = self._correction(inputs)
+        correction = inputs.correction
+        if self.residual is not None and self.residual.is_learned:
+            around = {"payload": inputs.load.payload_mass, **inputs.conditions}
+            learned = self.residual.correction(inputs.joint_angles, inputs.approach, around)
+            correction = learned if correction is None else learned + correction
         if correction is not None:
             of_joints = ca.vertsplit(correction[len(OF_TOOL) :])
             displacements = [own + more for own, more in zip(displacements, of_joints, strict=True)]
@@ -202,13 +206,6 @@ class Arm:
         origins = tuple(site.origin for site in frames.sites)
         tool = frames.base_T_tool if correction is None else corrected(frames.base_T_tool, correction)
         return ArmState(tool, frames.named, answer, joint_efforts(chain, frames, acting), origins)
-
-    def _correction(self, inputs: ArmInputs) -> Expression | None:
-        if self.residual is None or not self.residual.is_learned:
-            return inputs.correction
-        around = {"payload": inputs.load.payload_mass, **inputs.conditions}
-        learned = self.residual.correction(inputs.joint_angles, inputs.approach, around)
-        return learned if inputs.correction is None else learned + inputs.correction
 
     @property
     def conditions(self) -> tuple[str, ...]:

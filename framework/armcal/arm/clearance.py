@@ -97,25 +97,14 @@ class Clearance:
 
     def pairs(self, rule: Rule, moved_by: Mapping[str, int]) -> tuple[tuple[str, str], ...]:
         """The pairs of parts that a rule is about; ``moved_by`` gives each frame's joint (0: none)."""
-        pairs = {
-            (min(a, b), max(a, b))
-            for a in self._matching(rule.between[0], rule)
-            for b in self._matching(rule.between[1], rule)
-            if a != b and not self._adjacent(a, b, moved_by)
-        }
-        return tuple(sorted(pairs))
-
-    def _matching(self, glob: str, rule: Rule) -> list[str]:
         kept = [name for name in self.parts if not any(fnmatchcase(name, other) for other in rule.besides)]
-        return kept if glob == EVERYTHING else [name for name in kept if fnmatchcase(name, glob)]
-
-    def _adjacent(self, first: str, second: str, moved_by: Mapping[str, int]) -> bool:
-        (low, high), (other_low, other_high) = (self._joints(name, moved_by) for name in (first, second))
-        return max(low, other_low) - min(high, other_high) <= 1
-
-    def _joints(self, part: str, moved_by: Mapping[str, int]) -> tuple[int, int]:
-        joints = [moved_by[frame] for shape in self.parts[part] for frame in shape.frames]
-        return min(joints), max(joints)
+        joints = {name: [moved_by[frame] for shape in self.parts[name] for frame in shape.frames] for name in kept}
+        firsts, seconds = (
+            [name for name in kept if glob == EVERYTHING or fnmatchcase(name, glob)] for glob in rule.between
+        )
+        pairs = {(min(a, b), max(a, b)) for a in firsts for b in seconds if a != b}
+        lowest, highest = ({name: end(own) for name, own in joints.items()} for end in (min, max))
+        return tuple(sorted((a, b) for a, b in pairs if max(lowest[a], lowest[b]) - min(highest[a], highest[b]) > 1))
 
 
 @dataclass(frozen=True)
@@ -147,7 +136,8 @@ class ClearanceCheck:
         self._clearance = clearance
         moved_by = joints_of_frames(arm)
         self._pairs = [clearance.pairs(rule, moved_by) for rule in clearance.rules]
-        points = {p for shapes in clearance.parts.values() for s in shapes if isinstance(s, Capsule) for p in _ends(s)}
+        capsules = [shape for shapes in clearance.parts.values() for shape in shapes if isinstance(shape, Capsule)]
+        points = {point for capsule in capsules for point in (capsule.start, capsule.end)}
         self._points = [Point(TOOL_FRAME), *sorted(points, key=repr)]
         self._function = _point_function(arm, self._points)
 
@@ -186,10 +176,11 @@ class ClearanceCheck:
         tool = where[Point(TOOL_FRAME)]
         for region in self._clearance.forbidden:
             margins[-1] = np.minimum(margins[-1], distance(Capsule(*(Point(TOOL_FRAME),) * 2, 0.0), region, where))
-        inside = np.zeros(len(tool), dtype=bool)
-        for region in self._clearance.forbidden:
-            inside |= _holds(region, tool)
-        margins[-1] = np.where(inside, np.minimum(margins[-1], -_NO_LENGTH), margins[-1])
+            if isinstance(region, Box):
+                inside = np.all((tool >= region.low) & (tool <= region.high), axis=1)
+            else:
+                inside = np.linalg.norm(tool - np.array(region.start.at), axis=1) <= region.radius
+            margins[-1, inside] = np.minimum(margins[-1, inside], -_NO_LENGTH)
         return margins
 
     def _apart(self, pair: tuple[str, str], where: Mapping[Point, Array], count: int) -> Array:
@@ -210,9 +201,9 @@ def distance(first: Shape, second: Shape, where: Mapping[Point, Array]) -> Array
         first, second = second, first
     if not isinstance(first, Capsule):
         raise ValueError("two fixed bodies need no check")
-    start, end = (where[p] if p in where else np.array([p.at]) for p in _ends(first))
+    start, end = (where[p] if p in where else np.array([p.at]) for p in (first.start, first.end))
     if isinstance(second, Capsule):
-        others = (where[p] if p in where else np.array([p.at]) for p in _ends(second))
+        others = (where[p] if p in where else np.array([p.at]) for p in (second.start, second.end))
         return segment_to_segment(start, end, *others) - first.radius - second.radius
     if isinstance(second, Box):
         return segment_to_box(start, end, np.array(second.low), np.array(second.high)) - first.radius
@@ -260,16 +251,6 @@ def segment_to_box(p: Array, q: Array, low: Array, high: Array) -> Array:
 def _outside(points: Array, low: Array, high: Array) -> Array:
     """From the nearest point of the box to each point."""
     return np.asarray(points - np.clip(points, low, high))
-
-
-def _holds(region: Box | Capsule, tool: Array) -> Mask:
-    if isinstance(region, Box):
-        return np.asarray(np.all((tool >= region.low) & (tool <= region.high), axis=1))
-    return np.asarray(np.linalg.norm(tool - np.array(region.start.at), axis=1) <= region.radius)
-
-
-def _ends(capsule: Capsule) -> tuple[Point, Point]:
-    return capsule.start, capsule.end
 
 
 def _point_function(arm: Arm, points: Sequence[Point]) -> ca.Function:

@@ -4,7 +4,7 @@ Springs that share a site share its coordinates: their deflections add up.
 """
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -46,12 +46,10 @@ def elastic_sites(chain: Chain, springs: Sequence[Spring]) -> tuple[ElasticSite,
     for spring in springs:
         slides = spring.site > 0 and not spring.directions and not chain.joints[spring.site - 1].is_revolute
         grouped[spring.site, slides].append(spring)
-    return tuple(ElasticSite(site, _directions(group), tuple(group)) for (site, _), group in grouped.items())
-
-
-def _directions(springs: Sequence[Spring]) -> tuple[Vector3, ...]:
-    different = {spring.directions for spring in springs}
-    return springs[0].directions if len(different) == 1 else XYZ
+    alike = {key: len({spring.directions for spring in group}) == 1 for key, group in grouped.items()}
+    return tuple(
+        ElasticSite(key[0], group[0].directions if alike[key] else XYZ, tuple(group)) for key, group in grouped.items()
+    )
 
 
 def deflections(
@@ -92,30 +90,20 @@ def split_deflection(
     """
     along = [ca.SX(0) for _ in joints]
     rotations: dict[int, Expression] = {}
-    for site, part in _parts(sites, deflection):
-        if not site.directions:
-            along[site.site - 1] = part
-        elif site.size == 1:
-            rotations[site.site] = _about(site.directions[0], part)
-        else:
-            rotations[site.site] = se3.small_rotation(ca.mtimes(_matrix(site.directions), part))
-    return along, rotations
-
-
-def _parts(sites: Sequence[ElasticSite], deflection: Expression) -> Iterator[tuple[ElasticSite, Expression]]:
     start = 0
     for site in sites:
-        yield site, deflection[start : start + site.size]
+        part, axes = deflection[start : start + site.size], site.directions
         start += site.size
+        if not axes:
+            along[site.site - 1] = part
+        elif len(axes) > 1:
+            rotations[site.site] = se3.small_rotation(ca.mtimes(_matrix(axes), part))
+        elif axes[0] in XYZ:
+            rotations[site.site] = se3.rotation_about("xyz"[XYZ.index(axes[0])], part).rotation
+        else:
+            rotations[site.site] = se3.rotation_about_unit(ca.SX(list(axes[0])), part)
+    return along, rotations
 
 
 def _matrix(directions: Sequence[Vector3]) -> Expression:
     return ca.sparsify(ca.horzcat(*[ca.SX(list(axis)) for axis in directions]))
-
-
-def _about(axis: Vector3, angle: Expression) -> Expression:
-    """About one constant axis: exact, and cheap for a coordinate axis."""
-    named: Mapping[Vector3, str] = dict(zip(XYZ, "xyz", strict=True))
-    if axis in named:
-        return se3.rotation_about(named[axis], angle).rotation
-    return se3.rotation_about_unit(ca.SX(list(axis)), angle)

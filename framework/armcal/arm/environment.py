@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
+from armcal.arm.model import Vector3
 from armcal.arm.statics import Load
 from armcal.base import se3
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.se3 import Expression
 
-Vector3 = tuple[float, float, float]
 _ZERO: Vector3 = (0.0, 0.0, 0.0)
 STATICS = "statics"
 """The instance name of what acts on all arms."""
@@ -29,9 +29,8 @@ class Environment:
     @property
     def load(self) -> Load:
         """As constant expressions."""
-        gravity, com, force, torque = (
-            ca.SX(list(vector)) for vector in (self.gravity, self.payload_com, self.force, self.torque)
-        )
+        vectors = (self.gravity, self.payload_com, self.force, self.torque)
+        gravity, com, force, torque = (ca.SX(list(vector)) for vector in vectors)
         return Load(gravity, ca.SX(self.payload_mass), com, force, torque)
 
 

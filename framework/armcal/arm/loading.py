@@ -44,29 +44,21 @@ def site_loads(arm: Arm, values: Mapping[str, Array], commands: Array, acting: A
 
     ``values`` are the arm's parameter blocks by full name, as a calibration left them; masses are the stated ones.
     """
-    count = len(arm.joint_names)
-    sites = count + 1
-    function = _function(arm, values)
-    loads = np.asarray(function.map(commands.shape[1])(commands, acting).full())
-    moments = loads[: 3 * sites].reshape(sites, 3, -1)
-    efforts = loads[3 * sites : 3 * sites + count]
-    levers = loads[3 * sites + count :].reshape(sites, 3, 3, -1).swapaxes(1, 2)
-    return SiteLoads(moments, efforts, levers)
-
-
-def _function(arm: Arm, values: Mapping[str, Array]) -> ca.Function:
-    """(commands, what acts) -> moments, efforts, levers, stacked."""
     chain = arm.chain({name: ca.SX(list(value)) for name, value in values.items()})
-    commands, acting = ca.SX.sym("commands", len(chain.joints)), ca.SX.sym("acting", len(LOAD_CHANNELS))
-    load = Load(acting[0:3], acting[3], acting[4:7], acting[7:10], acting[10:13])
-    frames, loads = _rigid_statics(arm, chain, ca.vertsplit(commands), load)
+    joints, what = ca.SX.sym("commands", len(chain.joints)), ca.SX.sym("acting", len(LOAD_CHANNELS))
+    load = Load(what[0:3], what[3], what[4:7], what[7:10], what[10:13])
+    frames, wrenches_of = _rigid_statics(arm, chain, ca.vertsplit(joints), load)
     moments, levers = [], []
-    for site, wrench in zip(frames.sites, loads, strict=True):
+    for site, wrench in zip(frames.sites, wrenches_of, strict=True):
         moments.append(ca.mtimes(site.rotation.T, wrench.moment))
         lever = frames.base_T_tool.translation - site.origin
         levers += [ca.cross(ca.densify(site.rotation[:, axis]), ca.densify(lever)) for axis in range(3)]
-    shown = ca.densify(ca.vertcat(*moments, joint_efforts(chain, frames, loads), *levers))
-    return ca.Function("site_loads", [commands, acting], [shown], {"cse": True})
+    stacked = ca.densify(ca.vertcat(*moments, joint_efforts(chain, frames, wrenches_of), *levers))
+    function = ca.Function("site_loads", [joints, what], [stacked], {"cse": True})
+    loads = np.asarray(function.map(commands.shape[1])(commands, acting).full())
+    sites, ends = len(frames.sites), (3 * len(frames.sites), 3 * len(frames.sites) + len(chain.joints))
+    by_site = loads[ends[1] :].reshape(sites, 3, 3, -1).swapaxes(1, 2)
+    return SiteLoads(loads[: ends[0]].reshape(sites, 3, -1), loads[ends[0] : ends[1]], by_site)
 
 
 def holding_efforts(

@@ -70,11 +70,16 @@ def wrenches(chain: Chain, frames: Frames, masses: Sequence[Mass], load: Load) -
     last = len(chain.joints)
     weight_at: dict[int, Expression] = defaultdict(lambda: ca.SX(0))
     moment_at: dict[int, Expression] = defaultdict(lambda: ca.SX(3, 1))
+    mount, moved_by = frames.sites[0], frame_names(chain)
+    places = {
+        **frames.named,
+        MOUNT_FRAME: se3.Transform(mount.rotation, mount.origin),
+        TOOL_FRAME: frames.base_T_tool,
+    }
     for mass in masses:
-        pose, moved_by = _frame(chain, frames, mass.frame)
-        up_to = moved_by if mass.loads_up_to is None else mass.loads_up_to
+        up_to = moved_by[mass.frame] if mass.loads_up_to is None else mass.loads_up_to
         weight_at[up_to] += mass.mass
-        moment_at[up_to] += mass.mass * pose.apply(mass.com)
+        moment_at[up_to] += mass.mass * places[mass.frame].apply(mass.com)
     weight_at[last] += load.payload_mass
     moment_at[last] += load.payload_mass * frames.base_T_tool.apply(load.payload_com)
     if load.beyond is not None:
@@ -105,15 +110,6 @@ def joint_efforts(chain: Chain, frames: Frames, acting: Sequence[SiteWrench]) ->
     """What wrenches do about or along each joint's own axis (joints x 1; N m, N on sliding joints)."""
     joints = zip(chain.joints, frames.sites[1:], acting[1:], strict=True)
     return ca.vertcat(*[effort(joint, site, wrench) for joint, site, wrench in joints])
-
-
-def _frame(chain: Chain, frames: Frames, name: str) -> tuple[se3.Transform, int]:
-    if name == TOOL_FRAME:
-        return frames.base_T_tool, chain.tool.joint
-    if name == MOUNT_FRAME:
-        site = frames.sites[0]
-        return se3.Transform(site.rotation, site.origin), 0
-    return frames.named[name], chain.frames[name].joint
 
 
 def _cross(a: Expression, b: Expression) -> Expression:

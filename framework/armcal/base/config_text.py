@@ -1,7 +1,8 @@
-"""Text of a configuration that remembers where it was written, so that a path in it can be found."""
+"""Texts of configurations, which remember where they were written; JSON; and texts as they may be shown."""
 
 import json
 import math
+import unicodedata
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
@@ -109,3 +110,25 @@ def as_line(content: Mapping[str, Any]) -> str:
         return json.dumps(content, allow_nan=False)
     except ValueError:
         return as_json(content, indent=None)
+
+
+_STEERING = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
+"""Controls, marks of direction and width, lone surrogates, separators of lines and paragraphs."""
+
+
+def shown(text: str, keep: str = "\n\t") -> str:
+    """A text without characters that steer whatever shows it: ``\\x1b`` stands for an escape character.
+
+    Names, cells and messages of files are data, and whoever wrote them must not move a cursor, colour a line, hide a
+    name or end an XML file. ``keep`` are the characters that stay as they are.
+    """
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(
+        character if character in keep or unicodedata.category(character) not in _STEERING else _written(ord(character))
+        for character in text
+    )
+
+
+def _written(code: int) -> str:
+    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"

@@ -55,24 +55,12 @@ def quaternion_expression(rotation: Expression) -> Expression:
 
     It branches on its argument, so it serves to say where to start, not to be differentiated.
     """
-    diagonal = [rotation[i, i] for i in range(3)]
-    trace = sum(diagonal, ca.SX(0))
-    candidates = [(trace, _from_real(rotation, trace)), *((d, _from_axis(rotation, i)) for i, d in enumerate(diagonal))]
-    largest, chosen = candidates[0]
-    for size, quaternion in candidates[1:]:
-        is_larger = size > largest
-        chosen = ca.if_else(is_larger, quaternion, chosen)
-        largest = ca.fmax(size, largest)
+    r, largest = rotation, sum((rotation[i, i] for i in range(3)), ca.SX(0))
+    chosen = ca.vertcat(1 + largest, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1])
+    for i in range(3):
+        j, k, parts = (i + 1) % 3, (i + 2) % 3, [ca.SX(0)] * 3
+        parts[i] = 1 + r[i, i] - r[j, j] - r[k, k]
+        parts[j], parts[k] = r[j, i] + r[i, j], r[k, i] + r[i, k]
+        chosen = ca.if_else(r[i, i] > largest, ca.vertcat(r[k, j] - r[j, k], *parts), chosen)
+        largest = ca.fmax(r[i, i], largest)
     return chosen / ca.norm_2(chosen)
-
-
-def _from_real(r: Expression, trace: Expression) -> Expression:
-    return ca.vertcat(1 + trace, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1])
-
-
-def _from_axis(r: Expression, i: int) -> Expression:
-    j, k = (i + 1) % 3, (i + 2) % 3
-    parts = [ca.SX(0)] * 3
-    parts[i] = 1 + r[i, i] - r[j, j] - r[k, k]
-    parts[j], parts[k] = r[j, i] + r[i, j], r[k, i] + r[i, k]
-    return ca.vertcat(r[k, j] - r[j, k], *parts)

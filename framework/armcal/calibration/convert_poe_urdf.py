@@ -6,9 +6,9 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from armcal.base.config_text import shown
 from armcal.base.domains import Array
 from armcal.base.pose_settings import quaternion_of
-from armcal.base.shown import shown
 from armcal.calibration.rigid_chain import RigidChain, RigidJoint, require_independent, require_plain_axes, rpy_of
 
 _DIGITS = 15

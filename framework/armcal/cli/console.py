@@ -9,7 +9,7 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from armcal.base.shown import shown
+from armcal.base.config_text import shown
 
 _CUT = "\u2026"
 """What rich ends a word with that its column has no room for."""

@@ -9,7 +9,7 @@ from typing import TextIO
 
 import click
 
-from armcal.base.shown import shown
+from armcal.base.config_text import shown
 
 PATIENCE_S = 3.0
 """How long the end of a command waits for a terminal that takes nothing."""

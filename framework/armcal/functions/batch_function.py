@@ -233,11 +233,8 @@ def _agreeing(batch: BatchFunction, library: ctypes.CDLL | None, sample: Sequenc
     given = [np.ascontiguousarray(array[:, : c_source.LANES]) for array in sample]
     mine = [np.empty((size, c_source.LANES)) for size, _ in batch.places]
     _evaluate(library.armcal_evaluate, given, mine, c_source.LANES)
-    for one, two in zip(batch(*given), mine, strict=True):
-        scale = max(1.0, float(np.abs(one).max(initial=0.0)))
-        if not np.allclose(one, two, rtol=0.0, atol=_AGREEMENT * scale, equal_nan=True):
-            return None
-    return library
+    agreeing = all(compiler.agree(*both, _AGREEMENT) for both in zip(batch(*given), mine, strict=True))
+    return library if agreeing else None
 
 
 def _evaluate(function: Any, inputs: Sequence[Array], outputs: Sequence[Array], count: int) -> None:

@@ -79,6 +79,20 @@ class Trial:
     expected: Mapping[int, Array]
     tolerance: float
 
+    def as_json(self) -> dict[str, object]:
+        """For the process that makes the call."""
+        arguments = [one.ravel().tolist() if isinstance(one, np.ndarray) else one for one in self.arguments]
+        expected = {str(place): numbers.ravel().tolist() for place, numbers in self.expected.items()}
+        return {"entry": self.entry, "arguments": arguments, "expected": expected, "tolerance": self.tolerance}
+
+
+def agree(expected: Array, given: Array, tolerance: float) -> bool:
+    """Whether numbers differ by no more than a share of the largest, or of 1; exactly where one is not finite."""
+    scale = max(1.0, float(np.nanmax(np.abs(expected), initial=0.0)))
+    if not np.isfinite(scale):
+        return np.array_equal(expected, given, equal_nan=True)
+    return np.allclose(expected, given, rtol=0.0, atol=tolerance * scale, equal_nan=True)
+
 
 def load_cached(key: str, entry_points: Sequence[str] = ENTRY_POINTS) -> ctypes.CDLL | None:
     """A compiled library from the cache, or None.
@@ -147,7 +161,7 @@ def _prepare(key: str, source: Callable[[], str], trial: Callable[[], Trial] | N
     try:
         directory.mkdir(parents=True, exist_ok=True, mode=0o700)
         _forget_old(directory)
-        text, tried = source(), None if trial is None else _as_json(trial())
+        text, tried = source(), None if trial is None else trial().as_json()
         job = {"compile": [compiler, *FLAGS], "python": python, "place": str(directory), "key": key, "trial": tried}
         build = Path(tempfile.mkdtemp(prefix=_BUILD, dir=directory))
         (build / "kernel.c").write_text(text, encoding="utf-8")
@@ -155,14 +169,6 @@ def _prepare(key: str, source: Callable[[], str], trial: Callable[[], Trial] | N
     except OSError:
         return None
     return [*python, library_build.__file__, "build", str(build)]
-
-
-def _as_json(trial: Trial) -> dict[str, object]:
-    arguments = [
-        argument.ravel().tolist() if isinstance(argument, np.ndarray) else argument for argument in trial.arguments
-    ]
-    expected = {str(place): numbers.ravel().tolist() for place, numbers in trial.expected.items()}
-    return {"entry": trial.entry, "arguments": arguments, "expected": expected, "tolerance": trial.tolerance}
 
 
 def _forget_old(directory: Path) -> None:

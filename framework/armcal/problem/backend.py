@@ -114,11 +114,8 @@ def trial(factor: Factor, interpreter: Backend) -> compiler.Trial:
 
 def agree(factor: Factor, interpreter: Backend, compiled: Backend) -> bool:
     """Whether a library gives the interpreter's numbers; one that was compiled wrong is not used."""
-    for mine, other in zip(_sample(factor, interpreter)[2:], _sample(factor, compiled)[2:], strict=True):
-        scale = max(1.0, float(np.nanmax(np.abs(mine), initial=0.0)))
-        if not np.isfinite(scale) or not np.allclose(mine, other, rtol=0, atol=_AGREEMENT * scale, equal_nan=True):
-            return np.array_equal(mine, other, equal_nan=True)
-    return True
+    results = zip(_sample(factor, interpreter)[2:], _sample(factor, compiled)[2:], strict=True)
+    return all(compiler.agree(*both, _AGREEMENT) for both in results)
 
 
 def _sample(factor: Factor, backend: Backend) -> tuple[Array, Array, Array, Array]:

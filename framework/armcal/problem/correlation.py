@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dpstrf
 
 from armcal.base.domains import Array
-from armcal.base.process import kept, passed_on
 
 _LEAST_SHARED = 1e-3
 """Of the noise's variance: a part of the covariance that is smaller is left out of its root."""
@@ -173,3 +172,13 @@ class Correlation:
         ends = np.cumsum([len(rows) for rows in like])[:-1]
         parts = np.split(stacked.transpose(1, 0, 2), ends)
         return tuple(part[:, : rows.shape[1]] for part, rows in zip(parts, like, strict=True))
+
+
+def kept(distance: Array) -> Array:
+    """What is left of states after distances in units of those over which they forget: also their correlation."""
+    return np.asarray(np.exp(-distance))
+
+
+def passed_on(covariance: Array, left: Array) -> Array:
+    """The covariance of states (n x n) of which so much is left (n): what they lost in variance is new."""
+    return np.asarray(covariance * left[:, None] * left + np.diag(1 - left**2))

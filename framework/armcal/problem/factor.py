@@ -21,8 +21,9 @@ import casadi as ca
 from typing_extensions import override
 
 from armcal.arm.assembly import Arm, ArmInputs, ArmState, scoped
-from armcal.arm.environment import STATICS, Environment, Vector3, tilted
+from armcal.arm.environment import STATICS, Environment, tilted
 from armcal.arm.evaluator import ElasticPass
+from armcal.arm.model import Vector3
 from armcal.arm.pose_residual import SURROUNDINGS, correction_names
 from armcal.arm.statics import Load
 from armcal.base.domains import Array

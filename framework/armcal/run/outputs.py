@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from armcal.base.config_text import as_json, finite
-from armcal.base.shown import shown
+from armcal.base.config_text import as_json, finite, shown
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import (
     SCHEMA,

@@ -18,11 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.base.process import kept, passed_on
 from armcal.base.units import parse_quantity
 from armcal.config.selection import quantity
 from armcal.errors import ConfigError, Location
 from armcal.estimate.online import Gaussian, checked
+from armcal.problem.correlation import kept, passed_on
 from numpy.typing import NDArray
 
 from armcal_online.tracking.belief import Belief
