@@ -182,7 +182,7 @@ class Uncertainty:
 
     def _apart(self, problem: Problem, commands: Dataset, places: Indices) -> _Part:
         """Where nothing is told of a drift."""
-        records = with_joint_noise(problem, problem.records(commands), self.values)
+        records = with_joint_noise(problem, problem.records(commands), self.values, self.noise_scale)
         spreads = self._predictor(problem, None).in_new_recording(self._whitened(problem, records))
         recording: Recording = "same" if self.record.recording is None else "new"
         still = tuple(np.zeros_like(spread.deviations) for spread in spreads)
@@ -192,7 +192,7 @@ class Uncertainty:
         self, problem: Problem, commands: Dataset, places: Indices, drift: KnownDrift, along: Chain | None
     ) -> _Part:
         """In the recording, which tells of a drift."""
-        records = self._drifted(problem, commands, along)
+        records = self._drifted(problem, commands, along, self.noise_scale)
         spreads = self._predictor(problem, drift).in_recording(records)
         moved = [record.correlation.shift(i, drift.states) for i, record in enumerate(records) if record.correlation]
         off = tuple(m[:, : len(places), 0] for m in moved)
@@ -212,8 +212,10 @@ class Uncertainty:
             raise TypeError("a recording is kept only where something drifts")
         return known_drift
 
-    def _drifted(self, problem: Problem, dataset: Dataset, along: Chain | None) -> tuple[FactorRecords, ...]:
-        records = with_joint_noise(problem, problem.records(dataset), self.values)
+    def _drifted(
+        self, problem: Problem, dataset: Dataset, along: Chain | None, noise_scale: float = 1.0
+    ) -> tuple[FactorRecords, ...]:
+        records = with_joint_noise(problem, problem.records(dataset), self.values, noise_scale)
         return with_drift(problem, records, dataset, self.parameters.nominal(), along)
 
     def _with_predictions(self, commands: Dataset) -> tuple[Problem, Dataset]:

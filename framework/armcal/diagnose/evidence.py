@@ -10,6 +10,7 @@ import numpy as np
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.diagnose.hidden_payload import HiddenPayload
 from armcal.diagnose.large_errors import LargeErrors
 from armcal.diagnose.residual_structure import ResidualStructure
 from armcal.estimate.estimator import Estimate
@@ -50,6 +51,7 @@ class Evidence:
     priors_alone: PriorsAlone | None = None
     unit: str = "mm"
     new_recording: NewRecording | None = None
+    hidden_payload: HiddenPayload | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json."""
@@ -59,6 +61,7 @@ class Evidence:
             "large_errors": self.large_errors and asdict(self.large_errors),
             "priors_alone": alone
             and {"worst_mm": alone.worst_mm, "between_mm": alone.between_mm, "poses": alone.poses},
+            "hidden_payload": self.hidden_payload and asdict(self.hidden_payload),
         }
 
 

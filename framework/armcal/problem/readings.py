@@ -108,12 +108,17 @@ def readings_by_residual(by_reading: Array, noise: Array) -> Array | None:
     return np.asarray(np.linalg.pinv(whitened / sizes) / sizes[:, None] / noise)
 
 
-def with_joint_noise(problem: Problem, records: Sequence[FactorRecords], values: Array) -> tuple[FactorRecords, ...]:
+def with_joint_noise(
+    problem: Problem, records: Sequence[FactorRecords], values: Array, noise_scale: float = 1.0
+) -> tuple[FactorRecords, ...]:
     """The records whitened by the noise of residuals and of joints together; the same where no joint has any.
 
     The covariance of a residual is its own plus S diag(sd^2) S', with S its derivative by the joints at these values,
     those of the other record where a measurement lies between two. Records that name the same other one share its
     noise; that correlation is left out.
+
+    ``noise_scale`` is what the whitened residuals are multiplied by afterwards. Below 1 it leaves the joints' noise as
+    large as stated: records at few joint angles do not show what the joints are off between these.
 
     Raises:
         NotConvergedError: a record has no elastic equilibrium at these values.
@@ -128,7 +133,7 @@ def with_joint_noise(problem: Problem, records: Sequence[FactorRecords], values:
     }
     if not stated:
         return tuple(records)
-    deviations = np.array(list(stated.values()))
+    deviations = np.array(list(stated.values())) / min(noise_scale, 1.0)
     slopes = problem.channel_slopes(values, records, list(stated))
     result = []
     for kernel, record, slope in zip(problem.kernels, records, slopes, strict=True):

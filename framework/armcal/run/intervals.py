@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.diagnose.coverage import (
     Coverage,
@@ -23,6 +24,7 @@ from armcal.diagnose.coverage import (
     stretch,
     whitened_like,
 )
+from armcal.diagnose.dependences import MOST_LEVELS
 from armcal.diagnose.noise_findings import Finding
 from armcal.estimate.estimator import Estimator
 from armcal.estimate.prediction import LEVELS, POSITION, STATED, Predictor, Spread, is_position
@@ -45,6 +47,7 @@ class IntervalResult:
         half_width_mm: of 90 % intervals of a position coordinate, median over all records; stretched.
         radius_mm: of 95 % radii of positions, likewise.
         scores: of cross-validated and held-out records, in dataset order; nan elsewhere.
+        levels: each joint stood at no more angles than these, and nothing states its error between them; else 0.
     """
 
     stretches: Mapping[Recording, Stretch] = field(default_factory=dict)
@@ -53,6 +56,7 @@ class IntervalResult:
     half_width_mm: Mapping[Recording, float] = field(default_factory=dict)
     radius_mm: Mapping[Recording, float] = field(default_factory=dict)
     scores: Mapping[Recording, Scores] = field(default_factory=dict)
+    levels: int = 0
 
     @property
     def judged(self) -> tuple[Mapping[Recording, Coverage], str]:
@@ -62,7 +66,10 @@ class IntervalResult:
     def findings(self) -> list[Finding]:
         """Whether intervals cover their share."""
         coverages, words = self.judged
-        typical = [Finding("note", self._typical())] if self.half_width_mm else []
+        state = (
+            "State what the joints are off between those angles as arms.NAME.joint_noise_deg, or measure poses between."
+        )
+        typical = [Finding("note", self._typical(), "", state if self.levels else "")] if self.half_width_mm else []
         return [*typical, *(coverage_finding(own, words, name) for name, own in coverages.items())]
 
     def _typical(self) -> str:
@@ -74,7 +81,10 @@ class IntervalResult:
         text += f"{radius[first]:.2f} mm in all (95 %)"
         if first == "new":
             text += f"; within this recording to +- {half['same']:.2f} mm and {radius['same']:.2f} mm"
-        return text + ", the measurement's noise included."
+        text += ", the measurement's noise included."
+        if self.levels:
+            text += f" Each joint stood at {self.levels} angles at most: what it is off between them is not included."
+        return text
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json."""
@@ -97,8 +107,9 @@ def interval_result(
     split: Split,
     estimator: Estimator,
     crossed: tuple[CrossValidation, Sequence[Split]] | None,
+    dataset: Dataset,
 ) -> IntervalResult:
-    """From the fit on the training records, and the folds (of the training records) that judged them.
+    """From the fit on the training records of a dataset, and the folds (of the training records) that judged them.
 
     Raises:
         NotConvergedError: a record has no elastic equilibrium at the values found.
@@ -129,7 +140,17 @@ def interval_result(
         {name: half for name, (half, _) in typical.items()} if places else {},
         {name: radius for name, (_, radius) in typical.items()} if places else {},
         scores,
+        _levels(problem, dataset),
     )
+
+
+def _levels(problem: Problem, dataset: Dataset) -> int:
+    """The most angles at which any turning joint stood; 0 where they are many, or an arm states its joints' noise."""
+    arms = problem.blueprint.arms.values()
+    channels = [f"{arm.name}.{joint}" for arm in arms for joint, kind in arm.commanded.items() if kind == "angle"]
+    counts = [len(np.unique(np.round(dataset.column(channel), 9))) for channel in channels]
+    most = max(counts, default=0)
+    return most if most <= MOST_LEVELS and not any(arm.joint_noise for arm in arms) else 0
 
 
 def _crossed(

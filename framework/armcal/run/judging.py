@@ -21,6 +21,7 @@ from armcal.diagnose.gross_findings import (
     overfitted,
     size_findings,
 )
+from armcal.diagnose.hidden_payload import hidden_payload, hidden_payload_findings
 from armcal.diagnose.large_errors import Judged, large_errors
 from armcal.diagnose.majority import minority, moved_findings, moved_groups
 from armcal.diagnose.noise_findings import Finding
@@ -86,7 +87,15 @@ def verdict_of(
         run.dataset.ids,
         suggestions,
         fitted,
-        [*known, *gross, *worse, *intervals.findings(), *moved, *gravity_findings(system, run.dataset)],
+        [
+            *known,
+            *gross,
+            *hidden_payload_findings(evidence.hidden_payload),
+            *worse,
+            *intervals.findings(),
+            *moved,
+            *gravity_findings(system, run.dataset),
+        ],
         evidence,
     )
     return verdict, evidence
@@ -141,8 +150,9 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     few, acting = with_few_points(problem, problem.weighted(run.fitted.records, run.fitted.weights))
     own = (training, motion.subset(train), position[train])
     left = structure(few, acting, estimate, *own, modelled=effect_types(system))
+    hidden = hidden_payload(few, acting, estimate, own[0], own[1])
     new = predictor(problem, run.fitted).new_recording(run.records, np.flatnonzero(np.isfinite(judged_mm)))
-    return Evidence(left, missed, alone, error_unit(problem), new)
+    return Evidence(left, missed, alone, error_unit(problem), new, hidden)
 
 
 def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array, evidence: Evidence) -> list[Finding]:

@@ -354,7 +354,7 @@ def _validated(
             training = problem.subset(run.records, run.split.train)
             parts = (training, splits, estimator, start, means.progress, means.executor, fit_and_predict)
             crossed = cross_validate(problem, *parts), splits
-        intervals = interval_result(problem, run.fitted, run.records, run.split, estimator, crossed)
+        intervals = interval_result(problem, run.fitted, run.records, run.split, estimator, crossed, run.dataset)
         errors = errors_of(run, crossed and crossed[0])
         return errors if before.problem is problem else errors.with_nominal(errors_of(before, None)), intervals
 
