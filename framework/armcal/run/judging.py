@@ -87,15 +87,7 @@ def verdict_of(
         run.dataset.ids,
         suggestions,
         fitted,
-        [
-            *known,
-            *gross,
-            *hidden_payload_findings(evidence.hidden_payload),
-            *worse,
-            *intervals.findings(),
-            *moved,
-            *gravity_findings(system, run.dataset),
-        ],
+        [*known, *gross, *worse, *intervals.findings(), *moved, *gravity_findings(system, run.dataset)],
         evidence,
     )
     return verdict, evidence
@@ -175,6 +167,7 @@ def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array
         *displacement_findings(figure),
         *limit_findings(figure, scale_deviation(problem, rows, read, estimate.noise_scale)),
         *held_scale.held_scale_findings(scales, figure),
+        *hidden_payload_findings(evidence.hidden_payload),
     ]
 
 
