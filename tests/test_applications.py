@@ -58,7 +58,7 @@ def test_applications_announce_their_commands() -> None:
     assert announced == APPLICATIONS
 
 
-@pytest.mark.quick("bench", "online")
+@pytest.mark.slow
 @pytest.mark.parametrize("name", APPLICATIONS)
 def test_without_an_application_the_rest_works(name: str) -> None:
     listed = without(f"armcal_{name}", "--help")

@@ -99,6 +99,7 @@ def test_every_room_has_a_place_in_the_order_and_every_place_a_room() -> None:
     assert there == named
 
 
+@pytest.mark.quick("arm", "base", "cli", "estimate", "problem")
 @pytest.mark.parametrize("room", [name for names in ROOMS for name in names])
 def test_a_room_imports_only_rooms_below_it(room: str) -> None:
     upward = {

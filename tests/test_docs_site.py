@@ -93,6 +93,7 @@ def test_what_is_wrong_with_a_block_is_told_with_its_line(
     assert len(told.faults) == 1 and "page.md:2" in told.faults[0]
 
 
+@pytest.mark.slow
 def test_what_needs_no_shell_runs_in_a_fork_and_says_the_same() -> None:
     quoted = ["armcal", "check", "a.yaml", "--set", "parameters.free=[arm.*]"]
     assert plain_words("armcal check a.yaml --set 'parameters.free=[arm.*]'") == quoted
@@ -190,6 +191,7 @@ class Fetched(HTMLParser):
         self.addresses += [value for name, value in attrs if name == wanted and value]
 
 
+@pytest.mark.slow
 def test_every_page_is_in_the_site_and_in_its_contents(site: Path) -> None:
     class Loader(yaml.SafeLoader):
         """The configuration's tags for Python objects are of no interest here."""
@@ -201,6 +203,7 @@ def test_every_page_is_in_the_site_and_in_its_contents(site: Path) -> None:
     assert {page.stem for page in PAGES} <= {path.stem for path in site.glob("*.html")}
 
 
+@pytest.mark.slow
 def test_the_site_fetches_nothing_from_elsewhere(site: Path) -> None:
     for path in site.rglob("*.html"):
         page = Fetched()
@@ -239,6 +242,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     opened.close()
 
 
+@pytest.mark.slow
 def test_the_search_works_from_a_disk_without_a_network(site: Path, browser: Browser) -> None:
     browser.open((site / "index.html").as_uri() + "?q=backlash")
     browser.wait_for("document.querySelectorAll('.md-search-result__item').length >= 3")

@@ -210,6 +210,7 @@ def simulate_and_run(interpreter: Path, place: Path) -> None:
     assert (place / "result" / "report.html").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_the_wheel_runs_outside_of_the_checkout_without_a_compiler(release: Release, tmp_path: Path) -> None:
     pytest.importorskip("pip", reason="pip is not installed here, and installs the wheel")
     interpreter = new_environment(tmp_path / "env", Path(sysconfig.get_paths()["purelib"]))

@@ -109,6 +109,7 @@ def test_drift_is_that_of_the_last_ten_cycles_against_the_first(tmp_path: Path) 
     assert drift["measured"]["hours"] == pytest.approx(20 / 3600)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("visits", [3, 8])
 def test_intervals_of_few_visits_contain_the_truth_as_often_as_they_say(visits: int) -> None:
     """Known truth: sd 0.1, 0.2 and 0.4 along the axes, AP 0.5; RP of the truth by a million draws of the definition."""
@@ -200,12 +201,14 @@ def test_a_stated_frame_is_taken_as_it_is_and_one_that_the_records_contradict_is
     assert any("--frame found" in text for text in told["warnings"])
 
 
+@pytest.mark.slow
 def test_a_frame_found_from_few_poses_is_said_to_make_the_accuracy_smaller(tmp_path: Path) -> None:
     rows, tools = _spatial_rows(np.random.default_rng(4), 5, 3)
     told = judged(tmp_path, SPATIAL, _measured(rows, tools, Rotation.identity(), np.zeros(3)))
     assert any("9 numbers of base and target were found from the 15 coordinates" in t for t in told["warnings"])
 
 
+@pytest.mark.slow
 def test_records_in_another_order_give_the_same_figures(tmp_path: Path) -> None:
     rows, tools = _spatial_rows(np.random.default_rng(5), 6, 5)
     rows = _measured(rows, tools, Rotation.identity(), np.zeros(3))
@@ -220,6 +223,7 @@ def test_records_in_another_order_give_the_same_figures(tmp_path: Path) -> None:
     assert spread[0] == pytest.approx(spread[1], rel=1e-9), "pairs are of the same cycle"
 
 
+@pytest.mark.slow
 def test_commanded_poses_that_the_records_state_stand_above_the_joints(tmp_path: Path) -> None:
     rows = planar_rows({"P1": [(1, 0, 0), (1, 0, 0.1)], "P2": [(1, 0, 0), (1, 0, 0.1)]})
     for row, place in zip(rows, ((500, 0, 0),) * 2 + ((300, 200, 0),) * 2, strict=True):

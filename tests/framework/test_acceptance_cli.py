@@ -137,6 +137,7 @@ def test_bad_records_are_refused_with_their_place_and_mend(case: str, config: Pa
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
 
 
+@pytest.mark.slow
 def test_one_value_that_is_missing_costs_its_record_and_is_named(config: Path, tmp_path: Path) -> None:
     records = written(tmp_path / "records.csv", _with(4, x_mm="nan")(rows_of()))
     done = armcal("acceptance", config, records, "--out", tmp_path / "out")
@@ -154,6 +155,7 @@ def test_an_arm_that_no_instrument_sees_is_refused(tmp_path: Path) -> None:
     assert done.exit_code == 2 and "Traceback" not in done.output
 
 
+@pytest.mark.slow
 def test_one_name_for_two_commanded_poses_is_named(config: Path, tmp_path: Path) -> None:
     rows, random = rows_of(), np.random.default_rng(1)
     for row in rows[::3]:
@@ -165,6 +167,7 @@ def test_one_name_for_two_commanded_poses_is_named(config: Path, tmp_path: Path)
     assert "visits to P1 were commanded up to" in " ".join(done.output.split())
 
 
+@pytest.mark.slow
 def test_a_visit_that_lies_out_is_named_and_counts(config: Path, tmp_path: Path) -> None:
     rows = rows_of(10)
     far = _with(9, y_mm=float(str(rows[9]["y_mm"])) + 3)(rows)

@@ -142,6 +142,7 @@ class TestRefusedBeforeAnythingMoves:
         result = armcal("acquire", CONFIG, "--plan", plan, "--out", tmp_path / "out", "--yes", sets=clock)
         assert result.exit_code == 2 and "armcal simulated-bench" in result.output
 
+    @pytest.mark.slow
     def test_nobody_who_can_say_yes(self, run: BenchRun) -> None:
         with run.simulated() as clock:
             words = [word for text in (*run.sets, *there(run)) for word in ("--set", text)]
@@ -149,12 +150,14 @@ class TestRefusedBeforeAnythingMoves:
             assert done.exit_code == 2 and "--yes" in done.stderr  # its input is at its end
             assert clock.ask({"state": True})["events"] == {}
 
+    @pytest.mark.slow
     def test_another_board_than_the_servo_file_names(self, tmp_path: Path) -> None:
         run = BenchRun(tmp_path, (*SETS, "bench.simulator.board_id=LRM-2"))
         with run.simulated() as clock, pytest.raises(DeviceRefusedError, match="LRM-2"):
             run.acquire()
             assert clock.ask({"state": True})["events"] == {}
 
+    @pytest.mark.slow
     def test_a_tracker_that_sees_nothing(self, run: BenchRun) -> None:
         with run.simulated() as clock:
             clock.ask({"fault": {"kind": "lost", "body": "tool"}})
@@ -162,6 +165,7 @@ class TestRefusedBeforeAnythingMoves:
                 run.acquire()
             assert clock.ask({"state": True})["events"] == {}
 
+    @pytest.mark.slow
     def test_a_folder_with_a_run_unless_it_is_resumed_and_one_without_if_it_is(self, run: BenchRun, plan: Path) -> None:
         prepared = run.prepared()
         with pytest.raises(InputError, match="no run to resume"), run.simulated():
@@ -199,6 +203,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, plan: Path) -> Path:
 
 
 class TestRehearsal:
+    @pytest.mark.quick("bench.link={type: linux_i2c}---set bench.link='{type: framed}'")
     @pytest.mark.parametrize(
         ("change", "said"),
         [
@@ -212,6 +217,7 @@ class TestRehearsal:
         assert result.exit_code == 2, result.output
         assert said in result.output and "Traceback" not in result.output
 
+    @pytest.mark.slow
     def test_data_can_be_read_as_they_are(self, folder: Path) -> None:
         from armcal.run.experiment import Experiment
 
@@ -235,6 +241,7 @@ class TestRehearsal:
         assert pulses / tick == pytest.approx(round(pulses / tick), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_ctrl_c_parks_the_arm_and_resume_measures_the_rest(run: BenchRun) -> None:
     sets = [word for text in (*run.sets, *there(run)) for word in ("--set", text)]
     sets += ["--set", "bench.acquisition.at_end=release"]
@@ -257,6 +264,7 @@ def test_ctrl_c_parks_the_arm_and_resume_measures_the_rest(run: BenchRun) -> Non
     assert sorted(run.progress().measured) == ["p1", "p2", "p3", "p4"]
 
 
+@pytest.mark.slow
 def test_a_missing_library_is_named(tmp_path: Path, plan: Path) -> None:
     (tmp_path / "serial.py").write_text("raise ModuleNotFoundError(\"No module named 'serial'\", name='serial')\n")
     command = ("acquire", str(CONFIG), "--plan", str(plan), "--out", str(tmp_path / "o"), "--yes")

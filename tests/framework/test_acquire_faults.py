@@ -151,6 +151,7 @@ def test_random_troubles_never_make_the_arm_unsafe(
     judge(run, seed, undisturbed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(1))
 def test_a_link_without_checksums_survives_all_but_damage(
     firmata: BenchRun, undisturbed: dict[str, np.ndarray], seed: int

@@ -81,6 +81,7 @@ def is_parked(state: dict[str, Any]) -> bool:
 class TestHostThatStalls:
     """Another client lets the time pass: to the board the host is silent, as one that was stopped or swapped out."""
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("seconds", [pytest.param(0.8, marks=SLOW), pytest.param(1.5, marks=SLOW), 10.0])
     def test_while_it_measures(
         self, run: BenchRun, undisturbed: dict, seconds: float, monkeypatch: pytest.MonkeyPatch
@@ -197,6 +198,7 @@ class TestJournalThatFails:
             assert is_let_go(clock.ask({"state": True}))
             assert run.acquire().ending.how == "done"
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         "fault", [pytest.param(RuntimeError("a bug"), marks=SLOW), BrokenPipeError(errno.EPIPE, "nobody reads")]
     )
@@ -218,6 +220,7 @@ class TestJournalThatFails:
 
 
 class TestAskedToEnd:
+    @pytest.mark.slow
     @pytest.mark.parametrize("kind", ["nack", pytest.param("unplug", marks=SLOW), pytest.param("reset", marks=SLOW)])
     def test_a_passing_fault_on_the_way_home_does_not_leave_the_arm_standing(
         self, holding: BenchRun, kind: str
@@ -507,7 +510,7 @@ class TestTracker:
         assert list(run.progress.left_out) == ["p3"] and "body lost" in run.progress.left_out["p3"]
 
     @pytest.mark.parametrize("motion", ["still", "moving"])
-    @pytest.mark.quick("moving")
+    @pytest.mark.slow
     def test_a_base_body_that_stays_out_of_sight_makes_it_park_and_leaves_nothing_out(
         self, tmp_path: Path, motion: str
     ) -> None:
@@ -528,6 +531,7 @@ class TestTracker:
         assert run.run() == "failed"
         assert len(run.progress.left_out) == len(run.poses)
 
+    @pytest.mark.slow
     def test_frames_from_before_are_not_taken_for_frames_of_now(self, run: BenchRun) -> None:
         with run.simulated() as clock:
             monitor = TrackerMonitor(Bench.of(run.experiment), clock)
@@ -638,6 +642,7 @@ class TestWays:
 
 
 class TestResume:
+    @pytest.mark.slow
     def test_a_run_that_is_done_needs_no_bench_to_write_its_data_anew(self, run: BenchRun) -> None:
         write_plan(run.plan, POSES[:2])
         with run.simulated() as clock:

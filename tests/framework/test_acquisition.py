@@ -252,7 +252,7 @@ def test_where_parking_is_too_much_as_well_poses_are_left_out_and_none_is_lost()
 
 
 @pytest.mark.parametrize("dies_after", range(1, 34))
-@pytest.mark.quick("1", "5", "9", "14", "19", "24", "29", "33")
+@pytest.mark.quick("14")
 def test_killed_after_any_entry_nothing_is_measured_twice_and_nothing_is_lost(dies_after: int) -> None:
     run = Run()
     run.log.dies_after = dies_after
@@ -271,6 +271,7 @@ def test_killed_after_any_entry_nothing_is_measured_twice_and_nothing_is_lost(di
     assert again.fastest() <= RATE * 1.0001
 
 
+@pytest.mark.quick("2", "5", "6", "7", "9")
 @pytest.mark.parametrize("seed", [*range(10), *(pytest.param(s, marks=pytest.mark.slow) for s in range(10, 30))])
 def test_random_troubles_end_in_done_held_or_parked(seed: int) -> None:
     random = np.random.default_rng(seed)

@@ -74,6 +74,7 @@ def test_a_run_states_its_errors_in_mrad_and_is_read_back(place: Path) -> None:
     assert "mrad" in page and ">nan<" not in page
 
 
+@pytest.mark.slow
 def test_what_follows_a_run_works_too(place: Path) -> None:
     armcal("run", "arm.yaml", "--out", "run", "--set", "validation.folds=0", "--set", "noise.loss=huber")
     kept = "run/calibration.yaml"
@@ -117,6 +118,7 @@ def test_a_limit_in_mm_means_nothing_there(place: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_records_that_lack_the_tracker_do_not_spoil_the_table(place: Path) -> None:
     other = CONFIG.replace(EAST, "tracker: {type: tip_position, noise_mm: 0.2}").replace(", east.heading", "")
     Path("arm.yaml").write_text(other)
@@ -134,6 +136,7 @@ def test_records_that_lack_the_tracker_do_not_spoil_the_table(place: Path) -> No
     assert errors["train"]["mean"] == pytest.approx(0.2 * 1.6, rel=0.3)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_read_back_is_not_left_as_a_calibration(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     again = ("run", "arm.yaml", "--out", "run", "--parallel", "1", "--set", "validation.folds=0")
     armcal(*again)

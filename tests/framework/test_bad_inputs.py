@@ -70,6 +70,7 @@ def test_fewer_equations_than_parameters_needs_priors_and_says_both_numbers(tmp_
     warned(check(*alone, angles + lengths + rest, data=data), "24 equations", "28 free parameters", "priors")
 
 
+@pytest.mark.slow
 def test_a_rank_deficiency_is_named_and_needs_a_prior() -> None:
     more = 'parameters.free=["arm.mdh.*_z", "arm.mdh.d3", "arm.mdh.theta*"]'
     refused(check(more), "does not determine", "arm.mdh.d3", "arm.mdh.after2_z", "prior")
@@ -97,6 +98,7 @@ def test_a_compliance_below_zero_is_refused_as_nominal_value_and_as_setting() ->
     refused(check("arms.arm.effects.spring.compliance_rad_per_Nm=-0.1"), "below zero")
 
 
+@pytest.mark.slow
 def test_gravity_of_the_wrong_sign_or_of_another_body_is_warned_of() -> None:
     warned(check("statics.gravity_m_s2=[0, 0, 9.81]"), "points up")
     warned(check("statics.gravity_m_s2=[0, 0, -1.62]"), "1.620", "earth", "9.807")
@@ -125,6 +127,7 @@ def test_a_prediction_without_the_payload_its_calibration_had_is_refused(tmp_pat
     refused(check("statics.payload_g=-5"), "payload", "below zero")
 
 
+@pytest.mark.slow
 def test_millimetres_called_metres_and_the_reverse_are_refused(tmp_path: Path) -> None:
     metres = {f"{axis}_mm": f"{axis}_m" for axis in "xyz"}
     refused(check(data=some_rows(tmp_path, 60, metres)), "typically", "Check the unit", "rows.csv")

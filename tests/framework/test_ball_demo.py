@@ -26,6 +26,7 @@ def metrics(tmp_path_factory):
     return json.loads((folder / "metrics.json").read_text())
 
 
+@pytest.mark.slow
 def test_it_is_judged_on_positions_that_did_not_train(metrics):
     judged = {name for name, group in metrics["groups"].items() if not group["trained"]}
     assert judged == {"right", "raised"}
@@ -40,6 +41,7 @@ def test_all_that_is_free_is_determined_by_the_postures(metrics):
     assert metrics["parameters"]["undetermined"] == metrics["parameters"]["held_by_priors"] == []
 
 
+@pytest.mark.slow
 def test_without_the_known_distance_the_size_is_not_seen(tmp_path):
     ran = armcal("run", DEMO, "--out", tmp_path / "run", "--set", "measurements.sockets.distances=[]")
     assert ran.returncode == 2
@@ -47,6 +49,7 @@ def test_without_the_known_distance_the_size_is_not_seen(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_a_known_distance_that_is_ten_times_too_small_is_no_calibration(tmp_path):
     """Everything shrinks with it, and fits: only the nominal arm contradicts."""
     wrong = "measurements.sockets.distances=[{between: [hole_0, hole_1], distance_mm: 5, noise_mm: 0.05}]"
@@ -73,6 +76,7 @@ def test_a_missing_library_is_named_without_a_traceback(tmp_path, monkeypatch):
     assert "the library casadi is missing" in ran.stderr and "Traceback" not in ran.stderr
 
 
+@pytest.mark.slow
 def test_a_socket_that_no_record_has_is_told(tmp_path):
     change = "measurements.sockets.distances=[{between: [hole_0, hole_9], distance_mm: 50, noise_mm: 0.05}]"
     ran = armcal("check", DEMO, "--set", change)

@@ -41,6 +41,7 @@ class TestAFrameThatIsNotTheArms:
             code, said = acquired(arm, "--set", "bench.acquisition.settle.longest_s=3")
         assert code == 2 and "as if mm came where m are expected (by 3 poses)" in said
 
+    @pytest.mark.slow
     def test_metres_for_millimetres_are_named_with_their_gain(self, tmp_path: Path) -> None:
         arm = OwnArm(tmp_path, POST, **{"bench.simulator.tracker.length_gain": 0.001})
         with arm.run.simulated():
@@ -78,6 +79,7 @@ class TestAJointThatGivesWay:
         gives_way = json.loads((arm.out / "summary.json").read_text())["gives_way"]
         assert gives_way["joints"] == ["lift"] and 5 < gives_way["mm_per_min"] < 30
 
+    @pytest.mark.slow
     def test_none_is_named_where_none_does(self, tmp_path: Path) -> None:
         arm = OwnArm(tmp_path, TOWER)
         with arm.run.simulated():

@@ -67,6 +67,7 @@ def test_without_a_base_body_the_world_is_the_reference() -> None:
     np.testing.assert_allclose(found.poses[0], expected, atol=1e-12)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000), st.sampled_from(["moving", "still"]))
 def test_moving_the_world_changes_nothing(seed: int, motion: str) -> None:
     s = settings(base_motion=motion)

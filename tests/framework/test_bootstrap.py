@@ -51,6 +51,7 @@ def test_weights_are_whole_blocks_of_neighbours(count: int, block: int) -> None:
         assert alone.sum(axis=1).max() <= cut, "a record was drawn without any neighbour"
 
 
+@pytest.mark.slow
 def test_the_standard_error_is_that_of_resampled_means() -> None:
     random = np.random.default_rng(2)
     series, count, block = _chain(random, 0.5, 60), 60, 6
@@ -218,6 +219,7 @@ class _Refusing:
         return Solution(start + np.nan, SolverVerdict("refusing", "no", False, 1, 0.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by_raising", [True, False])
 def test_refits_that_fail_are_counted_and_left_out(lrm, by_raising: bool) -> None:
     experiment, problem, records, found = _fitted(lrm)
@@ -227,6 +229,7 @@ def test_refits_that_fail_are_counted_and_left_out(lrm, by_raising: bool) -> Non
     assert np.isnan(few.intervals).all() and np.isnan(few.deviations).all(), "six refits are no interval"
 
 
+@pytest.mark.slow
 def test_percentiles_are_of_the_refits(lrm) -> None:
     experiment, problem, records, found = _fitted(lrm)
     resampled = bootstrap(problem, records, experiment.estimator, found, BootstrapSettings(bootstrap=40))
@@ -245,6 +248,7 @@ def test_what_was_not_measured_cannot_be_made_up(lrm) -> None:
         bootstrap(problem, drifting, experiment.estimator, found, BootstrapSettings(bootstrap=2, method="parametric"))
 
 
+@pytest.mark.slow
 def test_a_run_leaves_the_bootstrap_beside_the_curvature(tmp_path: Path) -> None:
     out = tmp_path / "run"
     asked = ["--set", FREE, "--set", "uncertainty.bootstrap=25", "--set", "validation.folds=0"]

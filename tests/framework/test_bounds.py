@@ -104,6 +104,7 @@ def stiff_result(found: Estimate):
     return type("Result", (), {"estimate": found})()
 
 
+@pytest.mark.slow
 def test_what_a_cone_shifts_beside_its_matrix_is_named() -> None:
     """A joint that would have to push one way: its matrix ends on the cone, and no entry of it on a bound."""
     give = "arms.arm.effects.flex={type: compliance, compliance_rad_per_Nm: 0.02}"

@@ -104,6 +104,7 @@ def damaged(data: bytes, dice: random.Random) -> bytes:
     return data[:place] + new + data[place + 1 :]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [250, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_no_damage_of_one_byte_is_taken_or_ends_in_a_traceback(calibration: Path, tmp_path: Path, count: int) -> None:
     data, dice, path, registry = calibration.read_bytes(), random.Random(15), tmp_path / "damaged.yaml", discover()
@@ -159,6 +160,7 @@ def test_an_edit_on_purpose_is_checked_noted_and_said_until_the_next_run(calibra
     assert "edited by hand" in predicted(kept / "calibration.yaml").stderr
 
 
+@pytest.mark.slow
 def test_a_server_says_that_its_calibration_was_edited(calibration: Path, tmp_path: Path) -> None:
     path = tmp_path / "edited.yaml"
     path.write_text(calibration.read_text().rpartition("#")[0])
@@ -170,6 +172,7 @@ def test_a_server_says_that_its_calibration_was_edited(calibration: Path, tmp_pa
     assert done.stderr.decode().count("edited by hand and accepted on") == 1
 
 
+@pytest.mark.slow
 def test_what_no_run_could_have_written_is_not_accepted(calibration: Path, tmp_path: Path) -> None:
     path = tmp_path / "edited.yaml"
     original = calibration.read_text()
@@ -189,6 +192,7 @@ def test_what_no_run_could_have_written_is_not_accepted(calibration: Path, tmp_p
     assert done.exit_code == 0 and "nothing to accept" in done.output and path.read_text() == original
 
 
+@pytest.mark.slow
 def test_line_ends_of_another_system_are_no_damage(calibration: Path, tmp_path: Path) -> None:
     path = tmp_path / "windows.yaml"
     path.write_bytes(calibration.read_bytes().replace(b"\n", b"\r\n"))
@@ -227,6 +231,7 @@ def test_the_calibration_names_the_plugins_that_it_is_made_of(calibration: Path)
     assert all(c["distribution"] and c["version"] and len(c["source"]) == 16 for c in kept)
 
 
+@pytest.mark.slow
 def test_other_versions_whose_predictions_agree_are_said_once(
     calibration: Path, upgraded: Callable[[], None], tmp_path: Path
 ) -> None:
@@ -245,6 +250,7 @@ def test_other_versions_whose_predictions_agree_are_said_once(
         Calibration.load(calibration)
 
 
+@pytest.mark.slow
 def test_other_physics_under_the_calibrated_values_is_refused_by_every_command(
     calibration: Path, upgraded: Callable[[], None], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -297,6 +303,7 @@ def test_a_source_that_was_changed_under_the_same_version_is_named(calibration: 
         Calibration.load(path, registry)
 
 
+@pytest.mark.slow
 def test_a_calibration_of_many_free_parameters_is_read(tmp_path: Path) -> None:
     """Covariance and information of 200 free parameters, such as many sockets bring: more than a mebibyte."""
     square = np.random.default_rng(1).normal(size=(200, 200))

@@ -117,6 +117,7 @@ def test_manipulability_of_two_links_is_the_textbook_one(tmp_path: Path) -> None
     assert found.values["smallest_mm_per_rad"].min() > 0
 
 
+@pytest.mark.slow
 def test_pose_measures_are_those_of_the_weighted_jacobian(lrm: Task) -> None:
     subject, length = lrm.subject, 0.07
     commands = spread(subject.limits, 40, 3)
@@ -182,6 +183,7 @@ def predicted(subject: Subject, parameters_of: str, commands: np.ndarray, acting
     return shown.reshape(4, 3, count).transpose(2, 1, 0)
 
 
+@pytest.mark.slow
 def test_positions_sag_and_deflection_are_those_of_the_fitted_model(lrm: Task) -> None:
     subject, config = lrm.subject, str(CONFIGS / "designs.yaml")
     commands = spread(subject.limits, 12, 5)
@@ -248,6 +250,7 @@ def test_the_same_seed_gives_the_same_and_another_seed_another(tmp_path: Path) -
     assert (one >= subject.limits[:, :1]).all() and (one <= subject.limits[:, 1:]).all()
 
 
+@pytest.mark.slow
 def test_the_order_of_postures_does_not_matter(lrm: Task) -> None:
     postures = postures_at(mechanics(lrm.subject), spread(lrm.subject.limits, 500, 0), weights(lrm.subject))
     shuffled = postures.subset(np.random.default_rng(0).permutation(len(postures)))
@@ -321,6 +324,7 @@ def test_areas_hold_every_sampled_posture_and_keep_limits_and_direction(lrm: Tas
     assert len(missed) <= 0.1 * len(hit)
 
 
+@pytest.mark.slow
 def test_found_postures_are_where_and_how_they_should_be(lrm: Task) -> None:
     from armcal_capability.inverse import reach_for
 
@@ -337,6 +341,7 @@ def test_found_postures_are_where_and_how_they_should_be(lrm: Task) -> None:
     assert (commands >= subject.limits[:, :1]).all() and (commands <= subject.limits[:, 1:]).all()
 
 
+@pytest.mark.slow
 def test_clearance_takes_postures_away() -> None:
     settings = CapabilitySettings.si(samples=2000, voxel=0.05)
     task = load_task(CONFIGS / "plan.yaml")
@@ -346,6 +351,7 @@ def test_clearance_takes_postures_away() -> None:
     assert open_air.clear == 2000
 
 
+@pytest.mark.slow
 def test_what_the_parameters_leave_open_is_what_predictions_say(calibration: Calibration, tmp_path: Path) -> None:
     subject = of(calibration)
     commands = spread(subject.limits, 15, 1)
@@ -368,6 +374,7 @@ def of(calibration: Calibration) -> Subject:
     return of_calibration(calibration, load_config(CONFIGS / "plan.yaml"), "demo")
 
 
+@pytest.mark.slow
 def test_the_nominal_error_is_between_two_forward_models(calibration: Calibration) -> None:
     subject = of(calibration)
     commands = spread(subject.limits, 10, 1)
@@ -404,6 +411,7 @@ def test_expected_errors_are_no_smaller_than_their_parts(calibration: Calibratio
     assert (found["expected_mm"] >= found["known_to_mm"]).all()
 
 
+@pytest.mark.slow
 def test_a_design_keeps_what_was_found_and_changes_what_it_says(lrm: Task) -> None:
     built, longer, flatter = (lrm.designs[n] for n in ("60 deg, as built", "upper arm + 1 cm", "45 deg"))
     assert np.allclose(outline(built), outline(lrm.subject))

@@ -132,6 +132,13 @@ def refused(folder: Path, source: object, *arguments: object, says: tuple[str, .
     assert not (folder / "refused").exists()
 
 
+@pytest.mark.quick(
+    "capability.basket=1-says12",
+    "capability.designs={a: 3}-says16",
+    "capability.designs={a: {arms.arm.model.base.4.ry_degree: 45}}-says15",
+    "capability.length=5-says8",
+    "capability.samples=many-says3",
+)
 @pytest.mark.parametrize(
     ("setting", "says"),
     [
@@ -182,6 +189,7 @@ def test_a_missing_or_broken_library_is_told_before_the_survey(
         assert "cannot be loaded (libfreetype)" in done.output and "armcal doctor" in done.output
 
 
+@pytest.mark.slow
 def test_bad_files_are_refused_in_words(tmp_path: Path) -> None:
     refused(tmp_path, tmp_path / "none.yaml", says=("there is no such file",))
     refused(tmp_path, tmp_path, says=("it is a directory",))

@@ -120,7 +120,7 @@ def said(found):
 
 
 @pytest.mark.parametrize("name", NAMED)
-@pytest.mark.quick("gravity", "heavy payload")
+@pytest.mark.slow
 def test_a_planted_cause_is_named_or_said_to_be_open(lrm, name):
     found = found_in(lrm, name, 3)
     assert graded(found, name) in (("open",) if name == "heavy payload" else ("right", "open"))
@@ -134,6 +134,7 @@ def smooth(lrm):
     return found_in(lrm, "smooth", 4)
 
 
+@pytest.mark.slow
 def test_what_is_not_among_the_causes_is_not_given_the_name_of_one(smooth):
     found = smooth
     assert graded(found, "smooth") != "wrong" and found.is_predictable
@@ -153,6 +154,7 @@ def test_in_short_nothing_is_left_only_where_no_function_of_the_pose_is(smooth):
     assert "nothing that was recorded predicts them" in short(replace(found.predictable, p_value=0.5))
 
 
+@pytest.mark.slow
 def test_what_is_significant_but_less_likely_than_chance_is_no_finding(lrm):
     """Of noise: the one recording in twenty or so of which the best of 200 causes has a family-wise p of 0.01."""
     found = found_in(lrm, "none", 62)
@@ -160,6 +162,7 @@ def test_what_is_significant_but_less_likely_than_chance_is_no_finding(lrm):
     assert "none explains the error left" in said(found)
 
 
+@pytest.mark.slow
 def test_how_large_an_unseen_scale_may_be_is_not_a_matter_of_chance(lrm):
     """The noise of the positions, taken for a part of the scale, made its deviation half as large."""
     q, _ = poses(1)
@@ -173,6 +176,7 @@ def test_how_large_an_unseen_scale_may_be_is_not_a_matter_of_chance(lrm):
     assert found[1] == pytest.approx(found[0], rel=0.15)
 
 
+@pytest.mark.slow
 def test_noise_that_grows_is_noise_that_depends_on_the_order(lrm):
     found = found_in(lrm, "growing noise", 5)
     assert found.noise is not None and found.noise.words == "the recorded order"
@@ -194,6 +198,7 @@ def test_larger_noise_is_not_said_to_be_the_models_error(tmp_path):
     assert "Repeat some poses" in told["action"]
 
 
+@pytest.mark.slow
 def test_a_stretched_instrument_is_named_by_the_command(tmp_path):
     lines = [line.split(",") for line in (DEMO / "demo.csv").read_text().splitlines()]
     z = lines[0].index("z_mm")
@@ -209,7 +214,7 @@ def test_a_stretched_instrument_is_named_by_the_command(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "in_order", "cause"), [("drift", False, "time"), ("slow joints", True, "open")])
-@pytest.mark.quick("slow joints-True-open")
+@pytest.mark.slow
 def test_time_is_blamed_only_where_poses_do_not_follow_it(lrm, name, in_order, cause):
     found = found_in(lrm, name, 0, in_order)
     assert found.lag_p <= LEVEL

@@ -217,6 +217,7 @@ def test_a_mesh_is_taken_in_its_unit_and_frame(lrm, arm, tmp_path, monkeypatch) 
     assert margin == ClearanceCheck(arm, Clearance(own, (Rule(("hand", "post"), 0.0),)))(np.zeros((6, 1))).margins[0, 0]
 
 
+@pytest.mark.slow
 def test_holding_efforts_are_the_slope_of_potential_energy(arm) -> None:
     """By central differences of -sum m g.p, with every mass on the joint that moves it."""
     gravity = (1.0, -2.0, -9.0)

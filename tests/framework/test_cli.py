@@ -47,6 +47,7 @@ def demo(said: Result) -> Path:
     return Path(json.loads(said.stdout)["folder"])
 
 
+@pytest.mark.slow
 def test_a_run_leaves_every_file_and_says_the_same_in_json(demo: Path) -> None:
     names = {path.name for path in demo.iterdir()}
     assert names == {
@@ -96,6 +97,7 @@ def again(demo: Path, tmp_path_factory: pytest.TempPathFactory) -> Result:
     return result
 
 
+@pytest.mark.slow
 def test_the_experiment_that_was_run_can_be_run_again(demo: Path, again: Result) -> None:
     first = json.loads((demo / "metrics.json").read_text())["error_mm"]
     second = json.loads(again.stdout)["error_mm"]
@@ -135,6 +137,7 @@ def test_check_solves_nothing_and_tells_rank_and_excitation() -> None:
     assert told["excitation_rad_or_m"]["arm.q2"]["levels"] == 3
 
 
+@pytest.mark.slow
 def test_an_earlier_run_is_kept_and_foreign_files_are_not_touched(demo: Path, tmp_path: Path) -> None:
     """And quiet says nothing."""
     folder = Path(shutil.copytree(demo, tmp_path / "run"))
@@ -147,6 +150,7 @@ def test_an_earlier_run_is_kept_and_foreign_files_are_not_touched(demo: Path, tm
     assert (folder / "measured_in_march.csv").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_fit_that_does_not_converge_ends_with_3_and_leaves_no_calibration(tmp_path: Path) -> None:
     for solver in ("ipopt", "cvxpy"):
         folder = tmp_path / solver
@@ -244,6 +248,7 @@ def _wait_for_fit(process: subprocess.Popen[str]) -> None:
     time.sleep(0.3)
 
 
+@pytest.mark.slow
 def test_a_missing_library_is_named_and_only_hurts_who_asks_for_it(tmp_path: Path) -> None:
     (tmp_path / "cvxpy.py").write_text("raise ImportError('no cvxpy on this machine')\n")
     runs = [["run", DEMO, "--out", str(tmp_path / name), *FAST] for name in ("cvxpy", "ipopt")]
@@ -299,6 +304,7 @@ def test_a_misspelt_command_is_answered_with_the_nearest() -> None:
     assert ran.exit_code == 2 and "Did you mean" not in ran.output
 
 
+@pytest.mark.slow
 def test_the_judging_of_a_run_shows_progress(tmp_path: Path) -> None:
     from armcal.run.experiment import Experiment
     from armcal.run.pipeline import calibrate
@@ -330,7 +336,7 @@ def numbers_of(text: str) -> set[str]:
 
 @pytest.mark.parametrize("columns", [24, 40, 80])
 @pytest.mark.parametrize("command", ["check", "run", "plan"])
-@pytest.mark.quick("check-24", "check-80", "plan-40")
+@pytest.mark.slow
 def test_a_narrow_terminal_gets_every_number_of_the_tables(command: str, columns: int, tmp_path: Path) -> None:
     more = {"plan": ["--poses", "12", "--set", "plan.starts=1"]}.get(command, [])
     out = [] if command == "check" else ["--out", str(tmp_path / "out.csv")]

@@ -47,6 +47,7 @@ def test_a_sound_set_is_told_to_be_sound() -> None:
     assert "minimal" not in told
 
 
+@pytest.mark.slow
 def test_45_parameters_reduce_to_34_of_which_the_published_28_are_part() -> None:
     told = asked(ALL, "--data", DATA, "--minimal", *PREFER)
     assert (len(told["free"]), told["rank"], len(told["undetermined"])) == (45, 34, 11)
@@ -70,6 +71,7 @@ def test_the_printed_block_is_a_configuration_that_can_be_solved(tmp_path: Path)
     assert "rank 34 of 34" in done.stdout
 
 
+@pytest.mark.slow
 def test_gauge_poses_and_values_are_told_apart_in_words() -> None:
     names = ("arm.mdh.alpha6", "arm.mdh.tool_rx", "arm.mdh.after2_z", "arm.mdh.d3", "arm.spring.k?")
     result = armcal("identify", ALL, "--data", DATA, "--set", free(*names))
@@ -96,6 +98,7 @@ def test_poses_that_do_not_tell_are_told_from_poses_that_cannot(tmp_path: Path) 
     assert "poses" not in {c["cause"] for c in moved}
 
 
+@pytest.mark.slow
 def test_a_gauge_that_priors_hold_is_said_and_can_be_run(tmp_path: Path) -> None:
     flags = ["--set", free("arm.mdh.d6", "arm.mdh.tool_y", "arm.mdh.theta2"), "--set"]
     flags.append('parameters.priors={"arm.mdh.d6": 1 mm}')
@@ -115,6 +118,7 @@ def test_what_stays_uncertain_is_left_out_when_asked() -> None:
     assert max(minimal["sd_ordinary_sizes"].values()) <= 0.1
 
 
+@pytest.mark.quick("--data-nowhere.csv", "--max-sd---max-sd", "--most---most", "--prefer-none of the parameters")
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -135,12 +139,14 @@ def test_bad_input_is_refused_in_words(arguments: list[str], words: list[str]) -
         assert word in result.output
 
 
+@pytest.mark.slow
 def test_quiet_prints_nothing_and_verbose_prints_every_deviation() -> None:
     assert armcal("identify", DEMO, "-q").stdout == ""
     verbose = armcal("identify", DEMO, "-v").stdout
     assert len(re.findall(r"^  arm\.[a-z0-9_.]+: [0-9.e-]+$", verbose, re.MULTILINE)) == 28
 
 
+@pytest.mark.slow
 def test_few_records_are_no_reason_to_refuse(tmp_path: Path) -> None:
     few = tmp_path / "few.csv"
     few.write_text("\n".join(Path(DATA).read_text().splitlines()[:6]) + "\n")

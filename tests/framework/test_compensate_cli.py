@@ -100,6 +100,7 @@ def test_the_commands_lead_where_the_targets_are(desk: Desk) -> None:
     assert np.abs(places(desk.answers()) - desk.places_mm).max() < 2e-6
 
 
+@pytest.mark.slow
 def test_what_was_written_can_be_predicted(desk: Desk) -> None:
     """``armcal predict`` reads the commands as they were meant."""
     told(desk.ask(desk.file()))
@@ -113,6 +114,7 @@ def test_what_was_written_can_be_predicted(desk: Desk) -> None:
     assert np.abs(read / 1000 - np.stack([expected[f"tracker.{axis}"] for axis in "xyz"], axis=1)).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_poses_by_quaternion_and_by_angles_are_the_same(desk: Desk) -> None:
     turned = Rotation.from_matrix(desk.tools[:, :3, :3])
     quaternions = np.column_stack([desk.places_mm, turned.as_quat(scalar_first=True)])
@@ -165,6 +167,7 @@ def test_joints_without_limits_are_named(desk: Desk) -> None:
     assert "no limits are known of q1, q2, q3: commands may lie beyond them. Give --within CONFIG." in result.stderr
 
 
+@pytest.mark.slow
 def test_a_pose_file_may_hold_the_targets(desk: Desk) -> None:
     """As ``armcal simulate`` writes it: its commands, in any unit, give way to those that are found."""
     rows = [[1, 2, 3, *place] for place in desk.places_mm]
@@ -207,6 +210,7 @@ def test_counts_and_pulses_stand_in_the_file_of_an_arm_with_servos(tmp_path: Pat
     assert [float(each["error_mm"]) for each in desk.answers()] == pytest.approx(away, rel=1e-4, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_what_to_tell_a_controller_of_the_nominal_arm(desk: Desk) -> None:
     """Its own inverse kinematics turns that into the commands again."""
     told(desk.ask(desk.file()))
@@ -228,6 +232,7 @@ def test_what_to_tell_a_controller_of_the_nominal_arm(desk: Desk) -> None:
     assert had == pytest.approx(1000 * np.linalg.norm(away[wrong.reached], axis=1), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_one_arm_of_two(tmp_path: Path) -> None:
     both = made_calibration(CONFIGS / "frida" / "dual_twists.yaml")
     path, out, targets = written(both, tmp_path / "c.yaml"), tmp_path / "out.csv", tmp_path / "t.csv"
@@ -296,6 +301,7 @@ def test_files_that_are_no_tables(desk: Desk, content: bytes, said: str) -> None
     assert said in told(desk.ask(path), 2)
 
 
+@pytest.mark.slow
 def test_paths_that_lead_nowhere(desk: Desk) -> None:
     targets = desk.file()
     assert "there is no such file" in told(desk.ask(desk.folder / "none.csv"), 2)
@@ -339,6 +345,7 @@ def test_options_that_do_not_fit(desk: Desk, option: list[str], said: str) -> No
     assert not desk.out.exists()
 
 
+@pytest.mark.slow
 def test_an_elastic_arm_must_know_what_hangs_on_it(desk: Desk) -> None:
     """As for a prediction; the column says it."""
     unsaid = calibration("three", "statics.payload_g=null")
@@ -350,6 +357,7 @@ def test_an_elastic_arm_must_know_what_hangs_on_it(desk: Desk) -> None:
         unsaid.compensate(desk.places_mm / 1000)
 
 
+@pytest.mark.slow
 def test_limits_of_the_plan_are_kept(tmp_path: Path) -> None:
     """Clearance too: the plan of the LRM arm has both."""
     given = made_calibration(CONFIGS / "lrm_arm" / "arm.yaml")
@@ -408,6 +416,7 @@ def grid(folder: Path, **changed) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_table_corrects_at_its_nodes_and_between_them(tmp_path: Path, arms) -> None:
     path, real, nominal = arms
     out = tmp_path / "table.csv"

@@ -54,6 +54,7 @@ def within(found: Compensator, commands: Commands) -> bool:
     return bool(((commands.joint_angles >= low - 1e-12) & (commands.joint_angles <= high + 1e-12)).all())
 
 
+@pytest.mark.quick("False-rigid", "False-three", "True-lift", "True-play", "True-rigid")
 @pytest.mark.parametrize("name", ["three", "rigid", "play", "five", "lift", "lrm", "seven"])
 @pytest.mark.parametrize("turns", [False, True])
 def test_what_the_arm_reaches_is_found_again(name: str, turns: bool) -> None:
@@ -144,7 +145,7 @@ def nearest_by_scipy(found: Compensator, position: np.ndarray, known: np.ndarray
 
 
 @pytest.mark.parametrize("name", ["three", "five", "lrm"])
-@pytest.mark.quick("five")
+@pytest.mark.slow
 def test_beyond_its_reach_the_arm_comes_as_near_as_it_can(name: str) -> None:
     found = compensator(name)
     positions = np.array([[1.5, 0.2, 0.1], [0.1, -0.2, 0.9], [-0.4, 0.5, -0.6]])
@@ -367,6 +368,7 @@ def improved(found: Compensator, cost, position: np.ndarray, starts: np.ndarray)
     return best
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, pytest.param(5, marks=pytest.mark.slow)])
 def test_the_nearest_commands_cannot_be_bettered(count: int) -> None:
     """From where they are, limits included, nor from elsewhere."""

@@ -58,6 +58,7 @@ class Pair:
         return float(one.there.mean())
 
 
+@pytest.mark.quick("1")
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 203])
 def test_all_targets_are_answered_at_their_places(count: int) -> None:
     """However they fill the lanes."""
@@ -71,7 +72,7 @@ def test_no_targets_have_no_answers() -> None:
 
 
 @pytest.mark.parametrize(("name", "turns"), [("three", False), ("rigid", False), ("lift", True), ("lrm", True)])
-@pytest.mark.quick("three-False", "rigid-False", "lift-True")
+@pytest.mark.quick("three-False")
 def test_targets_in_reach(name: str, turns: bool) -> None:
     pair = Pair(name, turns)
     assert pair.alike(pair.goal(400), QUICK) > 0.3
@@ -82,6 +83,7 @@ def test_targets_out_of_reach_end_at_the_nearest() -> None:
     assert pair.alike(pair.goal(200, stretch=5.0), NEAREST) == 0
 
 
+@pytest.mark.slow
 def test_wishes_and_joints_that_are_held() -> None:
     pair = Pair("five", False)
     goal = pair.goal(200)

@@ -54,6 +54,7 @@ def completed(words: str, number: int, then: str = "") -> list[str]:
     return done.stdout.split()
 
 
+@pytest.mark.slow
 def test_values_come_without_the_libraries_that_running_needs() -> None:
     loaded = (
         f"import sys; import os; os.write(1, ' '.join(['heavy:', *[m for m in {HEAVY} if m in sys.modules]]).encode())"

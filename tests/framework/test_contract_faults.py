@@ -146,6 +146,9 @@ def test_the_sound_twin_passes_all_that_is_known_of_its_kind(kind: str, module: 
     assert ran >= KNOWN_CHECKS[kind], [result for result in results if result.not_run]
 
 
+@pytest.mark.quick(
+    "AddsInsteadOfSubtracting", "BlockInDegrees", "IdleParameter", "ReadsMillimetres", "ResidualInMillimetres"
+)
 @pytest.mark.parametrize(("kind", "module", "name", "check"), FAULTS, ids=[name for _, _, name, _ in FAULTS])
 def test_a_planted_fault_is_found(kind: str, module: str, name: str, check: str) -> None:
     failed = [result for result in checked(kind, module, name) if result.fault]
@@ -200,6 +203,7 @@ PLUGIN_FAULTS = {
 }
 
 
+@pytest.mark.quick("missing", "misspelt", "unmarked")
 @pytest.mark.parametrize("name", PLUGIN_FAULTS)
 def test_a_fault_of_a_registration_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str) -> None:
     more, check, said = PLUGIN_FAULTS[name]
@@ -207,6 +211,7 @@ def test_a_fault_of_a_registration_is_found(monkeypatch: pytest.MonkeyPatch, tmp
     assert [result for result in failed if check in result.check and said in result.fault], failed
 
 
+@pytest.mark.slow
 def test_two_plugins_of_one_component_are_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     text = PLUGIN.format(more="")
     failed = failed_checks(registry_of(monkeypatch, tmp_path, one=text, two=text))

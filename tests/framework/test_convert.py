@@ -142,6 +142,7 @@ def rows_in(pin, section):
     return robot, pending * steps(section["tool"])
 
 
+@pytest.mark.quick("lrm-urdf")
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("arm", ARMS)
 def test_every_form_of_an_arm_stands_where_the_arm_stands_by_pinocchio_too(arm, form):
@@ -155,7 +156,7 @@ def test_every_form_of_an_arm_stands_where_the_arm_stands_by_pinocchio_too(arm, 
 
 
 @pytest.mark.parametrize("arm", ARMS)
-@pytest.mark.quick("lrm")
+@pytest.mark.slow
 def test_round_and_round_again_comes_back(arm):
     first = chain = ARMS[arm]()
     for form in ("poe", "urdf", "mdh", "craig", "urdf", "poe", "mdh"):
@@ -197,6 +198,7 @@ def arms(draw):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("examples", [8, pytest.param(40, marks=pytest.mark.slow)])
 def test_any_arm_converts(examples):
     settings(max_examples=examples, deadline=None)(given(arms())(converts))()
@@ -342,6 +344,7 @@ def armcal(*arguments):
     return CliRunner().invoke(cli, ["convert", *map(str, arguments)])
 
 
+@pytest.mark.quick("mdh")
 @pytest.mark.parametrize("form", ["poe", "mdh", "urdf"])
 def test_the_command_writes_what_reads_as_the_same_arm(tmp_path, form):
     out = tmp_path / "converted"
@@ -355,6 +358,7 @@ def test_the_command_writes_what_reads_as_the_same_arm(tmp_path, form):
     assert max(off.position_m, off.angle_rad) < EXACT
 
 
+@pytest.mark.slow
 def test_the_mount_is_said_to_be_lost_where_it_is():
     assert "the mount" not in armcal(ARM, "--to", "poe").stderr
     assert "the mount" in armcal(ARM, "--to", "mdh").stderr
@@ -411,6 +415,7 @@ def test_a_file_without_an_arm_is_refused(tmp_path, text):
         load_source(path, None, REGISTRY)
 
 
+@pytest.mark.slow
 def test_a_calibration_gives_its_calibrated_arm(demo_calibration, tmp_path):
     """The shipped demonstration, run and converted: not the nominal arm, and the one that predicts."""
     from armcal.calibration.calibration import Calibration

@@ -137,6 +137,7 @@ def slipped() -> tuple[World, list[dict[str, Any]], float]:
     return world, events, 1000 * float(np.median(np.linalg.norm(away, axis=1)))
 
 
+@pytest.mark.slow
 def test_a_decision_names_its_record_its_cost_and_where_to_go_back(slipped: Any) -> None:
     _, events, median_mm = slipped
     decision = told(events, "decision")[0]
@@ -181,6 +182,7 @@ def test_records_that_nothing_explains_say_stop_and_where_to_go_back() -> None:
     assert session.status()["last_good"]["id"] == "p20"
 
 
+@pytest.mark.slow
 def test_a_clock_that_jumps_says_what_to_do() -> None:
     session, world = begun(settings(clock={"longest_step_h": 1})), World.drawn(1)
     taken(session, [world.record()], 1)

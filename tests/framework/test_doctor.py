@@ -212,6 +212,7 @@ def test_ports_are_listed_and_never_opened(monkeypatch: pytest.MonkeyPatch, tmp_
     assert refused.state == "warning" and refused.hint
 
 
+@pytest.mark.slow
 def test_a_compiler_is_optional_and_its_faults_are_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     false = tmp_path / "cc"
     false.write_text('#!/bin/sh\necho "cc1: no such processor" >&2\nexit 3\n')

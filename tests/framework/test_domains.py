@@ -73,6 +73,7 @@ def test_local_gives_back_the_increment_that_retract_was_given(domain, seed):
     np.testing.assert_allclose(found, delta, rtol=0, atol=1e-8 if isinstance(domain, Semidefinite) else 1e-12)
 
 
+@pytest.mark.quick("Interval")
 @every_domain
 @checked
 @given(seed=seeds)
@@ -84,6 +85,7 @@ def test_retract_by_the_local_increment_arrives_at_the_value(domain, seed):
     same_value(domain, value, domain.retract(base, domain.local(base, value)), 1e-9)
 
 
+@pytest.mark.quick("Interval")
 @every_domain
 @checked
 @given(seed=seeds)
@@ -107,6 +109,7 @@ def test_the_jacobian_of_retract_is_that_of_central_differences(domain, size):
         np.testing.assert_allclose(found, numeric, rtol=0, atol=1e-9 * max(1.0, np.abs(found).max()))
 
 
+@pytest.mark.quick("Interval")
 @every_domain
 @checked
 @given(seed=seeds, size=st.sampled_from([1e-9, 0.1, 3.0, 50.0]))
@@ -124,6 +127,7 @@ def test_an_increment_never_leaves_the_domain(domain, seed, size):
         assert lowest >= -1e-13 * np.abs(value).max()
 
 
+@pytest.mark.quick("Interval", "Rotation")
 @every_domain
 def test_repeated_retraction_does_not_drift_out_of_the_domain(domain):
     random = np.random.default_rng(3)

@@ -155,7 +155,7 @@ def compared(lrm, problem, records, dense, v):
                                hessian / np.outer(size, size), rtol=0, atol=1e-6)  # fmt: skip
 
 
-@pytest.mark.quick("3-64")
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [31, 64])
 @pytest.mark.parametrize("drifts", [DRIFTS, {"theta1": (2e-3, 3.0)}, {"base_y": (1e-3, 200.0)}], ids=len)
 def test_cost_and_derivatives_are_those_of_the_dense_covariance(lrm, count, drifts):
@@ -163,6 +163,7 @@ def test_cost_and_derivatives_are_those_of_the_dense_covariance(lrm, count, drif
     compared(lrm, *posed(lrm, dataset, drifts), Dense(dataset, drifts), somewhere(2))
 
 
+@pytest.mark.slow
 def test_a_drift_over_time_is_that_over_records_by_another_clock(lrm):
     dataset = recorded(lrm, 40, 3, DRIFTS)
     clock = np.cumsum(np.random.default_rng(1).uniform(5, 60, 40)) + 1.7e9
@@ -197,6 +198,7 @@ def test_some_of_the_records_are_a_problem_of_their_own(lrm):
     compared(lrm, problem, weighted, Dense(dataset.subset(chosen), DRIFTS, weights), somewhere(8))
 
 
+@pytest.mark.slow
 def test_the_order_of_the_records_does_not_matter(lrm):
     dataset = recorded(lrm, 50, 9, DRIFTS)
     turned = dataset.subset(np.random.default_rng(4).permutation(50))
@@ -218,7 +220,7 @@ def test_where_a_sequence_starts_at_a_multiple_of_the_distance_does_not_matter(l
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.quick("True")
+@pytest.mark.slow
 def test_residuals_of_other_records_are_kriged_from_those_that_tell(lrm, weighted):
     dataset, v = recorded(lrm, 48, 11, DRIFTS), somewhere(12)
     order = np.random.default_rng(5).permutation(48)
@@ -260,6 +262,7 @@ def test_without_drift_nothing_changes(lrm):
     assert all(each.correlation is None for each in records)
 
 
+@pytest.mark.slow
 def test_a_drift_far_smaller_than_the_noise_is_none(lrm):
     dataset = recorded(lrm, 40, 17)
     still, drifting = (posed(lrm, dataset, drifts) for drifts in ({}, {"base_x": (1e-12, 5.0)}))
@@ -279,6 +282,7 @@ def test_a_drift_that_never_forgets_is_a_shift_of_the_whole_recording(lrm):
     assert fits[1][place, place] - fits[0][place, place] == pytest.approx((2e-3) ** 2, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_ipopt_and_cvxpy_agree_on_a_drifting_recording(lrm):
     problem, records = posed(lrm, recorded(lrm, 60, 19, DRIFTS))
     upper = problem.triangular_factor(problem.parameters.nominal(), records)
@@ -294,6 +298,7 @@ def test_ipopt_and_cvxpy_agree_on_a_drifting_recording(lrm):
 # ---------------------------------------------------------------- the process
 
 
+@pytest.mark.quick("20-0.01")
 @pytest.mark.parametrize("over", [0.01, 1.0, 7.0, 1e7])
 @pytest.mark.parametrize(
     "at", [np.arange(3.0, 23.0), np.array([10.0] * 4), np.array([0.0, -20.0, 35.5, 1e6, 35.5, 35.5 + 1e-9])], ids=len
@@ -312,6 +317,7 @@ def test_the_covariance_of_residuals_is_that_of_the_process_as_stated(lrm, at, o
     np.testing.assert_allclose(root @ root.T, expected, rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_drifts_over_records_and_over_time_at_once(lrm):
     """Records that both count are in one order, or refused."""
     dataset, clock = recorded(lrm, 30, 3, DRIFTS), np.cumsum(np.random.default_rng(1).uniform(5, 60, 30))
@@ -372,6 +378,7 @@ def test_intervals_that_know_of_a_drift_hold_the_truth_as_often_as_they_say(lrm)
     assert held[:, : len(PLANTED)].mean() < 0.65
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [range(400, 403), pytest.param(range(400, 600), marks=pytest.mark.slow)], ids=len)
 def test_a_drift_as_stated_is_no_error_of_the_model(lrm, seeds):
     """The test of the size of residuals warns at one of its two tails, 2.5 %, as often as chance allows (0.1 %)."""
@@ -402,6 +409,7 @@ def test_neighbours_tell_of_the_drift_so_held_out_errors_fall(lrm):
 # ---------------------------------------------------------------- robust fits
 
 
+@pytest.mark.slow
 def test_a_robust_fit_finds_outliers_on_a_drifting_arm(lrm):
     """Not the records that the drift moved, but those that lie off their neighbours."""
     dataset = recorded(lrm, 80, 21, PLANTED, noise=0.2e-3)
@@ -482,6 +490,7 @@ def test_a_matrix_cannot_drift():
     assert told.exit_code == 2 and "arm.flex.C3" in text and "matrix" in text and "Traceback" not in text
 
 
+@pytest.mark.quick("first", "nan")
 @pytest.mark.parametrize("cell", ["", "nan", "first"])
 def test_a_record_that_does_not_say_its_place_is_refused_or_set_aside(cell, tmp_path):
     lines = (CONFIGS / "demo.csv").read_text().splitlines()
@@ -494,6 +503,7 @@ def test_a_record_that_does_not_say_its_place_is_refused_or_set_aside(cell, tmp_
     assert told.exit_code == 2 or "1 set aside" in told.output, told.output
 
 
+@pytest.mark.slow
 def test_a_run_on_a_drifting_recording_states_both_errors(tmp_path):
     """The arm's base wanders while the shipped poses are measured."""
     lines = [line.split(",") for line in (CONFIGS / "demo.csv").read_text().splitlines()]
@@ -529,6 +539,7 @@ def new_recording(problem, records, fitted):
     return by.new_recording(records, np.arange(records[0].count))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("over", [0.01, 8.0])
 def test_records_count_as_their_drift_lets_them(lrm, over):
     """Against the dense covariance, and as independent ones where the drift forgets between records."""

@@ -239,6 +239,7 @@ SAME = {
 }
 
 
+@pytest.mark.quick("a joint's own axis or a matrix of rank one")
 @pytest.mark.parametrize("case", SAME)
 def test_the_same_compliance_written_otherwise_is_the_same_arm(case):
     commands = np.random.default_rng(3).uniform(-1, 1, (5, 3)) * [1.5, 1.5, 0.2]

@@ -53,6 +53,7 @@ def judged(experiment: Experiment) -> FixedParameters:
     return fixed_parameters(experiment, assemble(experiment, Stopwatch()))
 
 
+@pytest.mark.slow
 def test_what_was_held_and_is_wrong_is_recommended_and_what_is_right_is_not(folder: Path) -> None:
     """The true ``alpha3`` is 0.1 deg off the drawing, the true ``a3`` 0.04 mm."""
     found = judged(loaded(folder, OFF_THE_AXIS))
@@ -81,6 +82,7 @@ def clean(folder: Path, seed: int) -> Experiment:
     return Experiment.load(experiment.source.path, _free(experiment), folder / f"clean{seed}.csv", REGISTRY)
 
 
+@pytest.mark.slow
 def test_nothing_is_recommended_where_the_model_is_right(folder: Path) -> None:
     assert judged(clean(folder, 11)).recommended == ()
 

@@ -52,6 +52,7 @@ def test_an_error_beyond_3_percent_of_the_reach_is_bad(tmp_path: Path) -> None:
     assert code == 3 and "% of the arm's reach: the values do not describe this arm" in bad(verdict)
 
 
+@pytest.mark.slow
 def test_an_error_of_five_times_the_noise_is_bad_unless_it_is_explained(tmp_path: Path) -> None:
     """0.5 mm of noise on an arm of 0.4 m is 0.2 % of its reach."""
     code, verdict = ran(tmp_path, "measurements.tracker.noise_mm=0.07")
@@ -64,6 +65,7 @@ def test_an_error_of_five_times_the_noise_is_bad_unless_it_is_explained(tmp_path
     assert re.search(r"Residuals are [5-9]", told) and verdict["grade"] == "usable with care"
 
 
+@pytest.mark.slow
 def test_a_noise_that_nobody_stated_is_estimated_and_said(tmp_path: Path) -> None:
     """No fault is found in 0.5 mm of noise where 0.07 mm was a guess; priors are weighed against 0.5 mm."""
     code, verdict = ran(tmp_path, "measurements.tracker.noise_mm=0.07", "noise.estimate=instruments")
@@ -73,12 +75,14 @@ def test_a_noise_that_nobody_stated_is_estimated_and_said(tmp_path: Path) -> Non
     assert sd == pytest.approx(0.5 / 0.07, rel=0.15) and "State it once you know it" in told["action"]
 
 
+@pytest.mark.slow
 def test_an_estimate_beyond_four_deviations_of_its_prior_is_bad(tmp_path: Path) -> None:
     prior = 'parameters.priors={"arm.mdh.theta2": 0.2 deg}'
     code, verdict = ran(tmp_path, prior)
     assert code == 3 and "Far from the nominal values: arm.mdh.theta2" in bad(verdict) and "its prior" in bad(verdict)
 
 
+@pytest.mark.slow
 def test_a_fit_with_nearly_as_many_parameters_as_equations_is_bad(tmp_path: Path) -> None:
     """Ten records: 30 equations for 28 parameters that nothing else holds."""
     code, verdict = ran(tmp_path, "validation.holdout=0.95")
@@ -99,6 +103,7 @@ def test_what_the_parameters_take_of_the_training_errors_is_no_overfitting() -> 
     assert not any(judged(spent) for spent in (5, 30, 60, 60, 60)) and all(judged(88) for _ in range(5))
 
 
+@pytest.mark.slow
 def test_poses_are_suggested_only_where_they_are_worth_it(tmp_path: Path) -> None:
     assert is_worth_measuring([Suggestion({}, "", 0.95)]) and not is_worth_measuring([Suggestion({}, "", 0.951)])
     _, verdict = ran(tmp_path, "validation.holdout=0.85")

@@ -132,7 +132,7 @@ def test_the_gradient_is_that_of_the_cost_and_the_exact_hessian_that_of_the_grad
 
 @pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler on this machine")
 @pytest.mark.parametrize("counts", [(1, 0), (3, 2)], ids=["one record a group", "several"])
-@pytest.mark.quick("several")
+@pytest.mark.slow
 def test_compiled_and_interpreted_evaluators_agree(counts):
     data, made = touches(3, counts), bench(mean_weight=30.0)
     if not counts[1]:
@@ -190,6 +190,7 @@ def test_names_of_groups_mean_nothing_but_their_order():
     np.testing.assert_allclose(np.linalg.eigvalsh(second.hessian), np.linalg.eigvalsh(first.hessian), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_same_records_in_two_measurements_give_the_same_sums():
     data = touches(6, (4, 0))
     arms = {"left": co.the_arm(LEFT, "left")}
@@ -204,6 +205,7 @@ def test_the_same_records_in_two_measurements_give_the_same_sums():
     assert_same(summary(problem, records, values), summary(parted, both, moved))
 
 
+@pytest.mark.slow
 def test_the_unit_of_length_means_nothing():
     """A thousand times larger in everything: the same whitened residuals."""
     data, k = touches(7, (3, 0)), 1000.0
@@ -250,6 +252,7 @@ def test_a_missing_label_column_is_told():
     assert "touches.csv" in str(told.value)
 
 
+@pytest.mark.quick('d"')
 @pytest.mark.parametrize("label", ["a*", "b[0]", "c?", 'd"', "e'"])
 def test_a_label_that_is_no_name_is_told_with_its_row(label):
     data = touches(15, (2, 0))
@@ -271,6 +274,7 @@ def test_labels_that_make_the_same_key_of_different_groups_are_not_one_group():
     assert len(problem.parameters.nuisances) == 6
 
 
+@pytest.mark.slow
 def test_sockets_of_a_measurement_that_is_not_there_are_refused():
     data = touches(15, (2, 0))
     with pytest.raises(InputError, match="nosuch"):
@@ -317,12 +321,14 @@ def in_sockets():
     return co.dataset(seated())
 
 
+@pytest.mark.slow
 def test_an_arm_whose_lengths_are_all_free_does_not_know_its_size(in_sockets):
     said = refusal(one_arm(), in_sockets)
     assert UNSEEN in said
     assert "known distance" in said
 
 
+@pytest.mark.quick("known sockets")
 @pytest.mark.parametrize("way", ["known distance", "held length", "tracker", "known sockets"])
 def test_one_length_of_any_kind_tells_the_size(in_sockets, way):
     made, data = one_arm(), in_sockets
@@ -344,6 +350,7 @@ def test_one_length_of_any_kind_tells_the_size(in_sockets, way):
     assert said == "" or "does not determine" in said
 
 
+@pytest.mark.slow
 def test_a_held_length_that_a_free_one_makes_up_for_tells_nothing(in_sockets):
     """The ball's place along the flange and the last link are one length: together they may grow."""
     made = replace(one_arm(), values={"balls.centre_x": 0.03})
@@ -351,6 +358,7 @@ def test_a_held_length_that_a_free_one_makes_up_for_tells_nothing(in_sockets):
     assert UNSEEN not in refusal(replace(made, free=("left.mdh.a[123]", *LENGTHS[1:])), in_sockets)
 
 
+@pytest.mark.slow
 def test_a_length_of_one_arm_tells_the_size_of_another_that_touches_the_same_sockets():
     spots = ("front/hole_0", "front/hole_1", "shelf/hole_0")
     data = co.dataset([*seated(spots=spots), *seated(RIGHT, spots, arm="right")])
@@ -363,6 +371,7 @@ def test_a_length_of_one_arm_tells_the_size_of_another_that_touches_the_same_soc
     assert UNSEEN not in refusal(replace(both, free=[*held, "right.mdh.a[134]", "right.mdh.base_?"]), data)
 
 
+@pytest.mark.slow
 def test_a_base_that_may_move_with_its_sockets_is_named_and_not_claimed():
     """Nothing but the sockets says where the arm stands: all six ways of moving both are told."""
     steps = tuple((kind, 0.1) for kind in ("x", "y", "z", "rx", "ry", "rz"))

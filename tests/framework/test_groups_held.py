@@ -38,7 +38,7 @@ def data():
 
 
 @pytest.mark.parametrize("counts", [(1, 0), (2, 0), (3, 0), (4, 3)])
-@pytest.mark.quick("counts0", "counts3")
+@pytest.mark.quick("counts0")
 def test_where_sockets_start_does_not_depend_on_the_order_of_records(counts):
     data, made = touches(8, counts, scatter=0.05), bench()
     if not counts[1]:
@@ -54,6 +54,7 @@ def test_where_sockets_start_does_not_depend_on_the_order_of_records(counts):
         assert np.linalg.norm([found[f"balls.{key}.{a}"] for a in "xyz"] - np.array(spot)) < 0.15
 
 
+@pytest.mark.slow
 def test_a_prior_keeps_what_was_stated_and_known_sockets_stay(data):
     stated = {"balls.front/hole_0.x": 0.31}
     made = bench(values=stated, priors={"balls.front/hole_0.x": 0.01})

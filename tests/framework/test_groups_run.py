@@ -82,6 +82,7 @@ def means(data, values):
     return {key: at[keys == key].mean(axis=0) for key in np.unique(keys)}
 
 
+@pytest.mark.slow
 def test_the_arm_is_found_from_the_trained_positions(run):
     found = co.by_name(run.estimate.parameters, run.estimate.values)
     for name, sd in zip(run.estimate.names, run.estimate.deviations, strict=True):
@@ -122,6 +123,7 @@ def test_known_distances_are_judged_by_what_the_postures_say(run, data):
             assert told == pytest.approx(MM * abs(apart - DISTANCE), rel=1e-5, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_folds_that_leave_a_socket_out_still_judge_it(data, tmp_path):
     """Two postures a socket and many folds: now and then a fold trains on one, or on none."""
     few = data.subset([i for i in range(len(data)) if i % 7 < 2])
@@ -184,6 +186,7 @@ def test_a_position_to_train_on_that_is_not_there_is_refused(data, tmp_path):
     refused(written(tmp_path, data, validation={"train_groups": ["attic"]}), "attic", "shelf")
 
 
+@pytest.mark.slow
 def test_an_arm_that_does_not_know_its_size_is_refused(tmp_path):
     free = ["left.mdh.a?", "left.mdh.d?", "left.mdh.tool_z", "balls.centre_?"]
     instrument = {"distances": [], "centre_mm": [0, 0, 0]}

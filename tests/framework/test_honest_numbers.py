@@ -72,6 +72,7 @@ def larger_than_the_noise(found: Estimate) -> bool:
     return found.noise_scale**2 * found.degrees_of_freedom > chdtri(found.degrees_of_freedom, 0.025)
 
 
+@pytest.mark.slow
 def test_parameters_that_priors_hold_are_not_counted_as_spent() -> None:
     """Few poses, many parameters: the scale of data that satisfy the model is one, and nothing is found missing."""
     fits = fits_under_priors(13, 12)
@@ -188,6 +189,7 @@ def predict(folder: Path, poses: Path) -> Result:
     return armcal("predict", calibration, "--poses", str(poses), "--out", str(folder / "predicted.csv"))
 
 
+@pytest.mark.slow
 def test_a_prediction_says_when_it_lacks_what_the_calibration_knew(tilted: Path) -> None:
     told = predict(tilted, CONFIGS / "demo.csv")
     assert told.exit_code == 0 and "gravity_x, gravity_y, gravity_z" in " ".join(told.output.split())
@@ -201,6 +203,7 @@ def test_a_prediction_refuses_half_a_gravity_vector(tilted: Path) -> None:
     assert told.exit_code == 2 and "gravity has no gravity_x" in told.output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("values", "words"), [("0,0,-1", "gravity is 1.000"), ("0,0,9.81", "points up")])
 def test_gravity_columns_in_another_unit_or_sign_are_warned_of(tilted: Path, values: str, words: str) -> None:
     text = (tilted / "poses.csv").read_text().replace(",0,0,-9.81", f",{values}")
@@ -209,6 +212,7 @@ def test_gravity_columns_in_another_unit_or_sign_are_warned_of(tilted: Path, val
     assert told.exit_code == 0 and words in " ".join(told.output.split())
 
 
+@pytest.mark.slow
 def test_the_information_kept_is_that_of_the_estimate() -> None:
     """Without priors, its inverse is the covariance."""
     loaded = Experiment.load(DEMO, ["evaluator=interpreted"])

@@ -152,6 +152,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_json_on_standard_output_is_not_spoilt(measured: Path) -> None:
     command = ("run", "experiment.yaml", "--out", "result", "--json", "--set", "validation.folds=0")
     ran = armcal(*command, cwd=measured, trace="1")

@@ -95,6 +95,7 @@ def test_what_is_shown_is_told_apart_from_what_steers() -> None:
 # -- files that never end, or never begin --------------------------------------------------------------------------
 
 
+@pytest.mark.quick("zero")
 @pytest.mark.parametrize("kind", ["zero", "pipe", "directory", "large"])
 def test_what_is_no_file_is_refused_at_once(kind: str, found: Path, tmp_path: Path) -> None:
     path = {"zero": Path("/dev/zero"), "directory": tmp_path}.get(kind, tmp_path / kind)
@@ -137,6 +138,7 @@ def test_a_recording_behind_a_link_is_not_read_nor_quoted(tmp_path: Path) -> Non
 # -- outputs -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.quick("pipe")
 @pytest.mark.parametrize("kind", ["device", "link", "pipe"])
 def test_an_output_replaces_no_device_and_follows_no_link(kind: str, found: Path, tmp_path: Path) -> None:
     (tmp_path / "poses.csv").write_text("q1_deg,q2_deg,q3_deg\n0,10,20\n")
@@ -163,6 +165,7 @@ def test_an_output_replaces_no_device_and_follows_no_link(kind: str, found: Path
 COMMAND = [sys.executable, "-m", "armcal.cli"]
 
 
+@pytest.mark.slow
 def test_a_terminal_that_was_stopped_delays_no_end() -> None:
     """With less patience than it has: half a second in place of three."""
     impatient = "from armcal.cli import main, outlet; outlet.PATIENCE_S = 0.5; main.main()"

@@ -8,6 +8,13 @@ from armcal.estimate.structure import explain, identify
 from planted_arms import PLANTED, SOUND, as_rows, full, oracle_null, same_span
 
 
+@pytest.mark.quick(
+    "a joint that stood at zero",
+    "a shoulder that never moved",
+    "a turn of the tool about its own point",
+    "a twist behind the last joint",
+    "two effects of the same meaning",
+)
 @pytest.mark.parametrize("name", PLANTED)
 def test_what_is_planted_is_found_exactly_and_nothing_else(name: str) -> None:
     case = PLANTED[name]
@@ -35,6 +42,9 @@ def test_what_is_told_has_no_more_names_than_what_was_planted(name: str) -> None
     assert sorted(len(each.combination.terms) for each in found) == sorted(len(each) for each, _ in case.planted)
 
 
+@pytest.mark.quick(
+    "a planar arm", "a shoulder that stood, and what it leaves", "a tool's lengths", "an elbow arm", "three links"
+)
 @pytest.mark.parametrize("name", SOUND)
 def test_nothing_is_invented(name: str) -> None:
     case = SOUND[name]

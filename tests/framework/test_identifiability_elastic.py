@@ -53,7 +53,7 @@ ELASTIC = {
 
 
 @pytest.mark.parametrize("name", ELASTIC)
-@pytest.mark.quick("two masses in one frame")
+@pytest.mark.slow
 def test_planted_elastic_combinations_are_found_exactly(lrm: Any, name: str) -> None:
     planted, company = ELASTIC[name]
     problem, records, start, q = elastic(lrm, (*planted, *company))

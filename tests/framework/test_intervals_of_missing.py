@@ -27,6 +27,7 @@ def judged(seen: np.ndarray):
     return predictor(problem, fitted), problem.subset(records, np.arange(40, 60))
 
 
+@pytest.mark.slow
 def test_what_was_not_measured_has_no_residual() -> None:
     by, held = judged(SEEN)
     first, second = missed(by, held)["same"]

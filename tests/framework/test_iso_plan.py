@@ -108,6 +108,13 @@ def test_single_poses_are_come_to_along_each_axis_and_joints_from_the_sides_that
             assert abs(abs(way[axis]) - 0.025) < 1e-5 and np.abs(np.delete(way, axis)).max() < 1e-5
 
 
+@pytest.mark.quick(
+    "options0-give --poses N to calibrate, or --iso-cube SIZE_MM to test",
+    "options2-found '40cm', expected an edge of 1 to 10000 mm, or auto",
+    "options3-found 'nan'",
+    "options4---goal has no meaning with --iso-cube",
+    "options6-found no limits for q2",
+)
 @pytest.mark.parametrize(
     ("options", "expected"),
     [

@@ -45,6 +45,7 @@ def unchecked(folder: Path, *sets: str) -> str:
     return str(content["unchecked"])
 
 
+@pytest.mark.slow
 def test_joints_that_turn_as_commanded_are_right_and_only_those_are_driven(tmp_path: Path) -> None:
     code, text, offences = checked(tmp_path)
     assert (code, offences) == (0, {}), text
@@ -57,6 +58,7 @@ def test_joints_that_turn_as_commanded_are_right_and_only_those_are_driven(tmp_p
     assert "(shoulder_pan, shoulder_lift, elbow_flex, wrist_flex, wrist_roll: changed" in real, "it was a simulated one"
 
 
+@pytest.mark.quick("changes2-elbow_flex stands +13")
 @pytest.mark.parametrize(
     ("changes", "says"),
     [

@@ -240,6 +240,7 @@ def test_a_hundred_seeds_lie_in_their_intervals_as_often_as_they_say():
     assert np.abs(errors.mean(axis=0)).max() < 0.45, "an estimate is off by more than chance"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, 0.4])
 def test_intervals_of_predictions_have_what_the_joints_noise_makes_of_the_tip(scale: float) -> None:
     """By differences of the predicted tip: servos that are off by 0.1 deg move it, however many poses were fitted.

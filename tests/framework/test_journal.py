@@ -288,6 +288,7 @@ def test_a_journal_whose_folder_is_removed_stops(tmp_path: Path) -> None:
             journal.record("record", 2)
 
 
+@pytest.mark.slow
 def test_short_writes_are_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = os.write
     monkeypatch.setattr(os, "write", lambda descriptor, data: real(descriptor, bytes(data[:7])))
@@ -317,6 +318,7 @@ def test_the_reserve_is_of_real_bytes(tmp_path: Path) -> None:
     assert (tmp_path / BALLAST).stat().st_blocks * 512 >= BALLAST_BYTES
 
 
+@pytest.mark.slow
 def test_memory_stays_flat(tmp_path: Path) -> None:
     """What a journal holds on to does not grow with what went through it."""
     import tracemalloc

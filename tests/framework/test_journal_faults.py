@@ -129,6 +129,7 @@ def test_a_missing_sync_would_be_seen(kind: str) -> None:
     assert "lost" in faults or any("no journal" in fault for fault in faults)
 
 
+@pytest.mark.slow
 def test_a_power_loss_at_every_call() -> None:
     """The same work, stopped at each call in turn."""
     calls = 0
@@ -174,6 +175,7 @@ def test_truncation_at_every_byte_is_told() -> None:
             assert told is None or "may have been" in told.sentence
 
 
+@pytest.mark.slow
 def test_a_flip_of_every_bit_is_told() -> None:
     """All entries, or damage, or a told cut of at most the last entry: never another entry in silence."""
     held, _ = small_journal()
@@ -343,6 +345,7 @@ def under_fault(failing: Failing) -> tuple[MemoryFiles, ReplayVerifier, list[Exc
     return files, witness, raised
 
 
+@pytest.mark.quick("kinds0-28-3", "kinds1-122-3", "kinds3-28-3", "kinds4-5-1", "kinds5-5-3")
 @pytest.mark.parametrize("lasting", [1, 3, 10_000])
 @pytest.mark.parametrize(
     ("kinds", "error"),

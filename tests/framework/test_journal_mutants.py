@@ -136,6 +136,7 @@ def rewritten(folder: Path, chance: random.Random) -> None:
         file.write_bytes(text)
 
 
+@pytest.mark.quick("seeds0-watch")
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 400), marks=SLOW)])
 def test_damaged_bytes_end_with_a_sentence(kept: Path, tmp_path: Path, command: str, seeds: range) -> None:

@@ -29,6 +29,7 @@ def without_priors():
     return problem, fitted, np.hstack([slopes, drift])[rows] * scale / NOISE, known
 
 
+@pytest.mark.slow
 def test_it_is_the_posterior_without_the_record() -> None:
     """Values and drift together, each record in turn taken out of the information."""
     problem, fitted, joint, known = without_priors()

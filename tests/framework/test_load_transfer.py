@@ -87,6 +87,7 @@ def plain(place: Path) -> Path:
     return place
 
 
+@pytest.mark.slow
 def test_only_the_elastic_model_carries_over(place: Path) -> None:
     result = _run(place / "study.yaml", "study.payloads_g=[0, 250]")
     assert result.simulated and result.counts == (60, 60) and result.payloads_g == (0.0, 250.0)
@@ -203,6 +204,7 @@ def test_a_study_of_loads_that_cannot_be_is_bad_input(place: Path, setting: str,
     assert says in done.output and not (place / "out").exists()
 
 
+@pytest.mark.slow
 def test_measured_records_must_say_their_payload(plain: Path) -> None:
     data = _measured(plain, {0: 12, 66.3: 12})
     silent = plain / "silent.csv"

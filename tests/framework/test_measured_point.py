@@ -80,6 +80,7 @@ def test_the_measured_target_arrives_where_it_was_measured(tmp_path: Path) -> No
     assert np.linalg.norm(tool - target, axis=1) == pytest.approx(np.full(5, 1000 * known.distance), abs=1e-4)
 
 
+@pytest.mark.slow
 def test_where_nobody_says_which_point_arrives_the_miss_is_named(tmp_path: Path) -> None:
     found = measured(tmp_path, "three", (OFF_MM,))
     away, ran = missed(tmp_path, found, "--json")
@@ -99,6 +100,7 @@ def test_where_nobody_says_which_point_arrives_the_miss_is_named(tmp_path: Path)
     assert "--point target" not in quiet.output
 
 
+@pytest.mark.slow
 def test_a_program_and_a_server_can_ask_for_the_measured_target(tmp_path: Path) -> None:
     """What the tracker would read at their commands is the goal; without the choice it is the tool's origin."""
     off = calibration("three", OFF_MM)
@@ -152,6 +154,7 @@ def test_a_measured_body_arrives_with_its_rotation(tmp_path: Path) -> None:
     assert np.abs(away).max() < 1e-5
 
 
+@pytest.mark.slow
 def test_a_target_beyond_the_tool_is_not_called_out_of_reach(tmp_path: Path) -> None:
     """The arm's tool reaches 0.41 m from its base, a rod of 0.3 m on it reaches farther."""
     rod = ("measurements.tracker.target_mm=[300, 0, 0]",)

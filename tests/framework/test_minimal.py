@@ -150,6 +150,7 @@ def all_of_the_arm(lrm: Any) -> tuple[np.ndarray, Parameters]:
     return problem.triangular_factor(experiment.parameters.nominal(), problem.records(dataset)), experiment.parameters
 
 
+@pytest.mark.slow
 def test_the_45_parameters_of_the_arm_have_rank_34_in_plain_numpy_too(all_of_the_arm: Any) -> None:
     from chain_oracle import jacobian
 

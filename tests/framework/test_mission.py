@@ -158,6 +158,7 @@ def test_power_cuts_end_sessions_and_each_record_is_taken_once() -> None:
     assert tuple(session.taken) == mission().records.ids
 
 
+@pytest.mark.slow
 def test_frozen_errors_are_distances_between_tips_worked_out_apart(
     start: Calibration, knowing: tuple[MissionLog, Judgement]
 ) -> None:
@@ -210,6 +211,7 @@ def test_recovery_is_counted_in_records_that_arrived(start: Calibration) -> None
     assert bump.records is None and bump.seconds is None
 
 
+@pytest.mark.slow
 def test_wrong_names_missed_events_and_false_alarms_are_told_apart(start: Calibration) -> None:
     wrong = {"slip": {"kind": "joint_slipped", "joint": "arm.q2"}, "swap": {"kind": "sensor_moved"}}
     _, judgement = judged(start, Knowing(0, wrong))
@@ -340,6 +342,7 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
     return folder, json.loads(result.stdout)
 
 
+@pytest.mark.slow
 def test_the_command_leaves_every_file(short: tuple[Path, dict[str, Any]]) -> None:
     folder, told = short
     texts = {"bench.csv", "records.csv", "calibration.yaml", "truth.csv", "truth.json", "mission.csv", "mission.json"}

@@ -62,6 +62,7 @@ def series() -> dict[str, Series]:
     return refits(system, parameters, mission(), RefitSettings(records=20, every=30), "auto")
 
 
+@pytest.mark.slow
 def test_a_refit_is_where_the_estimator_of_calibrations_comes_to_rest() -> None:
     made = problem()
     records = made.subset(made.records(mission().records), before_the_slip())
@@ -73,6 +74,7 @@ def test_a_refit_is_where_the_estimator_of_calibrations_comes_to_rest() -> None:
     assert np.abs(tips[0] - tips[1]).max() < 5e-6  # m
 
 
+@pytest.mark.slow
 def test_a_refit_from_a_start_far_off_goes_to_the_next_start() -> None:
     made = problem()
     records = made.subset(made.records(mission().records), before_the_slip())

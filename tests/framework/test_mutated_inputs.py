@@ -200,12 +200,14 @@ def hunger_kib() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
+@pytest.mark.slow
 def test_the_files_are_taken_as_they_are(desk: Path) -> None:
     for case in CASES:
         code, said = call(case.command)
         assert code == 0, f"{case.command}: {said}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [45, pytest.param(135, marks=pytest.mark.slow)])
 def test_mutated_files_are_taken_or_refused_with_a_sentence(desk: Path, seeds: int) -> None:
     before = hunger_kib()

@@ -64,7 +64,7 @@ def test_a_new_package_installs_and_works(kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("package", [False, True])
 @pytest.mark.parametrize("name", ["a", "x" * LONGEST], ids=["shortest", "longest"])
-@pytest.mark.quick("shortest-False", "longest-True")
+@pytest.mark.slow
 def test_it_is_clean_whatever_its_name(name: str, package: bool, tmp_path: Path) -> None:
     need("ruff")
     for kind in KINDS:
@@ -184,6 +184,7 @@ def test_the_page_is_done_word_for_word(tmp_path: Path) -> None:
     assert tried.returncode == 0, tried.stdout
 
 
+@pytest.mark.slow
 def test_a_changed_file_is_named_by_the_calibration_that_it_made(tmp_path: Path) -> None:
     """With the same predictions it goes on and says so; with others it is refused."""
     files = files_of(page("write_a_plugin.md"))

@@ -118,6 +118,7 @@ def warnings_of_a_first_run(made: RobotFolder, seed: int) -> list[str]:
 # What is written
 
 
+@pytest.mark.slow
 def test_nothing_that_is_free_is_redundant_or_unknown(here: Path) -> None:
     rows = read_rows(here / table(here, files_of(PAGE)["arm5.csv"]))
     made = write_robot(robot_of_rows("arm5", "standard", rows), here / "arm5", REGISTRY)
@@ -219,6 +220,7 @@ def test_a_scara_slides_in_either_convention(convention: str, here: Path) -> Non
     assert "masses" not in text and "assumed" not in text
 
 
+@pytest.mark.slow
 def test_an_so101_begins_as_the_arm_of_the_shipped_configurations(here: Path) -> None:
     ran = new_robot("so101", "--up", "z", "--json")
     assert ran.exit_code == 0 and json.loads(ran.stdout)["works"], ran.output
@@ -235,6 +237,7 @@ def test_an_so101_begins_as_the_arm_of_the_shipped_configurations(here: Path) ->
     assert weights[0] == weights[1]
 
 
+@pytest.mark.slow
 def test_a_urdf_gives_limits_and_masses(here: Path) -> None:
     source = ROOT / "configs" / "mukca" / "gen3lite.urdf"
     ran = new_robot("lite", "--urdf", str(source), "--json")
@@ -361,6 +364,7 @@ def test_a_frame_that_is_tilted_is_stated_or_the_assumption_is_a_finding(here: P
     assert "The direction of gravity is not stated" not in asked.output
 
 
+@pytest.mark.slow
 def test_an_arm_without_springs_needs_no_statics(here: Path) -> None:
     rows = table(here, f"{HEADER}\n90,0,0,120\n0,200,0,0\n0,160,0,0\n")
     ran = new_robot("arm", "--dh", rows, "--convention", "standard")
@@ -384,6 +388,7 @@ def test_up_is_an_axis_or_three_numbers(up: str, expected: tuple[float, ...] | N
         assert direction(up) == pytest.approx(expected)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
 def test_somebody_at_a_terminal_is_asked_which_way_is_up_and_of_no_other_frame(here: Path) -> None:
     import pty
@@ -403,6 +408,7 @@ def test_somebody_at_a_terminal_is_asked_which_way_is_up_and_of_no_other_frame(h
 # Where the target sits
 
 
+@pytest.mark.slow
 def test_a_target_off_the_last_axis_is_stated_and_estimated(here: Path) -> None:
     """Far off the axis all three of its coordinates are found; on the axis, the last row stands in for two of them."""
     rows = table(here, files_of(PAGE)["arm5.csv"])
@@ -421,6 +427,7 @@ def test_a_target_off_the_last_axis_is_stated_and_estimated(here: Path) -> None:
     assert all(found[f"tracker.target_{axis}"]["sd"] < 1e-4 for axis in "xyz")
 
 
+@pytest.mark.slow
 def test_a_target_that_was_not_stated_is_taken_to_sit_beside_the_last_axis(here: Path) -> None:
     """Then all is free that a target beside the axis shows, as where its place was stated."""
     rows = robot_of_rows(

@@ -79,6 +79,7 @@ def compliances(out):
     return {p["name"]: (p["value"], p["sd"]) for p in springs}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "loss", [*(pytest.param(loss, marks=pytest.mark.slow) for loss in ("huber", "cauchy")), "reject"]
 )
@@ -161,6 +162,7 @@ def test_components_reach_every_output(repository, tmp_path):
     Calibration.load(tmp_path / "out" / "calibration.yaml")
 
 
+@pytest.mark.slow
 def test_noise_for_each_axis_is_one_number_thrice_or_a_list(repository):
     def judged(*overrides):
         config = repository / "configs" / "lrm_arm" / "demo.yaml"

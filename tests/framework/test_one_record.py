@@ -104,6 +104,7 @@ def test_small_systems_are_solved_as_numpy_does_and_indefinite_ones_too() -> Non
     assert np.array_equal(before, covariance)
 
 
+@pytest.mark.quick("8-interpreted")
 @pytest.mark.parametrize("evaluator", EVALUATORS)
 @pytest.mark.parametrize("count", [3, 8, 11])
 def test_a_few_records_at_once_are_what_they_are_one_by_one(evaluator: EvaluatorChoice, count: int) -> None:

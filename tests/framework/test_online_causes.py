@@ -59,6 +59,7 @@ def tilted(arm: Loaded) -> None:
 CAUSES = {"link_bent": bent, "payload_changed": loaded, "gravity_tilted": tilted}
 
 
+@pytest.mark.quick("link_bent", "payload_changed")
 @pytest.mark.parametrize("kind", CAUSES)
 def test_a_cause_is_named_with_its_size_and_no_joint_is(kind: str) -> None:
     arm, session = Loaded.drawn(2), begun()
@@ -91,6 +92,7 @@ def calibration_of(text: str) -> Calibration:
         return Calibration.load(path)
 
 
+@pytest.mark.slow
 def test_what_no_decision_has_opened_is_not_published() -> None:
     session = begun()
     session.take(World.drawn(1).record(), 1)

@@ -208,7 +208,7 @@ def _recoveries(seeds: range, outliers: float, joints: tuple[int, ...] = (1, 2, 
 
 @pytest.mark.parametrize("seeds", [1, pytest.param(25, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("outliers", [0.0, 0.05])
-@pytest.mark.quick("0.05-1")
+@pytest.mark.slow
 def test_a_slipped_joint_is_named_and_recovered(seeds: int, outliers: float) -> None:
     found = _recoveries(range(seeds), outliers)
     named, soon = np.mean([r.named for r in found]), np.mean([r.first <= 10 for r in found])
@@ -271,6 +271,7 @@ BUMPS = {
 late = pytest.mark.xfail(reason="measured over 15 runs: decided within 5 records in 93 %, within 7 in all")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("bump", "seeds"),
     [

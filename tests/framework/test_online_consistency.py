@@ -141,6 +141,7 @@ def test_the_recalibrator_notices(lie: str) -> None:
     print(f"\n{lie}: first decision after {', '.join(f'{n} ({kind})' for n, kind in after)}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runs", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_the_recalibrator_stays_calm_where_all_is_as_stated(runs: int) -> None:
     recalibrator = begun()

@@ -34,6 +34,7 @@ class Study:
         return cls(sum(run.rejected for run in runs), records * len(runs), decisions, levels)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rows", "trained"), [(3, 5), (6, 10), (12, 10)])
 def test_good_records_after_few_are_believed(rows: int, trained: int, tmp_path: Path) -> None:
     """Of 120, chance rejects two or more in one study of a hundred; a noise taken for well known rejects 35."""
@@ -56,6 +57,7 @@ def test_the_share_of_good_records_rejected_is_the_nominal_one(noise: float, tmp
     assert np.mean(shares) <= 2 * NOMINAL
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [40, pytest.param(108, marks=pytest.mark.slow)])
 def test_a_board_of_many_corners_is_taken_whatever_the_number_of_records(rows: int, tmp_path: Path) -> None:
     """6 records determine no covariance of 40 rows, nor of the 108 of a 6x9 board."""

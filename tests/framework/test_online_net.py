@@ -83,6 +83,7 @@ def test_a_filter_that_is_stuck_is_taken_over_by_a_refit(monkeypatch: pytest.Mon
     assert recalibrator.state.health.level in ("watch", "nominal")
 
 
+@pytest.mark.slow
 def test_without_a_net_it_stays_stuck(monkeypatch: pytest.MonkeyPatch) -> None:
     recalibrator, arm = _blind(begun(settings(net=False)), monkeypatch), World.drawn(5, outliers=0.05)
     arm.moved("arm.mdh.theta2", np.radians(14.4))
@@ -99,6 +100,7 @@ def test_off_in_a_file_of_settings_leaves_it_out(tmp_path: Path) -> None:
     assert load_settings(None).net is True
 
 
+@pytest.mark.slow
 def test_a_net_that_was_interrupted_goes_on_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     one, arm = _blind(begun(), monkeypatch), World.drawn(6, outliers=0.05)
     arm.moved("arm.mdh.theta2", np.radians(14.4))
@@ -118,6 +120,7 @@ def test_a_net_that_was_interrupted_goes_on_to_the_last_bit(monkeypatch: pytest.
     assert json.dumps(other.snapshot()) == snapshots[27][0]
 
 
+@pytest.mark.slow
 def test_a_state_of_an_earlier_version_starts_an_empty_net() -> None:
     recalibrator = begun(settings(net=False))
     earlier = recalibrator.snapshot()
@@ -128,6 +131,7 @@ def test_a_state_of_an_earlier_version_starts_an_empty_net() -> None:
     assert recalibrator.digest() == digest
 
 
+@pytest.mark.slow
 def test_records_that_only_the_net_sees_change_its_digest() -> None:
     recalibrator, arm = begun(), World.drawn(7)
     _run(recalibrator, arm, 12)
@@ -136,6 +140,7 @@ def test_records_that_only_the_net_sees_change_its_digest() -> None:
     assert recalibrator.digest() != before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("outliers", "count"),
     [(0.0, 100), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((0.2, 100), (0.0, 2500), (0.2, 2500)))],

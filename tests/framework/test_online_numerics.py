@@ -53,6 +53,7 @@ def still(seed: int, count: int, **given) -> tuple[World, list[dict[str, float]]
     return arm, records
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("updates", "walk"),
     [
@@ -164,6 +165,7 @@ def test_a_clock_that_jumps_ahead_counts_as_its_longest_step(ahead: float, warm)
     assert beliefs[0] == beliefs[1]
 
 
+@pytest.mark.slow
 def test_a_time_that_is_no_number_counts_as_none(warm) -> None:
     recalibrator, snapshot, arm = warm
     recalibrator.restore(snapshot)
@@ -226,6 +228,7 @@ def test_a_restored_state_goes_on_as_if_nothing_had_been(estimator: str) -> None
             assert other.digest() == digests[i], (k, i)
 
 
+@pytest.mark.slow
 def test_both_evaluators_agree() -> None:
     one, other = begun_setup(), begun_setup(evaluator="interpreted")
     if one.problem.backend != "compiled":
@@ -371,6 +374,7 @@ def stiff(setup: FilterSetup, seed: int) -> World:
     return arm
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bounded", [False, True])
 def test_the_filter_ends_where_a_batch_of_all_records_does(bounded: bool) -> None:
     compliance = {"compliance": SMALL} if bounded else {}

@@ -73,6 +73,7 @@ def decisions_of(records: list[Incoming]) -> list[Mapping[str, Any]]:
     return told(events, "decision")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "count"), [(0, 130), *(pytest.param(s, 1000, marks=pytest.mark.slow) for s in range(3))]
 )
@@ -84,6 +85,7 @@ def test_exchanged_records_are_no_slip(seed: int, count: int) -> None:
     assert [event for event in decisions_of(records) if event["kind"] != "unexplained"] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size_mm", [500, *(pytest.param(s, marks=pytest.mark.slow) for s in (30, 100, 300))])
 def test_outliers_of_any_size_change_nothing(size_mm: int) -> None:
     arm = World.drawn(5, outliers=0.05, outlier=size_mm / 1000)

@@ -143,6 +143,7 @@ def test_nothing_slow_is_seen_where_all_is_as_stated() -> None:
     assert [event["kind"] for event in decisions] == []
 
 
+@pytest.mark.slow
 def test_a_restored_state_goes_on_with_its_evidence() -> None:
     arm, session = World.drawn(1, wanders=False), begun(settings(process_noise={}))
     for k in range(1, 30):

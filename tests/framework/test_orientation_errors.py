@@ -50,6 +50,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+@pytest.mark.slow
 def test_a_run_states_them_in_every_table_and_file(folder: Path) -> None:
     done = armcal("run", folder / "arm.yaml", "--out", folder / "run")
     assert done.exit_code == 0, done.output
@@ -78,6 +79,7 @@ def test_a_run_states_them_in_every_table_and_file(folder: Path) -> None:
     assert len(set(cells)) == 1 and cells[0] == 9, "as many cells as headings"
 
 
+@pytest.mark.slow
 def test_a_prediction_says_how_far_position_and_orientation_may_be_off(folder: Path) -> None:
     """Judged on another recording: nine of ten within their angle, 19 of 20 within their radius."""
     fresh = armcal("simulate", folder / "arm.yaml", "--set", "simulation.seed=9", "--out", folder / "fresh.csv")

@@ -108,6 +108,7 @@ class TestPulsesThatNoServoBears:
         comments = [line.split("#")[1] for line in TOWER_SERVOS.splitlines() if "#" in line]
         assert [line.split("#")[1] for line in arm.servos.read_text().splitlines() if "#" in line] == comments
 
+    @pytest.mark.slow
     def test_nothing_outside_a_servos_range_is_sent_or_written(self, tmp_path: Path) -> None:
         """The true servo needs longer pulses than it bears for its last degrees: its table ends there, and says so."""
         arm = OwnArm(tmp_path, TOWER)
@@ -178,6 +179,7 @@ def dangers(arm: OwnArm, plan: Path, *sets: str) -> dict[str, Any]:
 
 
 class TestUncheckedWiring:
+    @pytest.mark.slow
     def test_exchanged_plugs_are_not_driven_until_they_are_put_right_and_seen(self, tmp_path: Path) -> None:
         """The plan keeps within the limits of b and c; exchanged, b is driven 25 degrees beyond its own."""
         arm = OwnArm(tmp_path, POST)
@@ -280,6 +282,7 @@ class TestFirstAndLastMotion:
 
 
 class TestWhatIsMissingIsNoSuccess:
+    @pytest.mark.slow
     def test_a_plan_of_which_some_poses_could_not_be_measured(self, post: Bench) -> None:
         """None comes to stand as still as is asked for."""
         arm, clock = post.arm, post.clock

@@ -67,6 +67,7 @@ def test_what_the_option_cannot_say_is_bad_input(text: str) -> None:
     assert "--parallel" in done.output and "dask:ADDRESS" in done.output
 
 
+@pytest.mark.quick("interpreted")
 @pytest.mark.parametrize("evaluator", ["interpreted", "compiled"])
 def test_a_problem_sent_elsewhere_gives_the_same_bits(lrm, evaluator: str) -> None:
     _, problem, dataset = _setup(lrm, evaluator)
@@ -84,11 +85,12 @@ def test_a_problem_sent_elsewhere_gives_the_same_bits(lrm, evaluator: str) -> No
 @pytest.mark.parametrize(
     "executor", [Workers("loky", 2), Workers("loky", 3), Workers("threading", 2), Automatic(worth_s=0.0), Automatic()]
 )
-@pytest.mark.quick("executor0", "executor2", "executor3")
+@pytest.mark.slow
 def test_every_backend_gives_the_same_bits(lrm, executor: Executor) -> None:
     assert np.array_equal(_fold_errors(lrm, executor), _fold_errors(lrm, None))
 
 
+@pytest.mark.slow
 def test_the_order_of_folds_does_not_change_a_fold(lrm) -> None:
     """No fit warms another's equilibria."""
     experiment, problem, dataset = _setup(lrm)
@@ -104,6 +106,7 @@ def _who(task: float) -> tuple[float, int]:
     return task, os.getpid()
 
 
+@pytest.mark.slow
 def test_results_come_in_the_order_of_the_tasks_from_several_processes_and_progress_ends_at_one() -> None:
     told: list[float] = []
     found = Workers("loky", 2).map(_who, list(range(8)), told.append)
@@ -112,6 +115,7 @@ def test_results_come_in_the_order_of_the_tasks_from_several_processes_and_progr
     assert told == sorted(told) and told[-1] == 1.0
 
 
+@pytest.mark.slow
 def test_work_that_lasts_is_handed_over_and_work_that_does_not_stays() -> None:
     told: list[float] = []
     shared = Automatic(worth_s=0.3).map(_who, list(range(8)), told.append)
@@ -148,6 +152,7 @@ def _die(task: int) -> int:
     return task
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_is_said_and_the_next_work_finds_new_ones() -> None:
     with pytest.raises(ArmcalError, match="worker process ended"):
         Workers("loky", 2).map(_die, list(range(4)))
@@ -167,6 +172,7 @@ def _locked(task: threading.Lock) -> bool:
     return task.locked()
 
 
+@pytest.mark.slow
 def test_starts_of_one_fit_can_be_spread(lrm) -> None:
     experiment, problem, dataset = _setup(lrm, "interpreted", "estimator.starts=4", "estimator.seed=2")
     start = experiment.parameters.nominal()
@@ -220,6 +226,7 @@ def test_a_dask_cluster_of_two_processes_gives_the_same_bits(lrm) -> None:
             executor.map(_refuse, list(range(6)))
 
 
+@pytest.mark.slow
 def test_a_cluster_that_is_not_there_is_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason='needs: pip install "dask[distributed]"')
     monkeypatch.setattr(parallel, "_DASK_TIMEOUT", "1s")
@@ -236,6 +243,7 @@ def test_a_cluster_library_that_is_missing_is_named(
         parse_executor(backend).map(_refuse, [1])
 
 
+@pytest.mark.slow
 def test_ctrl_c_stops_all_workers(tmp_path: Path) -> None:
     long = ["study", str(CONFIGS / "study_demo.yaml"), "--out", str(tmp_path / "s"), "--parallel", "2"]
     long += ["--set", "study.repeats=1000", "--set", "evaluator=interpreted"]
@@ -301,6 +309,7 @@ def hostile(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
     [

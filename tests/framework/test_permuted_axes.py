@@ -45,12 +45,14 @@ def test_right_data_are_not_suspected(demo: Prepared) -> None:
     assert told(demo, demo.dataset) == ()
 
 
+@pytest.mark.quick("q2")
 @pytest.mark.parametrize("joint", ["q1", "q2", "q3", "q4", "q5", "q6"])
 def test_a_joint_that_turns_the_other_way_is_named(demo: Prepared, joint: str) -> None:
     sides = {f"arm__{joint}": f"-arm.{joint}", f"arm__approach.{joint}": f"-arm.approach.{joint}"}
     assert told(demo, changed(demo.dataset, **sides)) == (f"the sign of {joint} reversed",)
 
 
+@pytest.mark.quick("columns2-the signs of x and z reversed")
 @pytest.mark.parametrize(
     ("columns", "words"),
     [
@@ -74,6 +76,7 @@ def test_exchanged_joints_are_named(demo: Prepared) -> None:
     assert told(demo, changed(demo.dataset, **exchanged)) == ("q2 and q5 exchanged",)
 
 
+@pytest.mark.quick("tracker.-0.1-positions 10 times as large")
 @pytest.mark.parametrize(
     ("channels", "factor", "words"),
     [
@@ -92,6 +95,7 @@ def test_few_records_tell_nothing(demo: Prepared) -> None:
     assert told(demo, mixed.subset(range(10))) == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turning", [True, False])
 def test_a_base_that_may_turn_is_no_mixup(turning: bool) -> None:
     """About x, say, as a tracker lies on its side: the fit can do that by itself, where it may."""
@@ -101,6 +105,7 @@ def test_a_base_that_may_turn_is_no_mixup(turning: bool) -> None:
     assert found == (() if turning else ("(x, z, -y) taken for (x, y, z)",))
 
 
+@pytest.mark.slow
 def test_measured_data_are_not_suspected_and_a_flipped_joint_is_named(shared_data: Path) -> None:
     for option in ("option1", "option3", "option5"):
         config = DEMO.with_name(f"{option}.yaml")
@@ -151,6 +156,7 @@ def test_a_fit_against_a_wall_ends(demo: Prepared, monkeypatch: pytest.MonkeyPat
     assert len(asked) < 1000
 
 
+@pytest.mark.slow
 def test_folds_of_a_lost_fit_are_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     experiment = Experiment.load(DEMO, ["estimator.max_iterations=2"])
     monkeypatch.setattr("armcal.run.pipeline.cross_validate", lambda *parts: pytest.fail("a fold was tried"))
@@ -159,6 +165,7 @@ def test_folds_of_a_lost_fit_are_not_tried(monkeypatch: pytest.MonkeyPatch) -> N
     assert "axes, units and frame" in result.verdict.findings[0].action
 
 
+@pytest.mark.slow
 def test_a_lost_fit_whose_residuals_cannot_be_taken_says_what_to_look_at(monkeypatch: pytest.MonkeyPatch) -> None:
     def nowhere(*parts: object) -> None:
         raise NotConvergedError("the elastic equilibrium of a record did not settle.")

@@ -6,6 +6,7 @@ import csv
 from pathlib import Path
 
 import numpy as np
+import pytest
 import yaml
 from armcal.run.experiment import Experiment
 from armcal.run.plan import make_plan
@@ -62,6 +63,7 @@ def test_a_joint_at_an_end_of_its_range_comes_from_inside() -> None:
     assert reachable(poses, signs, limits).tolist() == [[-1, -1, 1, -1, 1, 1]]
 
 
+@pytest.mark.slow
 def test_a_measuring_run_comes_from_the_planned_sides(tmp_path: Path) -> None:
     arm = OwnArm(tmp_path, POST)
     arm.run.plan.write_text(

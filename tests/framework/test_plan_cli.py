@@ -90,6 +90,7 @@ def test_predicted_deviations_are_those_that_a_run_finds(tmp_path: Path) -> None
     assert 0.7 < np.median(ratios) < 1.4
 
 
+@pytest.mark.slow
 def test_a_plan_reads_back_as_candidates_and_as_given_records(tmp_path: Path) -> None:
     first, second, third = (tmp_path / f"{name}.csv" for name in "abc")
     before = planned(first, "--poses", "40")
@@ -118,6 +119,7 @@ def test_given_records_may_be_a_list_of_ids(tmp_path: Path) -> None:
     assert answers[0]["ids"] == answers[1]["ids"]
 
 
+@pytest.mark.slow
 def test_the_bound_holds_over_other_plans_and_is_told(tmp_path: Path) -> None:
     told = planned(tmp_path / "plan.csv", "--poses", "30")
     other = planned(tmp_path / "other.csv", "--poses", "30", "--goal", "A")
@@ -128,6 +130,7 @@ def test_the_bound_holds_over_other_plans_and_is_told(tmp_path: Path) -> None:
     assert "upper bound" in spoken and "D-efficiency at least 9" in spoken and "least determined" in spoken
 
 
+@pytest.mark.slow
 def test_order_approach_and_travel_time_belong_together(tmp_path: Path) -> None:
     out, slow = tmp_path / "plan.csv", tmp_path / "slow.csv"
     told = planned(out, "--poses", "30")
@@ -145,6 +148,7 @@ def test_order_approach_and_travel_time_belong_together(tmp_path: Path) -> None:
     assert set(half["ids"]) == set(told["ids"])
 
 
+@pytest.mark.slow
 def test_by_torque_servos_stay_cooler_and_the_poses_are_the_same(tmp_path: Path) -> None:
     plans = {
         order: planned(tmp_path / f"{order}.csv", "--poses", "30", "--order", order)
@@ -167,6 +171,7 @@ def test_poses_are_drawn_until_enough_keep_a_clearance_that_few_keep() -> None:
     assert len(pool.dataset) == 1500
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["grid", "continuous"])
 def test_limits_and_clearance_are_kept(tmp_path: Path, kind: str) -> None:
     out = tmp_path / "plan.csv"
@@ -263,6 +268,7 @@ def test_an_out_that_cannot_be_written_is_refused_before_any_work(tmp_path: Path
         assert result.exit_code == 2 and str(place) in result.output.replace("\n", "")
 
 
+@pytest.mark.slow
 def test_a_plan_about_a_calibration_takes_its_values(tmp_path: Path, demo_run: Path) -> None:
     nominal = planned(tmp_path / "n.csv", "--poses", "30")
     about = planned(tmp_path / "c.csv", "--poses", "30", "--calibration", str(demo_run / "calibration.yaml"))
@@ -270,7 +276,7 @@ def test_a_plan_about_a_calibration_takes_its_values(tmp_path: Path, demo_run: P
 
 
 @pytest.mark.parametrize("command", ["check", "identify", "plan", "run", "study"])
-@pytest.mark.quick("check", "plan")
+@pytest.mark.quick("check")
 def test_another_data_file_wins_over_an_absolute_path_that_leads_nowhere(command: str, tmp_path: Path) -> None:
     """The configured path is not even looked at."""
     away = f"data.path={tmp_path / 'away' / 'records.csv'}"

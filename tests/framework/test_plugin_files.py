@@ -102,6 +102,7 @@ def test_a_folder_gives_all_its_files_but_tests_and_hidden_ones(tmp_path: Path) 
     assert names == ["one", "two"]
 
 
+@pytest.mark.slow
 def test_a_component_goes_to_another_process_and_back(tmp_path: Path) -> None:
     made = registry(written(tmp_path / "wheel.py")).find("effect", "gear").load()({}, ["q1"])
     code = (

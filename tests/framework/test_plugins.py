@@ -79,6 +79,7 @@ NOT_RUN = {
 """Why checks of a plugin are not run: it reads folders or recordings, or a bus of its own, and has tests of its own."""
 
 
+@pytest.mark.slow
 def test_our_plugins_keep_the_contract() -> None:
     ran = armcal("plugins", "check", "--json")
     reports = {report["plugin"]: report for report in json.loads(ran.stdout)["plugins"]}
@@ -107,6 +108,7 @@ def test_a_check_tells_how_many_ran_and_why_one_did_not() -> None:
     assert lines[-1] == f"contact: {len(lines) - 4} of {len(lines) - 4} checks passed, 3 not run."
 
 
+@pytest.mark.slow
 def test_checking_all_names_the_one_that_is_broken(tmp_path: Path) -> None:
     write_plugin(tmp_path, "import", BROKEN["import"][0])
     code = "from importlib.metadata import EntryPoint as E; import armcal.cli.plugins as p; d = p.discover; "
@@ -239,6 +241,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
+@pytest.mark.slow
 def test_an_installed_plugin_is_listed_and_checked(installed: Path) -> None:
     assert "scara" not in armcal("plugins", "list").stdout
     listed = armcal("plugins", "list", path=installed)
@@ -248,6 +251,7 @@ def test_an_installed_plugin_is_listed_and_checked(installed: Path) -> None:
     assert "springs on it settle under gravity" in found.stdout
 
 
+@pytest.mark.slow
 def test_an_installed_arm_is_calibrated_from_yaml(installed: Path, tmp_path: Path) -> None:
     for name in ("experiment.yaml", "truth.yaml"):
         shutil.copy(SCARA / name, tmp_path)
@@ -337,6 +341,7 @@ QUICKLY_BROKEN = ("import", "exits")
 """The others break in the same place."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [n if n in QUICKLY_BROKEN else pytest.param(n, marks=pytest.mark.slow) for n in BROKEN]
 )
@@ -374,6 +379,7 @@ def test_asking_for_a_broken_plugins_component_is_refused(tmp_path: Path, experi
     assert "Traceback" not in ran.stderr
 
 
+@pytest.mark.slow
 def test_a_component_that_does_not_import_is_refused(tmp_path: Path, experiment: Path) -> None:
     text = GOOD.replace("NAME", "lost").replace("TARGET", "no_such_module_of_anybody:Model")
     write_plugin(tmp_path, "late", text)
@@ -396,6 +402,7 @@ def test_two_plugins_of_one_name_are_both_named(monkeypatch: pytest.MonkeyPatch,
         registry.find("model", "arm")
 
 
+@pytest.mark.slow
 def test_plugins_that_share_a_name_keep_their_components_apart(tmp_path: Path) -> None:
     write_plugin(tmp_path, "twin", GOOD.replace("NAME", "arm").replace("TARGET", "twin_module:Arm"))
     (tmp_path / "broken_twin-1.0.dist-info" / "entry_points.txt").write_text("[armcal]\nmdh = broken_twin\n")

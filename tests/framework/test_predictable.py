@@ -70,6 +70,7 @@ def arm(lrm):
     return Residuals(*fitted(lrm))
 
 
+@pytest.mark.slow
 def test_noise_is_not_predicted(lrm):
     small = Residuals(*fitted(lrm, 60))
     found = [small.judged(seed=seed) for seed in range(20)]
@@ -77,6 +78,7 @@ def test_noise_is_not_predicted(lrm):
     assert max(one.share for one in found) < 0.1, "shares of noise are those of records held out"
 
 
+@pytest.mark.slow
 def test_neither_uneven_noise_nor_wild_records_are_a_dependence(lrm):
     small, found = Residuals(*fitted(lrm, 60)), []
     q = small.dataset.column("arm.q2")
@@ -88,6 +90,7 @@ def test_neither_uneven_noise_nor_wild_records_are_a_dependence(lrm):
     assert sum(one.above_chance for one in found) <= 1
 
 
+@pytest.mark.slow
 def test_the_share_is_that_of_what_was_planted(arm):
     """An error that changes within 30 degrees, as of a gear: more than noise, of q2 and q4 alone."""
     q = {joint: arm.dataset.column(f"arm.{joint}") for joint in ("q2", "q4")}
@@ -100,6 +103,7 @@ def test_the_share_is_that_of_what_was_planted(arm):
     assert found == arm.judged(planted)
 
 
+@pytest.mark.quick("time")
 @pytest.mark.parametrize("kind", ["time", "temperature", "approach"])
 def test_what_is_no_joint_is_named_too(arm, kind):
     count = np.arange(COUNT)
@@ -114,6 +118,7 @@ def test_what_is_no_joint_is_named_too(arm, kind):
     assert found.carriers[0].name == ("q3" if kind == "approach" else "")
 
 
+@pytest.mark.slow
 def test_a_few_records_do_not_make_a_dependence(arm):
     """Three of them, 40 standard deviations off to one side, at angles of q1 beside each other."""
     near = np.argsort(arm.dataset.column("arm.q1"))[:3]
@@ -123,6 +128,7 @@ def test_a_few_records_do_not_make_a_dependence(arm):
     assert not found.above_chance or found.share < 0.05
 
 
+@pytest.mark.slow
 def test_of_too_few_poses_nothing_is_known_however_often_they_were_repeated(lrm):
     """Each pose was measured four times, and errs alike each time: no other pose says so."""
     parts = fitted(lrm, COUNT, FEWEST_POSES - 1)

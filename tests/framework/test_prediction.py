@@ -64,6 +64,7 @@ def drifting():
     return drifting_problem()
 
 
+@pytest.mark.slow
 def test_covariances_are_those_of_dense_gaussian_conditioning(drifting) -> None:
     """Values and innovations as one Gaussian vector: its posterior after the training, mapped to new records."""
     loaded, dataset, problem, records, train, held, fitted = drifting
@@ -148,6 +149,7 @@ def test_a_record_counts_its_own_noise() -> None:
     assert (deviations > 1).all() and (deviations < 1.5).all()
 
 
+@pytest.mark.quick("100000-values0", "100000-values2")
 @pytest.mark.parametrize("values", [(1, 1, 1), (1, 1, 0), (1, 0, 0), (1, 0.5, 0.1), (1, 0.2, 0.2), (1, 0.03, 0.0)])
 @pytest.mark.parametrize("freedom", [12, 100_000])
 def test_a_radius_holds_its_share(values: tuple[float, ...], freedom: int) -> None:
@@ -309,6 +311,7 @@ def predicted(folder: Path, *options: str, calibration: Path | None = None, pose
     return result, {row["pose_id"]: row for row in csv.DictReader(out.open())} if out.exists() else {}
 
 
+@pytest.mark.slow
 def test_the_recording_that_is_kept_gives_the_residuals_of_the_run(recording: Path) -> None:
     measured = {row["pose_id"]: row for row in csv.DictReader((recording / "poses.csv").open())}
     result, rows = predicted(recording, "--recording", "calibrated")
@@ -329,6 +332,7 @@ def test_a_new_recording_is_predicted_at_rest_and_with_wider_intervals(recording
     assert np.median(wider) > 1.2
 
 
+@pytest.mark.slow
 def test_beyond_the_recording_the_drift_is_forgotten(recording: Path, tmp_path: Path) -> None:
     """The same pose, at more and more distant places after the last record."""
     rows = list(csv.reader((recording / "poses.csv").open()))
@@ -350,6 +354,7 @@ def test_beyond_the_recording_the_drift_is_forgotten(recording: Path, tmp_path: 
     assert np.allclose(np.divide(shifts[1:5], shifts[:4]), np.exp(-1), rtol=1e-6) and shifts[-1] == 0
 
 
+@pytest.mark.slow
 def test_python_gives_what_the_command_gives(recording: Path) -> None:
     calibration = Calibration.load(recording / "run" / "calibration.yaml")
     loaded = Experiment.load(DEMO, [FREE, *DRIFTING], recording / "poses.csv")
@@ -403,6 +408,7 @@ def test_what_is_kept_predicts_as_the_fit_itself(extra: tuple[str, ...], tmp_pat
         assert np.allclose(found.radii["tracker"], spreads[0].radius(), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_columns_that_the_run_named_are_known_to_its_predictions(recording: Path, tmp_path: Path) -> None:
     text = (recording / "poses.csv").read_text().replace("pose_id", "number", 1)
     other = tmp_path / "other.csv"
@@ -435,6 +441,7 @@ def test_predictions_know_when_they_cannot_say_how_good_they_are(recording: Path
         assert wrong.exit_code == 2 and "NAME=COLUMN" in wrong.output and "Traceback" not in wrong.output
 
 
+@pytest.mark.slow
 def test_a_calibration_without_drift_says_that_recordings_are_alike(demo_calibration: Path, tmp_path: Path) -> None:
     result, within = predicted(tmp_path, "--recording", "calibrated", calibration=demo_calibration, poses=POSES)
     assert result.exit_code == 0 and "no parameter drifts" in " ".join(result.output.split())

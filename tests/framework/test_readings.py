@@ -93,6 +93,7 @@ def test_a_prediction_of_pixels_says_how_many_it_may_be_off(place: Path) -> None
     assert np.median(found["tracker.radius95_mm" if "tracker.radius95_mm" in found else "radius95_mm"]) < 2
 
 
+@pytest.mark.slow
 def test_a_quaternion_has_the_noise_of_its_rotation_vector(place: Path) -> None:
     read = simulated("records.csv", POSE, 1, 60)
     lengths = np.linalg.norm([read[f"q{part}"] for part in "wxyz"], axis=0)

@@ -64,6 +64,7 @@ def estimate(folder: Path) -> Any:
     return yaml.safe_load((folder / "calibration.yaml").read_text())["parameters"]
 
 
+@pytest.mark.slow
 def test_the_stream_is_json_lines_and_the_calibration_can_be_used(whole: Path, tmp_path: Path) -> None:
     told = [json.loads(line) for line in (whole / "stdout").read_text().splitlines()]
     assert told == [json.loads(line) for line in (whole / "events.jsonl").read_text().splitlines()]
@@ -118,6 +119,7 @@ def test_fifty_kills_at_any_moment_of_a_long_run_change_no_bit(calibration: Path
     assert armcal("replay", folder).exit_code == 0
 
 
+@pytest.mark.slow
 def test_a_running_command_is_asked_and_told(calibration: Path, config: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     command = ["recalibrate", calibration, "--from", "-", "--config", config, "--out", folder]

@@ -283,6 +283,7 @@ def test_the_pace_of_what_is_written(tmp_path: Path) -> None:
     assert len(found) == 4
 
 
+@pytest.mark.slow
 def test_the_real_source_in_the_real_loop(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "a.csv").write_text(table(10))

@@ -53,7 +53,7 @@ def test_a_closed_standard_output_does_not_stop_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-@pytest.mark.quick("15")
+@pytest.mark.slow
 def test_signals_and_control_of_a_running_process(tmp_path: Path, number: signal.Signals) -> None:
     folder = tmp_path / "out"
     (tmp_path / "poses.csv").write_text(table(30))
@@ -101,6 +101,7 @@ def test_a_thousand_kills_lose_nothing_and_repeat_nothing(tmp_path: Path) -> Non
     killed(tmp_path, 1000, 12000)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kills", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_what_was_acknowledged_to_a_sender_outlasts_kills_and_counts_once(tmp_path: Path, kills: int) -> None:
     folder = tmp_path / "out"
@@ -164,6 +165,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         subprocess.run(["umount", "-l", place], check=True)
 
 
+@pytest.mark.slow
 def test_a_full_disk_does_not_stop_it(tmp_path: Path, small_disk: Path) -> None:
     """It lives in what the events and older entries leave; the calibration and the newest entries are whole."""
     (tmp_path / "poses.csv").write_text(table(20))

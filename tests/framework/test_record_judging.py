@@ -102,6 +102,7 @@ def test_a_first_posture_that_was_wrong_is_found_out_by_the_others() -> None:
     assert judged({0: 0.4}, 20)[1] == {0}
 
 
+@pytest.mark.slow
 def test_where_two_of_three_agree_in_a_socket_the_third_is_wrong() -> None:
     """The arm is known by then: 15 postures of another socket, and the first in this one is off."""
     order = [*range(15), 15, 16, 17, 18]

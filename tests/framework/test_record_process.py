@@ -37,6 +37,7 @@ def stand(arm: GuidedArm, row: dict[str, str], **other: float) -> None:
     arm.stand({**angles_of(row), **other})
 
 
+@pytest.mark.slow
 def test_captures_undone_named_killed_and_resumed(tmp_path: Path, arm: GuidedArm, started: list[Recording]) -> None:
     rows, out = postures(), tmp_path / "out"
     stand(arm, rows[0])
@@ -105,6 +106,7 @@ def test_kills_at_any_moment_lose_nothing_acknowledged_and_repeat_nothing(
     assert names == [str(i) for i in range(1, len(names) + 1)]
 
 
+@pytest.mark.slow
 def test_keys_of_a_terminal_which_is_left_as_it_was(tmp_path: Path, arm: GuidedArm) -> None:
     stand(arm, postures()[0])
     leader, follower = pty.openpty()
@@ -136,6 +138,7 @@ def test_keys_of_a_terminal_which_is_left_as_it_was(tmp_path: Path, arm: GuidedA
         os.close(follower)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)])
 def test_a_signal_ends_it_and_restores_the_terminal(tmp_path: Path, arm: GuidedArm, number: int) -> None:
     leader, follower = pty.openpty()
@@ -164,6 +167,7 @@ def expect(terminal: int, text: bytes, timeout_s: float = 30.0) -> None:
             seen += os.read(terminal, 4096)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_captured_is_refused_in_a_sentence(
     tmp_path: Path, arm: GuidedArm, started: list[Recording]
 ) -> None:

@@ -29,6 +29,7 @@ def best_of_all(task: Task) -> float:
     return max(value_of(task.candidates, task.criterion, np.array(chosen)) for chosen in every)
 
 
+@pytest.mark.quick("0-cvxpy-D", "0-interior_point-A", "1-cvxpy-D", "1-interior_point-E", "1-interior_point-O5")
 @pytest.mark.parametrize("goal", ["D", "A", "E", "O1", "O3", "O5"])
 @pytest.mark.parametrize("solver", ["cvxpy", "interior_point"])
 @pytest.mark.parametrize("seed", range(3))
@@ -39,6 +40,7 @@ def test_no_plan_exceeds_the_bound_and_the_bound_is_near(goal: str, solver: str,
     assert 0.85 < task.criterion.efficiency(best, found.bound, 4) <= 1 + 1e-9
 
 
+@pytest.mark.quick("O5")
 @pytest.mark.parametrize("goal", SMOOTH)
 def test_the_bound_holds_for_repeats_and_for_draws(goal: str) -> None:
     for task in (task_of(goal, count=7, limit=2), task_of(goal, count=10, draws=3)):
@@ -75,6 +77,7 @@ def test_at_the_optimum_the_bound_is_the_value_there(goal: str) -> None:
     assert found.bound == pytest.approx(value, rel=1e-5)
 
 
+@pytest.mark.quick("E")
 @pytest.mark.parametrize("goal", [*SMOOTH, "E"])
 def test_many_candidates_are_certified_on_all_of_them(goal: str) -> None:
     task = task_of(goal, count=900, size=4, poses=12, seed=2)

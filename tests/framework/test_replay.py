@@ -120,6 +120,7 @@ def whole(calibration: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_every_state_comes_out_again_to_the_last_bit(whole: Path, tmp_path: Path) -> None:
     before = {path.name: path.read_bytes() for path in sorted((whole / "journal").iterdir())}
     out = tmp_path / "again.yaml"
@@ -135,6 +136,7 @@ def test_every_state_comes_out_again_to_the_last_bit(whole: Path, tmp_path: Path
     assert done.exit_code == 0 and "all the same to the last bit" in done.output
 
 
+@pytest.mark.slow
 def test_the_calibration_as_it_was_at_any_entry(whole: Path, tmp_path: Path) -> None:
     checkpoint = [segment.checkpoint for segment in read_segments(whole / "journal")][2]
     session = Recalibrator.begin(Calibration.load(whole / "calibration.yaml"), SETTINGS)
@@ -196,6 +198,7 @@ def test_damage_is_told_and_everything_before_it_is_replayed(whole: Path, tmp_pa
     assert one == other
 
 
+@pytest.mark.slow
 def test_a_state_or_a_decision_that_differs_is_told(whole: Path, calibration: Path) -> None:
     header = next(read_segments(whole / "journal")).header
     journal = kept_journal(whole / "journal")
@@ -231,6 +234,7 @@ def test_what_cannot_be_replayed_ends_with_2(whole: Path, tmp_path: Path) -> Non
         assert done.exit_code == 2 and expected in done.stderr and done.stdout == "", (arguments, done.output)
 
 
+@pytest.mark.slow
 def test_distance_is_measured_in_standard_deviations(calibration: Path) -> None:
     session = Recalibrator.begin(Calibration.load(calibration), SETTINGS)
     state, space = session.state, session.setup.space

@@ -339,6 +339,7 @@ def test_a_hundred_thousand_records_stay_small() -> None:
     assert "too many to draw one by one" in html and "evenly chosen" in html
 
 
+@pytest.mark.slow
 def test_matplotlib_is_not_needed() -> None:
     code = "import sys, armcal.report; assert 'matplotlib' not in sys.modules and 'jinja2' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -376,6 +377,7 @@ def _browse(page: Path, home: Path, *arguments: str) -> subprocess.CompletedProc
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 def test_a_browser_shows_it(tmp_path: Path) -> None:
     page, shot = tmp_path / "report.html", tmp_path / "report.png"

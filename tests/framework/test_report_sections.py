@@ -40,6 +40,7 @@ def armcal_register_report_sections(register):
 '''
 
 
+@pytest.mark.slow
 def test_a_run_shows_them_and_a_broken_one_is_a_warning(repository, tmp_path):
     (tmp_path / "numbers.py").write_text(PLUGIN, encoding="utf-8")
     demo, out = str(repository / "configs" / "lrm_arm" / "demo.yaml"), tmp_path / "out"

@@ -103,7 +103,7 @@ def planted(lrm, name, seed, size=1.0):
 
 @pytest.mark.parametrize("name", PLANTED)
 @pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.quick("1-drifting base", "1-missing spring")
+@pytest.mark.slow
 def test_a_planted_structure_is_found_and_named(lrm, name, seed):
     found = looked_at(*planted(lrm, name, seed))
     kind, subject, effect = PLANTED[name]
@@ -114,6 +114,7 @@ def test_a_planted_structure_is_found_and_named(lrm, name, seed):
     assert {(s.kind, s.subject) for s in found.worthwhile} - beside == {(kind, subject)}
 
 
+@pytest.mark.slow
 def test_its_size_and_the_error_it_costs_are_told(lrm):
     """Against the planted half-width, and against a fit to the same noise without the structure."""
     found = looked_at(*planted(lrm, "backlash", 3))
@@ -192,6 +193,7 @@ def test_records_of_no_weight_tell_nothing(lrm):
     assert json.dumps(asdict(one)) == json.dumps(asdict(other))
 
 
+@pytest.mark.slow
 def test_what_the_model_has_is_told_to_be_loosened_not_added(lrm):
     found = looked_at(*planted(lrm, "backlash", 7), modelled=frozenset({"approach_backlash"}))
     assert found.structures[0].effect.endswith("(it is in the model: free it, or loosen its prior)")
@@ -301,6 +303,7 @@ def large_errors_of(lrm, spoil, limit=None):
     return large_errors(problem, records, found, dataset, motion, Judged(errors, raw, np.arange(120)), limit)
 
 
+@pytest.mark.slow
 def test_a_single_wrong_record_is_to_be_measured_again(lrm):
     def spoil(columns, q):
         turned = oracle.tip(oracle.published(), q[40:41] + on_joint(2, [3 * DEG]))[0]

@@ -83,6 +83,7 @@ def check_rolled_back(folder: Path, tmp_path: Path) -> dict[str, Any]:
     return reply
 
 
+@pytest.mark.slow
 def test_after_the_end_the_estimate_goes_back_to_the_last_good_record_and_forth_again(
     ended: Path, tmp_path: Path
 ) -> None:

@@ -93,6 +93,7 @@ def killed_at(step: int, folder: Path, in_place: bool, mark: str) -> int:
     return int(process.exitcode or 0)
 
 
+@pytest.mark.slow
 def test_a_run_killed_at_any_step_leaves_one_set_or_the_other_whole(tmp_path: Path) -> None:
     """Each change of the disk in turn is the one before which the process is killed."""
     total, ends = steps(tmp_path, in_place=False), []
@@ -115,6 +116,7 @@ def test_a_run_killed_at_any_step_leaves_one_set_or_the_other_whole(tmp_path: Pa
     assert True in ends and False in ends
 
 
+@pytest.mark.slow
 def test_where_folders_cannot_change_places_a_killed_run_leaves_no_result_with_other_companions(tmp_path: Path) -> None:
     for step in range(steps(tmp_path, in_place=True)):
         folder = tmp_path / f"step{step}" / "out"
@@ -176,6 +178,7 @@ def test_a_folder_that_is_the_working_directory_stays_the_same_folder(
     assert [found(path) for path in sorted((folder / "earlier").iterdir())] == [texts("first"), texts("second")]
 
 
+@pytest.mark.slow
 def test_a_second_run_into_one_folder_is_refused_while_the_first_lasts(tmp_path: Path) -> None:
     """Both ended with 0, and the folder had files of both."""
     folder = tmp_path / "out"

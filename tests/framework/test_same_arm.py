@@ -151,6 +151,7 @@ def recorded(arm):
     return Dataset(tuple(str(i) for i in range(POSES)), channels)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arm", ["lrm", "frida"])
 def test_the_nominal_forms_stand_where_pinocchio_puts_them(arm, tmp_path):
     pin = pytest.importorskip("pinocchio")
@@ -162,7 +163,7 @@ def test_the_nominal_forms_stand_where_pinocchio_puts_them(arm, tmp_path):
 
 
 @pytest.mark.parametrize("arm", ["lrm", "frida"])
-@pytest.mark.quick("frida")
+@pytest.mark.slow
 def test_calibrated_on_the_same_points_all_forms_predict_the_same(arm, tmp_path):
     q = commands(arm, 10_000, 2)
     true, before = points(tool_poses(true_chain(arm), q)), points(tool_poses(nominal_chain(arm), q))
@@ -181,6 +182,7 @@ def test_calibrated_on_the_same_points_all_forms_predict_the_same(arm, tmp_path)
     assert set(ranks.values()) == {4 * joints + 3}, "four numbers an axis, and the point"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arm", ["lrm", "frida"])
 def test_a_calibrated_form_written_as_a_urdf_predicts_the_same_by_pinocchio(arm, tmp_path):
     pin = pytest.importorskip("pinocchio")
@@ -192,7 +194,7 @@ def test_a_calibrated_form_written_as_a_urdf_predicts_the_same_by_pinocchio(arm,
 
 
 @pytest.mark.parametrize("arm", ["lrm", "frida"])
-@pytest.mark.quick("lrm")
+@pytest.mark.slow
 def test_with_noise_the_forms_are_as_good_as_each_other(arm, tmp_path):
     """The same minimum but for priors: the same points left over, and the same rank, to the last thousandth."""
     data, random = recorded(arm), np.random.default_rng(9)
@@ -211,6 +213,7 @@ def test_with_noise_the_forms_are_as_good_as_each_other(arm, tmp_path):
         assert np.linalg.norm(predicted[form] - predicted["poe"], axis=1).max() < 1e-3 * spread
 
 
+@pytest.mark.quick("mdh")
 @pytest.mark.parametrize("form", FORMS)
 def test_every_form_sees_as_much_at_its_nominal_values(form, tmp_path):
     """Where the point is off all axes the nominal arm is no special case."""

@@ -120,6 +120,7 @@ def test_plugged_in_again_under_another_name(pty):
         os.close(handle)
 
 
+@pytest.mark.slow
 def test_a_full_port_is_lost_and_does_not_block_for_ever(pty):
     port = port_at(pty.path)
     port.open()

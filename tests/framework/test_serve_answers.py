@@ -53,6 +53,7 @@ def position(answer: dict[str, Any], row: int = 0) -> np.ndarray:
     return np.array(answer["tools"][row]["position_mm"])
 
 
+@pytest.mark.slow
 def test_forward_is_the_calibrations_prediction(answerer: Answerer, calibration: Calibration) -> None:
     postures = np.random.default_rng(1).uniform(-90, 90, (5, 6))
     answer = told(answerer, do="forward", joint_angles_deg=postures.tolist())
@@ -188,6 +189,7 @@ def test_any_line_has_an_answer(answerer: Answerer, line: bytes) -> None:
     assert told(answerer, do="forward", joint_angles_deg=Q_DEG)
 
 
+@pytest.mark.slow
 def test_thousands_of_damaged_requests(answerer: Answerer) -> None:
     chance = random.Random(5)
     whole = [
@@ -254,6 +256,7 @@ def test_an_elastic_arm_whose_payload_nobody_states_asks_for_it(answerer: Answer
     assert arm.acting(Acting(), 1, [Acting.si(payload=0.1)])[3, 0] == 0.1
 
 
+@pytest.mark.slow
 def test_only_a_whole_calibration_of_the_same_arm_is_made_ready(path: Path, answerer: Answerer) -> None:
     text = path.read_text()
     arm = answerer.tag["arm"]
@@ -274,6 +277,7 @@ def test_only_a_whole_calibration_of_the_same_arm_is_made_ready(path: Path, answ
         assert "armcal-serve-" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_commands_stay_within_what_a_configuration_allows(path: Path) -> None:
     text, folder = path.read_text(), ROOT / "configs" / "lrm_arm"
     config = shutil.copytree(folder, path.with_name("configs")) / "plan.yaml"

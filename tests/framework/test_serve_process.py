@@ -77,6 +77,7 @@ def taken(running: Running, text: str) -> dict[str, Any]:
     return running.until(lambda status: status["calibration"]["sha256"] == sha256(text))
 
 
+@pytest.mark.slow
 def test_a_calibration_is_replaced_under_load(path: Path, text: str, clients: list[Asking], tmp_path: Path) -> None:
     texts = [text, variant(text, 1)]
     with serving(path, "--workers", "1") as running:
@@ -181,6 +182,7 @@ def test_a_killed_worker_loses_no_request_and_a_damaged_file_does_not_matter_the
         assert second.returncode == 2 and "a server is running here" in second.stderr
 
 
+@pytest.mark.slow
 def test_nonsense_by_standard_input_is_answered_line_by_line_to_the_end(path: Path) -> None:
     chance = random.Random(11)
     whole = {"do": "forward", "joint_angles_deg": [0] * 6}
@@ -205,6 +207,7 @@ def test_nonsense_by_standard_input_is_answered_line_by_line_to_the_end(path: Pa
     assert "256 KiB" in answers[-2]["error"]
 
 
+@pytest.mark.quick("-empty", "None-no such file", "\\xff\\xfe\\n-no whole calibration")
 @pytest.mark.parametrize(
     ("content", "says"),
     [

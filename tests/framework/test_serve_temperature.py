@@ -57,6 +57,7 @@ def commanded(answer: dict[str, Any]) -> np.ndarray:
     return np.array([command["joint_angles_deg"] for command in answer["commands"]])
 
 
+@pytest.mark.slow
 def test_a_warm_arm_is_where_the_calibration_predicts_it(warm: Answerer) -> None:
     for said, channels in (
         ({}, {}),

@@ -142,6 +142,7 @@ def test_a_later_answer_waits_for_an_earlier_one(house: House, tmp_path: Path) -
         assert [answer["echo"] for answer in heard(house, client, 2)] == ["one", "two"]
 
 
+@pytest.mark.slow
 def test_clients_have_their_turns(house: House, tmp_path: Path) -> None:
     unix(house, tmp_path)
     with connected(tmp_path) as greedy, connected(tmp_path) as modest:
@@ -173,6 +174,7 @@ def test_who_does_not_read_is_not_listened_to_and_then_let_go(house: House, tmp_
         assert heard(house, other, 1)[0]["echo"] == "here"
 
 
+@pytest.mark.slow
 def test_who_reads_slowly_gets_everything(house: House, tmp_path: Path) -> None:
     unix(house, tmp_path)
     house.size = 50_000
@@ -391,6 +393,7 @@ def test_a_line_has_a_deadline_and_an_answer_that_is_awaited_has_none(
         assert "no whole request" in heard(house, planner, 1)[0]["error"]
 
 
+@pytest.mark.slow
 def test_out_of_descriptors_it_neither_spins_nor_stops(house: House, tmp_path: Path) -> None:
     transport = unix(house, tmp_path)
     with connected(tmp_path) as first, connected(tmp_path) as second:

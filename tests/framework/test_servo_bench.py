@@ -94,6 +94,7 @@ def test_interrupted_it_holds_and_keeps_what_it_measured(bench, tmp_path):
     assert len(keys) == len(set(keys)) and {k[0] for k in keys} == set(JOINTS)
 
 
+@pytest.mark.slow
 def test_it_finds_what_the_servos_truly_are(calibrated, bench):
     found = json.loads(calibrated[0].stdout)
     truth = yaml.safe_load((bench.parent / "bench_servos.yaml").read_text())
@@ -108,6 +109,7 @@ def test_it_finds_what_the_servos_truly_are(calibrated, bench):
     assert any("cannot be found" in sentence for sentence in found["findings"])
 
 
+@pytest.mark.slow
 def test_the_servo_file_is_written_and_the_one_before_is_kept(calibrated, bench):
     before = yaml.safe_load((bench.parent / "servos.yaml.before-1").read_text())
     after = yaml.safe_load((bench.parent / "servos.yaml").read_text())
@@ -135,6 +137,7 @@ def test_an_unplugged_board_that_comes_back_is_gone_on_with(calibrated, bench, t
     assert not json.loads(done.stdout)["not_told"]["servos"]
 
 
+@pytest.mark.slow
 def test_check_says_that_all_is_right(calibrated, bench):
     bent = "bench.servo.base={q2: 30 deg, q4: -40 deg}"
     done = armcal("servo", bench, "--check", "--yes", "--json", "--set", bent)
@@ -142,6 +145,7 @@ def test_check_says_that_all_is_right(calibrated, bench):
     assert {v["kind"] for v in json.loads(done.stdout)["joints"]} == {"right"}
 
 
+@pytest.mark.slow
 def test_check_finds_a_planted_swap(calibrated, bench, monkeypatch):
     servos = yaml.safe_load((bench.parent / "servos.yaml").read_text())
     servos["servos"]["q2"]["channel"], servos["servos"]["q4"]["channel"] = 3, 1
@@ -157,6 +161,7 @@ def test_check_finds_a_planted_swap(calibrated, bench, monkeypatch):
     assert "q2 and q4 are swapped" in done.stdout
 
 
+@pytest.mark.slow
 def test_guided_by_lines_of_a_pipe(calibrated, bench, tmp_path):
     words = ("--set", "bench.servo.joints=[q6]", "--guided", "--yes", "--out", tmp_path / "out", "--keep", "--json")
     with piped("+10\nok\n-10\nok\nquit\n"):

@@ -118,6 +118,7 @@ names = st.one_of(
 )
 
 
+@pytest.mark.slow
 @given(
     st.dictionaries(
         names,

@@ -63,6 +63,7 @@ def test_a_planted_table_and_lag_come_back() -> None:
     assert found.outliers == () and 0.6 < found.scale < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [12, pytest.param(40, marks=pytest.mark.slow)])
 def test_deviations_are_right_over_seeds(seeds: int) -> None:
     off = []

@@ -62,6 +62,7 @@ def observed(folder):
     return [(e["joint"], e["target"], e["came"], e["counts"]) for e in entries]
 
 
+@pytest.mark.slow
 def test_somebody_who_knows_the_angles_finds_the_tables(tmp_path, monkeypatch):
     setup, device, _ = setup_on(monkeypatch, config_in(tmp_path, SERVO))
     measure(setup, tmp_path / "out", talk(Person(device)), "guided")

@@ -285,6 +285,7 @@ class TestRecord:
         (folder / NAME).write_text("".join(json.dumps(row) + "\n" for row in rows))
         return folder
 
+    @pytest.mark.quick("at-None", "came-0", "counts-307.5", "counts-99999", "deviations-value9")
     @pytest.mark.parametrize(
         ("key", "value"),
         [
@@ -318,6 +319,7 @@ class TestRecord:
             with pytest.raises(DataError, match=rf"{NAME}:5"):
                 Record(self.damaged(done, tmp_path, 4, lambda row, key=key: row.pop(key)))  # type: ignore[misc]
 
+    @pytest.mark.slow
     def test_so_is_any_bit_that_makes_it_no_line(self, done: ServoRun, tmp_path: Path) -> None:
         whole = bytearray((done.out / NAME).read_bytes())
         random = np.random.default_rng(1)
@@ -339,6 +341,7 @@ class TestRecord:
         with pytest.raises(DataError, match="by which tables"):
             Record(tmp_path)
 
+    @pytest.mark.slow
     def test_another_base_pose_or_adapter_is_refused_and_other_steps_are_not(self, done: ServoRun) -> None:
         with done.run.simulated() as clock:
             with pytest.raises(InputError, match=r"another base pose: q2 stood at -50.0 deg, not at -40.0 deg"):

@@ -174,6 +174,7 @@ def test_by_a_new_oscillator_servos_that_were_not_measured_stand_where_they_stoo
         assert after == pytest.approx(before * shorter, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_servo_that_lets_go_is_left_out_and_spoils_no_other(truth, nominal):
     record = record_of(truth, joints=("q3", "q5"))
     dropped = [i for i, line in enumerate(record) if line["joint"] == "q5"][8:]

@@ -54,6 +54,7 @@ def test_moving_the_base_or_the_body_changes_no_angle():
     assert np.diff(moved.angles) == pytest.approx(np.diff(plain.angles), abs=1e-7)
 
 
+@pytest.mark.slow
 def test_noise_of_rotations_becomes_noise_of_angles_and_no_more():
     off = [
         np.diff(turning_of_rotations(turned(Rotation.random(random_state=i), 0.1), AXIS).angles) - np.diff(ANGLES)
@@ -89,6 +90,7 @@ def test_axes_are_those_about_which_the_tool_turns(arm):
         assert arm.angle_of_rotation(joint, pose, tool[:3, :3]) == pytest.approx(pose[joint])
 
 
+@pytest.mark.slow
 def test_what_springs_give_is_their_torque_times_their_compliance(arm):
     """To first order, by virtual work: the potential of the weights falls by what a joint's spring gives."""
     pose = {"q2": 0.4, "q4": 0.6}
@@ -138,12 +140,13 @@ def kinds(verdicts):
     return {v.joint: (v.kind, v.other) for v in verdicts if v.kind != "right"}
 
 
+@pytest.mark.slow
 def test_an_arm_that_does_as_told_is_right(arm):
     assert kinds(judged(moves_of(arm), BASE, arm)) == {}
 
 
 @pytest.mark.parametrize("joint", ["q1", "q3", "q6"])
-@pytest.mark.quick("q3")
+@pytest.mark.slow
 def test_a_reversed_joint_is_found(arm, joint):
     found = judged(moves_of(arm, signs={joint: -1}), BASE, arm)
     assert [v.joint for v in found if v.kind == "reversed"] == [joint]
@@ -151,7 +154,7 @@ def test_a_reversed_joint_is_found(arm, joint):
 
 
 @pytest.mark.parametrize("pair", [("q2", "q4"), ("q1", "q2"), ("q5", "q6")])
-@pytest.mark.quick("pair0")
+@pytest.mark.slow
 def test_swapped_channels_are_found(arm, pair):
     a, b = pair
     found = judged(moves_of(arm, moves={a: b, b: a}), BASE, arm)
@@ -159,6 +162,7 @@ def test_swapped_channels_are_found(arm, pair):
     assert len(swapped(found)) == 1
 
 
+@pytest.mark.slow
 def test_a_wrong_size_and_a_dead_servo_are_found(arm):
     found = judged(moves_of(arm, gains={"q2": 0.5, "q4": 0.0}), BASE, arm)
     verdicts = {v.joint: v.kind for v in found}

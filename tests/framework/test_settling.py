@@ -74,6 +74,7 @@ def test_an_arm_that_stands_stands() -> None:
     np.testing.assert_allclose(found.base_T_target[:3, :3], at(0)[:3, :3], atol=3e-4)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 1000), st.floats(1.2e-3, 0.1), st.integers(0, 2), st.floats(0.2, 3.0))
 @settings(max_examples=60, deadline=None)
 def test_a_ramp_is_never_settled(seed: int, speed: float, axis: int, scale: float) -> None:
@@ -89,6 +90,7 @@ def test_a_ramp_is_never_settled(seed: int, speed: float, axis: int, scale: floa
         assert "moving" in why(state([f for f in seen if f.arrived <= now], now))
 
 
+@pytest.mark.slow
 @given(st.integers(0, 1000), st.floats(0.0, 0.94), st.floats(1.2e-3, 0.1), st.floats(0.2, 2.0))
 @settings(max_examples=80, deadline=None)
 def test_a_step_within_the_window_is_not_settled(seed: int, share: float, size: float, scale: float) -> None:
@@ -163,7 +165,7 @@ def test_many_outliers_or_many_in_a_row_are_not() -> None:
 
 
 @pytest.mark.parametrize("motion", ["moving", "still"])
-@pytest.mark.quick("moving")
+@pytest.mark.slow
 def test_deviations_are_those_of_the_mean(motion: str) -> None:
     bodies = BodySettings(tool="tool", base="base", base_motion=motion)
     found = [state(frames(lambda t: at(0.3), 1.1, seed), 1.1, bodies=bodies) for seed in range(150)]

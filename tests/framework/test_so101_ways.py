@@ -71,6 +71,7 @@ def judge(way: Way, run: armcal.Run) -> None:
     assert errors[0] < way.gripper_mm < 20 < errors[1], (way, errors)
 
 
+@pytest.mark.quick("sockets")
 @pytest.mark.parametrize(
     "way", [pytest.param(way, id=way.name, marks=[pytest.mark.slow] * (way.name == "camera")) for way in WAYS]
 )

@@ -189,6 +189,7 @@ def test_a_file_with_anything_in_it_gives_its_good_rows_and_a_fault_for_each_bad
     assert found[-1].source_row == 11
 
 
+@pytest.mark.slow
 def test_bytes_at_random_never_raise(tmp_path: Path) -> None:
     random_ = random.Random(20)
     base = table(10).encode() + b"\n".join(json.dumps(WHOLE).encode() for _ in range(5))
@@ -450,6 +451,7 @@ def test_only_datagrams_of_named_senders_are_records(named: str, ours: bool) -> 
     source.close()
 
 
+@pytest.mark.slow
 def test_memory_stays_flat_over_a_long_line_and_many_records(tmp_path: Path) -> None:
     import tracemalloc
 
@@ -466,6 +468,7 @@ def test_memory_stays_flat_over_a_long_line_and_many_records(tmp_path: Path) -> 
     assert count == 5001 and peak < 12_000_000
 
 
+@pytest.mark.slow
 def test_a_pipe_in_the_place_of_a_followed_file_is_not_waited_for(tmp_path: Path) -> None:
     """It counts as a file that is away; what takes its place is read."""
     path = tmp_path / "poses.csv"
@@ -483,6 +486,7 @@ def test_a_pipe_in_the_place_of_a_followed_file_is_not_waited_for(tmp_path: Path
     assert len(everything(source)) == 3
 
 
+@pytest.mark.slow
 def test_a_pipe_that_takes_the_place_of_a_file_before_it_is_opened_is_not_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -71,7 +71,7 @@ def test_an_arm_is_not_predicted_to_stand_against_gravity(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("load", [0.5, 0.9, 1.1, 1.4])
-@pytest.mark.quick("0.9", "1.1")
+@pytest.mark.quick("0.9")
 def test_near_buckling_an_arm_stands_where_it_falls_to_or_is_refused(tmp_path: Path, load: float) -> None:
     found, said = link(tmp_path, load), 0
     compensator = found.compensator(choice="interpreted")

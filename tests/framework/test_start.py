@@ -81,6 +81,7 @@ def test_what_upright_axes_do_not_determine_is_named() -> None:
     assert undetermined(random_tools(random), found, np.eye(3)) == ()
 
 
+@pytest.mark.slow
 def test_parameters_that_place_the_arm_are_known_by_what_they_move(anywhere: Prepared) -> None:
     problem, records = anywhere.problem, anywhere.records
     sighting = sighting_of(problem, records, anywhere.dataset, 0, 300)
@@ -113,6 +114,7 @@ def test_a_base_that_may_not_move_everywhere_is_not_looked_for() -> None:
     assert assemble(Experiment.load(DEMO), Stopwatch()).start.alignment is None
 
 
+@pytest.mark.slow
 def test_a_prior_is_kept_and_a_contradiction_said() -> None:
     """Within its prior a base is a start; beyond it the user is told."""
     random = np.random.default_rng(1)
@@ -132,6 +134,7 @@ def test_a_prior_is_kept_and_a_contradiction_said() -> None:
             assert abs(first[place] - held) > 0.1
 
 
+@pytest.mark.quick("<lambda>-positions 25.4 times as large")
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -170,6 +173,7 @@ def test_mixed_up_data_are_refused_until_accepted_and_then_a_bad_finding(tmp_pat
     assert any(f["grade"] == "bad" and "a left-handed frame" in f["text"] for f in findings)
 
 
+@pytest.mark.slow
 def test_check_prints_where_the_base_stands(tmp_path: Path) -> None:
     free = f"parameters.free={json.dumps(ANYWHERE)}"
     checked = CliRunner().invoke(cli, ["check", str(DEMO), "--set", free, "--set", "evaluator=interpreted"])

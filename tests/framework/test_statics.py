@@ -282,6 +282,7 @@ def test_the_gradient_is_the_difference_of_the_cost(lrm):
         assert equations.gradient[column] == pytest.approx(numeric, abs=1e-6 * np.abs(equations.gradient).max())
 
 
+@pytest.mark.slow
 def test_a_small_force_one_way_moves_the_tip_as_far_the_other_way_as_the_reverse(lrm):
     """Maxwell and Betti: with physical loading the springs are conservative, so flexibility is symmetric."""
     experiment, step = lrm.experiment(), 1e-4
@@ -407,6 +408,7 @@ def lifted(vector):
     return matrix
 
 
+@pytest.mark.quick("2")
 @pytest.mark.parametrize("site", [0, 1, 2])
 def test_a_spring_about_three_axes_answers_the_full_moment_at_its_site(site):
     matrix = np.array([[0.05, 0.01, -0.02], [0.01, 0.04, 0.005], [-0.02, 0.005, 0.06]])

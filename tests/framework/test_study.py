@@ -139,6 +139,9 @@ def test_a_variant_that_cannot_be_is_refused_in_its_own_words(place: Path, secti
     assert "study.yaml" in str(caught.value) or "option1" in str(caught.value)
 
 
+@pytest.mark.quick(
+    "change0-found no study", "change1-folds", "change2-folds", "change4-models or load_transfer", "change7-blocks"
+)
 @pytest.mark.parametrize(
     "change, says",
     [
@@ -188,6 +191,7 @@ def close_choices(tmp_path_factory: pytest.TempPathFactory):
     return _run(_few(place), *COMPILED)
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_a_run_with_the_same_folds(place: Path, two_rungs) -> None:
     result = two_rungs
     overrides = [*FAST, "parameters.free=['arm.mdh.theta[1-3]']"]
@@ -318,6 +322,7 @@ def _problem(experiment: Experiment, system, dataset):
     )
 
 
+@pytest.mark.slow
 def test_variants_must_be_judged_on_the_same_records(place: Path) -> None:
     lines = (place / "demo.csv").read_text().splitlines()
     (place / "other.csv").write_text("\n".join(lines[:-1]) + "\n")
@@ -405,6 +410,7 @@ def test_an_earlier_study_is_kept_and_a_run_is_not_written_into_one(place: Path)
     assert foreign.exit_code == 2 and "arm.yaml" in foreign.output
 
 
+@pytest.mark.slow
 def test_names_of_variants_are_shown_as_text(place: Path) -> None:
     path = _write(place, TWO.replace("none: {}", "'<b>[bold]': {}"))
     done = armcal("study", str(path), "--out", str(place / "out"), "--set", FAST[0])

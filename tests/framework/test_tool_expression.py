@@ -36,6 +36,7 @@ def apart(one: np.ndarray, two: np.ndarray) -> float:
     return float(np.abs(one - two).max())
 
 
+@pytest.mark.quick("rigid")
 @pytest.mark.parametrize("name", ARMS)
 def test_the_tool_is_where_the_calibration_predicts_it(name: str) -> None:
     """Under what the configuration states, and under every load at once, coming from either side."""
@@ -74,6 +75,7 @@ def test_gravity_that_is_calibrated_to_be_tilted_pulls_that_way() -> None:
     assert apart(found.forward(commands), compensator("three").forward(commands)) > 1e-5
 
 
+@pytest.mark.slow
 def test_both_arms_of_two_stand_where_they_are_predicted() -> None:
     both = made_calibration(CONFIGS / "frida" / "dual_twists.yaml")
     commands = np.random.default_rng(4).uniform(-1, 1, (COUNT, 7))
@@ -235,6 +237,7 @@ def test_an_arm_whose_springs_cannot_hold_it_has_no_tool() -> None:
         heavy.forward(np.array([[0.0, 0.3, 0.2]]), load)
 
 
+@pytest.mark.slow
 def test_moving_the_base_moves_the_targets_and_not_the_commands() -> None:
     """Gravity turned with it."""
     plain, moved = calibration("three"), calibration("three", "arms.arm.placement={position_mm: [500, 0, 200]}")

@@ -151,6 +151,7 @@ def test_a_check_of_the_plugin_itself_is_placed_at_its_part(tmp_path: Path) -> N
         validate(Holder, load(tmp_path, "# a range\nspan: {low: 2.0, high: 1}\n"))
 
 
+@pytest.mark.slow
 def test_two_thousand_mutated_configs_give_settings_or_a_refusal(tmp_path: Path) -> None:
     rng, refused = random.Random(7), 0
     for _ in range(2000):

@@ -114,6 +114,7 @@ def test_whitening_makes_covariances_the_identity():
     np.testing.assert_allclose(transformed(whitening, rows), expected, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_slopes_by_joint_angles_agree_with_differences_of_the_oracle(lrm):
     """Through the springs: the deflected arm moves a little farther than the rigid one."""
     q, points, _ = measured(15, 1)
@@ -129,6 +130,7 @@ def test_slopes_by_joint_angles_agree_with_differences_of_the_oracle(lrm):
     assert not slopes[:, 7].any()
 
 
+@pytest.mark.slow
 def test_applied_components_are_the_covariance_they_say(lrm):
     """W' W against the inverse of tracker noise plus propagated joint noise, from the oracle's differences."""
     q, points, _ = measured(40, 2, joint_sd=JOINT_RAD)
@@ -232,6 +234,7 @@ def test_neither_order_nor_the_declared_noise_matters(lrm):
         assert c.rms == pytest.approx(a.rms, rel=0.02, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_one_pose_again_and_again_tells_no_joint_from_another(lrm):
     """Six joints and the tracker scatter three coordinates: whose it is cannot be seen, and that is said."""
     rng = np.random.default_rng(6)
@@ -268,6 +271,7 @@ def test_outliers_do_not_pass_for_noise(lrm, loss):
     assert np.abs(deviations_off(found, truth)).max() < 4
 
 
+@pytest.mark.slow
 def test_too_few_equations_are_refused(lrm):
     q, points, _ = measured(8, 9)
     problem, records, start = posed(lrm, q, points)

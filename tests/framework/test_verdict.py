@@ -60,6 +60,7 @@ def test_sound_data_gives_no_warning() -> None:
     assert "good: Of" in told and "none explains the error left" in told
 
 
+@pytest.mark.slow
 def test_a_noise_stated_too_small_or_too_large_is_noticed() -> None:
     assert "warning: Residuals are 5" in sentences("measurements.tracker.noise_mm=0.1")
     assert "was it stated too large" in sentences("measurements.tracker.noise_mm=5")
@@ -73,6 +74,7 @@ def test_a_drift_of_the_tracker_shows_as_correlated_neighbours(tmp_path: Path) -
     assert "Residuals of neighbouring records correlate by" in told
 
 
+@pytest.mark.slow
 def test_gross_errors_are_counted(tmp_path: Path) -> None:
     def spoil(points):
         points[[5, 50, 120]] += 25
@@ -82,6 +84,7 @@ def test_gross_errors_are_counted(tmp_path: Path) -> None:
     assert "five robust deviations of the training errors: 3 records, the worst" in told
 
 
+@pytest.mark.slow
 def test_data_that_wants_a_negative_compliance_pushes_against_its_bound() -> None:
     """With gravity turned round in the model, springs would have to push with their load."""
     told = sentences("statics.gravity_m_s2=[0, 0, 9.81]")
@@ -98,6 +101,7 @@ def verdict(folder: Path, *settings: str, data: Path = CONFIGS / "demo.csv") -> 
     return json.loads(result.stdout)
 
 
+@pytest.mark.slow
 def test_missed_records_are_listed_where_the_limit_says(tmp_path: Path) -> None:
     """Every judged record beyond the limit, by its held-out error, in the JSON, the verdict and the report."""
 
@@ -151,6 +155,7 @@ def test_what_priors_alone_hold_is_a_note_where_the_tip_does_not_depend_on_it(tm
     assert "Not determined" in run["verdict"]["paragraph"]
 
 
+@pytest.mark.slow
 def test_terminal_and_report_say_what_the_json_says(tmp_path: Path) -> None:
     settings = [
         x for s in ("evaluator=interpreted", "validation.holdout=0", "validation.folds=2") for x in ("--set", s)
@@ -174,6 +179,7 @@ def test_a_poor_condition_is_told_and_not_called_undetermined() -> None:
     assert str(known.weakest) == "c alone"
 
 
+@pytest.mark.slow
 def test_suggested_poses_tell_more_than_random_ones() -> None:
     """Judged by the determinant of the information, with the suggested poses really added to the data."""
     experiment = Experiment.load(DEMO, ["evaluator=interpreted"])

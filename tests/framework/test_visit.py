@@ -40,6 +40,7 @@ def test_peaks_are_those_of_a_moving_average() -> None:
     assert peak(heats[:, :3], np.arange(3)) == pytest.approx(heats[:, :3].mean(axis=1).max())
 
 
+@pytest.mark.slow
 def test_servos_stay_cooler_than_on_the_quickest_way() -> None:
     random = np.random.default_rng(3)
     angles = random.uniform(-1, 1, (3, 40))

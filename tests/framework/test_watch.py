@@ -337,6 +337,7 @@ def test_what_has_finished_is_not_shown_as_if_it_went_on(tmp_path: Path) -> None
     assert said not in going.output and said in over.output
 
 
+@pytest.mark.slow
 def test_a_calibration_that_is_nested_deeply_does_not_end_the_watcher(tmp_path: Path) -> None:
     """In a process of its own: where the nesting is followed by recursion in C, the process is killed."""
     (tmp_path / "events.jsonl").write_text(written([{"event": "estimate", "sequence": 9, "parameters": {"a": [1, 2]}}]))
@@ -363,6 +364,7 @@ def test_bad_calls_are_told(tmp_path: Path) -> None:
         assert result.exit_code == 2, arguments
 
 
+@pytest.mark.slow
 def test_the_command_serves_changes_nothing_and_ends_when_asked(tmp_path: Path) -> None:
     folder = made_up_folder(tmp_path / "dir", 20)
     before = {path.name: (path.stat().st_mtime_ns, path.stat().st_size) for path in folder.iterdir()}
@@ -380,6 +382,7 @@ def test_the_command_serves_changes_nothing_and_ends_when_asked(tmp_path: Path) 
     assert {path.name: (path.stat().st_mtime_ns, path.stat().st_size) for path in folder.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_where_there_is_no_terminal_it_is_a_line_an_event(tmp_path: Path) -> None:
     folder = tmp_path / "dir"
     command = [sys.executable, "-m", "armcal.cli", "watch", str(folder), "--terminal", "--wait"]

@@ -108,6 +108,7 @@ def test_a_browser_shows_the_state_and_what_comes_after(browser: Browser, tmp_pa
         served.close()
 
 
+@pytest.mark.slow
 def test_hostile_text_is_shown_as_text(browser: Browser, tmp_path: Path) -> None:
     folder = made_up_folder(tmp_path / HOSTILE[2:9], 3)
     served = Served(folder)
@@ -133,6 +134,7 @@ def test_hostile_text_is_shown_as_text(browser: Browser, tmp_path: Path) -> None
         served.close()
 
 
+@pytest.mark.slow
 def test_a_page_that_is_opened_too_early_or_loses_its_server_comes_to_itself(browser: Browser, tmp_path: Path) -> None:
     folder = tmp_path / "later"
     served = Served(folder)
@@ -155,6 +157,7 @@ def test_a_page_that_is_opened_too_early_or_loses_its_server_comes_to_itself(bro
         again.close()
 
 
+@pytest.mark.slow
 def test_the_page_works_with_a_token_and_says_so_without(browser: Browser, tmp_path: Path) -> None:
     served = Served(made_up_folder(tmp_path / "dir", 5), "0.0.0.0")
     try:

@@ -76,6 +76,7 @@ def test_ten_pages_hear_of_an_event_and_a_page_that_was_away_hears_what_it_misse
         stream.close()
 
 
+@pytest.mark.slow
 def test_a_page_that_missed_too_much_or_knew_another_watcher_begins_anew(served: Served) -> None:
     first = served.state()["after"]
     for place in ("", "nonsense", "other-5", first.split("-")[0] + "-999999999", first.split("-")[0] + "-\u00b2"):
@@ -91,6 +92,7 @@ def test_a_page_that_missed_too_much_or_knew_another_watcher_begins_anew(served:
     stream.close()
 
 
+@pytest.mark.slow
 def test_idle_streams_beat_and_those_that_left_give_their_place_back(served: Served) -> None:
     after = served.state()["after"]
     streams = [Stream(served, after) for _ in range(MOST_STREAMS)]
@@ -119,6 +121,7 @@ def _free(served: Served) -> int:
     return sum(places)
 
 
+@pytest.mark.slow
 def test_a_client_that_does_not_read_is_dropped(tmp_path: Path) -> None:
     served = Served(made_up_folder(tmp_path / "dir", 2), patience=0.3)
     try:

@@ -238,6 +238,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     opened.close()
 
 
+@pytest.mark.quick("1280-720")
 @pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 720)])
 def test_the_first_screen_of_the_page_answers_everything_and_is_not_live(
     browser: Browser, tmp_path: Path, width: int, height: int
@@ -272,6 +273,7 @@ def test_the_first_screen_of_the_page_answers_everything_and_is_not_live(
         served.close()
 
 
+@pytest.mark.slow
 def test_a_page_of_what_was_killed_is_silent_and_one_that_runs_shows_a_decision_as_it_comes(
     browser: Browser, tmp_path: Path
 ) -> None:

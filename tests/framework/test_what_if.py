@@ -65,6 +65,7 @@ def slopes(loaded: Calibration, names: tuple[str, ...], poses: Path) -> np.ndarr
     return np.stack(columns, axis=2)
 
 
+@pytest.mark.slow
 def test_bits_and_deviations_are_those_of_the_covariance_with_the_record(calibration: Path, poses: Path) -> None:
     loaded, rows = Calibration.load(calibration), found(calibration, poses)
     known = loaded.uncertainty.record
@@ -99,6 +100,7 @@ def test_a_table_a_file_and_the_best_poses_first(calibration: Path, poses: Path,
     assert written[0]["tells_most"].count("%") == 3
 
 
+@pytest.mark.slow
 def test_bad_input_ends_with_2(calibration: Path, poses: Path, tmp_path: Path) -> None:
     (tmp_path / "bad.csv").write_text("a,b\n1,2\n")
     for arguments, expected in (

@@ -164,6 +164,7 @@ def test_a_refusal_names_file_line_field_and_mend(
     assert all(words in message for words in says), message
 
 
+@pytest.mark.slow
 def test_a_file_over_sixteen_mebibytes_is_refused_and_one_at_the_limit_is_read(tmp_path: Path) -> None:
     body = b"a: 1\n#"
     assert load(tmp_path, body + b"x" * ((16 << 20) - len(body))).data == {"a": 1}
@@ -171,6 +172,7 @@ def test_a_file_over_sixteen_mebibytes_is_refused_and_one_at_the_limit_is_read(t
     assert "larger than 16 MiB, expected a YAML file. Check the path" in message
 
 
+@pytest.mark.slow
 def test_fifty_levels_are_read_and_values_up_to_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert load(tmp_path, "a: " + "[" * 49 + "]" * 49).data["a"] is not None
     assert yaml_nodes.MAX_NODES == 1_000_000

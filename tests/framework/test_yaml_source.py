@@ -329,6 +329,7 @@ def mutate(rng: random.Random, text: bytes) -> bytes:
     return bytes(raw)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [500, pytest.param(2000, marks=pytest.mark.slow)])
 def test_mutated_configs_give_a_result_or_a_refusal_that_names_the_file(tmp_path: Path, count: int) -> None:
     write(tmp_path, BASE, "base.yaml")

@@ -89,7 +89,7 @@ def test_the_same_seed_gives_the_same_records_and_another_seed_others(tmp_path):
 @pytest.mark.parametrize(
     ("of_arm", "stated", "expected"), [(2e-3, None, 2e-3), (2e-3, 5e-4, 5e-4), (2e-3, 0.0, 0.0), (0.0, 1e-3, 1e-3)]
 )
-@pytest.mark.quick("0.002-0.0005-0.0005", "0.002-0.0-0.0")
+@pytest.mark.slow
 def test_joints_read_with_the_noise_that_is_stated_last(tmp_path, of_arm, stated, expected):
     chosen = {} if stated is None else {"joint_noise": stated}
     data = simulated(tmp_path, sockets(of_arm), {"balls": KEYS}, count=150, **chosen)

@@ -77,7 +77,7 @@ def touches_of_plane(normal, offset, tip, count, seed, scatter):
 
 @pytest.mark.parametrize("stated", [(0.0, 0.0, 1.0), (0.3, -1.0, 0.2), (-1.0, 0.0, 0.0)], ids=str)
 @pytest.mark.parametrize("tilt", [0.02, 0.6, 1.3])
-@pytest.mark.quick("0.02-(0.0, 0.0, 1.0)", "0.6-(0.3, -1.0, 0.2)", "1.3-(-1.0, 0.0, 0.0)")
+@pytest.mark.slow
 def test_the_plane_found_is_the_one_of_least_squares(stated, tilt):
     """With an exact arm nothing is left but the plane: that of the smallest singular value of the points."""
     mean = np.array(stated) / np.linalg.norm(stated)
@@ -168,6 +168,7 @@ def test_an_unknown_clamp_starts_at_the_tool_wherever_that_points(turn):
     np.testing.assert_allclose(pose_in(v, "clamp.fixture") @ pose_in(v, "clamp.bench.point"), pose, atol=1e-7)
 
 
+@pytest.mark.slow
 @needs_logarithm
 def test_a_clamp_that_only_judges_settles_at_the_pose_of_least_squares():
     q = clamped(HOLD, 6, 9, 3e-3)
@@ -195,6 +196,7 @@ def test_a_clamp_that_only_judges_settles_at_the_pose_of_least_squares():
     np.testing.assert_allclose(pose_in(every, "clamp.judged.point"), expected, atol=1e-7)
 
 
+@pytest.mark.slow
 @needs_logarithm
 def test_points_known_only_to_each_other_tell_arm_and_fixture():
     truth = {**co.named(co.SEVEN), "arm.mdh.a3": 0.033, "arm.mdh.theta4": 0.004}
@@ -281,6 +283,7 @@ def test_both_arms_of_a_closed_chain_bring_the_noise_of_their_joints():
     )
 
 
+@pytest.mark.slow
 @needs_logarithm
 def test_two_arms_that_hold_each_other_tell_a_length_of_either_and_the_clamp():
     truth = {**co.named(co.SEVEN, "left"), "left.mdh.a3": 0.033}

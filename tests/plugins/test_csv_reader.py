@@ -364,6 +364,7 @@ def fuzzed(text: bytes, random_: random.Random) -> bytes:
     return bytes(data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trials", [400, pytest.param(1000, marks=pytest.mark.slow)])
 def test_mutated_files_never_give_anything_else(tmp_path: Path, trials: int) -> None:
     random_ = random.Random(20240)
@@ -383,6 +384,7 @@ def test_mutated_files_never_give_anything_else(tmp_path: Path, trials: int) -> 
     assert min(outcomes.values()) > trials // 20, outcomes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [20_000, pytest.param(100_000, marks=pytest.mark.slow)])
 def test_a_long_file_is_read_whole(tmp_path: Path, count: int) -> None:
     random_ = np.random.default_rng(0)

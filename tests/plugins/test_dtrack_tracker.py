@@ -175,6 +175,7 @@ def test_the_noise_is_as_stated(listener: Listener) -> None:
     np.testing.assert_allclose(turns.std(axis=0), 2e-3, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_occlusions_take_the_stated_part_of_the_time_in_pieces(listener: Listener) -> None:
     found = sent(listener, listener.simulated(occluded={"tool": 0.3}, occlusion=0.2), 6000)
     unseen = np.array([f.bodies.get("2") is None for f in found])

@@ -114,6 +114,7 @@ def by_hand(case, data):
     return pose
 
 
+@pytest.mark.slow
 def test_shared_sockets_tell_where_the_arms_stand_to_each_other(in_sockets):
     data, (true, _) = in_sockets.records(), true_placement()
     assert len(data) == 2 * 8 * len(SOCKETS)
@@ -146,6 +147,7 @@ def test_with_noise_the_placement_comes_back_within_its_intervals(in_sockets):
     assert np.all(np.mean(off, axis=0) > 0.2 * np.mean(by_means, axis=0)), "too good: the truth leaks in"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [pytest.param((), marks=pytest.mark.slow), ("validation.holdout=0.3", "validation.folds=3")],

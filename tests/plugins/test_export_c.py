@@ -86,7 +86,7 @@ def predicted(calibration, compiled, records):
 
 
 @pytest.mark.parametrize("name", [*CASES, "mimic and slide"])
-@pytest.mark.quick("elastic", "rigid, limits")
+@pytest.mark.quick("rigid, limits")
 def test_the_code_says_where_the_calibrated_arm_is(arms, name):
     calibration, compiled = arms(name)
     records = records_of(compiled, 60)
@@ -117,7 +117,7 @@ def test_defaults_are_the_configured_load(arms, name):
         np.testing.assert_allclose(compiled.forward(record)[1], pose[:3], rtol=0, atol=1e-12)
 
 
-@pytest.mark.quick("counts and heat", "mimic and slide")
+@pytest.mark.quick("mimic and slide")
 @pytest.mark.parametrize("name", [*CASES, "mimic and slide"])
 def test_the_jacobian_is_the_slope_of_the_arm_in_equilibrium(arms, name):
     _, compiled = arms(name)
@@ -158,6 +158,7 @@ def test_efforts_bend_the_springs_as_far_as_these_give(arms):
         np.testing.assert_allclose(state[1:], compliances * efforts, rtol=0, atol=1e-11)
 
 
+@pytest.mark.quick("rigid, limits")
 @pytest.mark.parametrize("name", ["elastic", "all effects, 21 states", "rigid, limits"])
 def test_compensated_commands_bring_the_tool_to_its_target(arms, name):
     calibration, compiled = arms(name)
@@ -315,6 +316,7 @@ def test_counts_are_those_of_the_board(arms):
     assert np.isnan(compiled.library.lrm_set_angle(0, 100))
 
 
+@pytest.mark.slow
 def test_the_code_keeps_no_state_and_its_header_serves_cpp(arms, tmp_path):
     _, compiled = arms("elastic")
     write(compiled.exported, "arm_left.c", tmp_path)
@@ -329,6 +331,7 @@ def test_the_code_keeps_no_state_and_its_header_serves_cpp(arms, tmp_path):
         subprocess.run(["g++", "-Wall", "-Werror", "-fsyntax-only", "x.cpp"], cwd=tmp_path, check=True)
 
 
+@pytest.mark.slow
 def test_the_test_program_passes_and_notices_another_arm(arms, tmp_path):
     _, compiled = arms("elastic")
     write(compiled.exported, "arm_left.c", tmp_path)
@@ -348,6 +351,7 @@ def test_the_test_program_passes_and_notices_another_arm(arms, tmp_path):
     assert "poses: " in bad.stdout
 
 
+@pytest.mark.slow
 def test_what_differs_or_warns_is_not_handed_out(monkeypatch):
     request = request_of(made_calibration(CONFIGS / "mukca" / "panda.yaml"), None, "arm.c")
     whole = c_code.filled
@@ -372,6 +376,7 @@ def test_without_a_compiler_the_code_is_written_and_that_is_said(monkeypatch):
     assert "not compiled" in CExporter(CExportSettings()).export(request).remarks[0]
 
 
+@pytest.mark.slow
 def test_names_of_any_kind_do_no_harm(tmp_path):
     request = request_of(made_calibration(CONFIGS / "mukca" / "panda.yaml"), None, "arm_arm.c")
     hostile = 'a */ b \\ "c" ??/ \n#error "é"'

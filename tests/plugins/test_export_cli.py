@@ -32,6 +32,7 @@ def no_compiler(monkeypatch):
     monkeypatch.setattr("armcal_export.c_check.find_compiler", lambda: None)
 
 
+@pytest.mark.slow
 def test_every_file_is_written_and_told(calibration, tmp_path):
     ran = armcal(
         "export", calibration, "--format", "c", "--out", tmp_path / "lrm.c", "--option", "prefix=lrm", "--json"
@@ -46,6 +47,7 @@ def test_every_file_is_written_and_told(calibration, tmp_path):
     assert b"lrm_forward" in (tmp_path / "lrm.h").read_bytes()
 
 
+@pytest.mark.slow
 def test_nothing_is_written_over_without_force_and_nothing_half(calibration, tmp_path):
     (tmp_path / "arm.h").write_text("mine")
     arguments = ("export", calibration, "--format", "c", "--out", tmp_path / "arm.c")
@@ -60,6 +62,7 @@ def test_nothing_is_written_over_without_force_and_nothing_half(calibration, tmp
     assert armcal(*arguments, "--force").exit_code == 0  # all as it is
 
 
+@pytest.mark.slow
 def test_a_companion_never_takes_the_place_of_the_calibration(calibration, tmp_path):
     here = tmp_path / "arm.schema.json"
     here.write_bytes(calibration.read_bytes())
@@ -71,6 +74,7 @@ def test_a_companion_never_takes_the_place_of_the_calibration(calibration, tmp_p
     assert (ran.exit_code, "it is a directory" in ran.stderr) == (2, True)
 
 
+@pytest.mark.slow
 def test_a_schema_that_several_exports_share_may_be_there(calibration, tmp_path):
     for kind in ("yaml", "json"):
         ran = armcal("export", calibration, "--format", kind, "--out", tmp_path / f"arm.{kind}")
@@ -78,6 +82,7 @@ def test_a_schema_that_several_exports_share_may_be_there(calibration, tmp_path)
     assert len(list(tmp_path.iterdir())) == 3
 
 
+@pytest.mark.slow
 def test_what_a_file_cannot_be_written_for_leaves_the_others_as_they_were(calibration, tmp_path, monkeypatch):
     for name in ("arm.c", "arm.h", "arm_test.c"):
         (tmp_path / name).write_text(f"old {name}")
@@ -95,6 +100,7 @@ def test_what_a_file_cannot_be_written_for_leaves_the_others_as_they_were(calibr
     assert all(path.read_text() == f"old {path.name}" for path in tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="rights are those of POSIX")
 def test_files_get_the_rights_of_new_files(calibration, tmp_path):
     before = os.umask(0o027)

@@ -47,6 +47,7 @@ def request_for(name):
     return request_of(made_calibration(config, overrides), None)
 
 
+@pytest.mark.quick("mdh, all effects-json")
 @pytest.mark.parametrize("kind", EXPORTERS)
 @pytest.mark.parametrize("name", ARMS)
 def test_the_file_alone_makes_the_rigid_arm_again(kind, name):

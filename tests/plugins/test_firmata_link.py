@@ -52,6 +52,7 @@ def test_the_driver_works_over_it(board, tmp_path):
     assert not device.guard([{"q1": 0.0}], 0.3, 1.0)
 
 
+@pytest.mark.slow
 def test_a_board_that_starts_when_its_port_is_opened_is_waited_for(board):
     """It hears nothing for a while, then tells its versions unasked."""
     board.deaf = True
@@ -70,6 +71,7 @@ def test_a_board_that_starts_when_its_port_is_opened_is_waited_for(board):
     assert link.read(0x40, 0x00, 1) == b"\x11"
 
 
+@pytest.mark.quick("3-to_host-split")
 @pytest.mark.parametrize("fault", ["drop", "duplicate", "split"])
 @pytest.mark.parametrize("direction", ["to_board", "to_host"])
 @pytest.mark.parametrize("turns", [3, pytest.param(8, marks=pytest.mark.slow)])
@@ -99,6 +101,7 @@ class Late:
         return [self._held, data] if self._passed == self._last else [data]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("last", [2, 3])
 def test_an_answer_that_comes_late_is_not_taken_for_another(board, monkeypatch, last):
     """Not by the read that is made again, nor by one after a write that made the late answer an old one."""

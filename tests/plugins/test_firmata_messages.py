@@ -65,6 +65,7 @@ def agrees_with_the_naive_one(messages: int, seed: int) -> None:
     assert len(found) > 0.4 * messages and decoder.dropped > 0
 
 
+@pytest.mark.slow
 def test_nothing_is_made_up():
     agrees_with_the_naive_one(20_000, 0)
 

@@ -125,6 +125,7 @@ def agrees_with_the_naive_one(frames: int, seed: int) -> None:
     assert len(found) > 0.4 * frames and decoder.dropped > 0.2 * frames
 
 
+@pytest.mark.slow
 def test_nothing_harmed_is_accepted():
     agrees_with_the_naive_one(20_000, 0)
 
@@ -157,6 +158,7 @@ def guards(draw):
     return messages.Guard(draw(u16), channels, tuple(draw(st.lists(rows, max_size=5))))
 
 
+@pytest.mark.slow
 @given(
     st.one_of(
         st.builds(messages.Hello, u8),

@@ -58,6 +58,7 @@ def test_the_driver_works_over_it(board, tmp_path):
     assert board.chips[0].pulse_s(0) is None
 
 
+@pytest.mark.quick("3-to_board-duplicate", "3-to_board-split", "3-to_host-duplicate", "3-to_host-split")
 @pytest.mark.parametrize("fault", ["drop", "duplicate", "reorder", "flip", "split"])
 @pytest.mark.parametrize("direction", ["to_board", "to_host"])
 @pytest.mark.parametrize("turns", [3, pytest.param(12, marks=pytest.mark.slow)])
@@ -134,6 +135,7 @@ def test_unplugged_and_plugged_in_under_another_name(board, tmp_path):
         os.close(handle)
 
 
+@pytest.mark.slow
 def test_a_silent_board_is_lost(board):
     link = FramedLink(FramedLink.Settings(port=board.path, start_s=0.05))
     link.open(board.clock)

@@ -240,6 +240,7 @@ def two_arms():
     return ReadRequest(arms, clamp, requested_channels(arms, clamp, measured=True))
 
 
+@pytest.mark.quick("0-still1")
 @pytest.mark.parametrize("still", [{"samples": 15}, {"window_s": 0.3, "spread_deg": 0.01}])
 @pytest.mark.parametrize("seed", range(4))
 def test_a_log_streamed_live_gives_the_records_that_reading_it_gives(tmp_path, still, seed):

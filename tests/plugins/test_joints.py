@@ -291,6 +291,7 @@ def test_the_oracle_of_chains_is_that_of_the_arm_where_both_apply():
     np.testing.assert_allclose(found, oracle.tip(v, q), rtol=0, atol=1e-14)
 
 
+@pytest.mark.quick("approach_backlash", "gear_error", "quantisation", "thermal_length, each link", "thermal_length")
 @pytest.mark.parametrize("name", EFFECTS)
 def test_an_effect_alone_moves_the_tip_as_its_description_says(lrm, tmp_path, name):
     experiment, drawn = configured(tmp_path, [name], np.random.default_rng(len(name)))
@@ -302,7 +303,7 @@ def test_an_effect_alone_moves_the_tip_as_its_description_says(lrm, tmp_path, na
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.quick("0")
+@pytest.mark.slow
 def test_all_effects_together_move_the_tip_as_all_descriptions_say(lrm, tmp_path, seed):
     experiment, drawn = configured(tmp_path, TOGETHER, np.random.default_rng(seed))
     dataset = visited(lrm, 10 + seed)
@@ -310,6 +311,7 @@ def test_all_effects_together_move_the_tip_as_all_descriptions_say(lrm, tmp_path
     np.testing.assert_allclose(predicted(lrm, experiment, dataset), expected, rtol=0, atol=AGREEMENT_M)
 
 
+@pytest.mark.slow
 def test_effects_act_under_loads_of_every_kind(lrm, tmp_path):
     """Tilted gravity, payload and wrench of each record."""
     names = ("compliance", "cubic_spring", "bearing_play", "torque_backlash", "thermal_length, each link")
@@ -569,6 +571,7 @@ SCARA_CASES = {
 }
 
 
+@pytest.mark.quick("bearing_play", "cubic_spring", "torque_backlash", "torsional_spring")
 @pytest.mark.parametrize("cases", [(name,) for name in SCARA_CASES] + [tuple(SCARA_CASES)], ids="+".join)
 def test_springs_hold_a_sliding_joint_by_force_and_every_site_by_moment(cases):
     random = np.random.default_rng(30)

@@ -225,6 +225,7 @@ class Keeps(_Faulty):
     fault = "keeps"
 
 
+@pytest.mark.quick("Keeps-keeps nothing")
 @pytest.mark.parametrize(
     ("name", "said"),
     [("Wide", "prior and records"), ("Skew", "symmetric"), ("Changes", "changes nothing"), ("Keeps", "keeps nothing")],

@@ -109,6 +109,7 @@ def test_random_arms_and_poses_agree_with_the_matrix_product_of_the_convention(c
             np.testing.assert_allclose(found["row4"], rows[3], rtol=0, atol=EXACT_M * 10)
 
 
+@pytest.mark.quick("craig-12")
 @pytest.mark.parametrize("arms", [12, pytest.param(50, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("convention", ["standard", "craig"])
 def test_random_arms_and_poses_agree_with_pinocchio(convention, arms):
@@ -142,6 +143,7 @@ def pinocchio_arm(pin, config):
     return model, pending @ product(*(next(iter(s.items())) for s in config["tool"]))
 
 
+@pytest.mark.slow
 def test_the_shipped_arm_is_the_oracles_arm(lrm):
     import oracle
 

@@ -78,6 +78,7 @@ def tips_at(made: Mission, values: np.ndarray) -> np.ndarray:
     return np.array([exact[name] for name in TIP]).T
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_mission_and_another_does_not() -> None:
     one, two, other = (mission(quiet=False, days=4, seed=seed, events=[]) for seed in (3, 3, 4))
     assert one.records.ids == two.records.ids and np.array_equal(one.outliers, two.outliers)
@@ -105,6 +106,7 @@ def test_a_still_mission_is_what_the_ordinary_forward_model_gives() -> None:
     assert np.abs(tips(made) - tips_at(made, values)).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_parameters_that_move_are_those_of_each_record() -> None:
     """Record by record through a model that knows one value vector at a time."""
     made = mission(quiet=False, days=8, noise=0.0, events=[SLIP], **{"outliers.fraction": 0, "tilt.error_deg": 0})
@@ -187,6 +189,7 @@ def test_a_bump_is_a_rigid_motion_of_what_is_measured() -> None:
     assert np.array_equal(poses[0], np.eye(4)) and np.allclose(poses[1, :3, 3], [0.003, -0.002, 0.001])
 
 
+@pytest.mark.slow
 def test_losses_and_outliers_come_in_the_stated_fractions() -> None:
     whole = mission(days=60)
     made = mission(days=60, **{"losses.fraction": 0.1, "losses.hours": 0.2, "outliers.fraction": 0.05})
@@ -203,11 +206,13 @@ def test_losses_and_outliers_come_in_the_stated_fractions() -> None:
     assert away[made.outliers].min() >= 0.0299 and away[made.outliers].max() <= 0.0601
 
 
+@pytest.mark.slow
 def test_noise_is_as_large_as_stated() -> None:
     clean, noisy = mission(days=20), mission(days=20, noise=0.0005)
     assert np.allclose((tips(noisy) - tips(clean)).std(axis=0), 0.0005, rtol=0.06)
 
 
+@pytest.mark.slow
 def test_temperature_goes_by_day_and_night_and_acts() -> None:
     thermal = {"arm.mdh.theta1": {"per_K": "0.01 deg", "reference_C": 20}}
     still, made = mission(days=2), mission(days=2, thermal=thermal)
@@ -281,6 +286,7 @@ def test_a_creep_begins_on_its_day_adds_to_what_creeps_already_and_ends() -> Non
     assert (planned.kind, planned.joint, planned.time, planned.until) == ("creep", "arm.q3", DAY_S, 2 * DAY_S)
 
 
+@pytest.mark.slow
 def test_growing_play_moves_tips_apart_by_the_side_they_came_from() -> None:
     event = {"kind": "play", "day": 0, "joint": "arm.q2", "parameter": "arm.lag.lag2", "change": "1 deg in 1 d"}
     made, still = mission(days=1, events=[event]), mission(days=1)
@@ -378,6 +384,7 @@ def test_no_record_arrives_in_a_gap() -> None:
     assert made.records.ids == plain.records.subset(np.flatnonzero(~inside)).ids and made.lost == inside.sum()
 
 
+@pytest.mark.slow
 def test_exchanged_records_have_their_neighbours_measurements_and_their_own_joints() -> None:
     plain, made = mission(days=20), mission(days=20, exchanged={"fraction": 0.1})
     assert np.array_equal(made.records.column("arm.q1"), plain.records.column("arm.q1"))
@@ -394,6 +401,7 @@ JOINTS = tuple(
 )
 
 
+@pytest.mark.slow
 def test_a_surprise_is_the_same_for_a_seed_and_what_is_configured_stays() -> None:
     simulator = experiment().simulator()
     assert isinstance(simulator, MissionSimulator)
@@ -403,6 +411,7 @@ def test_a_surprise_is_the_same_for_a_seed_and_what_is_configured_stays() -> Non
     assert MissionSettings.model_validate({"truth": "truth.yaml", "days": 30, **plan}).events
 
 
+@pytest.mark.slow
 def test_a_surprise_finds_what_acts_as_a_joints_offset_and_play_and_which_link_it_carries() -> None:
     built, asked = experiment().simulator(), request()
     arm, random_ = asked.arms["arm"], np.random.default_rng(0)

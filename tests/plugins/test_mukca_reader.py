@@ -248,6 +248,7 @@ def damaged(place, random):
     return place
 
 
+@pytest.mark.slow
 def test_damaged_folders_are_read_or_refused_by_an_armcal_error(tmp_path):
     random, refused, asked = np.random.default_rng(5), 0, request()
     for number in range(200):

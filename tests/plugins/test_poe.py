@@ -319,6 +319,7 @@ def test_a_plain_joint_and_the_same_twist_move_alike():
         assert float(ca.norm_inf(ca.evalf(ca.densify(off)))) < 1e-15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parametrisation", ["minimal", "full"])
 def test_both_parametrisations_keep_the_contract(parametrisation):
     from armcal.plugins import Component
@@ -386,6 +387,7 @@ estimator: {type: ipopt}
 """
 
 
+@pytest.mark.slow
 def test_axes_are_found_by_calibration(tmp_path):
     """Offsets that are wrong in truth turn every axis beyond them; the axes that are found make up for it."""
     import json

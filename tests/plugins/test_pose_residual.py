@@ -81,7 +81,7 @@ def test_the_contract(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.quick("fourier")
+@pytest.mark.slow
 def test_unseen_errors_fall_to_near_the_noise_and_the_run_says_so(kind):
     run = learned_run(kind)
     errors, outcome = run.metrics["error_mm"]["calibrated"], run.metrics["pose_residual"]
@@ -125,6 +125,7 @@ def test_a_calibration_predicts_what_the_run_found_and_compensates_to_the_same_a
     np.testing.assert_allclose(back[:, :3, 3], tools[0][:20, :3, 3], atol=1e-9)
 
 
+@pytest.mark.quick("fourier")
 @pytest.mark.parametrize("kind", KINDS)
 def test_intervals_widen_where_nothing_was_measured(kind):
     run = learned_run(kind)
@@ -137,7 +138,7 @@ def test_intervals_widen_where_nothing_was_measured(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.quick("fourier")
+@pytest.mark.slow
 def test_an_arm_without_such_errors_keeps_none(kind, tmp_path):
     ran(tmp_path, f"{{type: {kind}}}", recorded(tmp_path, ""))
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
@@ -147,6 +148,7 @@ def test_an_arm_without_such_errors_keeps_none(kind, tmp_path):
     assert kept is not None and not kept.is_learned
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize("kind", KINDS)
 def test_c_code_stands_where_the_calibration_does(kind, tmp_path):
@@ -216,6 +218,7 @@ def expanding_run():
     return SimpleNamespace(folder=folder, calibration=Calibration.load(folder / "run/calibration.yaml"))
 
 
+@pytest.mark.slow
 def test_errors_that_depend_on_the_temperature_are_learned_where_it_was_recorded():
     run = expanding_run()
     folds = json.loads((run.folder / "run/metrics.json").read_text())["pose_residual"]["folds"]
@@ -239,6 +242,7 @@ def test_a_prediction_that_lacks_the_temperature_is_less_sure():
     assert untold > 2 * told
 
 
+@pytest.mark.slow
 def test_compensation_and_c_code_take_the_temperature(tmp_path):
     calibration, angles = expanding_run().calibration, np.random.default_rng(0).uniform(-1, 1, (6, 3))
     celsius = np.linspace(16, 29, 6)
@@ -325,6 +329,7 @@ def test_compensation_and_c_code_take_the_load(tmp_path):
         np.testing.assert_allclose(pose, tools[1.3][1, :3], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_recalibration_holds_what_was_learned(tmp_path):
     run = learned_run("fourier")
     (tmp_path / "calibration.yaml").write_text((run.folder / "run/calibration.yaml").read_text())

@@ -112,6 +112,7 @@ def posed(lrm):
     return PosedProblem(replace(problem, parameters=changed), records)
 
 
+@pytest.mark.slow
 def test_the_gradient_by_increments_is_the_difference_of_the_cost(posed):
     random = np.random.default_rng(1)
     for _ in range(3):
@@ -320,6 +321,7 @@ def training_sets(lrm, seeds, solver):
     return smallest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [CONE, pytest.param(ROOT, marks=pytest.mark.slow)], ids=["cone", "root"])
 def test_no_fit_has_a_negative_eigenvalue(lrm, solver):
     assert min(training_sets(lrm, range(1), solver)) >= LEAST_EIGENVALUE
@@ -436,6 +438,7 @@ def test_intervals_of_compliances_hold_the_truth_as_often_as_they_say(lrm):
     assert 0.95 < np.sqrt(np.mean(scores**2)) < 1.05
 
 
+@pytest.mark.slow
 def test_without_noise_the_truth_comes_back(lrm):
     truth, q = definite_truth(), oracle.random_poses(80, 2)
     experiment = flexible(lrm, free=("arm.mdh.theta?", "arm.flex.C[1-3]"), start="0.02")

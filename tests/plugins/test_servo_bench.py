@@ -168,6 +168,7 @@ class TestTime:
         assert after["joints"] == before["joints"] and after["base_T_tool"] == before["base_T_tool"]
         assert after["now"] == before["now"] and heard(ear) == []
 
+    @pytest.mark.slow
     def test_the_same_requests_give_the_same_bytes(self, make: Make, ear: socket.socket) -> None:
         found = []
         for _ in range(2):
@@ -186,6 +187,7 @@ class TestTime:
             found.append(heard(ear))
         assert found[0] != found[1]
 
+    @pytest.mark.slow
     def test_the_way_time_is_cut_up_changes_nothing(self, make: Make, ear: socket.socket) -> None:
         whole, cut = make(), make()
         said = []
@@ -317,6 +319,7 @@ class TestSafety:
         host.ramp({"q2": 50.0}, {"q2": 55.0})
         assert set(host.state["offences"]) == {"limits"}
 
+    @pytest.mark.slow
     def test_a_pose_that_is_too_near_is_an_offence(self, make: Make, experiment: Experiment) -> None:
         plan = experiment.settings.plan
         assert plan is not None and plan.clearance is not None
@@ -508,6 +511,7 @@ class TestServer:
         assert second.ask(advance=0.25)["now"] == 0.25
         second.close()
 
+    @pytest.mark.quick("\\xff", '{"fault": 3}', "{}")
     @pytest.mark.parametrize("line", ["", "[]", "{", "{}", '{"advance": "x"}', "\xff", "[" * 20000, '{"fault": 3}'])
     def test_a_request_that_is_none_is_answered_by_an_error(self, path: Path, line: str) -> None:
         client = Client(path)
@@ -560,6 +564,7 @@ class TestCommand:
         sets = ["--set", f"bench.simulator.tracker.port={port}", *more]
         return subprocess.Popen([*command, *sets], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
+    @pytest.mark.slow
     def test_it_serves_until_it_is_told_to_end(self, tmp_path: Path, ear: socket.socket) -> None:
         folder = tmp_path / "new" / "bench"
         with self.start(folder, ear.getsockname()[1]) as process:

@@ -44,6 +44,7 @@ def problem_for(loaded: Experiment, dataset) -> Problem:
     return Problem.build(system.arms, system.measurements, loaded.parameters, system.environment, dataset, "compiled")
 
 
+@pytest.mark.quick("cvxpy")
 @pytest.mark.parametrize("solver", ["ipopt", "cvxpy"])
 def test_without_noise_the_truth_comes_back(solver: str) -> None:
     """Every parameter to 1e-6 of its typical scale."""
@@ -115,6 +116,7 @@ def test_the_arm_stands_at_the_quantised_command_and_the_record_says_the_one_ask
     assert max(np.abs(on_grid["arm.q1"] - exact.column("arm.q1"))) <= step / 2 + 1e-12
 
 
+@pytest.mark.slow
 def test_outliers_are_as_many_and_as_large_as_asked_for() -> None:
     loaded = experiment("simulation.poses.kind=random", "simulation.poses.count=2000")
     clean = simulated(loaded, noise=0.0)

@@ -189,6 +189,7 @@ def recorded(path, offsets, body):
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_what_priors_alone_hold_is_a_note_where_tips_do_not_depend_on_it(tmp_path):
     """The last joint's zero trades with the target's place and rotation: a gauge, and no reason not to use it."""
     recorded(tmp_path / "poses.csv", (0, 0.02, -0.03, 0.015, 0), Rotation.from_rotvec([0.03, -0.5, 0.2]))
@@ -202,6 +203,7 @@ def test_what_priors_alone_hold_is_a_note_where_tips_do_not_depend_on_it(tmp_pat
     assert len(known) - known.rank == len(known.undetermined) == 1 and finding.text.startswith("1 combination ")
 
 
+@pytest.mark.slow
 def test_a_calibration_finds_offsets_and_the_bodys_rotation_from_a_file(tmp_path):
     """What is found lies within five standard deviations of the truth."""
     offsets, body = (0, 0.02, -0.03, 0.015, 0), Rotation.from_rotvec([0.03, -0.5, 0.2])

@@ -137,6 +137,7 @@ def test_any_two_links_one_beyond_the_other_make_a_chain():
     np.testing.assert_allclose(found[""], expected, rtol=0, atol=EXACT_M)
 
 
+@pytest.mark.quick("panda-ball_link")
 @pytest.mark.parametrize(("name", "tip"), [("panda", "ball_link"), ("iiwa14", "ball_link"), ("gen3lite", "tool_frame")])
 def test_measured_arms_agree_with_pinocchio_in_1000_poses(shared_data, name, tip):
     pin = pytest.importorskip("pinocchio")

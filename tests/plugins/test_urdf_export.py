@@ -123,6 +123,7 @@ def test_everything_but_origins_stays_byte_for_byte(name):
     assert found.content == text.encode(encoding)
 
 
+@pytest.mark.slow
 def test_one_number_changes_one_number():
     for name, old, new in (
         ("turn_y", '"1e-1  0.20\t3."', '"1e-1 0.25 3."'),
@@ -221,6 +222,7 @@ def folder(tmp_path_factory):
     return place
 
 
+@pytest.mark.slow
 def test_a_calibration_is_exported_and_what_is_left_out_is_told(folder, tmp_path):
     out = tmp_path / "out.urdf"
     ran = armcal("export", folder / "run" / "calibration.yaml", "--format", "urdf", "--out", out, "--json")
@@ -252,6 +254,7 @@ def test_what_is_left_out_is_measured_against_the_elastic_arm(folder):
     assert effects_reach(loaded, request) == pytest.approx(np.linalg.norm(apart, axis=1).max(), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_files_are_overwritten_only_by_force_and_never_the_calibration(folder, tmp_path):
     calibration, out = folder / "run" / "calibration.yaml", tmp_path / "out.urdf"
     out.write_text("mine")

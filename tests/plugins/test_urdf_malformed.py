@@ -193,7 +193,7 @@ def expected(pin, arm, data, commands):
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.quick("0")
+@pytest.mark.slow
 def test_mutants_are_refused_or_read_as_pinocchio_reads_them(folder, registry, seed):
     pin = pytest.importorskip("pinocchio")
     random, refused, compared = np.random.default_rng(seed), 0, 0

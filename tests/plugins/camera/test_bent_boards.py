@@ -6,6 +6,7 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
+import pytest
 import yaml
 from armcal.run.experiment import Experiment
 from armcal.run.fixed_parameters import fixed_parameters
@@ -20,6 +21,7 @@ BENT = {"camera.board_bend_x": "1 mm"}
 TRUTH = {**numbers("camera.camera", CAMERA), **numbers("camera.board", BOARD), **BENT}
 
 
+@pytest.mark.slow
 def test_a_bent_board_is_named_and_known_with_its_interval(tmp_path: Path) -> None:
     flat = simulated(tmp_path, {"camera": {}}, TRUTH, 25)  # type: ignore[arg-type]
     left = fixed_parameters(flat, prepare(flat, Stopwatch()))

@@ -64,6 +64,7 @@ def printed_points(found: Array, pixels_per_mm: float) -> Array:
     return (found - found[0]) / pixels_per_mm
 
 
+@pytest.mark.quick("tag")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_drawn_page_shows_the_board_to_scale(tmp_path: Path, kind: str) -> None:
     made, out = written(tmp_path, kind)
@@ -89,6 +90,7 @@ def test_the_pdf_measures_what_it_says(tmp_path: Path, kind: str) -> None:
     np.testing.assert_allclose(np.array(rows, float), dark, atol=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium to draw the page")
 def test_a_browser_draws_the_page_so_that_the_board_is_found(tmp_path: Path) -> None:
     made, out = written(tmp_path, "charuco")

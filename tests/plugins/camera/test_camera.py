@@ -96,6 +96,7 @@ def test_undistorted_places_project_back(lens: str, distortion: tuple[float, ...
     assert pinhole(0.0, 0.0, DISTORTED[0]) == (0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_points_evaluate_as_one_long_expression(experiment: Experiment, dataset: Dataset) -> None:
     problem, few = problem_of(experiment, dataset), np.arange(5)
     values, records = away(problem), problem.subset(problem.records(dataset), few)
@@ -177,6 +178,7 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return armcal.Experiment.load(DEMO).run().write(tmp_path_factory.mktemp("camera") / "run")
 
 
+@pytest.mark.slow
 def test_arm_camera_and_board_together_come_to_the_truth(calibrated: Path) -> None:
     truth = load_config(DEMO.parent / "truth.yaml").data
     calibration = Calibration.load(calibrated / "calibration.yaml")

@@ -50,6 +50,7 @@ def matrix_of(place: list[float], rotation: Array) -> Array:
     return pose
 
 
+@pytest.mark.slow
 def test_opencv_reads_its_file(calibration: Path, tmp_path: Path) -> None:
     cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install 'armcal[camera]'")
     exported(calibration, "opencv", tmp_path / "camera.yaml")
@@ -62,6 +63,7 @@ def test_opencv_reads_its_file(calibration: Path, tmp_path: Path) -> None:
     assert storage.getNode("image_width").real() == 1280
 
 
+@pytest.mark.slow
 def test_ros_files_agree_with_each_other(calibration: Path, tmp_path: Path) -> None:
     exported(calibration, "hand_eye", tmp_path / "where.yaml", "--option", "tool_frame=flange")
     exported(calibration, "camera_info", tmp_path / "info.yaml")
@@ -97,6 +99,7 @@ def test_report_and_verdict_speak_of_pixels_and_of_the_camera(run: Run, calibrat
     assert len(rows) == 41 and "calibrated_px" in rows[0]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not SHARED.exists(), reason="the measured images are not beside the checkout (../shared/data/camera)"
 )
@@ -131,6 +134,7 @@ def test_rendered_images_give_the_camera_where_it_is(name: str, tmp_path: Path) 
     assert run.metrics["error_px"]["calibrated"]["holdout"]["rms"] < 0.02
 
 
+@pytest.mark.slow
 def test_commands_that_go_on_from_a_camera_take_its_records(calibration: Path, tmp_path: Path) -> None:
     records, out = str(DEMO.with_suffix(".csv")), tmp_path / "predicted.csv"
     predicted = armcal_says("predict", str(calibration), "--poses", records, "--out", str(out))

@@ -18,6 +18,7 @@ from tests.plugins.camera.simulated_views import ARM, assert_found, base_T, esti
 CAMERA_T_BOARD = pose((-0.08, -0.05, 0.8), (8, -6, 3))
 
 
+@pytest.mark.quick("eye_to_hand")
 @pytest.mark.parametrize("mounting", ["eye_in_hand", "eye_to_hand"])
 def test_what_the_forearm_carries_is_found(mounting: str, tmp_path: Path) -> None:
     carried = pose((0.05, 0.02, 0.06), (5, 20, -40))
@@ -29,6 +30,7 @@ def test_what_the_forearm_carries_is_found(mounting: str, tmp_path: Path) -> Non
     assert_found(estimate, camera_camera=camera, camera_board=board)
 
 
+@pytest.mark.slow
 def test_a_camera_on_the_forearm_sees_a_board_on_the_tool(tmp_path: Path) -> None:
     to_tool = np.linalg.inv(base_T("row3")) @ base_T("tool")
     board = pose((-0.08, -0.05, 0.05), (170, 8, 5))

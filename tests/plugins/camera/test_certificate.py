@@ -23,6 +23,7 @@ def poses(seed: int, mm: float, deg: float) -> tuple[Array, Array, Array, Array]
     return a, np.array([noisy(one, random, mm, deg) for one in np.linalg.inv(y) @ a @ x]), x, y
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mm", "deg"), [(0.0, 0.0), (0.3, 0.03), (20.0, 3.0)])
 def test_the_best_answer_is_certified_and_no_other_is_better(mm: float, deg: float) -> None:
     a, b, x, y = poses(1, mm, deg)

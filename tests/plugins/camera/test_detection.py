@@ -34,6 +34,7 @@ def truth(board: Board, pose: Array, lens: Lens = PINHOLE) -> Array:
     return lens.project(board.points @ pose[:3, :3].T + pose[:3, 3])
 
 
+@pytest.mark.quick("fisheye-aprilgrid", "fisheye-tag", "pinhole-aprilgrid", "pinhole-tag")
 @pytest.mark.parametrize("board", [CHESSBOARD, CHARUCO, APRILGRID, TAG], ids=lambda board: board.type)
 @pytest.mark.parametrize("lens", [PINHOLE, FISHEYE], ids=["pinhole", "fisheye"])
 def test_corners_are_where_they_were_rendered(board: Board, lens: Lens) -> None:
@@ -60,6 +61,7 @@ def test_the_lens_of_the_renderer_is_that_of_opencv(lens: Lens) -> None:
     np.testing.assert_allclose(lens.rays(lens.project(points)), points[:, :2] / points[:, 2:], atol=1e-6)
 
 
+@pytest.mark.quick("size1-1.5")
 @pytest.mark.parametrize("roll", [0.0, 1.5, 3.1, -2.0])
 @pytest.mark.parametrize("size", [(9, 6), (6, 9), (8, 5)])
 def test_a_chessboard_is_the_same_way_round_in_every_image(roll: float, size: tuple[int, int]) -> None:
@@ -116,6 +118,7 @@ def fault_of(image: Grey, board: Board) -> str:
     return found.fault
 
 
+@pytest.mark.slow
 def test_what_is_wrong_with_an_image_is_said() -> None:
     pose = facing(CHESSBOARD, TURN)
     image = image_of(CHESSBOARD, pose)
@@ -131,6 +134,7 @@ def test_what_is_wrong_with_an_image_is_said() -> None:
     assert "not found" in fault_of(image_of(CHESSBOARD, facing(CHESSBOARD, TURN, 4.0)), CHESSBOARD)
 
 
+@pytest.mark.slow
 def test_a_board_that_stands_there_twice_is_refused() -> None:
     left, right = facing(CHESSBOARD, distance=1.0), facing(CHESSBOARD, distance=1.0)
     left[0, 3] -= 0.2
@@ -150,6 +154,7 @@ def test_columns_for_rows_are_noticed_where_tags_say_so() -> None:
     assert "check its columns, rows" in fault_of(image_of(CHARUCO, facing(CHARUCO)), turned)
 
 
+@pytest.mark.quick("colour")
 @pytest.mark.parametrize("kind", ["colour", "sixteen bits", "jpeg"])
 def test_images_of_every_kind_are_read(kind: str) -> None:
     pose = facing(CHESSBOARD, TURN)

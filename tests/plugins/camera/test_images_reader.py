@@ -84,6 +84,7 @@ def read(request: ReadRequest | None = None, **settings: object) -> Any:
     return ImagesReader(ImagesSettings.model_validate(given)).read(request or request_of())
 
 
+@pytest.mark.slow
 def test_each_image_is_a_record_in_the_order_of_numbers(folder: Path) -> None:
     dataset = read(folder=folder, poses=folder / "poses.csv")
     assert dataset.ids == ("8.png", "9.png", "10.png", "11.png", "12.png")
@@ -94,6 +95,7 @@ def test_each_image_is_a_record_in_the_order_of_numbers(folder: Path) -> None:
         np.testing.assert_allclose(pixels, truth(i), atol=0.05)
 
 
+@pytest.mark.slow
 def test_how_much_is_looked_at_is_reported(folder: Path) -> None:
     seen: list[float] = []
     asked = replace(request_of(), report=seen.append)
@@ -106,6 +108,7 @@ def test_how_much_is_looked_at_is_reported(folder: Path) -> None:
     assert seen == sorted(seen) and 0.5 in seen and seen[-1] == 1.0
 
 
+@pytest.mark.slow
 def test_detections_are_kept_by_content(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = read(folder=folder, poses=folder / "poses.csv")
 
@@ -124,6 +127,7 @@ def test_detections_are_kept_by_content(folder: Path, cache: Path, monkeypatch: 
         read(folder=folder, poses=folder / "poses.csv")
 
 
+@pytest.mark.slow
 def test_a_column_may_name_the_image(folder: Path) -> None:
     (folder / "poses.csv").write_text("image,q1_deg,q2_deg\n12.png,1,2\n10,3,4\nsub/8.png,5,6\n")
     dataset = read(folder=folder, poses=folder / "poses.csv")
@@ -149,18 +153,21 @@ def test_what_says_nothing_is_set_aside_with_its_reason(folder: Path) -> None:
         read(folder=folder, poses=folder / "poses.csv")
 
 
+@pytest.mark.slow
 def test_a_blurred_image_among_sharp_ones_is_set_aside(folder: Path) -> None:
     cv2.imwrite(str(folder / "11.png"), cv2.GaussianBlur(cv2.imread(str(folder / "11.png"), 0), (0, 0), 3.0))
     dataset = read(folder=folder, poses=folder / "poses.csv")
     assert "it is blurred: edges are 6." in dataset.set_aside[0].reason
 
 
+@pytest.mark.slow
 def test_poses_and_images_that_differ_in_number_are_refused(folder: Path) -> None:
     (folder / "12.png").unlink()
     with pytest.raises(DataError, match=r"found 5 poses in .*poses.csv and 4 images"):
         read(folder=folder, poses=folder / "poses.csv")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change", [lambda f: [p.unlink() for p in f.glob("*.png")], lambda f: f.rename(f.parent / "x")]
 )
@@ -172,6 +179,7 @@ def test_a_folder_without_images_is_refused(folder: Path, change: Callable[[Path
         read(folder=folder, poses=poses)
 
 
+@pytest.mark.slow
 def test_corners_are_written_and_stand_for_the_images(folder: Path) -> None:
     corners = folder / "corners.csv"
     first = read(folder=folder, poses=folder / "poses.csv", corners=corners)
@@ -216,6 +224,7 @@ def test_a_file_of_corners_is_refused_with_its_line(tmp_path: Path, text: str, m
 POSES = [Rotation.from_euler("ZYX", (0.3 * i, -0.2, 3.0 + 0.1 * i)) for i in range(COUNT)]
 
 
+@pytest.mark.quick("quaternion", "three rows")
 @pytest.mark.parametrize("form", ["matrix", "three rows", "quaternion", "euler"])
 def test_flange_poses_become_coordinates(folder: Path, form: str) -> None:
     path, settings = folder / "flange.txt", None
@@ -242,6 +251,7 @@ def test_flange_poses_become_coordinates(folder: Path, form: str) -> None:
     assert np.abs(np.diff(values["rx"])).max() < 1
 
 
+@pytest.mark.quick("1 0 0 0 0 1 0 0 0 0 1 0 0 0 1 1-:2.*last row is not 0 0 0 1")
 @pytest.mark.parametrize(
     ("line", "message"),
     [
@@ -257,6 +267,7 @@ def test_a_flange_pose_that_is_none_is_refused(folder: Path, line: str, message:
         read(request_of(FLANGE), folder=folder, poses=path)
 
 
+@pytest.mark.slow
 def test_without_opencv_corners_are_read_and_images_are_not(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = read(folder=folder, poses=folder / "poses.csv", corners=folder / "corners.csv")
     monkeypatch.setitem(sys.modules, "cv2", None)

@@ -121,6 +121,7 @@ def test_images_of_a_folder_are_kept_judged_and_read_by_a_run(
     assert abs(found["camera.camera_x"] - 0.042) < 0.003 and abs(found["camera.camera_z"] - 0.055) < 0.003
 
 
+@pytest.mark.slow
 def test_a_camera_is_asked_at_a_key_and_looks_without_keeping(
     tmp_path: Path, shots: Shots, arm: GuidedArm, started: list[Recording]
 ) -> None:

@@ -95,6 +95,7 @@ class Bench:
         return replace(clean, channels=channels)
 
 
+@pytest.mark.quick("eye_in_hand-swapped")
 @pytest.mark.parametrize("mistake", ["swapped", "second", "rolled"])
 @pytest.mark.parametrize("mounting", ["eye_in_hand", pytest.param("eye_to_hand", marks=pytest.mark.slow)])
 def test_what_does_not_belong_together_is_refused_by_name(tmp_path: Path, mounting: str, mistake: str) -> None:
@@ -104,6 +105,7 @@ def test_what_does_not_belong_together_is_refused_by_name(tmp_path: Path, mounti
     assert SENTENCES[mistake] in str(refusal.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 20))])
 @pytest.mark.parametrize("mounting", ["eye_in_hand", pytest.param("eye_to_hand", marks=pytest.mark.slow)])
 def test_the_errors_of_a_poor_arm_are_no_second_board(tmp_path: Path, mounting: str, seed: int) -> None:

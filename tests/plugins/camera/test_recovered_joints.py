@@ -34,12 +34,14 @@ def path() -> Array:
     return START[:, None] + np.cumsum(steps, axis=1)
 
 
+@pytest.mark.slow
 def test_joints_of_a_path_are_found_on_its_branch(arm: Arm, path: Array) -> None:
     commands, postures = recovered_joints(arm, tools_at(arm, path), START)
     assert np.abs(commands - path).max() < 1e-6
     assert postures.min() >= 2
 
 
+@pytest.mark.slow
 def test_without_a_hint_the_poses_are_reached_and_the_joints_hardly_move(arm: Arm, path: Array) -> None:
     tools = tools_at(arm, path)
     commands, _ = recovered_joints(arm, tools, np.zeros(6))
@@ -47,6 +49,7 @@ def test_without_a_hint_the_poses_are_reached_and_the_joints_hardly_move(arm: Ar
     assert np.abs(np.diff(commands, axis=1)).sum() < 2 * np.abs(np.diff(path, axis=1)).sum()
 
 
+@pytest.mark.slow
 def test_a_pose_out_of_reach_has_no_joints(arm: Arm, path: Array) -> None:
     tools = tools_at(arm, path)
     tools[3, :3, 3] = (3.0, 0.0, 0.5)

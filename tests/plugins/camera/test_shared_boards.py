@@ -26,6 +26,7 @@ BOARD = base_T("tool") @ LEFT @ pose((-0.08, -0.05, 0.8), (8, -6, 3))
 TRUTH = {**numbers("left.camera", LEFT), **numbers("right.camera", RIGHT), **numbers("left.board", BOARD)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [("left", "right"), ("right", "left")])
 def test_a_board_is_known_better_by_two_cameras(order: tuple[str, str], tmp_path: Path) -> None:
     stated: dict[str, dict[str, object]] = {"left": {}, "right": {"boards_of": "left"}}
@@ -46,6 +47,7 @@ def test_a_board_is_known_better_by_two_cameras(order: tuple[str, str], tmp_path
             assert np.linalg.norm(off) < 2e-3
 
 
+@pytest.mark.slow
 def test_a_camera_beside_the_arm_is_placed_by_the_board_of_the_hand_camera(tmp_path: Path) -> None:
     beside = BOARD @ np.linalg.inv(pose((-0.08, -0.05, 1.2), (25, -20, 100)))
     truth = {**TRUTH, **numbers("right.camera", beside)}

@@ -54,6 +54,7 @@ def test_what_a_wrong_zero_costs(tmp_path: Path) -> None:
     assert "At the same command the gripper stands" in called("check", one, two, "--arm", ARM)
 
 
+@pytest.mark.slow
 def test_a_range_in_percent_stretches_the_motion(tmp_path: Path) -> None:
     one = write_motors(tmp_path / "one.json")
     two = write_motors(tmp_path / "two.json", shoulder_pan={"range_min": 1010, "range_max": 3085})
@@ -62,6 +63,7 @@ def test_a_range_in_percent_stretches_the_motion(tmp_path: Path) -> None:
     assert percent["moved_mm"]["largest_mm"] > 20
 
 
+@pytest.mark.slow
 def test_poses_of_a_data_set_count(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     one = write_motors(tmp_path / "one.json")
@@ -124,6 +126,7 @@ def test_limits_of_the_arm_give_zeros_and_name_ranges_that_were_not_swept(tmp_pa
     assert values["arm.zeros.offset1"] == "11.5 deg"
 
 
+@pytest.mark.slow
 def test_calibrated_zeros_go_back_into_the_file(tmp_path: Path, calibrated: Path) -> None:
     """The demo's true zeros are known: by the new file the joints stand within 0.5 deg of their commands."""
     path = write_motors(tmp_path / "arm.json")

@@ -49,6 +49,7 @@ def gripper() -> Gripper:
     return Gripper(ARM, None, {}, discover())
 
 
+@pytest.mark.quick("elbow_flex")
 @pytest.mark.parametrize("motor", PLANTED)
 def test_what_was_planted_is_found_within_its_interval(planted_motion: Motion, motor: str) -> None:
     found, true = by_motor(planted_motion)[motor], PLANTED[motor]
@@ -76,6 +77,7 @@ def test_intervals_cover_what_was_planted(tmp_path: Path) -> None:
     assert np.mean(covered) > 0.9
 
 
+@pytest.mark.slow
 def test_a_follower_that_lags_like_a_spring_and_damper_has_no_backlash(tmp_path: Path) -> None:
     """A first-order lag, which is no pure delay, must not be taken for play."""
     made = []
@@ -89,6 +91,7 @@ def test_a_follower_that_lags_like_a_spring_and_damper_has_no_backlash(tmp_path:
         assert abs(t.backlash.value) < 0.1 and 0.06 < t.delay_s.value < 0.14
 
 
+@pytest.mark.slow
 def test_sag_under_gravity_is_found_per_newton_metre(tmp_path: Path, gripper: Gripper) -> None:
     made, compliance = [], {"shoulder_lift": 2.4, "elbow_flex": 3.9}
     for action, _ in episodes({}, count=5, frames=800):
@@ -105,6 +108,7 @@ def test_sag_under_gravity_is_found_per_newton_metre(tmp_path: Path, gripper: Gr
     assert "gravity about it hardly changes" in motors["shoulder_pan"]["doubts"][0]
 
 
+@pytest.mark.slow
 def test_what_stopped_a_joint_is_left_out_and_named(tmp_path: Path) -> None:
     """A limit at 25 deg is no gain."""
     planted, made = {"elbow_flex": Planted(offset=1.0, backlash=0.8)}, []
@@ -118,12 +122,14 @@ def test_what_stopped_a_joint_is_left_out_and_named(tmp_path: Path) -> None:
     assert "a limit or an obstacle stopped it" in elbow.doubts[0]
 
 
+@pytest.mark.slow
 def test_exchanged_leader_and_follower_are_named(tmp_path: Path) -> None:
     made = [(state, action) for action, state in episodes({}, count=4, frames=600)]
     findings = findings_of(trackings(motion_of(tmp_path / "set", made)))
     assert re.search(r"exchanged: the commands follow the states, by (9\d|10\d|11\d) ms, in 6 of 6", findings[0])
 
 
+@pytest.mark.slow
 def test_faults_of_a_motor_are_named(tmp_path: Path) -> None:
     planted = {"elbow_flex": Planted(offset=-28.8), "wrist_roll": Planted(gain=-1.0), "wrist_flex": Planted(gain=0.8)}
     findings = findings_of(trackings(motion_of(tmp_path / "set", episodes(planted, count=4, frames=600))))
@@ -132,6 +138,7 @@ def test_faults_of_a_motor_are_named(tmp_path: Path) -> None:
     assert "wrist_flex moves 0.800 times as far" in findings[1] and "wrist_roll is inverted" in findings[2]
 
 
+@pytest.mark.slow
 def test_a_healthy_follower_has_no_findings(tmp_path: Path) -> None:
     assert not findings_of(trackings(motion_of(tmp_path / "set", episodes({}, count=4, frames=600))))
 
@@ -185,6 +192,7 @@ def test_two_data_sets_name_a_zero_that_moved(tmp_path: Path, offset: float, fac
     assert len(findings) == 1 and re.search(text.replace(".14..", r"\+14\.\d"), findings[0]), findings
 
 
+@pytest.mark.slow
 def test_mm_at_the_gripper(tmp_path: Path, gripper: Gripper) -> None:
     """2 deg of the pan alone move the gripper by its distance from the pan's axis."""
     made = []

@@ -114,6 +114,7 @@ def test_of_the_makers_own_urdf_the_arm_alone_is_written(tmp_path):
     assert exported.remarks == ()
 
 
+@pytest.mark.slow
 def test_a_makers_file_goes_into_its_own_urdf_and_back(tmp_path):
     """Only origins change; tool, limits and what stands around the arm stay, and the hash is known again."""
     (tmp_path / "cell.urdf").write_text(full_urdf())
@@ -193,6 +194,7 @@ def test_a_joint_that_slides_is_refused(tmp_path):
         UrExporter(UrSettings(hash=HASH)).export(made(tmp_path, model))
 
 
+@pytest.mark.slow
 def test_a_file_to_a_robot_and_back(tmp_path):
     """Read, made a robot with narrow priors, calibrated on simulated records, written, read."""
     of_maker(tmp_path, UR5E_YAML, "arm.urdf")

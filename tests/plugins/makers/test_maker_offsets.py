@@ -74,6 +74,7 @@ def baked(folder, offsets, *more):
     return armcal("maker", folder / "offsets.yaml", "--urdf", folder / "robot.urdf", "--tip", "hand", *more)
 
 
+@pytest.mark.slow
 def test_the_urdf_with_offsets_is_the_arm_that_they_describe(tmp_path):
     ran = baked(tmp_path, OFFSETS, "--out", tmp_path / "new.urdf", "--json")
     assert ran.exit_code == 0, ran.output

@@ -74,6 +74,7 @@ def shown_at(tour: bags.Tour, times: np.ndarray) -> np.ndarray:
     return np.clip(200 - 200 * away, 0, 255).astype(np.uint8)
 
 
+@pytest.mark.quick("mono8")
 @pytest.mark.parametrize("encoding", ["mono8", "rgb8", "bgra8", "yuv422_yuy2", "mono16"])
 def test_images_of_rests_are_taken_out(tour: bags.Tour, encoding: str) -> None:
     times = np.arange(tour.rests[0, 0], tour.rests[-1, 1], 0.1)

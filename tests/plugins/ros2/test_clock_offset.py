@@ -26,6 +26,7 @@ def estimated(tour: bags.Tour, bag: Path) -> tuple[float, float]:
     return float(sentence[1]), float(sentence[2])
 
 
+@pytest.mark.quick("-812.5")
 @pytest.mark.parametrize("ahead_ms", [37.0, -812.5, 3_600_250.0])
 def test_an_offset_is_found_within_its_interval(tour: bags.Tour, ahead_ms: float) -> None:
     bag = bags.write_bag(tour.config.with_name(f"ahead_{ahead_ms:.0f}"), tour.sent(ahead_ms / 1000))
@@ -34,6 +35,7 @@ def test_an_offset_is_found_within_its_interval(tour: bags.Tour, ahead_ms: float
     assert abs(offset - ahead_ms) < 2 * half_width
 
 
+@pytest.mark.slow
 def test_play_of_the_joints_is_not_taken_for_a_clock(tmp_path: Path) -> None:
     """A tool that follows only after 2 deg of play comes late where each motion begins, and not where it ends."""
     tour = bags.made_tour(tmp_path, rests=16, play_deg=2.0)
@@ -41,6 +43,7 @@ def test_play_of_the_joints_is_not_taken_for_a_clock(tmp_path: Path) -> None:
     assert abs(offset - 37) < 1 and half_width < 1
 
 
+@pytest.mark.slow
 def test_clocks_that_drift_apart_are_named(tour: bags.Tour) -> None:
     at, seen = tour.seen
     fast = replace(tour, seen=(at + 0.002 * (at - at[0]), seen))
@@ -63,6 +66,7 @@ def test_intervals_hold_as_often_as_they_state(tmp_path: Path) -> None:
     assert held >= 34
 
 
+@pytest.mark.slow
 def test_what_cannot_be_known_is_refused_with_the_reason(tour: bags.Tour) -> None:
     at, seen = tour.seen
     times, joints = tour.joints

@@ -39,6 +39,7 @@ def read(tour: bags.Tour, bag: Path) -> Dataset:
     return Experiment.load(bags.of_bag(tour, bag)).read()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("storage", "compressed"), KINDS)
 def test_a_file_that_was_cut_off_gives_what_comes_before(tour: bags.Tour, storage: str, compressed: str) -> None:
     bag, file = recorded(tour, f"cut_{storage}{compressed}", storage, compressed)
@@ -56,6 +57,7 @@ def test_a_file_that_was_cut_off_gives_what_comes_before(tour: bags.Tour, storag
     assert any("metadata.yaml is missing" in text for text in read(tour, bag).warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compressed", ["", "storage"])
 def test_every_cut_gives_a_beginning_of_the_whole(tour: bags.Tour, compressed: str) -> None:
     bag, file = recorded(tour, f"cuts_{compressed}", "mcap", compressed)
@@ -89,6 +91,7 @@ def test_a_damaged_chunk_costs_no_more_than_itself(tour: bags.Tour) -> None:
     assert ["the chunk at byte" in remark for remark in damaged.remarks] == [True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("storage", "compressed"), [*KINDS, ("mcap", "message"), ("sqlite3", "message")])
 def test_messages_are_those_that_rosbags_reads(tour: bags.Tour, storage: str, compressed: str) -> None:
     bag, _ = recorded(tour, f"read_{storage}{compressed}", storage, compressed)
@@ -101,6 +104,7 @@ def test_messages_are_those_that_rosbags_reads(tour: bags.Tour, storage: str, co
     assert {m.topic.name for m in passed_over if m.data is not None} == {"/tip"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_flat", [False, True])
 def test_chunks_may_be_compressed_by_lz4_or_missing(tour: bags.Tour, is_flat: bool) -> None:
     """A recorder that writes fast puts messages into the file without chunks."""
@@ -119,6 +123,7 @@ def test_chunks_may_be_compressed_by_lz4_or_missing(tour: bags.Tour, is_flat: bo
     assert list(Bag(bag).messages(lambda topic: True)) == whole
 
 
+@pytest.mark.quick("sqlite3-")
 @pytest.mark.parametrize(("storage", "compressed"), KINDS)
 def test_damaged_bytes_never_end_in_a_traceback(tour: bags.Tour, storage: str, compressed: str) -> None:
     bag, file = recorded(tour, f"damaged_{storage}{compressed}", storage, compressed)
@@ -133,6 +138,7 @@ def test_damaged_bytes_never_end_in_a_traceback(tour: bags.Tour, storage: str, c
             survey(Bag(bag))
 
 
+@pytest.mark.slow
 def test_rows_that_only_a_journal_holds_are_read(tour: bags.Tour, tmp_path: Path) -> None:
     """A recorder with a write-ahead log that was killed: nothing of the last seconds is in the file itself."""
     bag, file = recorded(tour, "journal", "sqlite3", "")

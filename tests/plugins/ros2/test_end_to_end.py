@@ -31,6 +31,7 @@ def calibrated(config: Path) -> tuple[Calibration, Array, Array]:
     return Calibration.load(out / "calibration.yaml"), numbers[:, 0], numbers[:, 1]
 
 
+@pytest.mark.slow
 def test_a_recording_gives_the_calibration_of_the_table(tour: bags.Tour) -> None:
     bag = bags.write_bag(tour.config.with_name("bag"), tour.sent(ahead=0.037), compressed="storage")
     from_bag, values, _ = calibrated(bags.of_bag(tour, bag, clock_offset="estimate"))

@@ -143,6 +143,7 @@ def test_the_file_compiles_and_is_lint_free(calibration: Path) -> None:
     assert "udp:5005" in path.read_text() and "@" not in path.read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("stubs")
 def test_rests_become_records_in_order_each_until_it_is_acknowledged(
     tour: bags.Tour, calibration: Path, listener: socket.socket
@@ -176,6 +177,7 @@ def test_rests_become_records_in_order_each_until_it_is_acknowledged(
     assert np.sqrt(((seen - exact.stacked([f"tracker.{axis}" for axis in "xyz"]).T) ** 2).mean()) < 0.3e-3
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("stubs")
 def test_targets_become_commands_and_faults_are_reported(
     tour: bags.Tour, calibration: Path, listener: socket.socket, tmp_path: Path

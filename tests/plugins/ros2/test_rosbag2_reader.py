@@ -52,6 +52,7 @@ def require_rests(dataset: Dataset, tour: bags.Tour) -> None:
     assert np.sqrt((apart**2).mean()) < 0.25e-3
 
 
+@pytest.mark.quick("sqlite3-")
 @pytest.mark.parametrize(
     ("storage", "compressed"),
     [("mcap", ""), ("mcap", "storage"), ("mcap", "message"), ("sqlite3", ""), ("sqlite3", "message")],
@@ -77,6 +78,7 @@ def test_joints_are_found_by_name_in_any_order(tour: bags.Tour, name: Path) -> N
         read(tour, bag, {"names": {"q9": "joint_1"}})
 
 
+@pytest.mark.slow
 def test_approaches_are_the_last_motion_before_a_rest(tour: bags.Tour, name: Path) -> None:
     dataset = read(tour, bags.write_bag(name, tour.sent()))
     angles = dataset.stacked(bags.CHANNELS)
@@ -85,6 +87,7 @@ def test_approaches_are_the_last_motion_before_a_rest(tour: bags.Tour, name: Pat
     np.testing.assert_array_equal(sides[:, 1:], np.sign(np.diff(angles, axis=1)))
 
 
+@pytest.mark.slow
 def test_a_stated_clock_offset_moves_the_measurement(tour: bags.Tour, name: Path) -> None:
     bag = bags.write_bag(name, tour.sent(ahead=1.3))
     require_rests(read(tour, bag, clock_offset_s=1.3), tour)
@@ -137,6 +140,7 @@ def test_transforms_are_read_by_frames(tour: bags.Tour, name: Path) -> None:
         read(tour, bag, topic="/tf")
 
 
+@pytest.mark.slow
 def test_poses_are_read_with_their_orientation(tour: bags.Tour, name: Path) -> None:
     """Quaternions of either sign; those that are zero, as trackers send where they see no body, are left out."""
     turns = Rotation.random(len(tour.rests), random_state=4).as_quat()
@@ -189,6 +193,7 @@ def _framed(sent: list[bags.Sent]) -> list[bags.Sent]:
     return sent
 
 
+@pytest.mark.quick("<lambda>-found no rest of at least 0.5 s", "<lambda>-no topic with joint states")
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
@@ -211,6 +216,7 @@ def test_recordings_that_are_refused(tour: bags.Tour, name: Path, change: Change
         read(tour, bag)
 
 
+@pytest.mark.slow
 def test_topics_that_measure_nothing_are_refused(tour: bags.Tour, name: Path) -> None:
     bag = bags.write_bag(name, tour.sent())
     with pytest.raises(
@@ -221,6 +227,7 @@ def test_topics_that_measure_nothing_are_refused(tour: bags.Tour, name: Path) ->
         read(tour, bag, reference="world", frame="tip")
 
 
+@pytest.mark.slow
 def test_a_recording_of_several_files_is_one(tour: bags.Tour, name: Path) -> None:
     """Without metadata.yaml the second file comes before the tenth."""
     sent = sorted(tour.sent(), key=lambda entry: entry[0])
@@ -237,6 +244,7 @@ def test_times_of_receipt_stand_for_stamps_that_are_zero(tour: bags.Tour, name: 
     require_rests(read(tour, bag, stamps="receive"), tour)
 
 
+@pytest.mark.slow
 def test_degrees_are_read_where_they_are_stated(tour: bags.Tour, name: Path) -> None:
     bag = bags.write_bag(name, _with_positions(np.degrees)(tour.sent()))
     require_rests(read(tour, bag, {"unit": "deg"}), tour)

@@ -119,6 +119,7 @@ def test_ports_that_are_not_there(tmp_path):
         Bus(BusSettings(port=tmp_path / "none")).open()
 
 
+@pytest.mark.slow
 def test_all_servos_are_found():
     with FakeBus([sts(1, 10), sts(3, 30), sts(250, 40)]) as fake:
         bus = opened(fake)
@@ -132,6 +133,7 @@ def test_all_servos_are_found():
         bus.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", [0, 2])
 def test_two_servos_with_one_id_are_seen(protocol):
     servo = xl430 if protocol == 2 else sts
@@ -142,6 +144,7 @@ def test_two_servos_with_one_id_are_seen(protocol):
         bus.close()
 
 
+@pytest.mark.slow
 def test_two_servos_that_talk_at_once_are_seen():
     """On a wire both pull low: what arrives is the AND of both."""
     with FakeBus([sts(2), sts(3, 100), sts(3, 900)]) as fake:

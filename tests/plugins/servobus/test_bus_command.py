@@ -52,6 +52,7 @@ def test_find_lists_the_servos():
         assert "two servos" in shown.output and "id 3" in shown.output
 
 
+@pytest.mark.slow
 def test_a_servo_of_an_unknown_model_is_found_and_can_be_driven_as_its_kin(tmp_path):
     with FakeBus([sts(1, **word(3, 0x0A0B)), sts(2)]) as fake:
         fake.servos.pop()
@@ -71,6 +72,7 @@ def test_find_says_plainly_what_is_wrong(tmp_path):
     assert "no such serial port" in refusal(called("find", tmp_path / "ttyUSB7"))
 
 
+@pytest.mark.slow
 def test_check_shows_the_joints_and_names_mistakes(tmp_path):
     with FakeBus([sts(1, 2148, **word(31, 0x800 | 5)), sts(2)]) as fake:
         config = written(tmp_path, fake.path)
@@ -84,6 +86,7 @@ def test_check_shows_the_joints_and_names_mistakes(tmp_path):
         assert "q2 (id 2) does not answer" in called("check", config).output
 
 
+@pytest.mark.quick("xl430-w250")
 @pytest.mark.parametrize("model", ["sts3215", "xl430-w250", "xl330-m288"])
 def test_home_sets_offsets_and_restores_them(tmp_path, model):
     """On the simulated servos: what they report afterwards is what was stated, and the old values come back."""

@@ -116,6 +116,7 @@ def test_a_joint_turns_no_faster_than_is_set(desk):
     made.close()
 
 
+@pytest.mark.quick("sts3215")
 def test_they_are_found(desk):
     protocol = desk.servos[0].table.protocol
     bus = Bus(BusSettings.model_validate({"port": desk.path, "protocol": protocol, "reply_ms": 10}))

@@ -113,6 +113,13 @@ def word(address: int, value: int, size: int = 2) -> dict[str, int]:
     return {f"r{address + i}": byte for i, byte in enumerate(value.to_bytes(size, "little"))}
 
 
+@pytest.mark.quick(
+    "servos2-changes2-q2 \\\\(id 2\\\\) is sts3250, expected sts3215",
+    "servos3-changes3-homing offset -90, expected 90",
+    "servos4-changes4-operating mode 1, expected 0",
+    "servos5-changes5-angles of several turns",
+    "servos6-changes6-stops at counts 1500 and 4095.*Narrow range_deg of q1 to \\\\[-48\\\\.2",
+)
 @pytest.mark.parametrize(
     ("servos", "changes", "words"),
     [
@@ -134,6 +141,7 @@ def test_what_is_not_as_configured_is_refused_before_anything_moves(servos, chan
         assert not [i for i in fake.instructions if i[1] in (3, 0x83)]
 
 
+@pytest.mark.slow
 def test_a_bus_without_power_is_lost_and_comes_back():
     with FakeBus([]) as fake:
         made = device(fake)

@@ -68,6 +68,7 @@ def test_what_does_not_answer_is_counted_and_comes_back():
         made.close()
 
 
+@pytest.mark.slow
 def test_channels_without_a_servo_and_buses_without_anybody():
     with FakeBus([]) as fake:
         with pytest.raises(ConfigError, match=r"found no servo for arm\.q3"):

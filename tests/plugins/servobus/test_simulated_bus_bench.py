@@ -218,6 +218,7 @@ def test_settings_that_do_not_fit_are_refused(change: str, says: str, tmp_path: 
         bench.serve(BenchRequest(experiment, tmp_path))
 
 
+@pytest.mark.slow
 def test_a_rehearsal_measures_its_poses_and_is_safe(tmp_path: Path) -> None:
     plan = tmp_path / "plan.csv"
     head = "pose_id," + ",".join(
