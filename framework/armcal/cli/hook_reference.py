@@ -3,6 +3,7 @@
 ``docs/hooks.md`` is what ``as_markdown`` gives; a test compares the two.
 """
 
+import ast
 import inspect
 import re
 import textwrap
@@ -127,35 +128,37 @@ def _entry(function: Callable[..., Any], name: str = "", around: str = "", is_pr
     """A function as the reference shows it; ``around`` is the docstring of its class."""
     name = name or function.__name__
     text, sections = _sections(inspect.cleandoc(function.__doc__ or ""))
-    signature = inspect.signature(function)
-    given = [p for p in signature.parameters.values() if p.name != "self"]
-    arguments = tuple((p.name, _explained(p, function, sections.get("Args", {}), f"{around}\n{text}")) for p in given)
-    call = name if is_property else f"{name}({', '.join(map(_shown, given))})"
-    if signature.return_annotation not in (inspect.Signature.empty, "None"):
-        call += f" -> {signature.return_annotation}"
+    # Annotations are shown as they are written, whether or not Python evaluates them.
+    written = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
+    assert isinstance(written, ast.FunctionDef)
+    arguments = tuple(
+        (p, _explained(p, function, sections.get("Args", {}), f"{around}\n{text}"))
+        for p in inspect.signature(function).parameters
+        if p != "self"
+    )
+    shown = (*written.args.posonlyargs, *written.args.args, *written.args.kwonlyargs)
+    defaults = dict(zip(reversed(shown), reversed((*written.args.defaults, *written.args.kw_defaults)), strict=False))
+    parts = [
+        ast.unparse(a) + (f" = {ast.unparse(default)}" if (default := defaults.get(a)) is not None else "")
+        for a in shown
+        if a.arg != "self"
+    ]
+    call = name if is_property else f"{name}({', '.join(parts)})"
+    if written.returns is not None and ast.unparse(written.returns) != "None":
+        call += f" -> {ast.unparse(written.returns)}"
     return Entry(name, call, text, arguments, tuple(sections.get("Raises", {}).items()))
 
 
-def _shown(parameter: inspect.Parameter) -> str:
-    empty = parameter.default is inspect.Parameter.empty
-    if empty:
-        return f"{parameter.name}: {parameter.annotation}"
-    default = getattr(parameter.default, "__name__", repr(parameter.default))
-    return f"{parameter.name}: {parameter.annotation} = {default}"
-
-
-def _explained(
-    parameter: inspect.Parameter, function: Callable[..., Any], summaries: Mapping[str, str], text: str
-) -> str:
+def _explained(parameter: str, function: Callable[..., Any], summaries: Mapping[str, str], text: str) -> str:
     """From its own docstring, the class's, the words above, or the docstring of its type."""
-    if parameter.name in summaries:
-        return summaries[parameter.name]
-    if f"``{parameter.name}``" in text:
+    if parameter in summaries:
+        return summaries[parameter]
+    if f"``{parameter}``" in text:
         return "see above."
-    if parameter.name in WORDS:
-        return WORDS[parameter.name]
+    if parameter in WORDS:
+        return WORDS[parameter]
     try:
-        hint = typing.get_type_hints(function).get(parameter.name)
+        hint = typing.get_type_hints(function).get(parameter)
     except (NameError, TypeError):  # of a type that is only imported for type checkers
         return ""
     if isinstance(hint, type) and hint.__module__.partition(".")[0] == "armcal" and hint.__doc__:
