@@ -161,3 +161,8 @@ def test_the_command_asks_and_tells(tmp_path: Path) -> None:
             assert armcal(*wrong).exit_code == 2, wrong
     gone = armcal("status")
     assert gone.exit_code == 2 and "armcal recalibrate" in gone.output
+    (tmp_path / "status.json").write_text('{"level": "watch", "finished": true}\n')
+    ended = armcal("status")
+    assert json.loads(ended.stdout)["level"] == "watch" and "no recalibration runs here" in ended.stderr
+    (tmp_path / "status.json").write_text("half of")
+    assert armcal("status").exit_code == 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from armcal.base.config_text import plain
 from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
@@ -20,7 +22,7 @@ from armcal.errors import ConfigError, InputError
 from armcal.estimate.simulation import DAY_S, Mission, SimulationRequest, measured_without_noise
 from armcal_online.mission.errors import error_curve, random_poses
 from armcal_online.mission.figure import mission_figure
-from armcal_online.mission.files import curve_text, figures, schedule, truth_text, write_files
+from armcal_online.mission.files import curve_text, figures, schedule, surprise_text, truth_text, write_files
 from armcal_online.mission.judge import Judgement, judge
 from armcal_online.mission.log import MissionLog
 from armcal_online.mission.mission import (
@@ -322,7 +324,18 @@ def test_a_surprise_minds_no_configured_event_after_the_last_day() -> None:
     for events in (EVENTS, "[]"):
         overrides = (*SHORT, "simulation.days=2", f"simulation.events={events}")
         drawn[events] = MissionPlan.surprised(CONFIG, 7, overrides, registry).planted
-    assert drawn[EVENTS] == drawn["[]"] and all(event["day"] < 2 for event in drawn["[]"]["events"])
+    assert drawn[EVENTS] == drawn["[]"] and all(event["day"] < 2 for event in drawn["[]"]["simulation"]["events"])
+
+
+def test_a_surprise_is_repeated_from_its_file_with_what_the_command_line_changed(tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(CONFIG.parent, tmp_path / "configs"))
+    overrides = (*SHORT, "simulation.days=2", "simulation.losses.fraction=0.1", "mission.limit_mm=4", "name=rehearsal")
+    drawn = MissionPlan.surprised(folder / CONFIG.name, 7, overrides, plan().experiment.registry)
+    (folder / "surprise.yaml").write_text(surprise_text(drawn), encoding="utf-8")
+    again = MissionPlan.load(folder / "surprise.yaml")
+    assert again.settings == drawn.settings and again.recalibrate == drawn.recalibrate
+    one, other = (plain(p.experiment.source.data) for p in (drawn, again))
+    assert one == other and one["simulation"]["days"] == 2 and one["name"] == "rehearsal"
 
 
 def test_a_mission_goes_to_no_folder_with_other_files(tmp_path: Path) -> None:

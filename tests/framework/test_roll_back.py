@@ -99,6 +99,10 @@ def test_after_the_end_the_estimate_goes_back_to_the_last_good_record_and_forth_
     assert armcal("predict", folder / "calibration.yaml", "--poses", POSES, "--out", tmp_path / "p.csv").exit_code == 0
     assert armcal("control", folder, "rollback", reply["before"]).exit_code == 0
     assert written(folder / "calibration.yaml") == end
+    assert (
+        json.loads(armcal("control", folder, "rollback", "record", slip["last_good"]["id"]).stdout)["to"] == reply["to"]
+    )
+    assert armcal("control", folder, "status").exit_code == 0
     assert armcal("replay", folder).exit_code == 0
 
 
@@ -123,7 +127,13 @@ def test_after_a_kill_too(command: list[str], ended: Path, tmp_path: Path) -> No
 def test_what_cannot_be_rolled_back_is_refused_and_nothing_changes(ended: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(ended, tmp_path / "out")
     before, kept = records(folder), {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
-    for to, words in (("99999", "99999"), ("1.5", "rollback good"), ("", "rollback good"), ("best", "rollback good")):
+    for to, words in (
+        ("99999", "99999"),
+        ("1.5", "rollback good"),
+        ("", "rollback good"),
+        ("best", "rollback good"),
+        ("record", "rollback good"),
+    ):
         refused = armcal("control", folder, "rollback", *filter(None, [to]))
         assert refused.exit_code == 2 and words in refused.stderr and "Traceback" not in refused.output
     assert records(folder) == before

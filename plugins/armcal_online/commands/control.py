@@ -1,7 +1,5 @@
 """``armcal control``."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +11,8 @@ from armcal.errors import InputError, Location
 from armcal.version import JSON_SCHEMA
 
 from armcal_online.running.control import GOOD, ask, is_running
+from armcal_online.running.outputs import STATUS
+from armcal_online.watch.events import parsed
 
 _COMMANDS = ("status", "pause", "resume", "finish", "rollback", "what-if")
 
@@ -26,8 +26,9 @@ _COMMANDS = ("status", "pause", "resume", "finish", "rollback", "what-if")
 def control(console: Console, folder: Path, command: str, values: tuple[str, ...], timeout: float) -> None:
     """Query or command the recalibration that runs in FOLDER.
 
-    `rollback good` takes up the estimate as it was after the last good record, `rollback N` after entry N; both work
-    after the end too. `what-if q1_deg=10 q2_deg=20 ...` predicts the tip.
+    `rollback good` takes up the estimate as it was after the last good record, `rollback record m139` after the record of
+    that name, `rollback 120` after entry 120; they and `status` work after the end too. `what-if q1_deg=10 q2_deg=20 ...`
+    predicts the tip.
     """
     request: dict[str, Any] = {"command": command}
     if command == "rollback":
@@ -37,6 +38,10 @@ def control(console: Console, folder: Path, command: str, values: tuple[str, ...
 
             _show(console, roll_back_ended(folder, request["to"], console.registry()))
             return
+    elif command == "status" and not is_running(folder) and (status := _last_status(folder)) is not None:
+        console.warn("no recalibration runs here: this is the last status that one wrote.")
+        _show(console, status)
+        return
     elif command == "what-if":
         request = {"command": "what_if", "joints": dict(map(_value, values))}
     elif values:
@@ -49,18 +54,27 @@ def control(console: Console, folder: Path, command: str, values: tuple[str, ...
     _show(console, reply)
 
 
+def _last_status(folder: Path) -> Mapping[str, Any] | None:
+    try:
+        return parsed((folder / STATUS).read_bytes())
+    except OSError:
+        return None
+
+
 def _show(console: Console, reply: Mapping[str, Any]) -> None:
     if not console.quiet:
         click.echo(json.dumps({**JSON_SCHEMA, **reply}, indent=2))
 
 
 def _target(values: tuple[str, ...]) -> int | str:
-    if len(values) == 1 and (values[0] == GOOD or (values[0].isascii() and values[0].isdigit())):
-        return values[0] if values[0] == GOOD else int(values[0])
+    if values[:1] == ("record",) and len(values) == 2:
+        return values[1]
+    if len(values) == 1:
+        return int(values[0]) if values[0].isascii() and values[0].isdigit() else values[0]
     raise InputError(
-        f"found {' '.join(values) or 'nothing'}, expected a sequence number, or {GOOD}.",
+        f"found {' '.join(values) or 'nothing'}, expected a sequence number, record NAME, or {GOOD}.",
         where=Location("rollback"),
-        hint=f"For example: armcal control DIR rollback 120, or armcal control DIR rollback {GOOD}.",
+        hint=f"For example: armcal control DIR rollback 120, or record m139, or rollback {GOOD}.",
     )
 
 

@@ -62,7 +62,7 @@ def surprise_text(plan: MissionPlan) -> str:
     """A configuration that plants the same again, beside the one that it extends."""
     name = plan.experiment.source.path.name
     above = f"# What was planted. Beside {name} this file repeats the mission, whatever later versions would draw.\n"
-    content = {"extends": name, "simulation": dict(plan.planted)}
+    content = {"extends": name, **plan.planted}
     return above + yaml.safe_dump(content, default_flow_style=None, sort_keys=False, width=100)
 
 

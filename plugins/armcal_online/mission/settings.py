@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import yaml
+from armcal.base.config_text import plain
 from armcal.base.settings import InputPath, Length, Settings
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
+from armcal.config.yaml_tree import steps_of
 from armcal.errors import ConfigError
 from armcal.estimate.simulation import MissionSimulator
 from armcal.plugins import PluginRegistry, discover
@@ -66,7 +68,7 @@ class MissionPlan:
         simulator: knows the truth.
         settings: of the run.
         recalibrate: settings of the recalibration.
-        planted: keys of the simulation that were drawn at random; empty where all is as configured.
+        planted: where events were drawn at random, what differs from the configuration: these, and overrides.
     """
 
     experiment: Experiment
@@ -86,8 +88,15 @@ class MissionPlan:
         none = ("simulation.events=[]",) if isinstance(stated, Mapping) and "events" in stated else ()
         bare = cls.load(path, (*overrides, *none), registry)
         drawn = bare.simulator.planted(bare.experiment.simulation_request, seed)
-        texts = [f"simulation.{key}={_one_line(value)}" for key, value in drawn.items()]
-        return replace(cls.load(path, (*overrides, *texts), registry), planted=drawn)
+        texts = (*overrides, *(f"simulation.{key}={_one_line(value)}" for key, value in drawn.items()))
+        planted, data = dict[str, Any](), plain(load_config(path, texts).data)
+        for steps in (steps_of(text.partition("=")[0].strip()) or () for text in texts):
+            section, key = steps[0], steps[1:2]
+            if key:
+                planted.setdefault(section, {})[key[0]] = data.get(section, {}).get(key[0])
+            else:
+                planted[section] = data.get(section)
+        return replace(cls.load(path, texts, registry), planted=planted)
 
     @classmethod
     def load(cls, path: Path, overrides: Sequence[str] = (), registry: PluginRegistry | None = None) -> MissionPlan:

@@ -15,7 +15,7 @@ from armcal.io.journal.journal import JournalLimits
 from armcal.plugins import PluginRegistry
 
 from armcal_online.replaying.kept_journal import kept_calibration, kept_journal, kept_settings
-from armcal_online.running.control import rolled_back
+from armcal_online.running.control import GOOD, entry_named, rolled_back
 from armcal_online.running.session import JOURNAL, Setup, opened
 from armcal_online.sources.source import Incoming, Source
 from armcal_online.tracking.recalibrator import Recalibrator
@@ -49,6 +49,8 @@ def roll_back_ended(folder: Path, to: int | str, registry: PluginRegistry) -> Ma
         hint = "Give the folder that armcal recalibrate was given as --out."
         raise InputError("there is no journal of a recalibration.", where=Location(str(folder)), hint=hint)
     held = kept_journal(journal)
+    if isinstance(to, str) and to != GOOD:
+        to = entry_named(journal, to)
     held.check_until(to if isinstance(to, int) else None, "rollback")
     header = held.first.header
     calibration = kept_calibration(header, journal, registry)

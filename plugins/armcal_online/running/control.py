@@ -14,11 +14,13 @@ from typing import Any
 from armcal.base.config_text import as_line
 from armcal.base.units import from_unit
 from armcal.errors import ArmcalError, InputError, Location
+from armcal.io.journal.reader import read_entries
 from armcal.io.unix_socket import listening, short_address
 from armcal.measure.column_match import spellings
 from armcal.measure.reader import ReadRequest
 
 from armcal_online.running.loop import Recalibration
+from armcal_online.running.state_replayer import RECORD
 from armcal_online.tracking.recalibrator import Recalibrator
 
 SOCKET = "control.sock"
@@ -200,10 +202,10 @@ def answer(recalibration: Recalibration, session: Recalibrator, request: Mapping
 
 
 def rolled_back(recalibration: Recalibration, session: Recalibrator, to: Any) -> Mapping[str, Any]:
-    """The reply after a roll-back: to the state after an entry (its number), or after the last good record (``good``).
+    """The reply after a roll-back, to the state after an entry (its number), a record (its name) or the last good one.
 
     Raises:
-        InputError: it is neither, or no record was good.
+        InputError: it is none of them, or no record was good.
         DataError: the journal does not reach there; nothing is changed.
     """
     before = recalibration.sequence
@@ -213,12 +215,28 @@ def rolled_back(recalibration: Recalibration, session: Recalibrator, to: Any) ->
             hint = "Begin a new --out from the calibration that this one began from."
             raise InputError("no record was good yet.", where=Location("rollback"), hint=hint)
         to = good["sequence"]
+    elif isinstance(to, str):
+        to = entry_named(recalibration.journal_folder, to)
     if isinstance(to, bool) or not isinstance(to, int) or to < 0:
         hint = f"Give the sequence number of a record, which every event has, or {GOOD} for the last good record."
         raise InputError(f"found {to!r}, expected a sequence number.", where=Location("to"), hint=hint)
     sentence = recalibration.roll_back(to)
     again = f"Nothing is lost: roll back to {before} to have the estimate as it was before this."
     return {"sentence": f"{sentence} {again}", "to": to, "before": before, **recalibration.status()}
+
+
+def entry_named(journal: Path, name: str) -> int:
+    """The entry of the last record of a name that a journal keeps.
+
+    Raises:
+        InputError: it keeps none.
+        DataError: it is damaged.
+    """
+    named = [e.sequence for e in read_entries(journal) if e.kind == RECORD and e.content.get("id") == name]
+    if not named:
+        hint = "Give an entry's number or a record's name, as events have them, or the last good record: rollback good."
+        raise InputError(f"found no record {name!r} in the journal.", where=Location("rollback"), hint=hint)
+    return named[-1]
 
 
 def joint_values(joints: Any, request: ReadRequest) -> dict[str, float]:

@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from armcal.base.config_text import finite
@@ -68,6 +69,11 @@ class Recalibration:
         self._calibrated = self._status_written = -float("inf")
         self.sequence = journal.sequence
         self.finishing = ""
+
+    @property
+    def journal_folder(self) -> Path:
+        """Where its journal is."""
+        return self._journal.folder
 
     @property
     def paused(self) -> bool:

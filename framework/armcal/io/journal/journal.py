@@ -116,6 +116,11 @@ class Journal:
         self.close()
 
     @property
+    def folder(self) -> Path:
+        """Of its files."""
+        return self._folder
+
+    @property
     def sequence(self) -> int:
         """The number of the last entry."""
         return self._writer.tail.sequence
