@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from string import Formatter
 from typing import Any, get_args
@@ -22,11 +23,11 @@ from armcal_online.tracking.decisions import (
     per_cent,
     sure,
 )
-from armcal_online.tracking.events import record_name, spoken_time
-from armcal_online.tracking.health import LEVELS
+from armcal_online.tracking.events import decided, last_good, record_name, spoken_time
+from armcal_online.tracking.health import LEVELS, Health
 from armcal_online.tracking.hypotheses import Kind
 from armcal_online.tracking.recalibrator import Recalibrator
-from armcal_online.tracking.state import REMEMBERED, Arrival, State, remembering
+from armcal_online.tracking.state import REMEMBERED, Arrival, State, remembering, troubled
 from online_arm import World, begun, predicted, random_poses, settings, told
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -101,6 +102,27 @@ def test_a_time_is_a_date_only_where_it_can_be_one() -> None:
 
 
 # What is remembered
+
+
+def test_no_record_is_good_from_the_first_that_a_decision_affects() -> None:
+    belief = Belief(np.zeros(1), Gaussian(np.zeros(1), np.eye(1)))
+    arrivals = tuple(Arrival(f"p{n}", "", n, float(n), is_good=n < 9) for n in range(1, 10))
+    state = State(belief, belief, ids=arrivals, sequence=9)
+    found = Decision("unexplained", "Some records do not fit", "chance", 9.0, since=6)
+    after = troubled(state, [found], is_good=False)
+    assert [arrival.sequence for arrival in after.ids if arrival.is_good] == [1, 2, 3, 4, 5]
+    assert last_good(after) == {"sequence": 5, "id": "p5", "at": 5.0}
+    assert troubled(state, [], is_good=True).ids == (*arrivals[:-1], replace(arrivals[-1], is_good=True))
+
+
+def test_at_a_worse_level_a_decision_advises_what_the_level_does() -> None:
+    belief = Belief(np.zeros(1), Gaussian(np.zeros(1), np.eye(1)))
+    found = Decision("refit_took_over", "A refit took over", "it predicts better", 20.0, since=6)
+    for level in LEVELS:
+        state = State(belief, belief, health=Health(level))
+        event = decided(state, found, None, 16)
+        worse = LEVELS.index(level) > LEVELS.index("watch")
+        assert event["do"].startswith(LEVEL_ADVICE[level][:20] if worse else KINDS["refit_took_over"].do[:20])
 
 
 def test_the_last_good_record_is_known_however_long_ago_it_was() -> None:

@@ -26,8 +26,8 @@ _COMMANDS = ("status", "pause", "resume", "finish", "rollback", "what-if")
 def control(console: Console, folder: Path, command: str, values: tuple[str, ...], timeout: float) -> None:
     """Query or command the recalibration that runs in FOLDER.
 
-    `rollback good` takes up the estimate as it was after the last good record, `rollback record m139` after the record of
-    that name, `rollback 120` after entry 120; they and `status` work after the end too. `what-if q1_deg=10 q2_deg=20 ...`
+    `rollback good` takes up the estimate as it was after the last good record, `rollback record m139` after the record
+    of that name, `rollback 120` after entry 120; they and `status` work after the end too. `what-if q1_deg=10 ...`
     predicts the tip.
     """
     request: dict[str, Any] = {"command": command}

@@ -14,7 +14,7 @@ from armcal_online.sources.source import Incoming
 from armcal_online.tracking.causes import CAUSES, LINK, spoken
 from armcal_online.tracking.decisions import LEVEL_ADVICE, Decision, advice, per_cent, sure
 from armcal_online.tracking.directions import Steps
-from armcal_online.tracking.health import Health
+from armcal_online.tracking.health import LEVELS, Health
 from armcal_online.tracking.hypotheses import Recent
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.start import FilterSetup
@@ -120,6 +120,9 @@ def decided(state: State, decision: Decision, tip: TipError | None, calm: int) -
         **_names(good, calm),
     }
     event |= {**advice(decision.kind, names), "last_good": _named(good)}
+    if LEVELS.index(state.health.level) > LEVELS.index(decision.level):
+        # What explains the last records does not end what was worse before.
+        event["do"] = LEVEL_ADVICE[state.health.level].format_map(names)
     off = "" if tip is None else f" The tip was {tip.size:.3g} {tip.unit} off."
     text = f"{decision.what}. First record affected: {record_name(decision.since, first)}. {sure(log_odds)}.{off}"
     event["sentence"] = text

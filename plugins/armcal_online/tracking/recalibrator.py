@@ -37,7 +37,7 @@ from armcal_online.tracking.refit import NetRecord
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.slow_changes import SlowChanges
 from armcal_online.tracking.start import FilterSetup, filter_setup
-from armcal_online.tracking.state import Arrival, State, Tick, advanced, remembering, ticked
+from armcal_online.tracking.state import Arrival, State, Tick, advanced, remembering, ticked, troubled
 from armcal_online.tracking.tip_error import tip_error
 from armcal_online.tracking.updated import calibration_text, deviations
 from armcal_online.tracking.what_if import worth_of_record
@@ -202,6 +202,8 @@ class Recalibrator:
             decisions = (*decisions, *taken_over)
         health, level = self._judge.health(gated, decisions, first), self.state.health.level
         record_events = [events.judged(incoming, state, recent, first, limit, self.setup)]
+        is_good = not recent.rejected and not decisions and health.level == "nominal"
+        self.state = state = troubled(replace(state, health=health), decisions, is_good)
         calm = self._settings.levels.calm
         for decision in decisions:
             # These two stand until something else is decided: they are news once.
@@ -211,9 +213,6 @@ class Recalibrator:
                 record_events.append(events.decided(state, decision, tip, calm))
         if health.level != level:
             record_events.append(events.level_changed(state, level, health, calm))
-        is_good = not recent.rejected and not decisions and health.level == "nominal"
-        newest = replace(state.ids[-1], is_good=is_good)
-        self.state = replace(state, health=health, ids=(*state.ids[:-1], newest))
         every = self._settings.output.estimate_every_records
         if decisions or (state.counts["accepted"] % every == 0 and not recent.rejected):
             record_events.append(events.estimated(self.state, self.estimate))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from types import UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -16,6 +16,7 @@ from armcal.errors import DataError
 from armcal.estimate.online import Gaussian, OnlineEstimator, kalman_update
 
 from armcal_online.tracking.belief import Belief, most_likely
+from armcal_online.tracking.decisions import Decision
 from armcal_online.tracking.health import Health
 from armcal_online.tracking.hypotheses import Candidate, Recent
 from armcal_online.tracking.net_state import NetState
@@ -199,6 +200,13 @@ def remembering(state: State, arrival: Arrival) -> State:
     ids = (*state.ids, arrival)
     gone = [earlier for earlier in ids[:-REMEMBERED] if earlier.is_good]
     return replace(state, ids=ids[-REMEMBERED:], good=gone[-1] if gone else state.good)
+
+
+def troubled(state: State, decisions: Sequence[Decision], is_good: bool) -> State:
+    """The state that knows whether its last record is good, and that none is from the first that a decision affects."""
+    since = min((decision.since for decision in decisions), default=state.sequence + 1)
+    *earlier, newest = (replace(a, is_good=False) if a.sequence >= since else a for a in state.ids)
+    return replace(state, ids=(*earlier, replace(newest, is_good=is_good)))
 
 
 def _encoded(value: Any) -> Any:
