@@ -196,6 +196,21 @@ def test_names_stay_text_in_yaml(name: str) -> None:
     assert yaml.safe_load(f"[{word(name)}]") == [name]
 
 
+@pytest.mark.parametrize("name", ["on", "no"])
+def test_a_robots_files_can_be_used_whatever_it_is_called(name: str, here: Path) -> None:
+    done = new_robot(
+        name,
+        "--dh",
+        table(here, f"{HEADER}\n90,0,0,100\n0,300,0,0\n0,250,0,0\n"),
+        "--convention",
+        "standard",
+        "--up",
+        "z",
+    )
+    assert done.exit_code == 0, done.output
+    assert Experiment.load(here / name / "calibrate.yaml").name == name
+
+
 # Other sources
 
 
