@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from armcal.errors import ConfigError
 from armcal.estimate.loss import tuned
 from armcal.estimate.online import Gaussian
 from armcal_online.tracking.belief import Belief
@@ -98,6 +99,15 @@ def test_off_in_a_file_of_settings_leaves_it_out(tmp_path: Path) -> None:
     path.write_text("net: off\n", encoding="utf-8")
     assert load_settings(path).net is False
     assert load_settings(None).net is True
+
+
+def test_a_change_of_another_section_than_the_one_that_is_read_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "mission.yaml"
+    path.write_text("days: 3\nrecalibrate: {net: off}\n", encoding="utf-8")
+    assert load_settings(path, ["recalibrate.gate.window=6"]).gate.window == 6
+    for elsewhere in ("gate.window=6", "evaluator=interpreted", "recalibrates.net=on"):
+        with pytest.raises(ConfigError, match=r"only the section recalibrate .*--set recalibrate\."):
+            load_settings(path, [elsewhere])
 
 
 @pytest.mark.slow

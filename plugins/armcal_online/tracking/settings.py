@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from armcal.base.settings import Angle, Duration, Length, Mass, Settings
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
-from armcal.errors import ConfigError
+from armcal.errors import ConfigError, Location
 from pydantic import Field, model_validator
 
 SECTION = "recalibrate"
@@ -154,4 +154,11 @@ def load_settings(path: str | Path | None, overrides: Sequence[str] = ()) -> Rec
             )
         return RecalibrateSettings()
     source = load_config(path, overrides)
-    return validate(RecalibrateSettings, source, (SECTION,) if SECTION in source.data else ())
+    if SECTION not in source.data:
+        return validate(RecalibrateSettings, source)
+    elsewhere = next((text for text in overrides if not text.strip().startswith((f"{SECTION}.", f"{SECTION}="))), None)
+    if elsewhere is not None:
+        hint = f"Write --set {SECTION}.{elsewhere.strip()} if it is a setting of the recalibration, else leave it out."
+        text = f"found --set {elsewhere}, but only the section {SECTION} of this file is read."
+        raise ConfigError(text, where=Location(str(path)), hint=hint)
+    return validate(RecalibrateSettings, source, (SECTION,))
