@@ -12,9 +12,8 @@ from armcal.errors import ConfigError
 from armcal.estimate.loss import tuned
 from armcal.estimate.online import Gaussian
 from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.net_state import NetState
 from armcal_online.tracking.recalibrator import Recalibrator
-from armcal_online.tracking.refit import NetRecord, Prior, Refit, Refitter
+from armcal_online.tracking.refit import NetRecord, NetState, Prior, Refit, Refitter
 from armcal_online.tracking.settings import load_settings
 from online_arm import NOISE_M, STATES, World, begun, begun_setup, settings, tip_error_mm, told
 

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from armcal.estimate.online import log_density
 from armcal_online.sources.source import Incoming
-from armcal_online.tracking.joint_density import JointDensity
-from armcal_online.tracking.outliers import log_density_of_outlier
+from armcal_online.tracking.joint_density import JointDensity, log_density_of_outlier
 from online_arm import AXES, World, begun, told
 from scipy.stats import multivariate_normal
 

@@ -10,8 +10,7 @@ from armcal.estimate.online import Gaussian, Linearised, kalman_update, log_like
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.hypotheses import Hypothesis
 from armcal_online.tracking.process_noise import GaussMarkovStates, ProcessNoise
-from armcal_online.tracking.slow_changes import SlowChanges
-from armcal_online.tracking.slow_state import SlowState
+from armcal_online.tracking.slow_changes import SlowChanges, SlowState
 from online_arm import World, begun, settings, told
 
 N, RECORDS, SECONDS = 3, 40, 3600.0

@@ -1,7 +1,5 @@
 """``armcal mission``."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """``armcal recalibrate``."""
 
-from __future__ import annotations
-
 import sys
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``armcal watch``."""
 
-from __future__ import annotations
-
 import json
 import signal
 import sys

@@ -1,7 +1,5 @@
 """``armcal what-if``."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Decisions of a recalibration against what happened: right, vague, wrong, missed, or a false alarm."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -10,7 +8,7 @@ from typing import Literal
 from armcal.estimate.simulation import DAY_S, MissionEvent
 
 from armcal_online.mission.log import Decision
-from armcal_online.tracking.causes import GRAVITY, LINK, PAYLOAD
+from armcal_online.tracking.directions import GRAVITY, LINK, PAYLOAD
 
 Verdict = Literal["right", "vague", "wrong", "missed"]
 INSTRUMENT, TEMPERATURE = "instrument", "temperature"

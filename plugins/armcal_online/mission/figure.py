@@ -1,7 +1,5 @@
 """The figure of a mission: tip errors over days with what happened, day and night, and the level."""
 
-from __future__ import annotations
-
 import io
 import textwrap
 from collections.abc import Sequence

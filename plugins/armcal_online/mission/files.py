@@ -1,7 +1,5 @@
 """The files that a mission leaves: its truth, its errors over time, its figures."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """What a recalibration did in a mission, judged against the truth: errors, recovery, availability, decisions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What a recalibration reported over a mission: verdicts, estimates, levels and decisions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +8,7 @@ import numpy as np
 from armcal.base.domains import Array
 from armcal.estimate.simulation import Mission
 
-from armcal_online.tracking.causes import LINK
+from armcal_online.tracking.directions import LINK
 
 
 @dataclass(frozen=True)

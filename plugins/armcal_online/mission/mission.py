@@ -1,7 +1,5 @@
 """A mission: simulated, calibrated before launch, recalibrated record by record, and judged against the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

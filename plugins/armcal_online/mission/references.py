@@ -1,7 +1,5 @@
 """What a recalibration has to be better than: robust fits of many records at once, again and again over a mission."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 
@@ -12,7 +10,7 @@ from armcal.config.system import System
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Progress, Solution, SolverVerdict, no_progress
 from armcal.estimate.polish import descended, polish
-from armcal.estimate.robust import RobustFit, reweighted
+from armcal.estimate.robust import reweighted
 from armcal.estimate.simulation import Mission
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.problem.posed import PosedProblem
@@ -105,7 +103,8 @@ def robust_fit(problem: Problem, records: Sequence[FactorRecords], starts: Seque
     best, values = np.inf, starts[0]
     for start in starts:
         try:
-            fit = _from(problem, records, start)
+            first = Solution(start, SolverVerdict("start", "", True, 0, 0.0))
+            fit = reweighted(problem, records, GaussNewton(), first, "cauchy")
         except NotConvergedError:
             continue
         if max(fit.scales) < best:
@@ -113,8 +112,3 @@ def robust_fit(problem: Problem, records: Sequence[FactorRecords], starts: Seque
         if best < _DOUBTFUL:
             break
     return values
-
-
-def _from(problem: Problem, records: Sequence[FactorRecords], start: Array) -> RobustFit:
-    first = Solution(start, SolverVerdict("start", "", True, 0, 0.0))
-    return reweighted(problem, records, GaussNewton(), first, "cauchy")

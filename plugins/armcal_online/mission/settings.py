@@ -88,7 +88,9 @@ class MissionPlan:
         none = ("simulation.events=[]",) if isinstance(stated, Mapping) and "events" in stated else ()
         bare = cls.load(path, (*overrides, *none), registry)
         drawn = bare.simulator.planted(bare.experiment.simulation_request, seed)
-        texts = (*overrides, *(f"simulation.{key}={_one_line(value)}" for key, value in drawn.items()))
+        one_line: dict[str, Any] = {"default_flow_style": True, "sort_keys": False, "width": 1 << 20}
+        written = {key: yaml.safe_dump(value, **one_line).strip() for key, value in drawn.items()}
+        texts = (*overrides, *(f"simulation.{key}={text}" for key, text in written.items()))
         planted, data = dict[str, Any](), plain(load_config(path, texts).data)
         for steps in (steps_of(text.partition("=")[0].strip()) or () for text in texts):
             section, key = steps[0], steps[1:2]
@@ -119,7 +121,3 @@ class MissionPlan:
                 hint="Write simulation: {type: mission, ...}.",
             )
         return cls(experiment, simulator, settings, recalibrate)
-
-
-def _one_line(value: Any) -> str:
-    return yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=1 << 20).strip()

@@ -1,7 +1,5 @@
 """What a journal keeps of a recalibration: its calibration, its settings, and its entries as far as they are whole."""
 
-from __future__ import annotations
-
 import hashlib
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """A journal replayed: every entry does to a session what it did when it was written; two replays compared."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass

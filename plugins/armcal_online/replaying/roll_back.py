@@ -4,8 +4,6 @@ The same is done as in one that runs: the journal gets an entry, the state is th
 replaced. Nothing is lost: the journal keeps every record, and another roll-back goes forth again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The control socket of a running recalibration: requests and replies, a JSON object a line."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import select

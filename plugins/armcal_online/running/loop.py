@@ -1,7 +1,5 @@
 """The loop of a recalibration: a record is journalled, acknowledged, used and reported, one at a time."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable

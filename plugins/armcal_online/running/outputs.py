@@ -1,7 +1,5 @@
 """Events, status and updated calibration of a recalibration. A fault in writing them never stops it."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import time

@@ -1,7 +1,5 @@
 """A recalibration in its folder: begun, or resumed where it was left."""
 
-from __future__ import annotations
-
 import hashlib
 import time
 from collections.abc import Callable, Iterator, Mapping

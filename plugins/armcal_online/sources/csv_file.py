@@ -1,7 +1,5 @@
 """A CSV file (or one of JSON lines: ``.jsonl``), which may still grow."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys

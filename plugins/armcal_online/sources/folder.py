@@ -1,7 +1,5 @@
 """A directory into which files are put: CSV, JSON lines, JSON."""
 
-from __future__ import annotations
-
 import math
 import os
 import sys

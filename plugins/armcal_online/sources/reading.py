@@ -1,7 +1,5 @@
 """Lines as they come, and files read whole, become records."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections import deque

@@ -3,8 +3,6 @@
 A source must survive any input: what cannot be read becomes a record with a fault, never an exception.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import math

@@ -1,7 +1,5 @@
 """Streams: a record a line from standard input or another pipe, or a JSON object in each datagram."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,16 +1,17 @@
-"""What a step of a joint, or of an instrument's frame, is in terms of the parameters.
+"""What a step of a joint or of an instrument's frame is in terms of the parameters, and what else may change at once.
 
-Found by trying, so that it holds for any arm model and effect: the combination of parameters that moves the
+Steps are found by trying, so that it holds for any arm model and effect: the combination of parameters that moves the
 prediction in some poses as the step does. Where one parameter alone does (a joint's offset), it is that one.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
+import casadi as ca
 import numpy as np
 from armcal.arm.assembly import Arm
+from armcal.arm.environment import gravity_tilt, unstated_payload
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.quaternions import quaternion_matrix
@@ -18,8 +19,65 @@ from armcal.calibration.calibration import Calibration
 from armcal.errors import ArmcalError
 from armcal.problem.problem import FactorRecords, Problem
 
-from armcal_online.tracking.causes import Cause, find_causes
 from armcal_online.tracking.observer import Observer
+from armcal_online.tracking.state_space import StateSpace
+
+CauseKind = Literal["payload_changed", "gravity_tilted", "link_bent"]
+CAUSES: tuple[CauseKind, ...] = get_args(CauseKind)
+PAYLOAD, GRAVITY, LINK = "payload", "gravity", "link "
+"""Subjects of these kinds; a link's is followed by the joint that carries it."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A change at once: its kind, what it is of, and the scaled coordinates that it changes."""
+
+    kind: CauseKind
+    subject: str
+    coordinates: tuple[int, ...]
+
+
+def spoken(subject: str) -> str:
+    """What a change is of, in words: a joint's channel and a measurement are their own names."""
+    if subject.startswith(LINK):
+        return f"the link behind {subject.removeprefix(LINK)}"
+    return {PAYLOAD: "the payload", GRAVITY: "the direction of gravity"}.get(subject, subject)
+
+
+def find_causes(calibration: Calibration, space: StateSpace, offsets: Collection[str]) -> tuple[Cause, ...]:
+    """Those that the free parameters can follow.
+
+    Args:
+        calibration: of the arms.
+        space: of the free parameters.
+        offsets: parameters that are a joint's own zero: no link's.
+    """
+    place = {name: i for i, name in enumerate(space.names)}
+    named: list[tuple[CauseKind, str, list[str]]] = [
+        ("payload_changed", PAYLOAD, [block.name for block in unstated_payload()]),
+        ("gravity_tilted", GRAVITY, [block.name for block in gravity_tilt()]),
+    ]
+    for arm in calibration.system.arms.values():
+        named += [("link_bent", LINK + joint, names) for joint, names in _links(arm, space)]
+    coordinates = [
+        (kind, subject, [n for n in names if n in place and n not in offsets]) for kind, subject, names in named
+    ]
+    return tuple(Cause(kind, subject, tuple(place[n] for n in names)) for kind, subject, names in coordinates if names)
+
+
+def _links(arm: Arm, space: StateSpace) -> Iterator[tuple[str, list[str]]]:
+    """The free numbers of each link, by the joint that carries it."""
+    symbols = {block.name: ca.SX.sym(block.name, block.size) for block in arm.parameters()}
+    chain = arm.chain(symbols)
+    single = {block.name for block in space.parameters.free if block.size == 1 and block.unit in ("m", "rad")}
+    free = [name for name in symbols if name in single]
+    behind = [joint.parent_T_joint for joint in chain.joints[1:]]
+    if chain.tool.joint == len(chain.joints):
+        behind.append(chain.tool.joint_T_frame)
+    for joint, fixed in zip(chain.joints, behind, strict=False):
+        numbers = ca.vertcat(ca.vec(fixed.rotation), fixed.translation)
+        yield f"{arm.name}.{joint.name}", [name for name in free if ca.depends_on(numbers, symbols[name])]
+
 
 _POSES = 60
 _REACH = {"angle": 1.2, "length": 0.1}
@@ -103,19 +161,16 @@ def find_steps(calibration: Calibration, observer: Observer, values: Array) -> S
         motions_of = {name: _sensor_motion(problem, values, records, name, complete, slopes) for name in factors}
     except ArmcalError:
         return Steps((), (), {})
+    # Of causes the coordinates that move a prediction in some pose.
+    seen = np.sum(slopes**2, axis=0) > _CUT * len(slopes)
+    causes = find_causes(calibration, space, {step.parameter for step in steps.values() if step})
+    narrowed = [replace(cause, coordinates=tuple(i for i in cause.coordinates if seen[i])) for cause in causes]
     return Steps(
         tuple(step for step in steps.values() if step is not None),
         tuple(channel for channel, step in steps.items() if step is None),
         {name: motion for name, motion in motions_of.items() if motion is not None},
-        _seen_causes(find_causes(calibration, space, {step.parameter for step in steps.values() if step}), slopes),
+        tuple(cause for cause in narrowed if cause.coordinates),
     )
-
-
-def _seen_causes(causes: Sequence[Cause], slopes: Array) -> tuple[Cause, ...]:
-    """Causes with the coordinates that move a prediction in some pose; none where no pose shows any."""
-    seen = np.sum(slopes**2, axis=0) > _CUT * len(slopes)
-    narrowed = [replace(cause, coordinates=tuple(i for i in cause.coordinates if seen[i])) for cause in causes]
-    return tuple(cause for cause in narrowed if cause.coordinates)
 
 
 def _probing_poses(arms: Iterable[Arm]) -> Dataset:

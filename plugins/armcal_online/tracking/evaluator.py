@@ -1,7 +1,5 @@
 """What evaluates a recalibration: where all of it is the same, the same records give the same bits."""
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import os

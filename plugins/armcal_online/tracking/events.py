@@ -1,7 +1,5 @@
 """Events of a recalibration: one JSON object each, with a finished sentence wherever something was decided."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -11,15 +9,14 @@ import numpy as np
 from armcal.estimate.online import Linearised
 
 from armcal_online.sources.source import Incoming
-from armcal_online.tracking.causes import CAUSES, LINK, spoken
 from armcal_online.tracking.decisions import LEVEL_ADVICE, Decision, advice, per_cent, sure
-from armcal_online.tracking.directions import Steps
+from armcal_online.tracking.directions import CAUSES, LINK, Steps, spoken
 from armcal_online.tracking.health import LEVELS, Health
 from armcal_online.tracking.hypotheses import Recent
 from armcal_online.tracking.settings import RecalibrateSettings
+from armcal_online.tracking.sizes import TipError
 from armcal_online.tracking.start import FilterSetup
 from armcal_online.tracking.state import Arrival, State
-from armcal_online.tracking.tip_error import TipError
 
 _MOST_LOG_ODDS = 700.0
 _SIZES = {
@@ -73,10 +70,11 @@ def judged(
     """A record that was accepted or rejected."""
     verdict = "rejected" if recent.rejected else "accepted"
     relation = "above" if recent.rejected else "within"
+    nis = f"{recent.nis:,.0f}" if 1000 <= recent.nis < 1e9 else f"{recent.nis:.3g}"
     name = setup.problem.kernels[recent.readings[0].factor].factor.name
     event = {
         **_record(incoming, state, verdict),
-        "why": f"Its NIS {_figure(recent.nis)} is {relation} the limit {limit:.3g}.",
+        "why": f"Its NIS {nis} is {relation} the limit {limit:.3g}.",
         "nis": recent.nis,
         "limit": limit,
         "dof": recent.dof,
@@ -207,10 +205,6 @@ def _named(arrival: Arrival | None) -> dict[str, Any] | None:
 def estimated(state: State, parameters: Mapping[str, list[float]]) -> dict[str, Any]:
     """What is believed: value and standard deviation by entry (SI)."""
     return _event("estimate", state, parameters=dict(parameters))
-
-
-def _figure(number: float) -> str:
-    return f"{number:,.0f}" if 1000 <= number < 1e9 else f"{number:.3g}"
 
 
 def _event(kind: str, state: State, /, **content: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Hypotheses of a change, weighed by the likelihood of the last records.
+"""Hypotheses of a change, single or two by two; ``window_evidence`` weighs them.
 
 Each hypothesis starts from the belief before a record that did not fit, with the variance that it reopens. Its
 evidence is the likelihood of the records since [Willsky1976]. What it reopens costs it evidence by itself: a wider
@@ -7,29 +7,23 @@ belief predicts every single record less well.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Literal, get_args
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.errors import ArmcalError
-from armcal.estimate.online import Gaussian, OnlineEstimator, log_likelihood
 
 from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.causes import CAUSES, Cause, CauseKind
-from armcal_online.tracking.directions import Steps
-from armcal_online.tracking.observer import JointNoise, Observer, Reading
-from armcal_online.tracking.outliers import log_density_of_outlier
-from armcal_online.tracking.process_noise import ProcessNoise
-from armcal_online.tracking.settings import ChangeSettings, OutlierSettings
+from armcal_online.tracking.directions import CAUSES, Cause, CauseKind, Steps
+from armcal_online.tracking.observer import JointNoise, Reading
+from armcal_online.tracking.settings import ChangeSettings
 from armcal_online.tracking.state_space import StateSpace
-from armcal_online.tracking.window_evidence import RecordsSince
 
 _SCALES = (1.0, 0.1)
 """A change is of the stated size, or small: to a prior wide enough for a slipped tooth a small step is unlikely."""
-_MOST_ONSETS = 5
-"""So many of the last records with a large NIS are tried as the first after a change."""
 GradualKind = Literal["joint_creeping", "sensor_drifting"]
 GRADUAL: tuple[GradualKind, ...] = get_args(GradualKind)
 Kind = Literal[
@@ -188,95 +182,44 @@ def _columns(columns: Sequence[Array], size: int) -> Array:
     return whole
 
 
-class HypothesisFilter:
-    """Weighs hypotheses by the last records, and follows them."""
+LEAST_RECORDS = 3
+"""So many records that do not fit are needed: two fit two changes of their own too easily."""
+_MOST = 7
+_TOGETHER = 0.01
+"""How probable it is that another certain change comes with one."""
+_ENOUGH = 0.9
 
-    def __init__(
-        self, observer: Observer, estimator: OnlineEstimator, process_noise: ProcessNoise, outliers: OutlierSettings
-    ) -> None:
-        self._observer, self._estimator = observer, estimator
-        self._process_noise, self._outliers = process_noise, outliers
-        self.is_model_wrong = any(state.instance for state in observer.gauss_markov.states)
 
-    def compare(
-        self, recent: Sequence[Recent], large: Sequence[int], changes: Sequence[Hypothesis], least: int = 1
-    ) -> list[Explanation]:
-        """Every hypothesis from its likeliest onset, the likeliest first.
+def is_enough(single: Explanation, large: int) -> bool:
+    """Whether one change explains all records since that do not fit, and most of their misfit.
 
-        ``large`` are records that do not fit; an onset has at least ``least`` of them from it on.
-        """
-        likeliest: dict[int, Explanation] = {}
-        for onset in large[-_MOST_ONSETS : len(large) + 1 - least]:
-            records = recent[onset:]
-            since = self._records_since(records)
-            none = since.weigh(np.zeros((self._observer.size, 0))).log_likelihood
-            misfits = [i - onset for i in large if i >= onset]
-            rejected = [i for i in misfits if records[i].rejected]
-            for place, change in enumerate(changes):
-                try:
-                    weighed = since.weigh(change.directions, change.factor)
-                except (ArmcalError, np.linalg.LinAlgError):
-                    continue
-                odds = weighed.log_likelihood - none + change.log_prior
-                misfit = sum(r.nis for r, fits in zip(records, weighed.fits, strict=True) if fits)
-                share = max(0.0, 1 - weighed.nis / misfit) if misfit > 0 else 0.0
-                if place not in likeliest or odds > likeliest[place].log_odds:
-                    counts = int(weighed.fits[misfits].sum()), int(weighed.fits[rejected].sum())
-                    wrong = int((~weighed.fits).sum()), len(records)
-                    likeliest[place] = Explanation(change, onset, odds, share, *counts, wrong)
-        return sorted(likeliest.values(), key=lambda explanation: -explanation.log_odds)
+    A change of everything is not enough: it would explain two changes as well.
+    """
+    if single.hypothesis.kind == "general_change":
+        return False
+    return single.large >= large and single.share >= _ENOUGH
 
-    def _records_since(self, records: Sequence[Recent]) -> RecordsSince:
-        before = records[0].before
-        return RecordsSince(
-            before,
-            [self._observer.observation(before, r.readings, r.joint_noise) for r in records],
-            [r.passed for r in records],
-            self._process_noise,
-            [self._outlier_covariance(r) for r in records],
-            self._outliers.fraction,
-            min(map(self.freedom, records)),
+
+def pairs(singles: Sequence[Explanation], changes: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
+    """Steps of joints and motions of instruments of the stated size, two by two, as a blow makes both at once.
+
+    Args:
+        singles: the likeliest first; only changes of the likeliest joints and instruments are combined.
+        changes: all single changes.
+    """
+    subjects = list(dict.fromkeys(single.hypothesis.subject for single in singles))
+    kinds = ("joint_slipped", "sensor_moved")
+    of = {change.subject: change for change in changes if change.kind in kinds and change.scale == 1.0}
+    known = [of[subject] for subject in subjects if subject in of][:_MOST]
+    return tuple(
+        Hypothesis(
+            "two_changes",
+            f"{one.subject} and {other.subject}",
+            np.hstack([one.directions, other.directions]),
+            1.0,
+            max(one.log_prior, other.log_prior) + math.log(_TOGETHER),
+            np.zeros_like(one.step),
+            parts=(one, other),
         )
-
-    def follow(self, place: int, recent: Sequence[Recent], directions: Array, factor: float = 1.0) -> Candidate:
-        """A change before the first of some records that reopens ``directions``, followed through them."""
-        before = recent[0].before
-        covariance = before.gaussian.covariance + directions @ directions.T
-        reopened = Belief(before.origin, Gaussian(before.gaussian.mean, covariance))
-        candidate = Candidate(place, 0.0, reopened.widened(len(self._process_noise.rates), factor))
-        candidate = self._absorbed(candidate, recent[0])
-        for record in recent[1:]:
-            candidate = self.step(candidate, record)
-        return candidate
-
-    def step(self, candidate: Candidate, record: Recent) -> Candidate:
-        """A hypothesis after the next record."""
-        return self._absorbed(
-            replace(candidate, belief=self._process_noise.faded(candidate.belief, record.passed)), record
-        )
-
-    def _absorbed(self, candidate: Candidate, record: Recent) -> Candidate:
-        """A hypothesis with a record, which is a good one or an outlier, whichever is likelier."""
-        belief, share = candidate.belief, self._outliers.fraction
-        observation = self._observer.observation(belief, record.readings, record.joint_noise)
-        try:
-            first = observation.at(belief.gaussian.mean)
-            freedom, stated = self.freedom(record), self._outlier_covariance(record)
-            outside = np.log(share) + log_density_of_outlier(first.innovation, first.noise, stated, freedom)
-            update = self._estimator.update(belief.gaussian, [observation])
-        except ArmcalError:
-            return candidate
-        within = np.log(1 - share) + log_likelihood(update.innovation, update.covariance, freedom)
-        if not within < outside:
-            belief = belief.updated(self._observer.space, update.posterior)
-        return Candidate(candidate.place, candidate.log_evidence + float(max(within, outside)), belief)
-
-    def freedom(self, record: Recent) -> float:
-        """Degrees of freedom with which the noise of a record is known."""
-        return self._observer.freedom(record.readings)
-
-    def _outlier_covariance(self, record: Recent) -> Array:
-        kernels = self._observer.problem.kernels
-        size = {"length": self._outliers.length, "angle": self._outliers.angle}
-        deviations = [size[d] for reading in record.readings for d in kernels[reading.factor].factor.dimensions]
-        return np.diag(np.array(deviations) ** 2)
+        for one, other in combinations(known, 2)
+    )

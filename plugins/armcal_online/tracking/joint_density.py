@@ -1,13 +1,12 @@
-"""The joint density of some of several records, and how it changes with each record more or less."""
+"""The joint density of some of several records, how it changes with each more or less, and that of a wrong record."""
 
-from __future__ import annotations
-
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.estimate.online import log_density
+from armcal.estimate.online import log_density, log_likelihood
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
@@ -67,3 +66,22 @@ def _solved(covariance: Array, innovation: Array) -> tuple[float, float]:
     if fault:
         raise np.linalg.LinAlgError("a covariance is not positive definite")
     return float(innovation @ weighted), 2 * float(np.log(root.diagonal()).sum())
+
+
+_SIZES = ((1.0, 0.5), (3.0, 0.25), (10.0, 0.125), (30.0, 0.125))
+"""Of errors in units of the stated size, and how probable each is."""
+
+
+def log_density_of_outlier(innovation: Array, expected: Array, stated: Array, freedom: float) -> float:
+    """Log density of a wrong record, of the size that makes it likeliest.
+
+    Args:
+        innovation: of the record (m).
+        expected: its covariance if the record were a good one (m x m).
+        stated: covariance of an error of the stated size (m x m).
+        freedom: degrees of freedom with which the noise is known.
+    """
+    return max(
+        math.log(probability) + log_likelihood(innovation, expected + size**2 * stated, freedom)
+        for size, probability in _SIZES
+    )

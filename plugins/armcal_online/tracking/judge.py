@@ -1,7 +1,5 @@
 """What the last records mean: whether something has changed, what, since when, and how far the estimate is trusted."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,13 +13,13 @@ from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.decisions import EXPLAINED, Decision, log_odds_of
 from armcal_online.tracking.directions import Steps
 from armcal_online.tracking.health import Health, improbability, many_outliers, nis_limit
-from armcal_online.tracking.hypotheses import GRADUAL, Explanation, Hypothesis, HypothesisFilter
-from armcal_online.tracking.pairs import LEAST_RECORDS, is_enough, pairs
+from armcal_online.tracking.hypotheses import GRADUAL, LEAST_RECORDS, Explanation, Hypothesis, is_enough, pairs
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.sizes import Size, rate_of, size_of
 from armcal_online.tracking.slow_changes import SlowChanges
 from armcal_online.tracking.state import State
 from armcal_online.tracking.state_space import StateSpace
+from armcal_online.tracking.window_evidence import HypothesisFilter
 
 _LARGE = 0.01
 """A record with an NIS as large as this is one in a hundred: two of them near each other are looked into."""

@@ -5,8 +5,6 @@ the filter, predict a record before it is used. Where the records are likelier b
 chance makes in a long mission, the belief becomes that window's. Everything is a function of the records.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -19,8 +17,7 @@ from armcal.estimate.online import Gaussian
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.decisions import Decision
 from armcal_online.tracking.hypotheses import Hypothesis
-from armcal_online.tracking.net_state import NetState, Prediction
-from armcal_online.tracking.refit import NetRecord, Prior, Refit, Refitter
+from armcal_online.tracking.refit import NetRecord, NetState, Prediction, Prior, Refit, Refitter
 from armcal_online.tracking.start import FilterSetup
 from armcal_online.tracking.state import State
 
@@ -160,7 +157,10 @@ class Net:
             refits.append(start)
         if not refits:
             return state
-        alert, prior = self._is_alert(state), self._prior(state.seconds)
+        failing = sum(p.relative[0] > _LARGE for p in state.predictions[-_LOOKED_AT:])
+        gains = [self._gain(state.predictions, place)[0] for place in range(len(refits))]
+        # The filter may be failing.
+        alert, prior = failing >= 2 or max(gains) > _ALERT, self._prior(state.seconds)
         for place in range(len(refits)) if alert else (state.taken % len(refits),):
             window = records[-WINDOWS[place] :]
             if alert:
@@ -168,12 +168,6 @@ class Net:
                 refits[place] = self._refitter.started([refits[place], *others], window)
             refits[place] = self._refitter.refitted(refits[place], prior, window, _ROUNDS)
         return replace(state, refits=tuple(refits))
-
-    def _is_alert(self, state: NetState) -> bool:
-        """Whether the filter may be failing."""
-        failing = sum(p.relative[0] > _LARGE for p in state.predictions[-_LOOKED_AT:])
-        gains = [self._gain(state.predictions, place)[0] for place in range(len(state.refits))]
-        return failing >= 2 or max(gains, default=0.0) > _ALERT
 
     def _take_over(self, state: NetState) -> TakeOver | None:
         """The window that predicts better than the filter beyond chance, the likeliest if several do."""

@@ -236,13 +236,11 @@ class RecordObservation(Observation):
     def at(self, point: Array) -> Linearised:
         key = point.tobytes()
         if key not in self._last:
+            inside, outside = self._place(point)
+            evaluated = [self.observer.linearise(inside, reading) for reading in self.readings]
             self._last.clear()
-            self._last[key] = self._linearised(point)
+            self._last[key] = self._assembled(point, outside, evaluated)
         return self._last[key]
-
-    def _linearised(self, point: Array) -> Linearised:
-        inside, outside = self._place(point)
-        return self._assembled(point, outside, [self.observer.linearise(inside, reading) for reading in self.readings])
 
     def _place(self, point: Array) -> tuple[Array, Array]:
         """Values within their domains at which a point is evaluated, and scaled coordinates of the way on to it."""

@@ -6,8 +6,6 @@ parameters. One that is a drift moves a parameter; one of a shared error, the pa
 neighbouring records have in common, shifts what an instrument reads.
 """
 
-from __future__ import annotations
-
 import fnmatch
 import math
 import re

@@ -29,18 +29,19 @@ from armcal_online.tracking.decisions import EXPLAINED
 from armcal_online.tracking.directions import Steps, find_steps
 from armcal_online.tracking.evaluator import identity
 from armcal_online.tracking.health import nis_limit
-from armcal_online.tracking.hypotheses import GRADUAL, HypothesisFilter, Recent, hypotheses, slow_changes
+from armcal_online.tracking.hypotheses import GRADUAL, Recent, hypotheses, slow_changes
 from armcal_online.tracking.judge import Judge
 from armcal_online.tracking.net import Net
 from armcal_online.tracking.observer import Reading
 from armcal_online.tracking.refit import NetRecord
 from armcal_online.tracking.settings import RecalibrateSettings
+from armcal_online.tracking.sizes import tip_error
 from armcal_online.tracking.slow_changes import SlowChanges
 from armcal_online.tracking.start import FilterSetup, filter_setup
 from armcal_online.tracking.state import Arrival, State, Tick, advanced, remembering, ticked, troubled
-from armcal_online.tracking.tip_error import tip_error
 from armcal_online.tracking.updated import calibration_text, deviations
 from armcal_online.tracking.what_if import worth_of_record
+from armcal_online.tracking.window_evidence import HypothesisFilter
 
 _WEEK = 7.0
 """days"""

@@ -1,14 +1,11 @@
 """What was decided, in words: a clause of what happened, and one of the evidence."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from scipy.special import logsumexp
 
-from armcal_online.tracking.causes import CAUSES, spoken
 from armcal_online.tracking.decisions import Decision, log_odds_of, per_cent
-from armcal_online.tracking.directions import Steps
+from armcal_online.tracking.directions import CAUSES, Steps, spoken
 from armcal_online.tracking.hypotheses import Explanation, Hypothesis
 from armcal_online.tracking.sizes import Size
 from armcal_online.tracking.state import State

@@ -6,8 +6,6 @@ likelihood under all records since is Gaussian, and its evidence against no chan
 of a few small products a record. Changes are taken to begin where a track begins; a new track begins again and again.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +17,40 @@ from armcal.estimate.online import Gaussian, Linearised
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.hypotheses import GRADUAL, Hypothesis
 from armcal_online.tracking.process_noise import ProcessNoise
-from armcal_online.tracking.slow_state import SlowEvidence, SlowState
+
+
+@dataclass(frozen=True)
+class SlowEvidence:
+    """What the records since one speak for, of all slow changes (m columns) together.
+
+    Attributes:
+        since: the number of the record before which the changes would have begun.
+        records: how many have been used since.
+        seconds: since then.
+        effect: how far the belief's mean would be off now, by change (N x m).
+        information: of the records about the changes (m x m).
+        score: their weighted innovations along the changes (m).
+    """
+
+    since: int
+    records: int
+    seconds: float
+    effect: Array
+    information: Array
+    score: Array
+
+
+@dataclass(frozen=True)
+class SlowState:
+    """Evidence from two beginnings, the older first, and the trends that were found.
+
+    ``trend`` is how far the parameters move in a second, ``wander`` the variance that they gain in one (n; scaled).
+    """
+
+    tracks: tuple[SlowEvidence, ...] = ()
+    trend: Array | None = None
+    wander: Array | None = None
+
 
 _LONGEST = 200
 """Records of a track; at half of them the next begins."""
@@ -92,19 +123,13 @@ class SlowChanges:
         both = np.column_stack([record.slope @ prior.covariance, record.innovation])
         weighted = np.asarray(np.linalg.solve(covariance, both), dtype=np.float64)
         gain, innovation = weighted[:, :-1].T, weighted[:, -1]
-        return replace(state, tracks=tuple(self._used(t, record, gain, innovation, covariance) for t in tracks))
-
-    def _used(
-        self, track: SlowEvidence, record: Linearised, gain: Array, innovation: Array, expected: Array
-    ) -> SlowEvidence:
-        seen = record.slope @ track.effect
-        return replace(
-            track,
-            records=track.records + 1,
-            effect=track.effect - gain @ seen,
-            information=track.information + seen.T @ np.linalg.solve(expected, seen),
-            score=track.score + seen.T @ innovation,
-        )
+        used = []
+        for track in tracks:
+            seen = record.slope @ track.effect
+            effect, score = track.effect - gain @ seen, track.score + seen.T @ innovation
+            information = track.information + seen.T @ np.linalg.solve(covariance, seen)
+            used.append(SlowEvidence(track.since, track.records + 1, track.seconds, effect, information, score))
+        return replace(state, tracks=tuple(used))
 
     def weighed(self, state: SlowState) -> list[Weighing]:
         """All changes by the track that speaks for them most, the likeliest first."""

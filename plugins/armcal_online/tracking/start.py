@@ -1,7 +1,5 @@
 """From a calibration to what a recalibration starts with: problem, belief, noise of records and of the process."""
 
-from __future__ import annotations
-
 import fnmatch
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace

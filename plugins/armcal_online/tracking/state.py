@@ -19,9 +19,9 @@ from armcal_online.tracking.belief import Belief, most_likely
 from armcal_online.tracking.decisions import Decision
 from armcal_online.tracking.health import Health
 from armcal_online.tracking.hypotheses import Candidate, Recent
-from armcal_online.tracking.net_state import NetState
+from armcal_online.tracking.refit import NetState
 from armcal_online.tracking.settings import ClockSettings
-from armcal_online.tracking.slow_state import SlowState
+from armcal_online.tracking.slow_changes import SlowState
 from armcal_online.tracking.start import FilterSetup
 
 REMEMBERED = 128

@@ -5,8 +5,6 @@ stays the Gaussian that the records make, and only what is taken from it is brou
 ``belief.most_likely``). Rotations, poses and screw axes are moved within their domain.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The updated calibration: the file of the one it started from, with the values and covariance of the belief."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any

@@ -1,7 +1,5 @@
 """How much one more record would determine, before it is taken."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

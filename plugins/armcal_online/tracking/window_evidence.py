@@ -1,4 +1,4 @@
-"""The likelihood of consecutive records under a change, all at once.
+"""The likelihood of consecutive records under a change, all at once, and the filter that weighs hypotheses by it.
 
 The innovations of the records, predicted from the belief before the first, are jointly Gaussian (Student's t where
 few records determined the noise): they share the belief's error and the Gauss-Markov states. A change adds what it
@@ -6,25 +6,27 @@ reopens to that covariance. The records are linearised where it leads (Gauss-New
 slipped tooth is no small step. Each record may also be an outlier, of any size, whichever is likelier.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate, combinations, pairwise
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.estimate.online import Linearised
+from armcal.errors import ArmcalError
+from armcal.estimate.online import Gaussian, Linearised, OnlineEstimator, log_likelihood
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.joint_density import JointDensity
-from armcal_online.tracking.observer import RecordObservation, linearised
-from armcal_online.tracking.outliers import log_density_of_outlier
+from armcal_online.tracking.hypotheses import Candidate, Explanation, Hypothesis, Recent
+from armcal_online.tracking.joint_density import JointDensity, log_density_of_outlier
+from armcal_online.tracking.observer import Observer, RecordObservation, linearised
 from armcal_online.tracking.process_noise import ProcessNoise
+from armcal_online.tracking.settings import OutlierSettings
 
+_MOST_ONSETS = 5
+"""So many of the last records with a large NIS are tried as the first after a change."""
 _ROUNDS = 3
 _STEPS = 8
 _SETTLED = 0.02
@@ -80,7 +82,17 @@ class RecordsSince:
         for i, j in combinations(range(len(passed)), 2):
             self._left[i, j] = np.prod(kept[i:j], axis=0)
         self._unmoved = linearised(observations, self._means)
-        self._log_outliers = math.log(1 - share), math.log(share) + self._outlier_densities(outlier_covariances)
+        # An outlier says nothing about the arm: its density is the same whatever has changed.
+        self._log_outliers = (
+            math.log(1 - share),
+            np.array(
+                [
+                    math.log(share)
+                    + log_density_of_outlier(r.innovation, r.slope @ prior @ r.slope.T + r.noise, error, freedom)
+                    for r, prior, error in zip(self._unmoved, self._priors, outlier_covariances, strict=True)
+                ]
+            ),
+        )
 
     def weigh(self, directions: Array, factor: float = 1.0) -> Weighed:
         """A change that reopens ``directions`` (N x k) and makes standard deviations of parameters larger.
@@ -102,14 +114,6 @@ class RecordsSince:
                 break
         assert best is not None
         return best
-
-    def _outlier_densities(self, stated: Sequence[Array]) -> Array:
-        """Of each record by itself (records), whatever has changed: an outlier says nothing about the arm."""
-        densities = []
-        for record, prior, error in zip(self._unmoved, self._priors, stated, strict=True):
-            expected = record.slope @ prior @ record.slope.T + record.noise
-            densities.append(log_density_of_outlier(record.innovation, expected, error, self._freedom))
-        return np.array(densities)
 
     def _records(self, directions: Array, shift: Array) -> list[Linearised]:
         if not shift.any():
@@ -175,3 +179,97 @@ class RecordsSince:
         for own, i in zip(rows, places, strict=True):
             covariance[own, own] += records[i].noise
         return np.concatenate([records[i].innovation for i in places]), slope, covariance, rows
+
+
+class HypothesisFilter:
+    """Weighs hypotheses by the last records, and follows them."""
+
+    def __init__(
+        self, observer: Observer, estimator: OnlineEstimator, process_noise: ProcessNoise, outliers: OutlierSettings
+    ) -> None:
+        self._observer, self._estimator = observer, estimator
+        self._process_noise, self._outliers = process_noise, outliers
+        self.is_model_wrong = any(state.instance for state in observer.gauss_markov.states)
+
+    def compare(
+        self, recent: Sequence[Recent], large: Sequence[int], changes: Sequence[Hypothesis], least: int = 1
+    ) -> list[Explanation]:
+        """Every hypothesis from its likeliest onset, the likeliest first.
+
+        ``large`` are records that do not fit; an onset has at least ``least`` of them from it on.
+        """
+        likeliest: dict[int, Explanation] = {}
+        for onset in large[-_MOST_ONSETS : len(large) + 1 - least]:
+            records = recent[onset:]
+            since = self._records_since(records)
+            none = since.weigh(np.zeros((self._observer.size, 0))).log_likelihood
+            misfits = [i - onset for i in large if i >= onset]
+            rejected = [i for i in misfits if records[i].rejected]
+            for place, change in enumerate(changes):
+                try:
+                    weighed = since.weigh(change.directions, change.factor)
+                except (ArmcalError, np.linalg.LinAlgError):
+                    continue
+                odds = weighed.log_likelihood - none + change.log_prior
+                misfit = sum(r.nis for r, fits in zip(records, weighed.fits, strict=True) if fits)
+                share = max(0.0, 1 - weighed.nis / misfit) if misfit > 0 else 0.0
+                if place not in likeliest or odds > likeliest[place].log_odds:
+                    counts = int(weighed.fits[misfits].sum()), int(weighed.fits[rejected].sum())
+                    wrong = int((~weighed.fits).sum()), len(records)
+                    likeliest[place] = Explanation(change, onset, odds, share, *counts, wrong)
+        return sorted(likeliest.values(), key=lambda explanation: -explanation.log_odds)
+
+    def _records_since(self, records: Sequence[Recent]) -> RecordsSince:
+        before = records[0].before
+        return RecordsSince(
+            before,
+            [self._observer.observation(before, r.readings, r.joint_noise) for r in records],
+            [r.passed for r in records],
+            self._process_noise,
+            [self._outlier_covariance(r) for r in records],
+            self._outliers.fraction,
+            min(map(self.freedom, records)),
+        )
+
+    def follow(self, place: int, recent: Sequence[Recent], directions: Array, factor: float = 1.0) -> Candidate:
+        """A change before the first of some records that reopens ``directions``, followed through them."""
+        before = recent[0].before
+        covariance = before.gaussian.covariance + directions @ directions.T
+        reopened = Belief(before.origin, Gaussian(before.gaussian.mean, covariance))
+        candidate = Candidate(place, 0.0, reopened.widened(len(self._process_noise.rates), factor))
+        candidate = self._absorbed(candidate, recent[0])
+        for record in recent[1:]:
+            candidate = self.step(candidate, record)
+        return candidate
+
+    def step(self, candidate: Candidate, record: Recent) -> Candidate:
+        """A hypothesis after the next record."""
+        return self._absorbed(
+            replace(candidate, belief=self._process_noise.faded(candidate.belief, record.passed)), record
+        )
+
+    def _absorbed(self, candidate: Candidate, record: Recent) -> Candidate:
+        """A hypothesis with a record, which is a good one or an outlier, whichever is likelier."""
+        belief, share = candidate.belief, self._outliers.fraction
+        observation = self._observer.observation(belief, record.readings, record.joint_noise)
+        try:
+            first = observation.at(belief.gaussian.mean)
+            freedom, stated = self.freedom(record), self._outlier_covariance(record)
+            outside = np.log(share) + log_density_of_outlier(first.innovation, first.noise, stated, freedom)
+            update = self._estimator.update(belief.gaussian, [observation])
+        except ArmcalError:
+            return candidate
+        within = np.log(1 - share) + log_likelihood(update.innovation, update.covariance, freedom)
+        if not within < outside:
+            belief = belief.updated(self._observer.space, update.posterior)
+        return Candidate(candidate.place, candidate.log_evidence + float(max(within, outside)), belief)
+
+    def freedom(self, record: Recent) -> float:
+        """Degrees of freedom with which the noise of a record is known."""
+        return self._observer.freedom(record.readings)
+
+    def _outlier_covariance(self, record: Recent) -> Array:
+        kernels = self._observer.problem.kernels
+        size = {"length": self._outliers.length, "angle": self._outliers.angle}
+        deviations = [size[d] for reading in record.readings for d in kernels[reading.factor].factor.dimensions]
+        return np.diag(np.array(deviations) ** 2)

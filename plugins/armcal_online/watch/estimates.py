@@ -1,7 +1,5 @@
 """Parameters over time, in bounded memory: the change of each since the start, and its standard deviation."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass

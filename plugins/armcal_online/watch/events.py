@@ -1,7 +1,5 @@
 """The events of a recalibration, checked and cut to what is shown: what is not as expected becomes None."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """What pages are fed with: the history, kept up to date from the folder, and the newest messages for each to fetch."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shlex

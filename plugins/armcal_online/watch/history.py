@@ -1,7 +1,5 @@
 """The state of a recalibration as its events give it, in bounded memory."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping
 from typing import Any

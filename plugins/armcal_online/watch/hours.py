@@ -1,7 +1,5 @@
 """How far off the predictions were over time, beside the level: hours in which the level was nominal all the same."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

@@ -4,8 +4,6 @@ It is drawn in elastic equilibrium under the load that the calibration states. c
 calibration is first drawn: a watcher in a terminal has no need of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What whoever is called at night has to know: what to do, how far off, since when, and where to roll back to."""
 
-from __future__ import annotations
-
 import shlex
 from collections import deque
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The present state as text for a terminal: a picture that is drawn again and again, or a line an event."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -143,7 +141,7 @@ def _records(records: Sequence[Mapping[str, Any]]) -> Table:
     for record in reversed(records):
         residual = record.get("residual_mm")
         table.add_row(
-            Text(_name(record)),
+            Text(str(record.get("id", record["sequence"]))),
             Text(record["verdict"], style=VERDICT_STYLES[record["verdict"]]),
             _number(record.get("nis")),
             _number(record.get("limit")),
@@ -178,10 +176,6 @@ def _kind(event: Mapping[str, Any]) -> str:
     if event["event"] == "decision":
         return str(event.get("kind", "decision")).replace("_", " ")
     return f"level {event.get('to', '')}" if event["event"] == "level" else str(event["event"])
-
-
-def _name(record: Mapping[str, Any]) -> str:
-    return str(record.get("id", record["sequence"]))
 
 
 def _place(message: Mapping[str, Any]) -> str:
