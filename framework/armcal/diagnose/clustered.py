@@ -6,8 +6,6 @@ of the records' errors, and so its covariance is the sandwich of the weights and
 random order poses weigh correlated errors with changing signs, and little is wider; along a path it is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

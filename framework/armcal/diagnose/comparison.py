@@ -1,7 +1,5 @@
 """Models compared on the same records: how much better, how sure, and which records gain."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

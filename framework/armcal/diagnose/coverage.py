@@ -9,8 +9,6 @@ stretch is never judged by the records it comes from: each fold of a cross-valid
 scores of the other folds give (cross-conformal [Vovk2015]).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ Each dependence is a set of columns: how residuals would move with it, to first 
 along the residual's own entries (base axes for a position), or along the turning of one site.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What a verdict rests on beside the estimate: structure left in residuals, misses, and what priors alone hold."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """What is left in residuals, which records are missed, and what priors alone hold, in sentences of the verdict."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,9 +1,8 @@
 """A fit as the rows of one linear least-squares problem: data, priors, and the innovations of a drift."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +34,7 @@ class FitRows:
     positions: tuple[bool, ...]
 
     @classmethod
-    def of(cls, problem: Problem, records: Sequence[FactorRecords], estimate: Estimate) -> FitRows:
+    def of(cls, problem: Problem, records: Sequence[FactorRecords], estimate: Estimate) -> Self:
         """The rows at an estimate; ``records`` with the weights they had."""
         values, parameters = estimate.values, problem.parameters
         count, scales = records[0].count, parameters.scales()

@@ -1,7 +1,5 @@
 """How a calibrated arm differs from the nominal one as a whole, and what of it contradicts what was known before."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

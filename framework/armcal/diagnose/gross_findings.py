@@ -1,7 +1,5 @@
 """What is grossly wrong with a calibration, and what no data can show, in sentences of the verdict."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Records that the model misses by more than a limit, and what is unusual about each."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

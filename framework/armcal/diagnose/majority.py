@@ -3,8 +3,6 @@
 And did what the arm touches stay where it was? A socket that moved splits its residuals in two, in recorded order.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ left-handed: a reflection reverses lengths along the axes of rotations. So three
 measured; positions alone show the gain by three, and the handedness by five.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations

@@ -4,8 +4,6 @@ QR with column pivoting on the scaled Jacobian [Golub2013], block by block, pref
 base parameters are found numerically [Khalil2002].
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

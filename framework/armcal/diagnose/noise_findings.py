@@ -1,7 +1,5 @@
 """Noise of a fit, in sentences of the verdict."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

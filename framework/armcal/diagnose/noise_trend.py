@@ -4,8 +4,6 @@ Squares of residuals, leverage counted, are regressed on one thing after another
 their level (Bonferroni). What does as well as the best, within 20 to 1, is named beside it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ A smooth function of the pose, or of time, stands for what is not among the caus
 likelihood. Several causes at once are judged one by one, each in the presence of the others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

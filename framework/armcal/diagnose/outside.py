@@ -1,7 +1,5 @@
 """What residuals might depend on outside of the arm: gravity, load, the instrument's scale and axes, sudden jumps."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 

@@ -6,10 +6,9 @@ is what is left of its residuals once all free parameters have adapted to first 
 wrong one cannot be mended by any parameters.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,12 +93,12 @@ class _Seen:
         """Positions (3 x n, m)."""
         return self.sighting.measured
 
-    def thinned(self, most: int) -> _Seen:
+    def thinned(self, most: int) -> Self:
         """At most so many of the records, evenly."""
         every = np.arange(0, self.records.count, max(1, -(-self.records.count // most)))
         rows = tuple((words, positions[:, every]) for words, positions in self.rows)
         (records,) = subset([self.records], every)
-        return _Seen(self.sighting.subset(every), records, rows, self.placing)
+        return replace(self, sighting=self.sighting.subset(every), records=records, rows=rows)
 
 
 @dataclass(frozen=True)

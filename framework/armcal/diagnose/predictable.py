@@ -8,13 +8,12 @@ through the same fit, is what chance predicts: signs keep how large each record'
 in a pose, so that neither outliers nor uneven noise pass for a dependence [Liu1988].
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -249,7 +248,7 @@ class _Regression:
     members: Sequence[NDArray[np.intp]]
     values: Array
 
-    def of_first(self) -> _Regression:
+    def of_first(self) -> Self:
         """Of the first values alone."""
         return replace(self, values=self.values[:, :1])
 

@@ -1,7 +1,5 @@
 """Other readings of recorded joints and positions: exchanged, reversed, of another unit, a row early or late."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations, permutations, product
 

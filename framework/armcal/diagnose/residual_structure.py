@@ -7,8 +7,6 @@ up, each dependence is freed of first. Of those that were found, each is then se
 what is not among them: it is named alone only where it is clearly the likeliest.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -7,10 +7,9 @@ so that errors which resemble their neighbours' do not pass for many independent
 same projection gives the distribution of the smallest p-value of the whole family [Westfall1993].
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,12 +54,12 @@ class Fit:
         """How many there are."""
         return int(self.block.max(initial=-1)) + 1
 
-    def without(self, basis: Array) -> Fit:
+    def without(self, basis: Array) -> Self:
         """With orthonormal columns (rows x k) taken up as well."""
         residual = self.residual - basis @ (basis.T @ self.residual)
         return replace(self, residual=residual, draws=self.draws - basis @ (basis.T @ self.draws))
 
-    def with_fewer_draws(self) -> Fit:
+    def with_fewer_draws(self) -> Self:
         """For the tests after the first."""
         return replace(self, draws=self.draws[:, :FEWER_DRAWS])
 

@@ -6,8 +6,6 @@ compared by their marginal likelihoods, by how well other records predict each r
 the other: where poses were visited in order, a function of time is a function of the pose, and no test separates them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """The verdict: what a person should conclude, each sentence from a test with a stated level."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal

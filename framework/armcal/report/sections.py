@@ -1,7 +1,5 @@
 """Sections that plugins add to the report of a run."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol

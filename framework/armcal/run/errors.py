@@ -1,11 +1,9 @@
 """Errors of a run's records, nominal and calibrated, and their summaries."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,7 +84,7 @@ class RecordErrors:
     unit: str = "mm"
     turns: TurnErrors | None = None
 
-    def with_nominal(self, other: RecordErrors) -> RecordErrors:
+    def with_nominal(self, other: Self) -> Self:
         """With the nominal errors of others, which were made without what was learned since."""
         turns = self.turns
         if turns is not None and other.turns is not None:
@@ -163,7 +161,7 @@ class ErrorTable:
     nominal: dict[str, ErrorSummary]
     calibrated: dict[str, ErrorSummary]
     at_rest: dict[str, ErrorSummary] = field(default_factory=dict)
-    turns: ErrorTable | None = None
+    turns: Self | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -174,7 +172,7 @@ class ErrorTable:
         }
 
     @classmethod
-    def of(cls, errors: RecordErrors, split: Split) -> ErrorTable:
+    def of(cls, errors: RecordErrors, split: Split) -> Self:
         """The summaries of every record's errors."""
         judged = np.isfinite(errors.cross_validated_mm)
         summaries = partial(_summaries, split=split, judged=judged)
