@@ -145,6 +145,11 @@ class Camera(PointInstrument):
         """The parameter on which all lengths depend."""
         return "" if self.lender else "board_scale"
 
+    @property
+    def scale_check(self) -> str:
+        """How to find out what it is."""
+        return "Measure the board over its whole width, and state its size"
+
     def check_lender(self, lender: object) -> None:
         """Refuse one that does not see the same boards, has them elsewhere or cannot place them (ValueError)."""
         if not isinstance(lender, Camera) or lender.boards != self.boards:

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.cli.main import cli
-from armcal.diagnose.comparison import Change, change, simplest_good
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.bootstrap import (
     BootstrapSettings,
@@ -23,6 +22,8 @@ from armcal.estimate.estimator import Solution, SolverVerdict, estimate
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.io.parallel import Workers
 from armcal.problem.correlation import Correlation
+from armcal.run.model_study import change, simplest_good
+from armcal.run.study_result import Change
 from click.testing import CliRunner
 
 DEMO = str(Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "demo.yaml")

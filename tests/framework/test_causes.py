@@ -14,11 +14,11 @@ from armcal.cli.main import cli
 from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.evidence_findings import neighbour_findings, structure_findings
 from armcal.diagnose.fit_rows import FitRows
-from armcal.diagnose.gross import scale_deviation
 from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.odds import UNLISTED
 from armcal.diagnose.outside import predicted_positions
 from armcal.diagnose.residual_structure import LEVEL, structure
+from armcal.diagnose.scales import scale_deviation
 from armcal.diagnose.verdict import _in_short
 from armcal.estimate.weighing import fit
 from armcal.problem.motion import Motion, recorded_position

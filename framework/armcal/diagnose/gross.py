@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armcal.base.domains import Array
-from armcal.diagnose.fit_rows import FitRows
 from armcal.errors import NotConvergedError
 from armcal.estimate.combination import Measure
 from armcal.estimate.estimator import Estimate
@@ -120,21 +119,3 @@ def displaced(problem: Problem, estimate: Estimate, records: Sequence[FactorReco
         times, name = abs(float(moved[i])) / sizes[i], parameters.coordinate_names[i]
         far.append(Displaced(name, amount, unit, float(times), block.prior_sd is not None, placement))
     return tuple(sorted(far, key=lambda coordinate: -coordinate.times))
-
-
-def scale_deviation(problem: Problem, rows: FitRows, positions: Sequence[Array], noise_scale: float) -> float | None:
-    """Standard deviation of an instrument's scale if it were free beside the parameters; None without positions.
-
-    Args:
-        problem: of the fit.
-        rows: of the fit, priors among them.
-        positions: what each factor should read (3 x N, or 0 x N; m), in the same records.
-        noise_scale: residuals in units of the declared noise.
-    """
-    if not any(map(len, positions)):
-        return None
-    raw = [np.zeros((len(k.factor.noise), len(rows.by_record), 1)) for k in problem.kernels]
-    for column, position in zip(raw, positions, strict=True):
-        column[: len(position), :, 0] = position
-    left = float(np.linalg.norm(apart_from(rows.slopes, rows.columns(raw))))
-    return noise_scale / left if left > 0 else float("inf")

@@ -26,7 +26,6 @@ _NO_EXCUSE = frozenset({"order", "step", "slip", "scale"})
 """Kinds of structure that explain no gross error: something may have moved, or a frame be wrong."""
 SIZE, GROSS_SIZE = 0.02, 0.05
 """How far the calibrated arm may be larger or smaller than the nominal one: worth a look, and gross."""
-UNSEEN_SCALE = 0.2
 MOST_NAMED = 3
 
 
@@ -170,23 +169,3 @@ def _listed(group: Sequence[Displaced]) -> str:
         ],
         MOST_NAMED,
     )
-
-
-def limit_findings(figure: Figure, scale_sd: float | None) -> list[Finding]:
-    """What no residual shows: in which frame the answer is, and how large an error of the instrument's scale may be."""
-    if scale_sd is None:
-        return []
-    text = (
-        f"The answer is in the instrument's frame: in it the arm stands {figure.moved_mm:.3g} mm and "
-        f"{figure.turned_deg:.2g} deg from where the configuration has it."
-    )
-    most = 2 * scale_sd
-    if most > UNSEEN_SCALE:
-        text += " An error of the instrument's scale would not show in these data at all."
-    else:
-        text += (
-            f" An error of the instrument's scale of up to {100 * most:.2g} % would not show"
-            f" ({most * figure.reach_mm:.2g} mm at the arm's reach)."
-        )
-    action = "Measure a known length with the instrument, if the scale matters."
-    return [Finding("note", text, "two standard deviations of a scale beside the parameters", action)]

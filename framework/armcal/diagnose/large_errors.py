@@ -112,12 +112,16 @@ def _miss(
     leverage: Array,
     efforts: Mapping[str, Array],
 ) -> Miss:
-    alike, far = _neighbours_alike(record, judged), bool(leverage[record] > UNUSUAL)
+    whole, step = np.vstack(judged.residuals), judged.position - judged.position[record]
+    lengths, beside = np.linalg.norm(whole, axis=0), np.abs(step) == 1
+    same = whole[:, record] @ whole > _ALIKE * lengths[record] * lengths
+    alike = bool(beside.any() and np.all((same & (lengths >= np.median(lengths)))[beside]))
+    far = bool(leverage[record] > UNUSUAL)
     heavy, along = _heaviest(record, problem, motion, efforts), _along(record, problem, motion, judged)
     reasons = [
         "its prediction is among the 5 % that depend most on the parameters' uncertainty" if far else "",
         heavy,
-        "its neighbours in the recording miss in the same direction" if alike else "",
+        "its neighbours in the recording miss in the same direction" if alike else "",  # and not by little
         along,
     ]
     advice = "measure it again: it may be a single wrong measurement"
@@ -159,14 +163,6 @@ def _heaviest(record: int, problem: Problem, motion: Motion, efforts: Mapping[st
             unit = "N m" if arm.joint_dimensions[joint] == "angle" else "N"
             return f"{shown} holds {abs(effort):.2g} {unit}, among the top 5 %"
     return ""
-
-
-def _neighbours_alike(record: int, judged: Judged) -> bool:
-    """Whether those before and after it (that there are) miss in its direction, and not by little."""
-    whole, step = np.vstack(judged.residuals), judged.position - judged.position[record]
-    lengths, beside = np.linalg.norm(whole, axis=0), np.abs(step) == 1
-    same = whole[:, record] @ whole > _ALIKE * lengths[record] * lengths
-    return bool(beside.any() and np.all((same & (lengths >= np.median(lengths)))[beside]))
 
 
 def _along(record: int, problem: Problem, motion: Motion, judged: Judged) -> str:

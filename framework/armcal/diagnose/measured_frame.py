@@ -90,7 +90,10 @@ def frame_mistake(expected: Array, seen: Array) -> FrameMistake | None:
         if reading.is_possible(seen):
             other = _fitted(expected, seen, reading)
             enough = min(FITS * spread, straight[reading.with_rotations].left / MUCH_BETTER)
-            if _differs(other, reading) and other.left <= enough * (1 if other.is_mirrored else _ROUGHLY):
+            no_gain = other.gain <= _LEAST_GAIN or 1 / _GAIN_OFF < other.gain < _GAIN_OFF
+            if reading.gain is None and no_gain:
+                continue
+            if other.left <= enough * (1 if other.is_mirrored else _ROUGHLY):
                 fitting.append(other)
     if not fitting:
         return None
@@ -137,11 +140,6 @@ _READINGS = tuple(
 )
 
 
-def _differs(frame: MeasuredFrame, reading: _Reading) -> bool:
-    """Whether a gain that was fitted is one."""
-    return reading.gain is not None or (frame.gain > _LEAST_GAIN and not 1 / _GAIN_OFF < frame.gain < _GAIN_OFF)
-
-
 def _fitted(expected: Array, seen: Array, reading: _Reading) -> MeasuredFrame:
     """Turn, shift, target and gain by turns, each the least squares of all others."""
     places, goals, count = expected[:, :3, 3], seen[:, :3, 3], len(seen)
@@ -157,7 +155,8 @@ def _fitted(expected: Array, seen: Array, reading: _Reading) -> MeasuredFrame:
         size = max(spread_of(goals.T), _TINY)
         both = np.vstack([reading.mirror * lever * centred, lever**2 * axes]).T
         others = np.vstack([lever * seen_centred * (spread_of(points.T) / size), lever**2 * seen_axes]).T
-        turn = _turned(both, others)
+        # With their opposites vectors have the origin as their middle.
+        turn = rigid_fit(*(np.hstack([vectors, -vectors]) for vectors in (both, others)))[0]
         moved = reading.mirror * centred @ turn.T
         if reading.gain is None:
             gain = max(float(np.sum(moved * seen_centred) / max(np.sum(moved**2), _TINY**2)), _TINY)
@@ -171,13 +170,6 @@ def _fitted(expected: Array, seen: Array, reading: _Reading) -> MeasuredFrame:
     fitted = MeasuredFrame(gain, reading.mirror < 0, has_rotations, turn, shift, target, 0.0)
     numbers = 6 + (reading.gain is None) + 3 * fits_target
     return replace(fitted, left=_left(fitted, points, goals, (expected, seen), pairs, numbers))
-
-
-def _turned(points: Array, others: Array) -> Array:
-    """The turn (3 x 3) that brings vectors (3 x N) nearest to others. [Umeyama1991]"""
-    origin = np.zeros((3, 1))
-    doubled = [np.hstack([vectors, -vectors, origin]) for vectors in (points, others)]
-    return rigid_fit(*doubled)[0]
 
 
 def _sines(poses: Array, pairs: Sequence[tuple[int, int]]) -> Array:

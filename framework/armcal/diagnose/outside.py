@@ -127,7 +127,7 @@ def _of_mistakes(
             always, blocks = one.course == "always", [problem.parameters[f"{name}.{p}"] for p in one.parameters]
             if any(block.free == always for block in blocks):
                 continue
-            moves = _moves(_freed(problem, blocks) if always else problem, values, records, blocks, one.together)
+            moves = _moves(freed(problem, blocks) if always else problem, values, records, blocks, one.together)
             subject, words = (name if many else ""), f"{name}: {one.words}" if many else one.words
             labels, unit = (("change",), "1") if one.together and one.course != "once" else ((), "")
             if always:
@@ -144,7 +144,7 @@ def _of_mistakes(
                     yield Dependence(one.kind, subject, "", at, "", one.measure, jump)
 
 
-def _freed(problem: Problem, blocks: Sequence[ParameterBlock]) -> Problem:
+def freed(problem: Problem, blocks: Sequence[ParameterBlock]) -> Problem:
     """The problem as a function of fixed parameters too; its records serve both."""
     plan = problem.blueprint
     parameters = plan.parameters.with_free([b.name for b in (*plan.parameters.free, *blocks)])

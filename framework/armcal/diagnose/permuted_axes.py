@@ -211,10 +211,13 @@ def _of(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, arm: Ar
     readings = list(_single(problem, seen, arm, straight, enough))
     if min(reading.left for reading in readings) > enough:
         if seen.placing is None:
-            elsewhere, by_itself = _elsewhere(seen, straight)
-            if elsewhere.left <= enough and by_itself:
-                return None
-            readings = [elsewhere] if elsewhere.left <= enough else []
+            turn, shift = rigid_fit(straight.predicted, seen.measured)
+            angle = np.rad2deg(np.linalg.norm(Rotation.from_matrix(turn).as_rotvec()))
+            words = f"the arm's base elsewhere by {np.linalg.norm(shift) * _MM:.3g} mm and {angle:.2g} deg"
+            left = straight.left(turn.T @ (seen.measured - shift[:, None]))
+            if left <= enough and straight.can_move(turn, shift):
+                return None  # the fit moves the base there by itself
+            readings = [_Reading(left, words, False)] if left <= enough else []
         if seen.placing is not None or not readings:
             readings = list(_several(problem, seen, arm, enough))
     if min((reading.left for reading in readings), default=np.inf) > enough:
@@ -227,15 +230,6 @@ def _of(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, arm: Ar
     likeliest = tuple(reading.words for reading in sorted(alike, key=lambda reading: reading.left)[:_MOST_NAMED])
     name = problem.kernels[seen.sighting.kernel].factor.name
     return PermutedAxes(name, likeliest, as_given * _MM, best.left * _MM, best.of_joints)
-
-
-def _elsewhere(seen: _Seen, straight: _Positions) -> tuple[_Reading, bool]:
-    """The arm's base elsewhere, and whether the free parameters bring it there by themselves."""
-    turn, shift = rigid_fit(straight.predicted, seen.measured)
-    angle = np.rad2deg(np.linalg.norm(Rotation.from_matrix(turn).as_rotvec()))
-    words = f"the arm's base elsewhere by {np.linalg.norm(shift) * _MM:.3g} mm and {angle:.2g} deg"
-    left = straight.left(turn.T @ (seen.measured - shift[:, None]))
-    return _Reading(left, words, False), straight.can_move(turn, shift)
 
 
 def _rewired(problem: Problem, seen: _Seen, read_as: Wires) -> FactorRecords:

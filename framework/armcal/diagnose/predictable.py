@@ -129,7 +129,8 @@ class _Input:
 
 def predictable(problem: Problem, rows: FitRows, basis: Array, motion: Motion, dataset: Dataset) -> Predictable | None:
     """Of the residuals of a fit, free of what it takes up (``basis``); None where the poses are too few to judge."""
-    pose = _poses(motion, dataset)
+    commands = np.nan_to_num(np.round(dataset.stacked(motion.channels), 9)).T
+    pose = np.unique(commands, axis=0, return_inverse=True)[1].astype(np.intp).ravel()
     count = int(pose.max(initial=-1)) + 1
     if count < FEWEST_POSES:
         return None
@@ -139,7 +140,14 @@ def predictable(problem: Problem, rows: FitRows, basis: Array, motion: Motion, d
     fold = np.argsort(random.permutation(count))[pose] * _FOLDS // count
     signs = random.choice((-1.0, 1.0), (count, _DRAWS))[pose]
     members = [np.flatnonzero(fold[rows.record_of] == f) for f in range(_FOLDS)]
-    whole = _Regression(blocks, members, _drawn(rows, basis, signs))
+    # Residuals, outliers bounded, and the same with random signs of their records, through the same fit.
+    data, lengths = len(rows.record_of), np.linalg.norm(rows.residual[rows.by_record], axis=1)
+    limit = MOST_OF_MEDIAN * float(np.median(lengths[lengths > 0])) if np.any(lengths) else 1.0
+    bounded = np.minimum(1.0, limit / np.maximum(lengths, 1e-300))
+    both = np.repeat(rows.residual[:, None], 1 + signs.shape[1], axis=1)
+    both[:data] *= bounded[rows.record_of][:, None]
+    both[:data, 1:] *= signs[rows.record_of]
+    whole = _Regression(blocks, members, np.asarray((both - basis @ (basis.T @ both))[:data]))
     shares = np.concatenate([whole.shares(_SIZES, parts) for parts in (None, *({i} for i in range(len(inputs))))])
     size, highest = _SIZES[int(np.argmax(shares[:, 0])) % len(_SIZES)], shares.max(axis=0)
     p = (1 + np.count_nonzero(highest[1:] >= highest[0])) / (1 + _DRAWS)
@@ -148,12 +156,6 @@ def predictable(problem: Problem, rows: FitRows, basis: Array, motion: Motion, d
     learnable = tools and not any(arm.residual for arm in problem.blueprint.arms.values())
     predicted = Predictable(float(highest[0]), chance, float(p), (), len(dataset), count, 0.0, learnable)
     return _carried(predicted, whole.of_first(), inputs, size) if predicted.above_chance else predicted
-
-
-def _poses(motion: Motion, dataset: Dataset) -> NDArray[np.intp]:
-    """Which distinct pose each record is of (N)."""
-    commands = np.nan_to_num(np.round(dataset.stacked(motion.channels), 9)).T
-    return np.asarray(np.unique(commands, axis=0, return_inverse=True)[1], dtype=np.intp).ravel()
 
 
 def _inputs(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[_Input]:
@@ -218,18 +220,6 @@ def _entries(rows: FitRows, inputs: frozenset[int], features: Array, order: Arra
     for entry, own in enumerate(rows.by_record.T):
         columns[own, entry * size : (entry + 1) * size] = features * acting[own, None]
     return _Block(inputs, columns, np.tile(order, entries))
-
-
-def _drawn(rows: FitRows, basis: Array, signs: Array) -> Array:
-    """The data's residuals, and the same with random signs of their records (rows x (1 + draws)); outliers bounded."""
-    count = len(rows.record_of)
-    lengths = np.linalg.norm(rows.residual[rows.by_record], axis=1)
-    limit = MOST_OF_MEDIAN * float(np.median(lengths[lengths > 0])) if np.any(lengths) else 1.0
-    bounded = np.minimum(1.0, limit / np.maximum(lengths, 1e-300))
-    both = np.repeat(rows.residual[:, None], 1 + signs.shape[1], axis=1)
-    both[:count] *= bounded[rows.record_of][:, None]
-    both[:count, 1:] *= signs[rows.record_of]
-    return np.asarray((both - basis @ (basis.T @ both))[:count])
 
 
 @dataclass(frozen=True)

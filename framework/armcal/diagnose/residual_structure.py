@@ -144,20 +144,20 @@ def structure(
     columns = [rows.columns(one.columns) for one in causes]
     kernels = pose_kernels(problem, dataset), time_kernels(len(dataset))
     contest = Contest(causes, columns, fit.residual, basis, rows.by_record, fit.block * _FOLDS // fit.blocks, *kernels)
-    search = _search(rows, fit, contest, modelled)
-    residual, whole = contest.beside(search.chosen)
+    structures, first, last = _search(rows, fit, contest, modelled)
+    residual, whole = contest.beside(tuple(structures))
     return ResidualStructure(
-        search.structures,
-        search.more,
-        search.first.lag_one,
-        search.first.lag_adjusted,
-        search.last.lag_one,
-        search.last.lag_adjusted,
-        _alike(residual, whole, rows, contest) if search.last.lag_adjusted <= LEVEL else None,
+        tuple(structures.values()),
+        bool(np.any(last.adjusted <= LEVEL)),
+        first.lag_one,
+        first.lag_adjusted,
+        last.lag_one,
+        last.lag_adjusted,
+        _alike(residual, whole, rows, contest) if last.lag_adjusted <= LEVEL else None,
         predictable(problem, rows, basis, motion, dataset),
         noise_trend(residual, whole, rows.by_record, Records(dataset, motion), place),
         rows.mean_error(fit.residual) * _MM,
-        search.tested,
+        len(first.adjusted),
         len(dataset),
         block,
     )
@@ -202,23 +202,18 @@ def _fit_of(rows: FitRows, count: int, consecutive: NDArray[np.bool_]) -> tuple[
     return fit, basis, int(np.bincount(block).max())
 
 
-@dataclass(frozen=True)
-class _Search:
-    structures: tuple[Structure, ...]
-    chosen: tuple[int, ...]
-    more: bool
-    first: FamilyTest
-    last: FamilyTest
-    tested: int
+def _search(
+    rows: FitRows, fit: Fit, contest: Contest, modelled: frozenset[str]
+) -> tuple[dict[int, Structure], FamilyTest, FamilyTest]:
+    """Causes one after another as long as one is significant, then each set against all others and chance.
 
-
-def _search(rows: FitRows, fit: Fit, contest: Contest, modelled: frozenset[str]) -> _Search:
-    """Causes one after another as long as one is significant, then each set against all others and chance."""
+    Also the test of the family before any cause was in the model, and that of what is left.
+    """
     left = [
         (i, own) for i, column in enumerate(contest.columns) if (own := own_basis(column, contest.basis)[0]).shape[1]
     ]
     first = test = family_test(fit, [own for _, own in left])
-    tested, chosen, p_values, whole = len(left), list[int](), list[float](), float(fit.residual @ fit.residual)
+    chosen, p_values, whole = list[int](), list[float](), float(fit.residual @ fit.residual)
     while len(chosen) < MOST_FOUND:
         now, significant = float(fit.residual @ fit.residual), np.flatnonzero(test.adjusted <= LEVEL)
         if not len(significant):
@@ -238,11 +233,11 @@ def _search(rows: FitRows, fit: Fit, contest: Contest, modelled: frozenset[str])
         test = family_test(fit, [own for _, own in left])
     worth = (1 - max(test.lag_one, 0.0)) / (1 + max(test.lag_one, 0.0))
     settled = _settled(contest, dict(zip(chosen, p_values, strict=True)), worth)
-    structures = [
-        _structure(rows, contest, i, [j for j in settled if j != i], modelled, p, odds)
+    structures = {
+        i: _structure(rows, contest, i, [j for j in settled if j != i], modelled, p, odds)
         for i, (p, odds) in settled.items()
-    ]
-    return _Search(tuple(structures), tuple(settled), bool(np.any(test.adjusted <= LEVEL)), first, test, tested)
+    }
+    return structures, first, test
 
 
 def _settled(contest: Contest, falls: Mapping[int, float], worth: float) -> dict[int, tuple[float, Odds]]:
@@ -281,22 +276,17 @@ def _structure(
     present = one.effect.split(" ")[0] in modelled
     effect = f"{one.effect} (it is in the model: free it, or loosen its prior)" if present else one.effect
     share = float(np.sum((own.T @ residual) ** 2) / max(float(residual @ residual), 1e-300))
-    falls = rows.mean_error(residual) - rows.mean_error(_left_out(residual, own, contest.fold))
+    left = residual.copy()  # less what it takes up, coefficients found without the records that are judged
+    for number in range(_FOLDS):
+        judged = contest.fold == number
+        gram = own[~judged].T @ own[~judged]
+        ridge = 1e-9 * max(float(np.trace(gram)), 1e-300) * np.eye(len(gram))
+        taken = np.linalg.solve(gram + ridge, own[~judged].T @ residual[~judged])
+        left[judged] -= own[judged] @ taken
+    falls = rows.mean_error(residual) - rows.mean_error(left)
     size = _size(one, -coefficients @ (own.T @ residual))
     named = (one.kind, one.subject, one.words, effect, one.measure)
     return Structure(*named, p_value, share, max(0.0, falls) * _MM, size, odds.share, odds.alternatives)
-
-
-def _left_out(residual: Array, own: Array, fold: NDArray[np.intp]) -> Array:
-    """The residual less what a dependence takes up, its coefficients found without the records that are judged."""
-    left = residual.copy()
-    for number in range(_FOLDS):
-        judged = fold == number
-        gram = own[~judged].T @ own[~judged]
-        ridge = 1e-9 * max(float(np.trace(gram)), 1e-300) * np.eye(len(gram))
-        coefficients = np.linalg.solve(gram + ridge, own[~judged].T @ residual[~judged])
-        left[judged] -= own[judged] @ coefficients
-    return left
 
 
 def _size(one: Dependence, coefficients: Array) -> str:

@@ -163,6 +163,10 @@ class HasScale(Protocol):
     def scale(self) -> str:
         """That parameter's local name, a share (``board_scale``); empty if it is another measurement's."""
 
+    @property
+    def scale_check(self) -> str:
+        """How a user finds out what it is, as a sentence without its full stop."""
+
 
 @dataclass(frozen=True)
 class Mistake:

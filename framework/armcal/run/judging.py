@@ -7,17 +7,15 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.config.system import System
-from armcal.diagnose import held_scale
 from armcal.diagnose.coverage import predictor
 from armcal.diagnose.evidence import Evidence, priors_alone, unseen_poses
 from armcal.diagnose.evidence_findings import worse_than_nominal
 from armcal.diagnose.fit_rows import FitRows
-from armcal.diagnose.gross import MOST_RECORDS, figure_of, scale_deviation, thinned
+from armcal.diagnose.gross import MOST_RECORDS, figure_of, thinned
 from armcal.diagnose.gross_findings import (
     contradicting,
     displacement_findings,
     gross_error,
-    limit_findings,
     overfitted,
     size_findings,
 )
@@ -27,6 +25,8 @@ from armcal.diagnose.majority import minority, moved_findings, moved_groups
 from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.outside import predicted_positions
 from armcal.diagnose.residual_structure import structure
+from armcal.diagnose.scales import MOST_RECORDS as MOST_FOR_SCALES
+from armcal.diagnose.scales import held_scales, scale_deviation, scale_findings
 from armcal.diagnose.verdict import Verdict, judge
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.start import certificates
@@ -153,8 +153,7 @@ def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array
     looked_at = thinned(train, MOST_RECORDS)
     figure = figure_of(problem, estimate, problem.subset(run.records, looked_at))
     own = thinned(np.arange(len(train)), MOST_RECORDS)
-    few = thinned(own, held_scale.MOST_RECORDS)
-    scales = held_scale.held_scales(problem, estimate, problem.subset(acting, few))
+    scales = held_scales(problem, estimate, problem.subset(acting, thinned(own, MOST_FOR_SCALES)))
     problem, acting = with_few_points(problem, problem.subset(acting, own))
     rows = FitRows.of(problem, acting, estimate)
     dataset = run.dataset.subset(looked_at)
@@ -165,8 +164,7 @@ def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array
         *contradicting(minority(rows, estimate.noise_scale, position), dataset.ids),
         *size_findings(figure),
         *displacement_findings(figure),
-        *limit_findings(figure, scale_deviation(problem, rows, read, estimate.noise_scale)),
-        *held_scale.held_scale_findings(scales, figure),
+        *scale_findings(figure, scale_deviation(problem, rows, read, estimate.noise_scale), scales),
         *hidden_payload_findings(evidence.hidden_payload),
     ]
 

@@ -8,8 +8,8 @@ from itertools import chain
 import numpy as np
 
 from armcal.base.domains import Array
-from armcal.diagnose.comparison import change, simplest_good
 from armcal.errors import NotConvergedError, ProblemError
+from armcal.estimate.blocks import BlockLength, automatic_block_length, standard_error_of_mean
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.validation import (
     ErrorSummary,
@@ -24,8 +24,9 @@ from armcal.estimate.validation import (
 from armcal.io.parallel import Executor
 from armcal.run.pipeline import Prepared, Stopwatch, prepare
 from armcal.run.study import PREVIOUS, ModelStudySettings, Study, interpreted_first, judged_fits, naming
-from armcal.run.study_result import NestedResult, StudyResult, VariantResult, VariantTurns
+from armcal.run.study_result import Change, NestedResult, StudyResult, VariantResult, VariantTurns
 
+MOST_LISTED = 10
 _MM = 1000.0
 
 
@@ -143,6 +144,37 @@ def _compared(
         else replace(result, change=change(result.errors_mm, other.errors_mm, other.name, ids, settings.blocks))
         for result, other in zip(plain, others, strict=False)
     )
+
+
+def change(errors: Array, others: Array, against: str, ids: Sequence[str], block: BlockLength = "auto") -> Change:
+    """Errors (N) of one model against those of another on the same records in recorded order; nan where not judged."""
+    both = np.flatnonzero(np.isfinite(errors) & np.isfinite(others))
+    gained = errors[both] - others[both]
+    length = automatic_block_length(gained) if block == "auto" else block
+    order = both[np.argsort(gained, kind="stable")]
+    listed = [(str(ids[i]), float(errors[i] - others[i])) for i in order]
+    return Change(
+        against=against,
+        mean=float(np.mean(gained)) if len(both) else float("nan"),
+        standard_error=standard_error_of_mean(gained, length),
+        block=length,
+        helped=float(np.mean(gained < 0)) if len(both) else float("nan"),
+        most_helped=tuple(pair for pair in listed[:MOST_LISTED] if pair[1] < 0),
+        most_hurt=tuple(pair for pair in listed[::-1][:MOST_LISTED] if pair[1] > 0),
+    )
+
+
+def simplest_good(means: Array, freedoms: Sequence[int], changes: Sequence[Change]) -> int:
+    """The model with the fewest parameters whose mean error is within one standard error of the lowest. [Hastie2009]
+
+    Args:
+        means: mean error of each model (M).
+        freedoms: how many parameters each has (M).
+        changes: each model against the one with the lowest mean (M).
+    """
+    best = int(np.nanargmin(means))
+    good = [i for i, c in enumerate(changes) if i == best or c.mean <= c.standard_error]
+    return min(good, key=lambda i: (freedoms[i], means[i]))
 
 
 def _choices(variants: Sequence[VariantResult], settings: ModelStudySettings, ids: Sequence[str]) -> tuple[str, str]:

@@ -8,12 +8,34 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.calibration.calibration_file import dump
 from armcal.config.variants import SECTION
-from armcal.diagnose.comparison import Change
 from armcal.estimate.validation import ErrorSummary, in_unit
 from armcal.io.cells import csv_text
 from armcal.run.study import Study
 
 FILES = ("experiment.yaml", "study.csv", "study.json", "study.html")
+
+
+@dataclass(frozen=True)
+class Change:
+    """One model against another, record by record; negative is better.
+
+    Attributes:
+        against: the other model.
+        mean: of the differences of each record's error.
+        standard_error: of that mean, from blocks of neighbouring records; the fitted models are taken as given.
+        block: how many neighbours a block has.
+        helped: the share of records whose error is smaller.
+        most_helped: ids and differences of the records that gain most.
+        most_hurt: of those that lose most.
+    """
+
+    against: str
+    mean: float
+    standard_error: float
+    block: int
+    helped: float
+    most_helped: tuple[tuple[str, float], ...]
+    most_hurt: tuple[tuple[str, float], ...]
 
 
 @dataclass(frozen=True)
