@@ -10,8 +10,7 @@ import pytest
 import yaml
 from armcal.run.experiment import Experiment
 from armcal.run.plan import make_plan
-from armcal.run.plan_approaches import APPROACH_ROOM, reachable
-from armcal.run.plan_between import with_poses_between
+from armcal.run.plan_approaches import APPROACH_ROOM, reachable, with_poses_between
 
 from tests.own_arms import POST, OwnArm, said_by
 

@@ -1,16 +1,13 @@
 """``armcal simulate``."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import click
 
 from armcal.cli.common import FILE, Console, overrides, spare_inputs, speaking
-from armcal.errors import ConfigError
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
-from armcal.run.plan_poses import read_poses
-from armcal.run.rendered import with_images
+from armcal.run.simulated import simulated, with_images
 
 
 @click.command()
@@ -27,14 +24,7 @@ def simulate(
     spare_inputs(out, poses)
     registry = console.registry()
     experiment = Experiment.load(config, overrides, registry=registry)
-    listed = None if poses is None else read_poses(experiment, poses)
-    dataset = experiment.simulator().simulate(replace(experiment.simulation_request, poses=listed))
-    if listed is not None and dataset.ids != listed.ids:
-        raise ConfigError(
-            f"the simulator made {len(dataset)} records of its own, expected the {len(listed)} poses of {poses}.",
-            where=experiment.source.where(("simulation", "type")),
-            hint="Leave --poses out, or use the simulator elastic_arm.",
-        )
+    dataset = simulated(experiment, poses)
     if images is not None:
         with console.progress() as progress:
             dataset = with_images(experiment, dataset, images, progress)

@@ -22,8 +22,7 @@ from armcal.report.numbers import (
     shown_unit,
 )
 from armcal.run.errors import ErrorTable
-from armcal.run.groups import GroupError
-from armcal.run.result import RunResult
+from armcal.run.result import GroupError, RunResult
 
 _SETS = (("train", "Train"), ("holdout", "Holdout"), ("cross_validated", "Cross-validated"))
 _STATISTICS = ("mean", "rms", "p95", "max")

@@ -161,7 +161,7 @@ def _tried(
         stands = compensator.stand(thought.joint_angles, targets, np.zeros_like(thought.joint_angles))
         away = np.linalg.norm(stands.base_T_tool[:, :3, 3] - points, axis=1)
         errors.append(np.where(thought.reached & stands.settled, away, np.nan))
-    return CorrectionTable(table.axes, table.reached, table.shifts, table.turns, np.stack(errors, axis=1))
+    return replace(table, tried=np.stack(errors, axis=1))
 
 
 def _targets(compensator: Compensator, positions: Array, settings: TableSettings) -> Targets:

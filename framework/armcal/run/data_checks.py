@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.config.system import System
 from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.permuted_axes import MUCH_BETTER, find_permuted_axes
@@ -30,30 +29,26 @@ def check_reach(problem: Problem, records: Sequence[FactorRecords], dataset: Dat
         if [channel.rpartition(".")[2] for channel in channels] != ["x", "y", "z"]:
             continue
         far, distances = (np.linalg.norm(x, axis=0) for x in (values[:3], dataset.stacked(channels)))
-        _check_rows(kernel.factor.name, dataset, distances / np.maximum(far, _NEAREST))
+        ratio, name = distances / np.maximum(far, _NEAREST), kernel.factor.name
+        # Some records as far out as the model (ratio 1), all others a thousand or ten times farther or nearer.
+        orders = np.log10(np.where(ratio > 0, ratio, np.nan))
+        right = np.abs(orders) < _ALIKE
+        for power in (3, -3, 1, -1):
+            wrong = np.abs(orders - power) < _ALIKE
+            if min(right.sum(), wrong.sum()) >= _FEWEST_ROWS and np.mean(right | wrong) >= _NEARLY_ALL:
+                first = int(np.argmax(wrong))
+                raise DataError(
+                    f"{name}: {wrong.sum()} of {len(dataset)} positions are about {10.0**power:g} times as far from "
+                    f"the base frame as the model's tip, the others as far (the first: record {dataset.ids[first]}).",
+                    where=Location(dataset.source, row=dataset.rows[first] if dataset.rows else None),
+                    hint="Write all rows in the unit of the column names.",
+                )
         reach, measured = float(np.median(far)), float(np.median(distances))
         if measured > _REACH_RATIO * reach or reach > _REACH_RATIO * measured:
             raise DataError(
-                f"{kernel.factor.name}: positions are typically {measured:.4g} m from the base frame, the model's tip "
-                f"{reach:.4g} m.",
+                f"{name}: positions are typically {measured:.4g} m from the base frame, the model's tip {reach:.4g} m.",
                 where=Location(dataset.source),
                 hint="Check the unit in the column names (x_mm or x_m) and the frame of the measurements.",
-            )
-
-
-def _check_rows(name: str, dataset: Dataset, ratio: Array) -> None:
-    """Some records as far out as the model (ratio 1), all others a thousand or ten times farther or nearer."""
-    orders = np.log10(np.where(ratio > 0, ratio, np.nan))
-    right = np.abs(orders) < _ALIKE
-    for power in (3, -3, 1, -1):
-        wrong = np.abs(orders - power) < _ALIKE
-        if min(right.sum(), wrong.sum()) >= _FEWEST_ROWS and np.mean(right | wrong) >= _NEARLY_ALL:
-            first = int(np.argmax(wrong))
-            raise DataError(
-                f"{name}: {wrong.sum()} of {len(dataset)} positions are about {10.0**power:g} times as far from the "
-                f"base frame as the model's tip, the others as far (the first: record {dataset.ids[first]}).",
-                where=Location(dataset.source, row=dataset.rows[first] if dataset.rows else None),
-                hint="Write all rows in the unit of the column names.",
             )
 
 

@@ -2,11 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
@@ -17,7 +15,6 @@ from armcal.estimate.nuisance import settled, untrained
 from armcal.estimate.validation import (
     CrossValidation,
     ErrorSummary,
-    Indices,
     Split,
     error_unit,
     errors_and_turns,
@@ -116,10 +113,14 @@ def errors_of(run: FittedRecords, crossed: CrossValidation | None) -> RecordErro
     first = len(problem.kernels[0].factor.output_channels)
     try:
         before, after = settled(unfitted, nominal, records), settled(problem, values, records)
-        (nominal_errors, *nominal_turns), (errors, *turns) = (
-            errors_and_turns(unfitted, nominal, records),
-            errors_and_turns(problem, values, records, fitted.records),
-        )
+        nominal_errors, nominal_turns = errors_and_turns(unfitted, nominal, records)
+        errors, turns = errors_and_turns(problem, values, records, fitted.records)
+        turned = None
+        if nominal_turns is not None and turns is not None:
+            judged_turns = np.full(len(turns), np.nan)
+            if crossed is not None and crossed.turns is not None:
+                judged_turns[train] = np.degrees(crossed.turns)
+            turned = TurnErrors(np.degrees(nominal_turns), np.degrees(turns), judged_turns)
         return RecordErrors(
             nominal_mm=nominal_errors * _MM,
             calibrated_mm=errors * _MM,
@@ -132,22 +133,11 @@ def errors_of(run: FittedRecords, crossed: CrossValidation | None) -> RecordErro
             cross_validated_at_rest_mm=judged_at_rest if drifts else None,
             residual_columns=("dx_mm", "dy_mm", "dz_mm") if dimensions == ["length"] * 3 else columns,
             unit=error_unit(problem),
-            turns=_turns(nominal_turns[0], turns[0], crossed, train),
+            turns=turned,
         )
     except NotConvergedError as fault:
         verdict = fitted.estimate.verdict
         raise fault if verdict.converged else gave_up(verdict) from fault
-
-
-def _turns(
-    nominal: Array | None, calibrated: Array | None, crossed: CrossValidation | None, train: Indices
-) -> TurnErrors | None:
-    if nominal is None or calibrated is None:
-        return None
-    judged = np.full(len(nominal), np.nan)
-    if crossed is not None and crossed.turns is not None:
-        judged[train] = np.degrees(crossed.turns)
-    return TurnErrors(np.degrees(nominal), np.degrees(calibrated), judged)
 
 
 @dataclass(frozen=True)
@@ -175,7 +165,11 @@ class ErrorTable:
     def of(cls, errors: RecordErrors, split: Split) -> Self:
         """The summaries of every record's errors."""
         judged = np.isfinite(errors.cross_validated_mm)
-        summaries = partial(_summaries, split=split, judged=judged)
+
+        def summaries(of: Array, crossed: Array) -> dict[str, ErrorSummary]:
+            sets = {"train": of[split.train], "holdout": of[split.holdout], "cross_validated": crossed[judged]}
+            return {name: summarise(own) for name, own in sets.items()}
+
         at_rest = {}
         if errors.at_rest_mm is not None and errors.cross_validated_at_rest_mm is not None:
             at_rest = summaries(errors.at_rest_mm, errors.cross_validated_at_rest_mm)
@@ -186,15 +180,6 @@ class ErrorTable:
             before = summaries(own.nominal_deg, own.nominal_deg)
             turns = cls(before, summaries(own.calibrated_deg, own.cross_validated_deg))
         return cls(nominal, summaries(errors.calibrated_mm, errors.cross_validated_mm), at_rest, turns)
-
-
-def _summaries(of: Array, crossed: Array, split: Split, judged: NDArray[np.bool_]) -> dict[str, ErrorSummary]:
-    """Of each set of records."""
-    return {
-        "train": summarise(of[split.train]),
-        "holdout": summarise(of[split.holdout]),
-        "cross_validated": summarise(crossed[judged]),
-    }
 
 
 def _known(raw: Sequence[Array], records: Sequence[FactorRecords]) -> Array:

@@ -52,12 +52,17 @@ def fixed_parameters(experiment: Experiment, ready: Prepared, progress: Progress
         NotConvergedError: a record has no elastic equilibrium at the fit.
     """
     parameters = ready.problem.parameters
-    wide = _with_candidates(experiment, ready)
+    # The problem with every candidate free, too: functions for whatever is chosen of them.
+    system, own = experiment.system, [block.name for block in parameters.free]
+    freer = parameters.with_free([*own, *candidates(parameters)])
+    groups, evaluator = ready.problem.blueprint.groups, experiment.settings.evaluator
+    built = (system.arms, system.measurements, freer, system.environment, ready.dataset, evaluator, groups)
+    wide = Problem.build(*built)
     train, narrow = ready.split.train, replace(wide, parameters=parameters)
     records = wide.subset(acting(wide, wide.records(ready.dataset), ready.dataset), train)
     start = next(iter(ready.start.values(ready.problem)), parameters.nominal())
     fitted = fit(narrow, records, experiment.estimator, start, progress)
-    values, own = fitted.solution.values, [block.name for block in parameters.free]
+    values = fitted.solution.values
     chosen = freeing(wide, own, values, fitted.records)
     others = tuple(one.name for one in chosen.others)
     if not chosen.gaining:
@@ -66,30 +71,18 @@ def fixed_parameters(experiment: Experiment, ready: Prepared, progress: Progress
     names = [one.name for one in chosen.gaining]
 
     def errors_with(count: int) -> Array:
-        freer = replace(wide, parameters=parameters.with_free([*own, *names[:count]]))
-        return cross_validate(freer, records, splits, experiment.estimator, values, progress).errors
+        problem = replace(wide, parameters=parameters.with_free([*own, *names[:count]]))
+        return cross_validate(problem, records, splits, experiment.estimator, values, progress).errors
 
     counts = sorted({*range(min(len(names), _MOST_STEPS) + 1), len(names)})
     errors, best = {count: errors_with(count) for count in counts}, 0
     for count in counts[1:]:
-        best = count if _is_gain(errors[best], errors[count]) else best
+        gains = errors[best] - errors[count]
+        chance = _STANDARD_ERRORS * float(np.std(gains)) / np.sqrt(len(gains))
+        if np.mean(gains) > max(chance, _LEAST_GAIN * float(np.mean(errors[best]))):
+            best = count
     means = {count: float(np.mean(error)) for count, error in errors.items()}
     steps = [
         FreedStep(one, parameters[one.name].unit, means.get(i, float("nan"))) for i, one in enumerate(chosen.gaining, 1)
     ]
     return FixedParameters(means[0], tuple(steps), tuple(names[:best]), others)
-
-
-def _with_candidates(experiment: Experiment, ready: Prepared) -> Problem:
-    """The problem with every candidate free, too: functions for whatever is chosen of them."""
-    parameters, system = ready.problem.parameters, experiment.system
-    names = [block.name for block in parameters.free]
-    freer = parameters.with_free([*names, *candidates(parameters)])
-    groups, evaluator = ready.problem.blueprint.groups, experiment.settings.evaluator
-    return Problem.build(system.arms, system.measurements, freer, system.environment, ready.dataset, evaluator, groups)
-
-
-def _is_gain(before: Array, after: Array) -> bool:
-    gains = before - after
-    sure = _STANDARD_ERRORS * float(np.std(gains)) / np.sqrt(len(gains))
-    return bool(np.mean(gains) > max(sure, _LEAST_GAIN * float(np.mean(before))))

@@ -167,7 +167,15 @@ def _crossed(
     fits = [fit if isinstance(fit, PredictedFit) else None for fit in judged.fits]
     held_residuals = collected(splits, [fit.held_residuals if fit else {} for fit in fits], len(split.train))
     ways = {"same": by.left_out_of_recording, "new": by.left_out_of_new_recording}
-    unknown = _unknown(fits, splits, fitted.records)
+    # What the pose residuals of folds did not know of the records that they did not see; None without any.
+    unknown: list[Array] | None = None
+    for fit, fold in zip(fits, splits, strict=True):
+        if fit is None or fit.unknown is None:
+            continue
+        if unknown is None:
+            unknown = [np.zeros((fitted.records[0].count, *block.shape[1:])) for block in fit.unknown]
+        for whole, block in zip(unknown, fit.unknown, strict=True):
+            whole[fold.holdout] = block
     scores = {
         name: scored(by.problem, own, ways[name](fitted.records, unknown)) for name, own in held_residuals.items()
     }
@@ -185,21 +193,6 @@ def _crossed(
     sure = [name for name, share in shares.items() if share.stretched is not None]
     stretches = {name: s for name in sure if (s := stretch(scores[name])) is not None}
     return {n: _filled(None, own, split.train, count) for n, own in scores.items()}, shares, stretches
-
-
-def _unknown(
-    fits: Sequence[PredictedFit | None], splits: Sequence[Split], records: Sequence[FactorRecords]
-) -> list[Array] | None:
-    """What the pose residuals of folds did not know of the records that they did not see; None without any."""
-    whole: list[Array] | None = None
-    for fit, split in zip(fits, splits, strict=True):
-        if fit is None or fit.unknown is None:
-            continue
-        if whole is None:
-            whole = [np.zeros((records[0].count, *own.shape[1:])) for own in fit.unknown]
-        for mine, own in zip(whole, fit.unknown, strict=True):
-            mine[split.holdout] = own
-    return whole
 
 
 def _filled(before: Scores | None, own: Scores, places: Indices, count: int) -> Scores:

@@ -1,7 +1,6 @@
 """How a run comes to its verdict: tests of the residuals, of the records that judge, and of unseen poses."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -141,7 +140,8 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
         alone = priors_alone(problem, estimate, *poses)
     few, acting = with_few_points(problem, problem.weighted(run.fitted.records, run.fitted.weights))
     own = (training, motion.subset(train), position[train])
-    left = structure(few, acting, estimate, *own, modelled=effect_types(system))
+    effects = [e for arm in system.description["arms"].values() for e in (arm.get("effects") or {}).values()]
+    left = structure(few, acting, estimate, *own, modelled=frozenset(str(effect.get("type")) for effect in effects))
     hidden = hidden_payload(few, acting, estimate, own[0], own[1])
     new = predictor(problem, run.fitted).new_recording(run.records, np.flatnonzero(np.isfinite(judged_mm)))
     return Evidence(left, missed, alone, error_unit(problem), new, hidden)
@@ -173,27 +173,16 @@ def _worse(run: FittedRecords, errors: RecordErrors, judged_mm: Array) -> list[F
     """Where records that did not train are missed by more than before, or by more than those that did.
 
     An arm of which no parameter is free is its nominal one: what was before is then the start, which all records gave.
+    Of a pose residual it is not known how much freedom it takes up, and its own folds judged it.
     """
-    problem = run.problem
-    moves = any(block.name.partition(".")[0] in problem.blueprint.arms for block in problem.parameters.free)
+    problem, fitted, arms = run.problem, run.fitted, run.problem.blueprint.arms
+    moves = any(block.name.partition(".")[0] in arms for block in problem.parameters.free)
     worse = worse_than_nominal(judged_mm, errors.nominal_mm, errors.unit) if moves else []
-    return worse + _overfitted(run, errors, judged_mm)
-
-
-def _overfitted(run: FittedRecords, errors: RecordErrors, judged_mm: Array) -> list[Finding]:
-    """Of a physical model: how much freedom what was learned takes up is not known, and its own folds judged it."""
-    problem, fitted = run.problem, run.fitted
-    if any(arm.residual is not None and arm.residual.is_learned for arm in problem.blueprint.arms.values()):
-        return []
+    if any(arm.residual is not None and arm.residual.is_learned for arm in arms.values()):
+        return worse
     trained = (errors.calibrated_mm if errors.at_rest_mm is None else errors.at_rest_mm)[run.split.train]
     spent = problem.equations(fitted.records), fitted.estimate.degrees_of_freedom
-    return overfitted(trained, judged_mm, *spent, errors.unit)
-
-
-def effect_types(system: System) -> frozenset[str]:
-    """The types of all effects of all arms."""
-    arms: Mapping[str, Any] = system.description["arms"]
-    return frozenset(str(effect.get("type")) for arm in arms.values() for effect in (arm.get("effects") or {}).values())
+    return worse + overfitted(trained, judged_mm, *spent, errors.unit)
 
 
 def _judged(run: FittedRecords, errors: RecordErrors) -> Array:

@@ -1,7 +1,7 @@
 """Load transfer: trained at one payload, judged at another, each way."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -34,18 +34,8 @@ _GRAMS = 1000.0
 PAYLOAD = "payload"
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """One fit of the plan: trained at some payloads (indices), without one fold of them, judged on the rest."""
-
-    variant: str
-    trained: tuple[int, ...]
-    split: Split
-
-    @property
-    def key(self) -> tuple[str, tuple[int, ...]]:
-        """All fits of a variant that trained at the same payloads."""
-        return self.variant, self.trained
+Training = tuple[str, tuple[int, ...]]
+"""A variant, and the payloads (indices) that it trained at."""
 
 
 def transfer(
@@ -62,22 +52,22 @@ def transfer(
     Raises:
         InputError: the records are not at two payloads, or a variant cannot be solved with those of one.
     """
-    watch, settings = watch or Stopwatch(), study.settings_as(LoadTransferSettings)
+    watch, settings = watch or Stopwatch(), study.settings
+    assert isinstance(settings, LoadTransferSettings)
     first = next(iter(study.experiments.values()))
     with watch.stage("prepare"):
         simulated = first.settings.data is None
         dataset = _simulated(first, settings) if simulated else first.read(progress)
         groups, payloads = _groups(dataset, settings)
         ready = {name: naming(name, partial(_prepared, e, dataset, groups)) for name, e in study.experiments.items()}
-    plan = [fit for name in ready for fit in _plan(name, groups, settings)]
-    fits = judged_fits(study, ready, [(fit.variant, fit.split) for fit in plan], executor, progress, watch)
-    errors = {fit.key: np.full(len(dataset), np.nan) for fit in plan}
-    turns = {fit.key: np.full(len(dataset), np.nan) for fit in plan}
-    for fit, judged in zip(plan, fits, strict=True):
-        errors[fit.key][fit.split.holdout] = judged.errors * _MM
+    plan = [((name, trained), split) for name in ready for trained, split in _plan(groups, settings)]
+    fits = judged_fits(study, ready, [(name, split) for (name, _), split in plan], executor, progress, watch)
+    errors, turns = ({key: np.full(len(dataset), np.nan) for key, _ in plan} for _ in range(2))
+    for (key, split), judged in zip(plan, fits, strict=True):
+        errors[key][split.holdout] = judged.errors * _MM
         if judged.turns is not None:
-            turns[fit.key][fit.split.holdout] = np.degrees(judged.turns)
-    unsolved = [fit.key for fit, judged in zip(plan, fits, strict=True) if not judged.converged]
+            turns[key][split.holdout] = np.degrees(judged.turns)
+    unsolved = [key for (key, _), judged in zip(plan, fits, strict=True) if not judged.converged]
     return TransferResult(
         name=study.name,
         command=command,
@@ -156,27 +146,26 @@ def _prepared(experiment: Experiment, dataset: Dataset, groups: Sequence[Indices
     return Prepared(dataset, problem, records, Split(every, every), start.warnings, start)
 
 
-def _plan(name: str, groups: Sequence[Indices], settings: LoadTransferSettings) -> list[_Fit]:
+def _plan(groups: Sequence[Indices], settings: LoadTransferSettings) -> list[tuple[tuple[int, ...], Split]]:
     """At each payload and at all of them: one fit on everything there, judged elsewhere, and one for each fold."""
-    every = tuple(range(len(groups)))
-    plan = []
+    every, plan = tuple(range(len(groups))), []
     for trained in [*((i,) for i in every), every]:
         train = np.concatenate([groups[i] for i in trained])
         elsewhere = [groups[i] for i in every if i not in trained]
         if elsewhere:
-            plan.append(_Fit(name, trained, Split(train, np.concatenate(elsewhere))))
+            plan.append((trained, Split(train, np.concatenate(elsewhere))))
         for split in folds(len(train), settings.folds, settings.seed):
-            plan.append(_Fit(name, trained, Split(train[split.train], train[split.holdout])))
+            plan.append((trained, Split(train[split.train], train[split.holdout])))
     return plan
 
 
 def _cells(
     ready: Mapping[str, Prepared],
-    errors: Mapping[tuple[str, tuple[int, ...]], Array],
-    turns: Mapping[tuple[str, tuple[int, ...]], Array],
+    errors: Mapping[Training, Array],
+    turns: Mapping[Training, Array],
     groups: Sequence[Indices],
     payloads: Sequence[float],
-    unsolved: Sequence[tuple[str, tuple[int, ...]]],
+    unsolved: Sequence[Training],
 ) -> tuple[TransferCell, ...]:
     """Variant by variant: without calibration, then by what it was trained at."""
     cells: list[TransferCell] = []

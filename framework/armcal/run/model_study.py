@@ -13,7 +13,6 @@ from armcal.estimate.blocks import BlockLength, automatic_block_length, standard
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.validation import (
     ErrorSummary,
-    Indices,
     JudgedFit,
     Split,
     error_unit,
@@ -43,7 +42,8 @@ def compare(
         InputError: a variant cannot be solved, or variants do not use the same records.
         NotConvergedError: of every variant some fit failed.
     """
-    watch, settings = watch or Stopwatch(), study.settings_as(ModelStudySettings)
+    watch, settings = watch or Stopwatch(), study.settings
+    assert isinstance(settings, ModelStudySettings)
     with watch.stage("prepare"):
         by_variant = {n: replace(e, settings=interpreted_first(e)) for n, e in study.experiments.items()}
         ready = {name: naming(name, partial(prepare, e, Stopwatch())) for name, e in by_variant.items()}
@@ -51,7 +51,10 @@ def compare(
     dataset, first = next(iter(ready.values())).dataset, next(iter(study.experiments.values()))
     every, poses = np.arange(len(dataset), dtype=np.intp), first.poses(dataset)
     drawn = [folds(len(dataset), settings.folds, settings.seed + r, poses) for r in range(settings.repeats)]
-    inner = [_inside(outer, settings, poses) for outer in drawn[0]] if settings.nested else []
+    inner = []  # of each fold, folds of its training records
+    for train in (outer.train for outer in drawn[0] if settings.nested):
+        parts = folds(len(train), settings.folds, settings.seed, poses[train])
+        inner.append(tuple(Split(train[part.train], train[part.holdout]) for part in parts))
     splits = [Split(every, every), *chain.from_iterable(drawn), *chain.from_iterable(inner)]
     fits = judged_fits(study, ready, [(name, split) for name in ready for split in splits], executor, progress, watch)
     by_name = {name: fits[i * len(splits) : (i + 1) * len(splits)] for i, name in enumerate(ready)}
@@ -74,24 +77,23 @@ def compare(
     )
 
 
-def _inside(outer: Split, settings: ModelStudySettings, poses: Indices) -> tuple[Split, ...]:
-    """Folds of the training records of a fold."""
-    train = outer.train
-    inner = folds(len(train), settings.folds, settings.seed, poses[train])
-    return tuple(Split(train[split.train], train[split.holdout]) for split in inner)
-
-
 def _judged(name: str, ready: Prepared, fits: Sequence[JudgedFit], drawn: Sequence[Sequence[Split]]) -> VariantResult:
-    whole, turned, rest = fits[0], fits[1:], iter(fits[1:])
-    repeats, at_rest = np.full((2, len(drawn), len(ready.dataset)), np.nan)
-    failed = 0
+    """A variant by its fit to all records, and by those of the folds, drawing by drawing."""
+    whole, rest = fits[0], iter(fits[1:])
+    nominal, nominal_turns = errors_and_turns(ready.problem, ready.problem.parameters.nominal(), ready.records)
+    repeats, at_rest, turned = np.full((3, len(drawn), len(ready.dataset)), np.nan)
+    failed, turns = 0, None
     for number, splits in enumerate(drawn):
         for split in splits:
             fit = next(rest)
             repeats[number, split.holdout] = fit.errors * _MM
             at_rest[number, split.holdout] = fit.at_rest * _MM
+            if fit.turns is not None:
+                turned[number, split.holdout] = np.degrees(fit.turns)
             failed += not fit.converged
-    nominal, nominal_turns = errors_and_turns(ready.problem, ready.problem.parameters.nominal(), ready.records)
+    if nominal_turns is not None and whole.turns is not None:
+        of_all = (summarise(np.degrees(nominal_turns)), summarise(np.degrees(whole.turns)))
+        turns = VariantTurns(*of_all, _averaged([summarise(row) for row in turned]))
     return VariantResult(
         name=name,
         free=ready.problem.increments,
@@ -105,22 +107,8 @@ def _judged(name: str, ready: Prepared, fits: Sequence[JudgedFit], drawn: Sequen
         failed_folds=failed,
         fit_seconds=whole.seconds,
         seconds=sum(fit.seconds for fit in fits),
-        turns=_turns(whole, turned, nominal_turns, drawn),
+        turns=turns,
     )
-
-
-def _turns(
-    whole: JudgedFit, rest: Sequence[JudgedFit], nominal: Array | None, drawn: Sequence[Sequence[Split]]
-) -> VariantTurns | None:
-    """Errors of orientations, where they are measured."""
-    if nominal is None or whole.turns is None:
-        return None
-    repeats, fits = np.full((len(drawn), len(nominal)), np.nan), iter(rest)
-    for number, splits in enumerate(drawn):
-        for split in splits:
-            repeats[number, split.holdout] = next(fits).turns
-    crossed = _averaged([summarise(np.degrees(row)) for row in repeats])
-    return VariantTurns(summarise(np.degrees(nominal)), summarise(np.degrees(whole.turns)), crossed)
 
 
 def _averaged(summaries: Sequence[ErrorSummary]) -> ErrorSummary:

@@ -42,12 +42,10 @@ from armcal.problem.readings import with_joint_noise
 from armcal.run.data_checks import check_permuted_axes, check_reach
 from armcal.run.errors import ErrorTable, FittedRecords, RecordErrors, errors_of
 from armcal.run.experiment import Experiment
-from armcal.run.groups import labels_of, run_groups
 from armcal.run.intervals import IntervalResult, interval_result
 from armcal.run.judging import verdict_of
-from armcal.run.noise import SuspiciousRecord, noise_result
 from armcal.run.pose_residual import ResidualOutcome, layer_of, learned_residual, unlearned
-from armcal.run.result import RunResult
+from armcal.run.result import RunResult, SuspiciousRecord, labels_of, noise_result, run_groups
 
 
 @dataclass(frozen=True)
@@ -168,7 +166,8 @@ def calibrate(
     """Calibrate (see ``outputs.write``), starts and folds by ``executor``; InputError if refused (see ``assemble``)."""
     watch, registry = watch or Stopwatch(), experiment.registry
     ready = prepare(experiment, watch, accept, progress)
-    faults = _notify_started(registry, experiment.name, ready.dataset)
+    faults = list(registry.notify("armcal_run_started", name=experiment.name, records=len(ready.dataset)))
+    faults += _notify_rejected(registry, ready.dataset.set_aside)
     means = _Means(experiment, progress, executor, watch)
     fitted = _fitted(means, ready)
     faults += registry.notify("armcal_estimate_changed", estimate=fitted.estimate)
@@ -254,8 +253,9 @@ def _fitted(means: _Means, ready: Prepared) -> WeighedFit:
             return plain_fit(problem, ready.training, next(given for given in given_up if given is not None))
         fitted = fit(problem, ready.training, estimator, left[0], progress)
         for start in left[1:]:
-            if fitted.solution.verdict.converged and _near(problem, ready, data, fitted):
-                break
+            solution = fitted.solution
+            if solution.verdict.converged and typical_off(problem, ready.training, data, solution.values) <= FAR:
+                break  # no other start can be much better
             other = fit(problem, ready.training, estimator, start, progress)
             costs = [problem.cost(one.solution.values, ready.training) for one in (fitted, other)]
             better = other.solution.verdict.converged and costs[1] < costs[0]
@@ -268,17 +268,6 @@ def _widened(ready: Prepared, fitted: WeighedFit) -> WeighedFit:
     position = recorded_position(ready.dataset)[ready.split.train]
     acting = ready.problem.weighted(fitted.records, fitted.weights)
     return replace(fitted, estimate=widened(ready.problem, acting, fitted.estimate, position))
-
-
-def _near(problem: Problem, ready: Prepared, data: Dataset, fitted: WeighedFit) -> bool:
-    """Whether a fit ends where positions are, so that no other start can be much better."""
-    return typical_off(problem, ready.training, data, fitted.solution.values) <= FAR
-
-
-def _notify_started(registry: PluginRegistry, name: str, dataset: Dataset) -> list[str]:
-    """Observers hear of a run, and of the records that were set aside before it; their faults."""
-    faults = registry.notify("armcal_run_started", name=name, records=len(dataset))
-    return [*faults, *_notify_rejected(registry, dataset.set_aside)]
 
 
 def _with_pose_residual(

@@ -25,8 +25,8 @@ from armcal.run.plan_approaches import (
     depends_on_approach,
     reachable,
     with_approaches,
+    with_poses_between,
 )
-from armcal.run.plan_between import with_poses_between
 from armcal.run.plan_clearance import clearance_check
 from armcal.run.plan_context import (
     PlanContext,
@@ -111,7 +111,9 @@ def make_plan(
         check = clearance_check(settings.clearance, experiment.system.arms, experiment.source)
     progress("candidates", 0.0)
     pool = pool_of(experiment, settings, space, listed, check)
-    pool = _approached(experiment, space, parameters, pool, settings)
+    both = come_from_both_sides(pool, space, space.limits(settings), settings.seed)
+    first = as_if_measured(experiment, both.dataset.subset([0]))
+    pool = both if depends_on_approach(problem_of(experiment, parameters, first)) else pool
     given = None if records is None else given_records(experiment, records)
     if given is not None and settings.repeats == 1 and pool.kind != "continuous":
         again = same_poses(pool.dataset.stacked(space.channels), given.stacked(space.channels))
@@ -132,15 +134,6 @@ def make_plan(
         task, plan, pool, refined = _refined(context, task, plan, pool, allowed)
     progress("bound", 0.8)
     return _result(context, task, _between(context, task, plan, pool), pool, refined)
-
-
-def _approached(
-    experiment: Experiment, space: JointSpace, parameters: Parameters, pool: Pool, settings: PlanSettings
-) -> Pool:
-    """Candidates from either side, where something depends on it."""
-    both = come_from_both_sides(pool, space, space.limits(settings), settings.seed)
-    first = as_if_measured(experiment, both.dataset.subset([0]))
-    return both if depends_on_approach(problem_of(experiment, parameters, first)) else pool
 
 
 def _identifiability(task: Task, chosen: Indices, parameters: Parameters) -> Identifiability:

@@ -145,13 +145,16 @@ def clearance_check(settings: ClearanceSettings, arms: Mapping[str, Arm], source
             )
         forbidden.append(_region(region))
     rules = tuple(Rule(rule.between, rule.at_least, rule.besides) for rule in settings.rules)
-    _check_part_names(rules, parts, source)
     check = ClearanceCheck(arm, Clearance(parts, rules, tuple(forbidden)))
-    for index, pairs in enumerate(check.pairs):
+    for index, (rule, pairs) in enumerate(zip(rules, check.pairs, strict=True)):
+        where, globs = source.where((*_AT, "rules", index)), (*rule.between, *rule.besides)
+        if unknown := [glob for glob in globs if glob != EVERYTHING and not matching(parts, glob)]:
+            hint = f"The parts are {', '.join(parts) or 'none'}."
+            raise ConfigError(f"no part is called {unknown[0]!r}.", where=where, hint=hint)
         if not pairs:
             raise ConfigError(
-                f"the rule between {' and '.join(rules[index].between)} is about no pair of parts.",
-                where=source.where((*_AT, "rules", index)),
+                f"the rule between {' and '.join(rule.between)} is about no pair of parts.",
+                where=where,
                 hint="Parts with at most one joint between them do not count; name others, or remove the rule.",
             )
     return check
@@ -222,14 +225,3 @@ def _vertices(path: Path) -> Array:
     if not len(vertices) or not np.isfinite(vertices).all():
         raise DataError("it has no vertices.", where=Location(str(path)), hint="Give a mesh with faces.")
     return vertices
-
-
-def _check_part_names(rules: tuple[Rule, ...], parts: Mapping[str, object], source: ConfigSource) -> None:
-    for index, rule in enumerate(rules):
-        for glob in (*rule.between, *rule.besides):
-            if glob != EVERYTHING and not matching(parts, glob):
-                raise ConfigError(
-                    f"no part is called {glob!r}.",
-                    where=source.where((*_AT, "rules", index)),
-                    hint=f"The parts are {', '.join(parts) or 'none'}.",
-                )

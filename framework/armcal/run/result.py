@@ -1,22 +1,219 @@
 """What a run knows when it ends: everything that the outputs, the report and the terminal show."""
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import numpy as np
+
+from armcal.base.config_text import finite
 from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
 from armcal.calibration.intervals import PredictionRecord
 from armcal.config.system import System
 from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.verdict import Verdict
+from armcal.errors import ConfigError
 from armcal.estimate.bootstrap import Bootstrap
 from armcal.estimate.estimator import Estimate
+from armcal.estimate.nuisance import settled, untrained
 from armcal.estimate.profile import Profile
+from armcal.estimate.residual_spread import ResidualSpread, residual_spread
 from armcal.estimate.validation import Indices, Split
-from armcal.run.errors import ErrorTable, RecordErrors
-from armcal.run.groups import RunGroups
+from armcal.estimate.variance import VarianceComponents
+from armcal.estimate.weighing import WeighedFit
+from armcal.measure.groups import Groups
+from armcal.measure.measurement import GroupedMeasurement
+from armcal.problem.problem import Problem
+from armcal.run.errors import ErrorTable, FittedRecords, RecordErrors
+from armcal.run.experiment import Experiment
 from armcal.run.intervals import IntervalResult
-from armcal.run.noise import NoiseResult
 from armcal.run.pose_residual import ResidualOutcome
+
+_MM = 1000.0
+
+
+@dataclass(frozen=True)
+class SuspiciousRecord:
+    """A training record beyond its limit: where it stood, how many standard deviations off, what became of it.
+
+    ``row`` is that of the source (0 if it has none); ``weight`` 0 means that it was set aside.
+    """
+
+    row: int
+    record_id: str
+    measurement: str
+    deviations: float
+    limit: float
+    weight: float
+    error_mm: float
+
+    @property
+    def reason(self) -> str:
+        """Why it is suspicious."""
+        return f"{self.deviations:.1f} standard deviations from the fit (limit {self.limit:.1f})"
+
+    @property
+    def fate(self) -> str:
+        """In words."""
+        return "set aside" if self.weight == 0 else f"weight {self.weight:.2g}"
+
+
+@dataclass(frozen=True)
+class NoiseResult:
+    """How the records of a run weighed.
+
+    Attributes:
+        loss: ``none``, ``huber``, ``cauchy`` or ``reject``.
+        weights: of each record of the dataset in the fit, its least one if it has several (N; nan: not trained on).
+        suspicious: the farthest first; not sought in plain least squares.
+        components: estimated variances, or None.
+        rounds: solves beyond the first.
+        scatter: of what the fit leaves unexplained, by measurement.
+    """
+
+    loss: str = "none"
+    weights: Array | None = None
+    suspicious: tuple[SuspiciousRecord, ...] = ()
+    components: VarianceComponents | None = None
+    rounds: int = 0
+    scatter: Mapping[str, ResidualSpread] = field(default_factory=dict)
+
+    @property
+    def set_aside(self) -> tuple[SuspiciousRecord, ...]:
+        """Those that took no part in the fit."""
+        return tuple(record for record in self.suspicious if record.weight == 0)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json and calibration.yaml."""
+        content: dict[str, Any] = {"loss": self.loss}
+        if self.loss != "none":
+            content["rounds"] = self.rounds
+            content["suspicious_records"] = [asdict(record) for record in self.suspicious]
+        if self.components is not None:
+            content["components"] = [finite(asdict(component)) for component in self.components.components]
+            content["inseparable"] = [list(pair) for pair in self.components.inseparable]
+            content["unseen_joints"] = list(self.components.unseen)
+        content["scatter"] = {
+            name: {
+                "covariance": spread.covariance.tolist(),
+                "share": spread.share,
+                "over": spread.over,
+                "channel": spread.channel,
+                "freedom": spread.freedom,
+            }
+            for name, spread in self.scatter.items()
+        }
+        return content
+
+
+def noise_result(problem: Problem, fit: WeighedFit, dataset: Dataset, split: Split, errors_mm: Array) -> NoiseResult:
+    """From a fit on the training records; errors are of all records (N)."""
+    weights = np.full(len(dataset), np.nan)
+    weights[split.train] = np.min(np.array(fit.weights), axis=0)
+    suspicious = []
+    for suspect in fit.suspects:
+        i = int(split.train[suspect.record])
+        row = dataset.rows[i] if dataset.rows else 0
+        numbers = (suspect.distance, suspect.limit, suspect.weight, float(errors_mm[i]))
+        suspicious.append(SuspiciousRecord(row, dataset.ids[i], suspect.measurement, *numbers))
+    scatter = residual_spread(problem, fit.estimate, fit.records, dataset.subset(split.train))
+    return NoiseResult(fit.loss, weights, tuple(suspicious), fit.components, len(fit.rounds), scatter)
+
+
+@dataclass(frozen=True)
+class GroupError:
+    """How wrong the model is on the records of one group (mean, mm), before and after calibration.
+
+    ``distance_error_mm`` is what is left of known distances within the group; None where none is known.
+    """
+
+    name: str
+    records: int
+    trained: int
+    nominal_error_mm: float
+    error_mm: float
+    nominal_distance_error_mm: float | None
+    distance_error_mm: float | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json."""
+        return {key: value for key, value in self.__dict__.items() if key != "name"}
+
+
+@dataclass(frozen=True)
+class RunGroups:
+    """What a run found of groups: their errors, sorted by name, and the keys of those that bring parameters."""
+
+    errors: tuple[GroupError, ...] = ()
+    keys: Groups = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json."""
+        return {error.name: error.as_dict() for error in self.errors}
+
+
+def label_of(experiment: Experiment) -> str | None:
+    """The text column that separates groups; None if there is none."""
+    text = experiment.settings.validation.group_by
+    if text is not None:
+        return text
+    labels = [
+        measurement.group_labels
+        for measurement in experiment.system.measurements.values()
+        if isinstance(measurement, GroupedMeasurement)
+    ]
+    return next((label[0] for label in labels if label), None)
+
+
+def labels_of(experiment: Experiment, dataset: Dataset) -> tuple[str, ...]:
+    """Which group each record belongs to.
+
+    Raises:
+        ConfigError: no column separates groups.
+    """
+    label = label_of(experiment)
+    if label is None or label not in dataset.extra:
+        raise ConfigError(
+            f"found no column {label or 'of groups'} in the records; they have {', '.join(dataset.extra) or 'none'}.",
+            where=experiment.source.where(("validation",)),
+            hint="Name a text column of the data: group_by: NAME.",
+        )
+    return _texts(dataset, label)
+
+
+def run_groups(experiment: Experiment, run: FittedRecords, errors: RecordErrors) -> RunGroups:
+    """Errors of each group, sorted by name (none if nothing separates groups), and the keys of the problem's groups."""
+    problem, records, dataset, keys = run.problem, run.records, run.dataset, run.problem.blueprint.groups
+    label = label_of(experiment)
+    if label is None or label not in dataset.extra:
+        return RunGroups((), keys)
+    labels = np.array(_texts(dataset, label))
+    before = _distances(problem, settled(untrained(problem), problem.parameters.nominal(), records))
+    # Distances are judged by what the records of each socket say, not by what the known distance made of them.
+    after = _distances(problem, settled(untrained(problem), run.fitted.estimate.values, records))
+    result = []
+    for name in sorted(set(labels.tolist()) - {""}):
+        inside = labels == name
+        nominal, calibrated = (float(np.nanmean(e[inside])) for e in (errors.nominal_mm, errors.calibrated_mm))
+        trained = int(np.sum(inside[run.split.train]))
+        of_nominal, of_calibrated = _within(name, before), _within(name, after)
+        result.append(GroupError(name, int(inside.sum()), trained, nominal, calibrated, of_nominal, of_calibrated))
+    return RunGroups(tuple(result), keys)
+
+
+def _texts(dataset: Dataset, label: str) -> tuple[str, ...]:
+    """A text column as groups are named by it: spaces about a text mean nothing."""
+    return tuple(text.strip() for text in dataset.extra[label])
+
+
+def _distances(problem: Problem, values: Array) -> list[tuple[tuple[str, str], float]]:
+    return [(tie.groups, float(np.linalg.norm(tie.residual(values))) * _MM) for tie in problem.known_ties]
+
+
+def _within(name: str, distances: list[tuple[tuple[str, str], float]]) -> float | None:
+    own = [error for groups, error in distances if all(name in group.split("/") for group in groups)]
+    return float(np.mean(own)) if own else None
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,6 @@ from armcal.run.pose_residual import Layer, judged_with, layer_of
 from armcal.run.settings import ExperimentSettings, ValidationSettings
 
 R = TypeVar("R")
-K = TypeVar("K", "ModelStudySettings", "LoadTransferSettings")
 PREVIOUS = "previous"
 """As a reference: each variant is compared with the one before it."""
 WORTH_COMPILING = 1000
@@ -96,16 +95,6 @@ class Study:
             whole = experiment.settings.model_copy(update={"validation": ValidationSettings()})
             experiments[name] = replace(experiment, settings=whole)
         return cls(str(read.base.data.get("name") or Path(path).stem), read.base, settings, experiments)
-
-    def settings_as(self, kind: type[K]) -> K:
-        """The settings of one kind of study.
-
-        Raises:
-            TypeError: it is of the other kind.
-        """
-        if not isinstance(self.settings, kind):
-            raise TypeError(f"{self.name} is a study of kind {self.settings.kind}")
-        return self.settings
 
 
 def study_settings(source: ConfigSource) -> ModelStudySettings | LoadTransferSettings:

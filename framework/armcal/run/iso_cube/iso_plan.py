@@ -135,7 +135,10 @@ def make_iso_plan(
         raise ConfigError(text, hint="Describe the arm that is to be tested alone.")
     arm, space = next(iter(arms.values())), JointSpace.of(experiment)
     settings = experiment.settings.plan or PlanSettings()
-    limits, check = _limits(experiment, settings, space), None
+    # Of each joint, stated or the model's own; ``spread`` refuses a joint without.
+    own, stated, check = joint_limits(arm.nominal_chain), space.limits(settings), None
+    model = np.array([own.get(joint) or (-np.inf, np.inf) for joint in arm.commanded], dtype=float)
+    limits = np.where(np.isfinite(stated), stated, model)
     if settings.clearance is not None:
         check = clearance_check(settings.clearance, arms, experiment.source)
     parameters = values_about(experiment, calibration)
@@ -156,12 +159,3 @@ def make_iso_plan(
         float(np.ptp(chosen.commands, axis=0).max()),
         warnings if check is not None else (*warnings, _NO_CLEARANCE),
     )
-
-
-def _limits(experiment: Experiment, settings: PlanSettings, space: JointSpace) -> Array:
-    """Of each joint (n x 2), stated or the model's own; ``spread`` refuses a joint without."""
-    arm = next(iter(experiment.system.arms.values()))
-    own = joint_limits(arm.nominal_chain)
-    stated = space.limits(settings)
-    model = np.array([own.get(joint) or (-np.inf, np.inf) for joint in arm.commanded], dtype=float)
-    return np.where(np.isfinite(stated), stated, model)

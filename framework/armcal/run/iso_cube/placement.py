@@ -118,16 +118,13 @@ def _fitting(
         steps.append((size, rows, commands))
     for size, own, poses_of in reversed(steps):
         order = np.argsort(np.ptp(poses_of, axis=1).max(axis=1), kind="stable")[:_CHECKED]
-        for i in order[_corners_reached(compensator, tools[own[order], :3, 3], size, poses_of[order])]:
+        # Whether the tool's place comes to all corners, from the commands of the nearest pose.
+        centres = tools[own[order], :3, 3]
+        corners = corners_about(centres, size)
+        apart = np.linalg.norm(corners[:, :, None] - points_about(centres, size)[:, None], axis=3)
+        nearest = np.take_along_axis(poses_of[order], apart.argmin(axis=2)[..., None], axis=1)
+        begun = nearest.reshape(-1, poses_of.shape[2])
+        reached = compensator.onward(compensator.targets(corners.reshape(-1, 3)), begun).reached
+        for i in order[reached.reshape(len(centres), -1).all(axis=1)]:
             tool = tools[own[i]]
             yield Placed(Cube(size, tool[:3, 3], tool[:3, :3] if turned else None), poses_of[i])
-
-
-def _corners_reached(compensator: Compensator, centres: Array, size: float, commands: Array) -> Array:
-    """Whether the tool's place comes to all corners of each cube (N), from its poses' commands (N x 5 x n)."""
-    corners, points = corners_about(centres, size), points_about(centres, size)
-    apart = np.linalg.norm(corners[:, :, None] - points[:, None], axis=3)
-    nearest = np.take_along_axis(commands, apart.argmin(axis=2)[..., None], axis=1)
-    begun = nearest.reshape(-1, commands.shape[2])
-    reached = compensator.onward(compensator.targets(corners.reshape(-1, 3)), begun).reached
-    return np.asarray(reached.reshape(len(centres), -1).all(axis=1))

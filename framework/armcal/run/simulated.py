@@ -1,4 +1,4 @@
-"""Images of simulated records, in place of the corners that an instrument would read in them."""
+"""Simulated records, and images of them in place of the corners that an instrument would read."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +16,25 @@ from armcal.measure.measurement import borrowed_names
 from armcal.measure.points import Rendering
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
+from armcal.run.plan_poses import read_poses
+
+
+def simulated(experiment: Experiment, poses: Path | None) -> Dataset:
+    """Records as the configured simulator makes them, at the poses of a file if one is given.
+
+    Raises:
+        ConfigError: no simulator is configured, or it does not take poses.
+        DataError: the poses are refused.
+    """
+    listed = None if poses is None else read_poses(experiment, poses)
+    dataset = experiment.simulator().simulate(replace(experiment.simulation_request, poses=listed))
+    if listed is not None and dataset.ids != listed.ids:
+        raise ConfigError(
+            f"the simulator made {len(dataset)} records of its own, expected the {len(listed)} poses of {poses}.",
+            where=experiment.source.where(("simulation", "type")),
+            hint="Leave --poses out, or use the simulator elastic_arm.",
+        )
+    return dataset
 
 
 def with_images(experiment: Experiment, dataset: Dataset, folder: Path, progress: Progress) -> Dataset:
