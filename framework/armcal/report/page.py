@@ -112,9 +112,6 @@ def _accuracy(result: RunResult) -> dict[str, Any]:
     shown = {"group_rows": rows, "group_distances": distances}
     errors = f"Distance between measured and predicted, {result.errors.unit}"
     parts = {errors: result.table, "Turn between measured and predicted, deg": turns}
-        (errors, result.table),
-        *([("Turn between measured and predicted, deg", turns)] if turns else []),
-    ]
     listed = [(caption, of_sets) for caption, table in parts.items() if table and (of_sets := error_rows(table))]
     turned = {"turned": turns is not None, "judged_turns": judged(turns) if turns else None}
     return {"judged": from_set, "tiles": tiles, "error_tables": listed, **turned, **shown}
