@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 from armcal.cli.main import cli
-from armcal.doctor import child, examination, libraries, machine, workings
-from armcal.doctor.finding import Finding
+from armcal.doctor import child, examination, libraries, machine
+from armcal.doctor.child import Finding
 from armcal.doctor.libraries import EXTRAS, LIBRARIES
 from click.testing import CliRunner
 from packaging.requirements import Requirement
@@ -107,9 +107,11 @@ def test_any_check_may_fail_and_the_others_are_told(probe: str) -> None:
 
 
 def test_one_solver_that_fails_is_told_and_matters_only_if_armcal_asks_for_it() -> None:
-    found = {f.subject: f for f in workings.solvers(told_by(convex={"solvers": {"CLARABEL": "", "SCS": "singular"}}))}
+    found = {
+        f.subject: f for f in examination.solvers(told_by(convex={"solvers": {"CLARABEL": "", "SCS": "singular"}}))
+    }
     assert found["CLARABEL (in cvxpy)"].state == "ok" and found["SCS (in cvxpy)"].state == "note"
-    found = {f.subject: f for f in workings.solvers(told_by(convex={"solvers": {"CLARABEL": "off", "SCS": ""}}))}
+    found = {f.subject: f for f in examination.solvers(told_by(convex={"solvers": {"CLARABEL": "off", "SCS": ""}}))}
     assert found["CLARABEL (in cvxpy)"].state == "warning" and found["SCS (in cvxpy)"].state == "ok"
 
 
@@ -118,7 +120,7 @@ def test_a_calibration_that_fails_is_a_fault() -> None:
 
 
 def test_no_plugins_at_all_is_a_fault() -> None:
-    assert [f.state for f in workings.plugins(told_by(components={"plugins": []}))] == ["fault"]
+    assert [f.state for f in examination.plugins(told_by(components={"plugins": []}))] == ["fault"]
 
 
 def test_a_check_that_raises_becomes_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -220,7 +222,7 @@ def test_a_compiler_is_optional_and_its_faults_are_told(monkeypatch: pytest.Monk
     monkeypatch.setenv("ARMCAL_CC", str(false))
     assert "no such processor" in child.ask("kernel")["fault"]
     monkeypatch.setattr(machine, "compiler_path", lambda: None)
-    none = workings.compiler(told_by())
+    none = examination.compiler(told_by())
     assert none.state == "note" and "none is needed" in none.text
 
 

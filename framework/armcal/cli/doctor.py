@@ -5,8 +5,8 @@ import sys
 
 import click
 
+from armcal.doctor.child import Finding
 from armcal.doctor.examination import examine, works
-from armcal.doctor.finding import Finding
 from armcal.errors import EXIT_BAD_INPUT
 from armcal.version import JSON_SCHEMA
 

@@ -14,8 +14,7 @@ from armcal.scaffold import dh_table
 from armcal.scaffold.dh_table import read_rows
 from armcal.scaffold.naming import robot_name
 from armcal.scaffold.robot import WIDTHS, Convention, Robot, Unit, robot_of_rows
-from armcal.scaffold.robot_files import write_robot
-from armcal.scaffold.trial import try_out
+from armcal.scaffold.robot_files import try_out, write_robot
 from armcal.scaffold.urdf_source import robot_of_urdf
 
 CONVENTIONS: dict[str, Convention] = {"standard": "standard", "modified": "craig"}
@@ -52,7 +51,7 @@ def begin(console: Console, name: str, source: Source, folder: Path) -> None:
         "robot": robot.name,
         "out": str(made.folder),
         "free": list(made.choice.kept),
-        "redundant": list(made.choice.redundant),
+        "redundant": [dropped.name for dropped in made.choice.redundant],
         "holdout_nominal_mm": trial.nominal_mm,
         "holdout_calibrated_mm": trial.calibrated_mm,
         "noise_alone_mm": trial.noise_mm,

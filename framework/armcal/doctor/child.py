@@ -1,17 +1,52 @@
-"""A check in a process of its own: a library that crashes, hangs or ends the process costs that check alone."""
+"""What a check finds, and a process of its own to do it in.
+
+A library that crashes, hangs or ends the process then costs that check alone.
+"""
 
 import json
 import signal
 import subprocess
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Any
+from types import MappingProxyType
+from typing import Any, Literal
+
+State = Literal["ok", "note", "warning", "fault"]
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 LONGEST_S = 120.0
 """A check takes a few seconds on a slow machine."""
 _MARK = "\x1earmcal-doctor "
 _START = "import sys; from armcal.doctor.child import answer; answer(sys.argv[1], sys.argv[2:])"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the doctor's report.
+
+    Attributes:
+        section: which part of the report it belongs to.
+        subject: what was looked at.
+        state: ``ok``; ``note``: not there and not needed; ``warning``: something that armcal can do without is broken
+            or out of range; ``fault``: no arm can be calibrated like this.
+        text: what was found, and what that costs.
+        hint: what to do next, a full sentence; empty where nothing is to be done.
+        detail: the same for programs, by name.
+    """
+
+    section: str
+    subject: str
+    state: State
+    text: str
+    hint: str = ""
+    detail: Mapping[str, Any] = field(default_factory=lambda: _NOTHING)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        content = {"section": self.section, "subject": self.subject, "state": self.state, "text": self.text}
+        return {**content, "hint": self.hint or None, **self.detail}
 
 
 def ask(probe: str, *arguments: str, longest_s: float = LONGEST_S) -> Mapping[str, Any]:

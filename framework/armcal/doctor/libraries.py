@@ -12,7 +12,7 @@ from typing import Any
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from armcal.doctor.finding import Finding, State
+from armcal.doctor.child import Finding, State
 from armcal.version import SOURCES, __version__
 
 DISTRIBUTION = "armcal"

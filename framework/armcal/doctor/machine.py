@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from armcal.doctor.finding import Finding
+from armcal.doctor.child import Finding
 
 LEAST_ROOM_BYTES = 200_000_000
 """Runs, journals and kernels need far less; a disk this full fills up while an arm is measured."""

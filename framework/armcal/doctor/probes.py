@@ -142,7 +142,15 @@ def calibration() -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="armcal-doctor-") as text:
         place = Path(text)
         (place / "arm.yaml").write_text(_CONFIG.format(*_NOMINAL_LENGTHS_M), encoding="utf-8")
-        (place / "poses.csv").write_text(_simulated_poses(), encoding="utf-8")
+        # A planar arm of two links, with a scatter that comes out the same each time.
+        lines = ["pose_id,q1_rad,q2_rad,x_m,y_m,z_m"]
+        one, two = TRUE_LENGTHS_M
+        for n in range(_POSES):
+            q1, q2 = 2.0 * math.sin(1.7 * n), 1.5 * math.cos(2.3 * n)
+            x = one * math.cos(q1) + two * math.cos(q1 + q2) + _NOISE_M * math.sin(12.9 * n)
+            y = one * math.sin(q1) + two * math.sin(q1 + q2) + _NOISE_M * math.sin(78.2 * n + 1)
+            lines.append(f"{n},{q1:.9f},{q2:.9f},{x:.9f},{y:.9f},{_NOISE_M * math.sin(37.7 * n + 2):.9f}")
+        (place / "poses.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
         experiment = Experiment.load(place / "arm.yaml", (), None, discover())
         result = calibrate(experiment, "armcal doctor")
         outputs.write(result, experiment, place / "run", render)
@@ -152,18 +160,6 @@ def calibration() -> dict[str, Any]:
     if not result.estimate.verdict.converged or not off < _NEAR_M:
         raise ArithmeticError(f"the lengths found are off by {off * 1000:.3g} mm")
     return {"off_mm": round(off * 1000, 4)}
-
-
-def _simulated_poses() -> str:
-    """Poses of a planar arm of two links, with a scatter that comes out the same each time."""
-    lines = ["pose_id,q1_rad,q2_rad,x_m,y_m,z_m"]
-    one, two = TRUE_LENGTHS_M
-    for n in range(_POSES):
-        q1, q2 = 2.0 * math.sin(1.7 * n), 1.5 * math.cos(2.3 * n)
-        x = one * math.cos(q1) + two * math.cos(q1 + q2) + _NOISE_M * math.sin(12.9 * n)
-        y = one * math.sin(q1) + two * math.sin(q1 + q2) + _NOISE_M * math.sin(78.2 * n + 1)
-        lines.append(f"{n},{q1:.9f},{q2:.9f},{x:.9f},{y:.9f},{_NOISE_M * math.sin(37.7 * n + 2):.9f}")
-    return "\n".join(lines) + "\n"
 
 
 def kernel() -> dict[str, Any]:

@@ -1,9 +1,11 @@
-"""The files of a new robot: its arm, what to calibrate, a plan, a simulated truth and records of it."""
+"""The files of a new robot: its arm, what to calibrate, a plan, a simulated truth and records of it, and a trial."""
 
 import fnmatch
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +13,18 @@ import numpy as np
 
 from armcal.base.dataset import Dataset
 from armcal.base.units import display_unit, to_unit
-from armcal.diagnose.minimal import minimal_set
+from armcal.diagnose.minimal import MinimalSet, minimal_set
 from armcal.errors import InputError
+from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.simulation import measured_without_noise
 from armcal.measure.csv_writer import write_csv
 from armcal.plugins import PluginRegistry
 from armcal.problem.projection import factor_at_zero
+from armcal.report import plugin_sections, render
+from armcal.run import outputs
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Stopwatch, assemble
+from armcal.run.pipeline import Stopwatch, assemble, calibrate
+from armcal.run.result import RunResult
 from armcal.scaffold import truth
 from armcal.scaffold.rendering import number, rendered, staged, write_texts
 from armcal.scaffold.robot import Robot, RobotJoint
@@ -35,13 +41,11 @@ RECORDS_MADE = 600
 its own."""
 
 
-@dataclass(frozen=True)
-class FreeChoice:
-    """Names to free, names that these stand in for, names that the data hardly determines."""
-
-    kept: tuple[str, ...]
-    redundant: tuple[str, ...]
-    left_out: tuple[str, ...]
+RESULTS = "runs/simulated"
+MOST_ERROR = 1.5
+"""Times what the noise alone makes: a calibration that misses held-out tips by more has not found the arm."""
+_MEAN_LENGTH = math.sqrt(8 / math.pi)
+"""Of three independent normal numbers of unit variance."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,7 @@ class RobotFolder:
     """What was written: where, the parameters chosen, and the noise that the simulated records have (mm)."""
 
     folder: Path
-    choice: FreeChoice
+    choice: MinimalSet
     noise_mm: float = NOISE_MM
 
 
@@ -69,9 +73,9 @@ def write_robot(robot: Robot, folder: Path, registry: PluginRegistry) -> RobotFo
     return RobotFolder(folder, chosen)
 
 
-def _fill(place: Path, robot: Robot, registry: PluginRegistry) -> FreeChoice:
+def _fill(place: Path, robot: Robot, registry: PluginRegistry) -> MinimalSet:
     """First with nothing free, to see what there is; then with everything; then with what the records determine."""
-    nothing = FreeChoice((), (), ())
+    nothing = MinimalSet((), (), (), {})
     if robot.urdf:
         (place / robot.urdf_file).write_bytes(robot.urdf)
     _write(place, robot, nothing, {})
@@ -79,7 +83,16 @@ def _fill(place: Path, robot: Robot, registry: PluginRegistry) -> FreeChoice:
     parameters = experiment.parameters
     masses = [b for b in parameters.blocks if b.name.startswith("arm.links.") and b.name.endswith(".mass")]
     weight_N = GRAVITY_M_S2 * sum(block.nominal[0] for block in masses)
-    reach = _reach(experiment, robot)
+    random = np.random.default_rng(truth.SEED)
+    commands = {f"arm.{j.name}": random.uniform(*j.limits, _TRIED_POSES) for j in robot.joints}
+    poses = Dataset(tuple(str(i) for i in range(_TRIED_POSES)), commands)
+    exact = measured_without_noise(experiment.simulation_request, poses)
+    reach = truth.reach(np.array([exact[f"tracker.{axis}"] for axis in "xyz"]))
+    if not reach > _SMALLEST_REACH_M:
+        raise InputError(
+            f"in all poses the tip stays within {1000 * reach:.3g} mm.",
+            hint="Check the lengths a and d and their units.",
+        )
     target = {} if robot.target else {name: share * reach for name, share in truth.UNSTATED_TARGET.items()}
     true = truth.made_up(parameters, weight_N * reach, target, robot.widths)
     _write(place, robot, nothing, truth.as_text(parameters, true))
@@ -92,7 +105,7 @@ def _fill(place: Path, robot: Robot, registry: PluginRegistry) -> FreeChoice:
     return chosen
 
 
-def _choose_free(experiment: Experiment, robot: Robot, target: Mapping[str, float]) -> FreeChoice:
+def _choose_free(experiment: Experiment, robot: Robot, target: Mapping[str, float]) -> MinimalSet:
     """A minimal set of the experiment's free parameters, for its training records (see ``armcal identify``).
 
     A target whose place was not stated is taken to sit there (m): on the last axis it would not show all that it does.
@@ -107,15 +120,10 @@ def _choose_free(experiment: Experiment, robot: Robot, target: Mapping[str, floa
     preferred = [
         [name for name in free if any(fnmatch.fnmatchcase(name, glob) for glob in globs)] for globs in robot.preferred
     ]
-    minimal = minimal_set(triangle, parameters, preferred, most_uncertain=MOST_UNCERTAIN)
-    return FreeChoice(
-        minimal.kept,
-        tuple(dropped.name for dropped in minimal.redundant),
-        tuple(dropped.name for dropped in minimal.left_out),
-    )
+    return minimal_set(triangle, parameters, preferred, most_uncertain=MOST_UNCERTAIN)
 
 
-def _write(place: Path, robot: Robot, choice: FreeChoice, true: Mapping[str, str]) -> None:
+def _write(place: Path, robot: Robot, choice: MinimalSet, true: Mapping[str, str]) -> None:
     held = {glob: unit for glob, unit in robot.priors.items() if fnmatch.filter(choice.kept, glob)}
     priors = {glob: f"{number(robot.widths[unit])} {unit}" for glob, unit in held.items()}
     context: dict[str, Any] = {
@@ -149,15 +157,46 @@ def _levels(joint: RobotJoint) -> list[str]:
     return [_shown(value, "angle" if joint.turns else "length") for value in (low, 0.5 * (low + high), high)]
 
 
-def _reach(experiment: Experiment, robot: Robot) -> float:
-    random = np.random.default_rng(truth.SEED)
-    commands = {f"arm.{j.name}": random.uniform(*j.limits, _TRIED_POSES) for j in robot.joints}
-    poses = Dataset(tuple(str(i) for i in range(_TRIED_POSES)), commands)
-    exact = measured_without_noise(experiment.simulation_request, poses)
-    reach = truth.reach(np.array([exact[f"tracker.{axis}"] for axis in "xyz"]))
-    if not reach > _SMALLEST_REACH_M:
-        raise InputError(
-            f"in all poses the tip stays within {1000 * reach:.3g} mm.",
-            hint="Check the lengths a and d and their units.",
-        )
-    return reach
+@dataclass(frozen=True)
+class Trial:
+    """How the calibration went: tip errors on held-out records (mm), and what the noise alone would make."""
+
+    result: RunResult
+    results: Path
+    nominal_mm: float
+    calibrated_mm: float
+    noise_mm: float
+
+    @property
+    def fault(self) -> str:
+        """What is wrong; empty if the files work."""
+        verdict = self.result.estimate.verdict
+        bad = [finding.text for finding in self.result.verdict.findings if finding.grade == "bad"]
+        if not verdict.converged:
+            return f"{verdict.name} did not converge ({verdict.status})"
+        if bad:
+            return bad[0]
+        if not self.calibrated_mm <= MOST_ERROR * self.noise_mm:
+            return (
+                f"the error at held-out tips is {self.calibrated_mm:.3f} mm, and the noise alone makes "
+                f"{self.noise_mm:.3f} mm"
+            )
+        return ""
+
+
+def try_out(made: RobotFolder, registry: PluginRegistry, command: str = "", progress: Progress = no_progress) -> Trial:
+    """Calibrate on the simulated records, as ``armcal run`` does.
+
+    Raises:
+        InputError: the data or the configuration is refused.
+    """
+    watch, folder = Stopwatch(), made.folder / RESULTS
+    experiment = Experiment.load(made.folder / SIMULATED, registry=registry)
+    result = calibrate(experiment, command, progress, watch)
+    result.seconds["total"] = watch.total()
+    sections = plugin_sections(result, registry)
+    outputs.write(result, experiment, folder, partial(render, sections=sections))
+    table = result.table
+    held = (table.nominal["holdout"].mean, table.calibrated["holdout"].mean)
+    nominal, calibrated = (math.nan if error is None else error for error in held)
+    return Trial(result, folder, nominal, calibrated, made.noise_mm * _MEAN_LENGTH)
