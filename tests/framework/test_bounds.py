@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armcal.cli.tables import _compliances, _matrices
+from armcal.cli.run import _compliances, _matrices
 from armcal.diagnose.evidence_findings import shift_findings
 from armcal.estimate.estimator import Estimate, estimate
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels

@@ -404,7 +404,7 @@ def test_a_file_with_an_arm_alone_is_enough_and_several_want_a_name(tmp_path):
         assert "Traceback" not in result.output
     result = armcal(path, "--to", "mdh", "--arm", "left", "--out", path)
     assert result.exit_code == 2
-    assert "the file to convert itself" in result.stderr
+    assert "it is one of the inputs" in result.stderr
 
 
 @pytest.mark.parametrize("text", ["name: x\n", "arms: {}\n", "arms: {arm: {links: {}}}\n", "arms: {arm: 3}\n"])

@@ -18,7 +18,7 @@ import yaml
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.convert_check import difference, load_source
 from armcal.cli.main import cli
-from armcal.cli.robot_questions import direction, place
+from armcal.cli.new_robot import direction, place
 from armcal.errors import InputError
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment

@@ -260,7 +260,7 @@ def test_files_are_overwritten_only_by_force_and_never_the_calibration(folder, t
     out.write_text("mine")
     for arguments, match in (
         (("--out", out), "it is there already"),
-        (("--out", calibration, "--force"), "it is the calibration itself"),
+        (("--out", calibration, "--force"), "it is one of the inputs"),
         (("--out", tmp_path), "it is a directory"),
         (("--out", tmp_path / "no" / "x.urdf"), "it cannot be written"),
         (("--out", out, "--force", "--arm", "other"), "no arm is called 'other'"),

@@ -161,6 +161,18 @@ def spare_inputs(out: Path, *given: Path | None) -> None:
             raise DataError("it is one of the inputs.", where=Location(str(out)), hint="Give another --out.")
 
 
+def unwritten(files: Mapping[Path, bytes]) -> dict[Path, bytes]:
+    """Those that are not there yet with this content."""
+
+    def is_there(file: Path, content: bytes) -> bool:
+        try:
+            return file.is_file() and file.read_bytes() == content
+        except OSError:
+            return False
+
+    return {file: content for file, content in files.items() if not is_there(file, content)}
+
+
 def warn_of_target(console: Console, subject: str, target: MeasuredPoint | None) -> None:
     """Warn that no point to arrive was stated, where it matters."""
     if target is not None and target.distance > _SAME_POINT_M:

@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib import import_module
 from importlib.machinery import ModuleSpec
 from types import ModuleType
@@ -27,33 +26,30 @@ are imported as they are."""
 
 
 def options_of(target: str) -> click.Command:
-    """The command at ``module:attribute``, to be completed and never run."""
+    """The command at ``module:attribute``, to be completed and never run.
+
+    Its file is imported with placeholders for all that is heavy; what came in meanwhile is forgotten again.
+    """
     module, _, attribute = target.partition(":")
+    before, finder = set(sys.modules), _Placeholders(module)
+    sys.meta_path.insert(0, finder)
     try:
-        with _postponed(module):
-            command: click.Command = getattr(import_module(module), attribute)
+        command: click.Command = getattr(import_module(module), attribute)
+        return command
     except Exception:  # a plugin's file that uses at once what it imports
-        command = getattr(import_module(module), attribute)
-    return command
+        pass
+    finally:
+        sys.meta_path.remove(finder)
+        for name in set(sys.modules) - before:
+            del sys.modules[name]
+    whole: click.Command = getattr(import_module(module), attribute)
+    return whole
 
 
 def component_names(kind: str, ctx: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """The names that plugins offer, for ``shell_complete``."""
     offered = (c for c in discover().components if c.kind == kind and c.name.startswith(incomplete))
     return [CompletionItem(c.name, help=c.summary) for c in offered]
-
-
-@contextmanager
-def _postponed(module: str) -> Iterator[None]:
-    """Import a command's file with placeholders for all that is heavy; what came in meanwhile is forgotten again."""
-    before, finder = dict(sys.modules), _Placeholders(module)
-    sys.meta_path.insert(0, finder)
-    try:
-        yield
-    finally:
-        sys.meta_path.remove(finder)
-        for name in set(sys.modules) - set(before):
-            del sys.modules[name]
 
 
 class _Placeholder(ModuleType):

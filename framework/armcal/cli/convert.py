@@ -11,9 +11,9 @@ from armcal.calibration.convert_check import ConvertSource, Difference, differen
 from armcal.calibration.convert_mdh import Convention, mdh_section
 from armcal.calibration.convert_poe_urdf import poe_section, urdf_text
 from armcal.calibration.rigid_chain import rigid_chain
-from armcal.cli.common import FILE, Console, arm, speaking
-from armcal.errors import ArmcalError, InputError, Location, PluginError
-from armcal.io.plain_files import check_output
+from armcal.cli.common import FILE, Console, arm, spare_inputs, speaking
+from armcal.errors import ArmcalError, PluginError
+from armcal.io.file_set import write_over
 from armcal.plugins import PluginRegistry
 
 LARGEST = 1e-9
@@ -41,6 +41,8 @@ def convert(
     Of a configuration the nominal geometry, of a calibration the calibrated one. What was written is read back and
     compared with the original over 10,000 random poses.
     """
+    if out is not None:
+        spare_inputs(out, source)
     registry = console.registry()
     original = load_source(source, arm, registry)
     text, section = _sections(original, target, convention)
@@ -63,14 +65,7 @@ def convert(
             click.echo(text, nl=False)
         console.err.print(said, soft_wrap=True)
         return
-    if out.resolve() == source.resolve():
-        raise InputError("it is the file to convert itself.", where=Location(str(out)), hint="Give another --out.")
-    try:
-        check_output(out, InputError)
-        out.write_text(text, encoding="utf-8")
-    except OSError as fault:
-        reason = f"the file cannot be written ({fault.strerror})."
-        raise InputError(reason, where=Location(str(out)), hint="Give another --out.") from fault
+    write_over({out: text.encode()})
     console.result({**content, "out": str(out)})
     console.line(f"{original.arm} as {target} written: {out}")
     console.line(said)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from armcal.cli.common import FILE, Console, speaking
+from armcal.cli.common import FILE, Console, speaking, unwritten
 from armcal.errors import InputError, Location
 from armcal.io.file_set import write_new
 from armcal.version import SOURCES
@@ -33,7 +33,18 @@ def demo(ctx: click.Context, console: Console, name: str, out: Path | None) -> N
         hint = f"The demonstrations are {', '.join(demos)}."
         raise InputError(f"found {name!r}, expected a demonstration.", where=Location("NAME"), hint=hint)
     folder = out or Path(f"armcal-demo-{name}")
-    _copy(demos[name], folder)
+    source = demos[name]
+    files = {folder / path.relative_to(source): path.read_bytes() for path in source.rglob("*") if path.is_file()}
+    try:
+        missing = unwritten(files)
+        if changed := next((path for path in missing if path.exists()), None):
+            hint = "Give another --out, or run it with armcal run."
+            raise InputError("it is there and was changed.", where=Location(str(changed)), hint=hint)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_new(missing)
+    except OSError as fault:
+        hint = "Give --out a place that can be written."
+        raise InputError(f"it cannot be written ({fault.strerror}).", where=Location(str(folder)), hint=hint) from fault
     results = folder / "results"
     console.line(f"the files of {name} are in {folder}; armcal run {folder / _CONFIG} --out {results}")
     from armcal.cli.run import run  # all of the solver
@@ -56,26 +67,3 @@ def _shipped() -> Path:
     """Where the demonstrations are: beside the core once it is installed, in a checkout in ``configs``."""
     installed = SOURCES / "demos"
     return installed if installed.is_dir() else SOURCES.parents[1] / "configs"
-
-
-def _copy(source: Path, folder: Path) -> None:
-    """Copy what is not there yet; a file that was changed is refused.
-
-    Raises:
-        InputError: a file is there with another content, or cannot be written.
-    """
-    files = {folder / path.relative_to(source): path.read_bytes() for path in source.rglob("*") if path.is_file()}
-    try:
-        missing = {path: content for path, content in files.items() if not _is(path, content)}
-        if changed := next((path for path in missing if path.exists()), None):
-            hint = "Give another --out, or run it with armcal run."
-            raise InputError("it is there and was changed.", where=Location(str(changed)), hint=hint)
-        folder.mkdir(parents=True, exist_ok=True)
-        write_new(missing)
-    except OSError as fault:
-        hint = "Give --out a place that can be written."
-        raise InputError(f"it cannot be written ({fault.strerror}).", where=Location(str(folder)), hint=hint) from fault
-
-
-def _is(path: Path, content: bytes) -> bool:
-    return path.is_file() and path.read_bytes() == content

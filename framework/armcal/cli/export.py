@@ -19,7 +19,7 @@ from armcal.calibration.exporter import (
     leaves_residual_out,
     request_of,
 )
-from armcal.cli.common import FILE, Console, accept, arm, speaking
+from armcal.cli.common import FILE, Console, accept, arm, spare_inputs, speaking, unwritten
 from armcal.cli.completion import component_names
 from armcal.config.validate import validate
 from armcal.config.yaml_nodes import Node, Origin
@@ -104,7 +104,7 @@ def export(
     try:
         if out.is_dir() or not out.name:
             raise InputError("it is a directory, expected a file.", where=where, hint="Name the file in it.")
-        _not_the_calibration(out, calibration)
+        spare_inputs(out, calibration)
         check_output(out, InputError)
         if not force:
             require_new([out])
@@ -116,8 +116,7 @@ def export(
     exported = exporter.export(request)
     exported, moved_m = _with_what_is_left_out(exporter, loaded, request, exported)
     files = _files(out, exported, calibration)
-    new = {file: content for file, content in files.items() if not _holds(file, content)}
-    (write_over if force else write_new)(new)
+    (write_over if force else write_new)(unwritten(files))  # several exports may share a schema
     _show(console, request, exported, moved_m, list(files), kind)
 
 
@@ -135,11 +134,6 @@ def _with_what_is_left_out(
     return exported, moved_m
 
 
-def _not_the_calibration(out: Path, calibration: Path) -> None:
-    if out.exists() and calibration.exists() and out.samefile(calibration):
-        raise InputError("it is the calibration itself.", where=Location(str(out)), hint="Give another --out.")
-
-
 def _files(out: Path, exported: Exported, calibration: Path) -> dict[Path, bytes]:
     """Every file to be written, by its path."""
     files = {out: exported.content}
@@ -148,18 +142,10 @@ def _files(out: Path, exported: Exported, calibration: Path) -> dict[Path, bytes
         if beside.is_dir():
             hint = "Move it, or give --out another name."
             raise InputError("it is a directory, expected a file.", where=Location(str(beside)), hint=hint)
-        _not_the_calibration(beside, calibration)
+        spare_inputs(beside, calibration)
         check_output(beside, InputError)
         files[beside] = content
     return files
-
-
-def _holds(file: Path, content: bytes) -> bool:
-    """Whether a file has this content already, as a schema has that several exports share."""
-    try:
-        return file.read_bytes() == content
-    except OSError:
-        return False
 
 
 def _show(

@@ -1,20 +1,14 @@
 """``armcal plugins``."""
 
-from __future__ import annotations
-
 import json
 import sys
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from armcal.errors import EXIT_BAD_INPUT, PluginError
-from armcal.plugins import PluginInfo, discover
+from armcal.plugins import discover
 from armcal.version import JSON_SCHEMA
-
-if TYPE_CHECKING:
-    from armcal.testing.results import CheckResult
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -58,28 +52,6 @@ def list_plugins(as_json: bool, quiet: bool, verbose: bool) -> None:
                 click.echo(f"  {component.kind:<12} {component.name:<18} {component.summary}{place}")
 
 
-def _report(name: str, plugins: Sequence[PluginInfo], results: Sequence[CheckResult]) -> dict[str, Any]:
-    """What the checks found on the plugins of one name."""
-    rows = [
-        {"component": r.component, "check": r.check, "fault": r.fault or None, "not_run": r.not_run or None}
-        for r in results
-    ]
-    failed, left = (sum(row[key] is not None for row in rows) for key in ("fault", "not_run"))
-    counts = {"ran": len(rows) - left, "failed": failed, "not_run": left}
-    broken = "; ".join(plugin.fault for plugin in plugins if plugin.fault)
-    return {"plugin": name, "fault": broken or None, **counts, "checks": rows}
-
-
-def _show(report: Mapping[str, Any], verbose: bool) -> None:
-    for row in report["checks"]:
-        if verbose or row["fault"]:
-            mark, fault = ("FAIL", f": {row['fault']}") if row["fault"] else ("ok  ", "")
-            click.echo(f"{'--  ' if row['not_run'] else mark} {row['component']}: {row['check']}{fault}")
-    left = f", {report['not_run']} not run" if report["not_run"] else ""
-    why = f"{left} (-v says why)" if left and not verbose else left
-    click.echo(f"{report['plugin']}: {report['ran'] - report['failed']} of {report['ran']} checks passed{why}.")
-
-
 @plugins.command("check")
 @click.argument("name", required=False)
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on standard output.")
@@ -94,16 +66,29 @@ def check_plugin(name: str | None, as_json: bool, quiet: bool, verbose: bool) ->
     if not names:
         known = ", ".join(p.name for p in registry.plugins)
         raise PluginError(f"no plugin is called {name!r}.", hint=f"Installed: {known}.")
-    reports = []
+    reports: list[dict[str, Any]] = []
     for text in names:
         chosen = tuple(plugin for plugin in registry.plugins if plugin.name == text)
         results = [result for plugin in chosen for result in checks_of(plugin, registry)]
-        reports.append(_report(text, chosen, results))
+        rows = [
+            {"component": r.component, "check": r.check, "fault": r.fault or None, "not_run": r.not_run or None}
+            for r in results
+        ]
+        wrong, idle = (sum(row[key] is not None for row in rows) for key in ("fault", "not_run"))
+        counts = {"ran": len(rows) - idle, "failed": wrong, "not_run": idle}
+        broken = "; ".join(plugin.fault for plugin in chosen if plugin.fault)
+        reports.append({"plugin": text, "fault": broken or None, **counts, "checks": rows})
     if as_json:
         click.echo(json.dumps({**JSON_SCHEMA, **({"plugins": reports} if name is None else reports[0])}, indent=2))
     elif not quiet:
         for report in reports:
-            _show(report, verbose)
+            for row in report["checks"]:
+                if verbose or row["fault"]:
+                    mark, fault = ("FAIL", f": {row['fault']}") if row["fault"] else ("ok  ", "")
+                    click.echo(f"{'--  ' if row['not_run'] else mark} {row['component']}: {row['check']}{fault}")
+            left = f", {report['not_run']} not run" if report["not_run"] else ""
+            why = f"{left} (-v says why)" if left and not verbose else left
+            click.echo(f"{report['plugin']}: {report['ran'] - report['failed']} of {report['ran']} checks passed{why}.")
     failed = [report for report in reports if report["failed"]]
     for report in failed:
         click.echo(f"armcal: {report['plugin']}: {report['fault'] or 'it breaks the plugin contract'}", err=True)

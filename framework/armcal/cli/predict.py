@@ -16,7 +16,7 @@ from armcal.base.pose_settings import quaternion_of
 from armcal.base.units import DIMENSIONLESS, split_suffix, to_unit
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.intervals import PlusMinus
-from armcal.cli.common import FILE, Console, accept, speaking
+from armcal.cli.common import FILE, Console, accept, spare_inputs, speaking
 from armcal.errors import DataError, InputError, Location
 from armcal.io.plain_files import input_file
 from armcal.measure.csv_writer import column_names, write_csv
@@ -47,6 +47,7 @@ def predict(
     console: Console, calibration: Path, poses: Path, out: Path, recording: str, columns: tuple[str, ...], accept: bool
 ) -> None:
     """Predict the tip of the arm in CALIBRATION for each row of commanded joint angles, and how far it may be off."""
+    spare_inputs(out, calibration, poses)
     registry = console.registry()
     loaded = Calibration.load(calibration, registry, accept)
     system = loaded.system
@@ -67,8 +68,6 @@ def predict(
         channels = {name: values + plus_minus.shift.get(name, 0.0) for name, values in channels.items()}
         if unknown := [name for name in channels if not np.isfinite(plus_minus.half_widths.get(name, np.nan)).any()]:
             console.warn(f"how far {', '.join(unknown)} may be off is not known: no residual determines it.")
-    if out.resolve() == poses.resolve():
-        raise DataError("it is the file of poses itself.", where=Location(str(out)), hint="Give another --out.")
     requested = requested_channels(system.arms, loaded.readable, measured=False)
     if not loaded.readable:
         requested = (*requested, *_tool_channels(tuple(system.arms)))

@@ -50,7 +50,14 @@ def study(
     if isinstance(result, StudyResult):
         _show_study(console, result)
     else:
-        _show_transfer(console, result)
+        shown = transfer_table(result)
+        words = [name for name, is_number in shown.headings if not is_number]
+        table = columned(f"{result.name}: {shown.caption}", [name for name, _ in shown.headings], left=words)
+        for row in shown.rows:
+            table.add_row(*row)
+        console.out.print(table)
+        for sentence in transfer_conclusions(result):
+            console.line(sentence)
     console.line(f"page: {folder / 'study.html'}  ({watch.total():.1f} s)")
 
 
@@ -73,15 +80,4 @@ def _show_study(console: Console, result: StudyResult) -> None:
         console.detail(f"{v.name}: {v.fit_seconds:.2f} s for the fit on all records, {v.seconds:.2f} s for all fits")
     console.out.print(table)
     for text in conclusions(result):
-        console.line(text)
-
-
-def _show_transfer(console: Console, result: TransferResult) -> None:
-    shown = transfer_table(result)
-    words = [name for name, is_number in shown.headings if not is_number]
-    table = columned(f"{result.name}: {shown.caption}", [name for name, _ in shown.headings], left=words)
-    for row in shown.rows:
-        table.add_row(*row)
-    console.out.print(table)
-    for text in transfer_conclusions(result):
         console.line(text)

@@ -287,11 +287,7 @@ def log_text(result: RunResult) -> str:
     ]
     lines += [f"{finding.grade}: {finding.whole}" for finding in result.verdict.findings]
     lines += [f"warning: {text}" for text in result.warnings]
-    lines += [f"set aside: row {a.row}, record {a.record_id}: {a.reason}" for a in result.dataset.set_aside]
-    lines += [
-        f"suspicious: row {s.row}, record {s.record_id}: {s.deviations:.1f} sd (limit {s.limit:.1f}), {s.fate}"
-        for s in result.noise.suspicious
-    ]
+    lines += result.odd_records
     lines += [f"seconds in {stage}: {seconds:.3f}" for stage, seconds in result.seconds.items()]
     return "\n".join(map(shown, lines)) + "\n"
 

@@ -267,6 +267,16 @@ class RunResult:
     pose_residual: ResidualOutcome | None = None
 
     @property
+    def odd_records(self) -> tuple[str, ...]:
+        """A line for each record that was set aside or is suspicious."""
+        aside = (f"set aside: row {a.row}, record {a.record_id}: {a.reason}" for a in self.dataset.set_aside)
+        suspicious = (
+            f"suspicious: row {s.row}, record {s.record_id}: {s.deviations:.1f} sd (limit {s.limit:.1f}), {s.fate}"
+            for s in self.noise.suspicious
+        )
+        return (*aside, *suspicious)
+
+    @property
     def train(self) -> Indices:
         """Indices of the training records."""
         return self.split.train
