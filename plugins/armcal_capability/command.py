@@ -9,7 +9,7 @@ import click
 from armcal.base.config_text import as_json
 from armcal.cli.common import Console, command_line, overrides, speaking
 from armcal.io.folder import Reservation, reserved
-from armcal.run.pipeline import Stopwatch
+from armcal.run.prepare import Stopwatch
 
 from armcal_capability import outputs
 from armcal_capability.capability_figures import DRAWN, designs_figure, quantity_figure, reach_figure

@@ -22,7 +22,8 @@ from armcal.cli.new_robot import direction, place
 from armcal.errors import InputError
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Stopwatch, calibrate, prepare
+from armcal.run.pipeline import calibrate
+from armcal.run.prepare import Stopwatch, prepare
 from armcal.scaffold.dh_table import read_rows
 from armcal.scaffold.rendering import number, word
 from armcal.scaffold.robot import Row, robot_of_rows

@@ -14,7 +14,8 @@ from armcal.cli.main import cli
 from armcal.diagnose.permuted_axes import _within, find_permuted_axes
 from armcal.errors import NotConvergedError
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Prepared, Stopwatch, assemble, calibrate
+from armcal.run.pipeline import calibrate
+from armcal.run.prepare import Prepared, Stopwatch, assemble
 from click.testing import CliRunner
 from scipy.optimize import minimize
 

@@ -36,7 +36,8 @@ from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.problem.drift import with_drift
 from armcal.problem.motion import recorded_position
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Stopwatch, calibrate, prepare
+from armcal.run.pipeline import calibrate
+from armcal.run.prepare import Stopwatch, prepare
 from click.testing import CliRunner, Result
 from drifting import DEMO, DRIFTING, FREE, dense_drift, dense_slopes, drifting_problem, problem_of
 

@@ -17,7 +17,7 @@ from armcal.estimate.start import aligned_start
 from armcal.problem.rigid_alignment import Alignment, Tools, alignments, hand_eye, undetermined
 from armcal.problem.sighting import sighting_of, tools_of
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Prepared, Stopwatch, assemble
+from armcal.run.prepare import Prepared, Stopwatch, assemble
 from click.testing import CliRunner
 from planted_mistakes import with_tips
 from scipy.spatial.transform import Rotation

@@ -15,9 +15,8 @@ from armcal.errors import ProblemError
 from armcal.estimate.identifiability import Identifiability
 from armcal.estimate.start import Start, pose_words
 from armcal.estimate.structure import identify, require_solvable
-from armcal.run.data_checks import gravity_findings
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Prepared, Stopwatch, assemble
+from armcal.run.prepare import Prepared, Stopwatch, assemble, gravity_findings
 
 _MM = 1000.0
 

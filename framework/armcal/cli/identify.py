@@ -23,7 +23,7 @@ from armcal.planning.criterion import observability
 from armcal.problem.projection import factor_at_zero
 from armcal.run.experiment import Experiment
 from armcal.run.fixed_parameters import FixedParameters, FreedStep, fixed_parameters
-from armcal.run.pipeline import Prepared, Stopwatch, assemble
+from armcal.run.prepare import Prepared, Stopwatch, assemble
 
 _DIMENSIONS = {"m": "length", "rad": "angle"}
 

@@ -26,7 +26,8 @@ from armcal.report.tables import parameter_rows, part_of
 from armcal.run import outputs
 from armcal.run.errors import ErrorTable
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Stopwatch, calibrate
+from armcal.run.pipeline import calibrate
+from armcal.run.prepare import Stopwatch
 from armcal.run.result import RunResult
 
 _SETS = {"train": "training", "holdout": "held out", "cross_validated": "cross-validated"}

@@ -12,7 +12,7 @@ from armcal.report.study_page import conclusions, render_study, render_transfer,
 from armcal.run import study_result
 from armcal.run.load_transfer import transfer
 from armcal.run.model_study import compare
-from armcal.run.pipeline import Stopwatch
+from armcal.run.prepare import Stopwatch
 from armcal.run.study import LoadTransferSettings, Study
 from armcal.run.study_result import StudyResult, TransferResult
 

@@ -6,7 +6,6 @@ from typing import Any, Self
 
 import numpy as np
 
-from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.units import ERROR_UNITS
 from armcal.errors import NotConvergedError
@@ -24,20 +23,17 @@ from armcal.estimate.validation import (
 from armcal.estimate.weighing import WeighedFit
 from armcal.problem.drift import residuals
 from armcal.problem.problem import FactorRecords, Problem
+from armcal.run.prepare import Prepared
 
 _MM = 1000.0
 """Thousandths of m; of rad where errors are angles."""
 
 
 @dataclass(frozen=True)
-class FittedRecords:
-    """All records of a run, which of them trained, and the fit to those."""
+class FittedRecords(Prepared):
+    """A prepared problem, and the fit to its training records."""
 
-    problem: Problem
-    records: tuple[FactorRecords, ...]
-    dataset: Dataset
-    split: Split
-    fitted: WeighedFit
+    fitted: WeighedFit = field(kw_only=True)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from armcal.estimate.validation import cross_validate, folds
 from armcal.estimate.weighing import fit
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Prepared, acting
+from armcal.run.prepare import Prepared, acting
 
 _FOLDS = 5
 _MOST_STEPS = 6

@@ -37,9 +37,9 @@ from armcal.problem.drift import residuals
 from armcal.problem.many_points import with_few_points
 from armcal.problem.motion import Motion, recorded_position
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.run.data_checks import gravity_findings
 from armcal.run.errors import FittedRecords, RecordErrors
 from armcal.run.intervals import IntervalResult
+from armcal.run.prepare import gravity_findings
 
 _MM = 1000.0
 _AT_REST = ", as in a new recording (its drift not known)"
@@ -51,16 +51,14 @@ def verdict_of(
     intervals: IntervalResult,
     system: System,
     limit: float | None,
-    known: Sequence[Finding] = (),
 ) -> tuple[Verdict, Evidence]:
     """The verdict on a fit, and what it rests on.
 
     Args:
-        run: the fit and its records.
+        run: the fit and its records, with what was found before.
         errors, intervals: of every record; whether prediction intervals cover their share.
         system: the arms.
         limit: above which the error of a judged record is explained (m); None for the default.
-        known: what was found before.
     """
     problem, fitted, train, held = run.problem, run.fitted, run.split.train, len(run.split.holdout)
     estimate, acting = fitted.estimate, run.problem.weighted(fitted.records, fitted.weights)
@@ -86,7 +84,7 @@ def verdict_of(
         run.dataset.ids,
         suggestions,
         fitted,
-        [*known, *gross, *worse, *intervals.findings(), *moved, *gravity_findings(system, run.dataset)],
+        [*run.findings, *gross, *worse, *intervals.findings(), *moved, *gravity_findings(system, run.dataset)],
         evidence,
     )
     return verdict, evidence

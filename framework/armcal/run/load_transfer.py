@@ -25,7 +25,7 @@ from armcal.io.parallel import Executor
 from armcal.problem.drift import with_drift
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Prepared, Stopwatch
+from armcal.run.prepare import Prepared, Stopwatch
 from armcal.run.study import LoadTransferSettings, Study, interpreted_first, judged_fits, naming
 from armcal.run.study_result import TransferCell, TransferResult
 

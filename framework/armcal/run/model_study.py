@@ -21,7 +21,7 @@ from armcal.estimate.validation import (
     summarise,
 )
 from armcal.io.parallel import Executor
-from armcal.run.pipeline import Prepared, Stopwatch, prepare
+from armcal.run.prepare import Prepared, Stopwatch, prepare
 from armcal.run.study import PREVIOUS, ModelStudySettings, Study, interpreted_first, judged_fits, naming
 from armcal.run.study_result import Change, NestedResult, StudyResult, VariantResult, VariantTurns
 

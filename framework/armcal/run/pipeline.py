@@ -1,142 +1,36 @@
 """A run: load, check, fit, validate, judge."""
 
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armcal.base.dataset import Dataset, SetAside
+from armcal.base.dataset import SetAside
 from armcal.calibration.intervals import PredictionRecord, covariance_rows, recording_record, stretch_records
 from armcal.diagnose.clustered import widened
 from armcal.diagnose.coverage import fit_and_predict
-from armcal.diagnose.noise_findings import Finding
-from armcal.errors import ConfigError, ProblemError
 from armcal.estimate.bootstrap import Bootstrap, bootstrap
 from armcal.estimate.estimator import Progress, no_progress, spread
-from armcal.estimate.nuisance import restricted, started
 from armcal.estimate.polish import hopeless, typical_off
-from armcal.estimate.profile import Profile, profiled, profiles
-from armcal.estimate.start import FAR, Start, aligned_start, with_proposals
-from armcal.estimate.structure import require_solvable
+from armcal.estimate.profile import Profile, profiles
+from armcal.estimate.start import FAR
 from armcal.estimate.validation import (
     CrossValidation,
     Split,
     cross_validate,
-    error_unit,
-    folds,
-    hold_out,
-    split_by_id,
-    split_by_label,
 )
 from armcal.estimate.weighing import WeighedFit, fit, plain_fit
 from armcal.io.parallel import Executor
-from armcal.measure.id_list import read_ids
 from armcal.plugins import PluginRegistry
 from armcal.problem.corrected import moved_by
-from armcal.problem.drift import with_drift
 from armcal.problem.motion import recorded_position
-from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.readings import with_joint_noise
-from armcal.run.data_checks import check_permuted_axes, check_reach
 from armcal.run.errors import ErrorTable, FittedRecords, RecordErrors, errors_of
 from armcal.run.experiment import Experiment
 from armcal.run.intervals import IntervalResult, interval_result
 from armcal.run.judging import verdict_of
-from armcal.run.pose_residual import ResidualOutcome, layer_of, learned_residual, unlearned
-from armcal.run.result import RunResult, SuspiciousRecord, labels_of, noise_result, run_groups
-
-
-@dataclass(frozen=True)
-class Stopwatch:
-    """Seconds of each stage."""
-
-    began: float = field(default_factory=time.perf_counter)
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Time a stage; a stage entered twice adds up."""
-        start = time.perf_counter()
-        yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
-
-    def total(self) -> float:
-        """Since it was made."""
-        return time.perf_counter() - self.began
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A problem ready to solve: data read and checked, functions compiled."""
-
-    dataset: Dataset
-    problem: Problem
-    records: tuple[FactorRecords, ...]
-    split: Split
-    warnings: tuple[str, ...]
-    start: Start
-    findings: tuple[Finding, ...] = ()
-
-    @property
-    def training(self) -> tuple[FactorRecords, ...]:
-        """The training records."""
-        return self.problem.subset(self.records, self.split.train)
-
-
-def prepare(
-    experiment: Experiment, watch: Stopwatch, accept: bool = False, progress: Progress = no_progress
-) -> Prepared:
-    """Everything that can be done and refused before solving; see ``assemble``.
-
-    Raises:
-        InputError: data, units, counts or rank do not allow a calibration.
-    """
-    ready = assemble(experiment, watch, accept, progress)
-    with watch.stage("check"):
-        problems = require_solvable(ready.problem, ready.training, ready.problem.parameters.nominal())
-    return replace(ready, warnings=(*ready.warnings, *problems))
-
-
-def assemble(
-    experiment: Experiment, watch: Stopwatch, accept: bool = False, progress: Progress = no_progress
-) -> Prepared:
-    """Data read and checked, and the problem that it makes, whether or not it can be solved.
-
-    With ``accept``, data that look mixed up are not refused, but a bad finding.
-
-    Raises:
-        InputError: data, units or counts do not allow a calibration.
-    """
-    with watch.stage("read"):
-        dataset = experiment.read(progress)
-        experiment = experiment.of_records(dataset)
-    system = experiment.system
-    with watch.stage("build"):
-        settings = (experiment.parameters, system.environment)
-        problem = Problem.build(system.arms, system.measurements, *settings, dataset, experiment.settings.evaluator)
-        records = problem.records(dataset)
-        start = with_proposals(aligned_start(problem, records, dataset), records, dataset)
-        problem = started(start.problem, records)
-        records = acting(problem, records, dataset)
-    with watch.stage("check"):
-        unlearned(system)
-        mixed_up = check_permuted_axes(problem, records, dataset, accept)
-        check_reach(problem, records, dataset)
-        split = _split(experiment, dataset)
-        if not len(split.train):
-            raise ProblemError("no record is left to train on.", hint="Hold fewer out, or measure more poses.")
-        if experiment.settings.validation.folds:
-            _folds(experiment, dataset, split)  # refused before the fit rather than after it
-        if experiment.settings.validation.limit is not None and error_unit(problem) != "mm":
-            where = experiment.source.where(("validation", "limit"))
-            hint = "Leave it out: records are explained that miss by far more than the median."
-            raise ConfigError("it is a length, and nothing that is measured is one.", where=where, hint=hint)
-        problem = restricted(problem, problem.subset(records, split.train))
-        profiled(problem, experiment.settings.uncertainty.profile)
-    texts = (*experiment.warnings, *dataset.warnings, *start.warnings)
-    return Prepared(dataset, problem, records, split, texts, start, tuple(mixed_up))
+from armcal.run.pose_residual import ResidualOutcome, layer_of, learned_residual
+from armcal.run.prepare import Prepared, Stopwatch, acting, folds_of, prepare
+from armcal.run.result import RunResult, SuspiciousRecord, noise_result, run_groups
 
 
 @dataclass(frozen=True)
@@ -147,12 +41,6 @@ class _Means:
     progress: Progress
     executor: Executor | None
     watch: Stopwatch
-
-
-def acting(problem: Problem, records: tuple[FactorRecords, ...], dataset: Dataset) -> tuple[FactorRecords, ...]:
-    """Records with the noise of joint readings and the drift that they share."""
-    records = with_joint_noise(problem, records, problem.parameters.nominal())
-    return with_drift(problem, records, dataset, problem.parameters.nominal())
 
 
 def calibrate(
@@ -169,35 +57,27 @@ def calibrate(
     faults = list(registry.notify("armcal_run_started", name=experiment.name, records=len(ready.dataset)))
     faults += _notify_rejected(registry, ready.dataset.set_aside)
     means = _Means(experiment, progress, executor, watch)
-    fitted = _fitted(means, ready)
-    faults += registry.notify("armcal_estimate_changed", estimate=fitted.estimate)
-    before = FittedRecords(ready.problem, ready.records, ready.dataset, ready.split, fitted)
-    ready, fitted, outcome = _with_pose_residual(means, ready, fitted)
-    run = replace(before, problem=ready.problem, records=ready.records, fitted=fitted)
-    uncertainty = _uncertainty(means, ready, fitted)
-    validated = _validated(means, before, run, outcome)
-    result = _judged(means, ready, run, outcome, validated)
+    before = FittedRecords(**vars(ready), fitted=_fitted(means, ready))
+    faults += registry.notify("armcal_estimate_changed", estimate=before.fitted.estimate)
+    run, outcome = _with_pose_residual(means, before)
+    resampled, profiled = _uncertainty(means, run)
+    result = _judged(means, run, outcome, *_validated(means, before, run, outcome))
     faults += _notify_rejected(registry, result.noise.set_aside)
     warnings = (*result.warnings, *dict.fromkeys(faults))
-    return replace(result, command=command, warnings=warnings, bootstrap=uncertainty[0], profiles=uncertainty[1])
+    return replace(result, command=command, warnings=warnings, bootstrap=resampled, profiles=profiled)
 
 
 def _judged(
-    means: _Means,
-    ready: Prepared,
-    run: FittedRecords,
-    outcome: ResidualOutcome | None,
-    validated: tuple[RecordErrors, IntervalResult],
+    means: _Means, run: FittedRecords, outcome: ResidualOutcome | None, errors: RecordErrors, intervals: IntervalResult
 ) -> RunResult:
     """What a run knows of its fit, with the verdict on it."""
-    experiment, (errors, intervals) = means.experiment, validated
-    dataset, split, fitted = run.dataset, run.split, run.fitted
+    experiment, dataset, split, fitted = means.experiment, run.dataset, run.split, run.fitted
     system, validation = experiment.system, experiment.settings.validation
     if outcome is not None:
         system = outcome.system(system)
     with means.watch.stage("judge"):
         means.progress("judging", 0.0)
-        verdict, evidence = verdict_of(run, errors, intervals, system, validation.limit, ready.findings)
+        verdict, evidence = verdict_of(run, errors, intervals, system, validation.limit)
         means.progress("judging", 1.0)
     return RunResult(
         name=experiment.name,
@@ -211,7 +91,7 @@ def _judged(
         table=ErrorTable.of(errors, split),
         verdict=verdict,
         evidence=evidence,
-        warnings=(*ready.warnings, *fitted.warnings, *errors.fold_warnings(validation.folds)),
+        warnings=(*run.warnings, *fitted.warnings, *errors.fold_warnings(validation.folds)),
         backend=run.problem.backend,
         seconds=means.watch.seconds,
         provenance=replace(experiment, system=system).provenance(dataset),
@@ -222,23 +102,20 @@ def _judged(
     )
 
 
-def _uncertainty(means: _Means, ready: Prepared, fitted: WeighedFit) -> tuple[Bootstrap | None, tuple[Profile, ...]]:
+def _uncertainty(means: _Means, run: FittedRecords) -> tuple[Bootstrap | None, tuple[Profile, ...]]:
     """What was asked for beyond the covariance, of a fit that converged."""
-    experiment, executor, progress = means.experiment, means.executor, means.progress
-    settings, estimate = experiment.settings.uncertainty, fitted.estimate
+    experiment, parts = means.experiment, (means.executor, means.progress)
+    settings, estimate = experiment.settings.uncertainty, run.fitted.estimate
     resampled: Bootstrap | None = None
-    profiled_result: tuple[Profile, ...] = ()
+    profiled: tuple[Profile, ...] = ()
     if settings.bootstrap and estimate.verdict.converged and estimate.names:
         with means.watch.stage("bootstrap"):
-            poses = experiment.poses(ready.dataset.subset(ready.split.train))
-            parts = (ready.training, experiment.estimator, estimate, settings, executor, progress, poses)
-            resampled = bootstrap(ready.problem, *parts)
+            poses = experiment.poses(run.dataset.subset(run.split.train))
+            resampled = bootstrap(run.problem, run.training, experiment.estimator, estimate, settings, *parts, poses)
     if settings.profile and estimate.verdict.converged:
         with means.watch.stage("profile"):
-            profiled_result = profiles(
-                ready.problem, fitted, experiment.estimator, settings.profile, executor, progress
-            )
-    return resampled, profiled_result
+            profiled = profiles(run.problem, run.fitted, experiment.estimator, settings.profile, *parts)
+    return resampled, profiled
 
 
 def _fitted(means: _Means, ready: Prepared) -> WeighedFit:
@@ -270,31 +147,28 @@ def _widened(ready: Prepared, fitted: WeighedFit) -> WeighedFit:
     return replace(fitted, estimate=widened(ready.problem, acting, fitted.estimate, position))
 
 
-def _with_pose_residual(
-    means: _Means, ready: Prepared, fitted: WeighedFit
-) -> tuple[Prepared, WeighedFit, ResidualOutcome | None]:
+def _with_pose_residual(means: _Means, run: FittedRecords) -> tuple[FittedRecords, ResidualOutcome | None]:
     """The problem and the fit with the pose residual that is to be learned, where it is kept, and what became of it."""
     experiment, progress, executor = means.experiment, means.progress, means.executor
-    training = ready.dataset.subset(ready.split.train)
+    training = run.dataset.subset(run.split.train)
     layer = layer_of(experiment.system, training)
-    if layer is None or not fitted.estimate.verdict.converged:
-        return ready, fitted, None
+    if layer is None or not run.fitted.estimate.verdict.converged:
+        return run, None
     with means.watch.stage("pose residual"):
-        splits = _folds(experiment, ready.dataset, ready.split) if experiment.settings.validation.folds else ()
+        splits = folds_of(experiment, run) if experiment.settings.validation.folds else ()
         order = np.argsort(recorded_position(training), kind="stable")
-        own = (ready.problem, ready.training, fitted, splits, order)
+        own = (run.problem, run.training, run.fitted, splits, order)
         outcome = learned_residual(experiment, layer, *own, progress, executor)
-        ready = replace(ready, findings=(*ready.findings, *outcome.findings()))
+        run = replace(run, findings=(*run.findings, *outcome.findings()))
         if outcome.residual is None:
-            return ready, fitted, outcome
+            return run, outcome
         arms = outcome.system(experiment.system).arms
-        problem = replace(ready.problem, blueprint=replace(ready.problem.blueprint, arms=arms))
-        records = acting(problem, problem.records(ready.dataset), ready.dataset)
-        ready = replace(ready, problem=problem, records=records)
+        problem = replace(run.problem, blueprint=replace(run.problem.blueprint, arms=arms))
+        run = replace(run, problem=problem, records=acting(problem, problem.records(run.dataset), run.dataset))
         estimator = spread(experiment.estimator, executor)
-        again = fit(problem, ready.training, estimator, fitted.estimate.values, progress)
-        moved = moved_by(problem, again.estimate.values, records, arms[outcome.arm])
-        return ready, _widened(ready, again), replace(outcome, moved=moved)
+        again = fit(problem, run.training, estimator, run.fitted.estimate.values, progress)
+        moved = moved_by(problem, again.estimate.values, run.records, arms[outcome.arm])
+        return replace(run, fitted=_widened(run, again)), replace(outcome, moved=moved)
 
 
 def _notify_rejected(registry: PluginRegistry, records: Sequence[SetAside | SuspiciousRecord]) -> list[str]:
@@ -306,21 +180,6 @@ def _notify_rejected(registry: PluginRegistry, records: Sequence[SetAside | Susp
             "armcal_record_rejected", row=record.row, record_id=record.record_id, reason=record.reason
         )
     ]
-
-
-def _split(experiment: Experiment, dataset: Dataset) -> Split:
-    validation = experiment.settings.validation
-    if validation.train_groups:
-        return split_by_label(labels_of(experiment, dataset), validation.train_groups)
-    if validation.train_ids is not None:
-        return split_by_id(dataset.ids, read_ids(validation.train_ids))
-    return hold_out(len(dataset), validation.holdout, validation.seed, experiment.poses(dataset))
-
-
-def _folds(experiment: Experiment, dataset: Dataset, split: Split) -> tuple[Split, ...]:
-    """Of the training records."""
-    validation_settings, training = experiment.settings.validation, dataset.subset(split.train)
-    return folds(len(training), validation_settings.folds, validation_settings.seed, experiment.poses(training))
 
 
 def _validated(
@@ -339,7 +198,7 @@ def _validated(
         if outcome is not None and outcome.residual is not None and outcome.crossed is not None:
             crossed = outcome.crossed, outcome.splits
         elif experiment.settings.validation.folds:
-            splits, start = _folds(experiment, run.dataset, run.split), problem.parameters.nominal()
+            splits, start = folds_of(experiment, run), problem.parameters.nominal()
             training = problem.subset(run.records, run.split.train)
             parts = (training, splits, estimator, start, means.progress, means.executor, fit_and_predict)
             crossed = cross_validate(problem, *parts), splits

@@ -13,7 +13,6 @@ from armcal.calibration.intervals import PredictionRecord
 from armcal.config.system import System
 from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.verdict import Verdict
-from armcal.errors import ConfigError
 from armcal.estimate.bootstrap import Bootstrap
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.nuisance import settled, untrained
@@ -23,12 +22,12 @@ from armcal.estimate.validation import Indices, Split
 from armcal.estimate.variance import VarianceComponents
 from armcal.estimate.weighing import WeighedFit
 from armcal.measure.groups import Groups
-from armcal.measure.measurement import GroupedMeasurement
 from armcal.problem.problem import Problem
 from armcal.run.errors import ErrorTable, FittedRecords, RecordErrors
 from armcal.run.experiment import Experiment
 from armcal.run.intervals import IntervalResult
 from armcal.run.pose_residual import ResidualOutcome
+from armcal.run.prepare import group_texts, label_of
 
 _MM = 1000.0
 
@@ -153,42 +152,13 @@ class RunGroups:
         return {error.name: error.as_dict() for error in self.errors}
 
 
-def label_of(experiment: Experiment) -> str | None:
-    """The text column that separates groups; None if there is none."""
-    text = experiment.settings.validation.group_by
-    if text is not None:
-        return text
-    labels = [
-        measurement.group_labels
-        for measurement in experiment.system.measurements.values()
-        if isinstance(measurement, GroupedMeasurement)
-    ]
-    return next((label[0] for label in labels if label), None)
-
-
-def labels_of(experiment: Experiment, dataset: Dataset) -> tuple[str, ...]:
-    """Which group each record belongs to.
-
-    Raises:
-        ConfigError: no column separates groups.
-    """
-    label = label_of(experiment)
-    if label is None or label not in dataset.extra:
-        raise ConfigError(
-            f"found no column {label or 'of groups'} in the records; they have {', '.join(dataset.extra) or 'none'}.",
-            where=experiment.source.where(("validation",)),
-            hint="Name a text column of the data: group_by: NAME.",
-        )
-    return _texts(dataset, label)
-
-
 def run_groups(experiment: Experiment, run: FittedRecords, errors: RecordErrors) -> RunGroups:
     """Errors of each group, sorted by name (none if nothing separates groups), and the keys of the problem's groups."""
     problem, records, dataset, keys = run.problem, run.records, run.dataset, run.problem.blueprint.groups
     label = label_of(experiment)
     if label is None or label not in dataset.extra:
         return RunGroups((), keys)
-    labels = np.array(_texts(dataset, label))
+    labels = np.array(group_texts(dataset, label))
     before = _distances(problem, settled(untrained(problem), problem.parameters.nominal(), records))
     # Distances are judged by what the records of each socket say, not by what the known distance made of them.
     after = _distances(problem, settled(untrained(problem), run.fitted.estimate.values, records))
@@ -200,11 +170,6 @@ def run_groups(experiment: Experiment, run: FittedRecords, errors: RecordErrors)
         of_nominal, of_calibrated = _within(name, before), _within(name, after)
         result.append(GroupError(name, int(inside.sum()), trained, nominal, calibrated, of_nominal, of_calibrated))
     return RunGroups(tuple(result), keys)
-
-
-def _texts(dataset: Dataset, label: str) -> tuple[str, ...]:
-    """A text column as groups are named by it: spaces about a text mean nothing."""
-    return tuple(text.strip() for text in dataset.extra[label])
 
 
 def _distances(problem: Problem, values: Array) -> list[tuple[tuple[str, str], float]]:

@@ -19,8 +19,8 @@ from armcal.io.parallel import Executor
 from armcal.plugins import PluginRegistry, discover
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Prepared, Stopwatch
 from armcal.run.pose_residual import Layer, judged_with, layer_of
+from armcal.run.prepare import Prepared, Stopwatch
 from armcal.run.settings import ExperimentSettings, ValidationSettings
 
 R = TypeVar("R")

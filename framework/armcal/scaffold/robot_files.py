@@ -23,7 +23,8 @@ from armcal.problem.projection import factor_at_zero
 from armcal.report import plugin_sections, render
 from armcal.run import outputs
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Stopwatch, assemble, calibrate
+from armcal.run.pipeline import calibrate
+from armcal.run.prepare import Stopwatch, assemble
 from armcal.run.result import RunResult
 from armcal.scaffold import truth
 from armcal.scaffold.rendering import number, rendered, staged, write_texts

@@ -15,7 +15,7 @@ from armcal.problem.many_points import as_seen
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.projection import factor_at_zero, projected
 from armcal.run.experiment import Experiment
-from armcal.run.result import labels_of
+from armcal.run.prepare import labels_of
 
 FEW = 6
 """So many undetermined combinations are named at most."""

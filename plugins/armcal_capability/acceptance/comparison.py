@@ -15,7 +15,7 @@ from armcal.problem.rigid_alignment import FEWEST, Alignment, Tools, alignments,
 from armcal.problem.sighting import Sighting, sighting_of, tools_of
 from armcal.problem.tool_motion import nearest_turn
 from armcal.report.numbers import plural
-from armcal.run.data_checks import check_reach
+from armcal.run.prepare import check_reach
 from scipy.spatial.transform import Rotation
 
 from armcal_capability.acceptance.records import COMMANDED, COMMANDED_TURN, Visits

@@ -15,7 +15,7 @@ from armcal.cli.console import columned
 from armcal.io.folder import reserved
 from armcal.io.standard_output import StandardOutput
 from armcal.plugins import PluginRegistry
-from armcal.run.pipeline import Stopwatch
+from armcal.run.prepare import Stopwatch
 from rich.table import Table
 
 from armcal_online.commands.recalibrate import setup_of

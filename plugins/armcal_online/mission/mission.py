@@ -18,7 +18,8 @@ from armcal.measure.csv_writer import write_csv
 from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment
 from armcal.run.outputs import calibration_content
-from armcal.run.pipeline import Stopwatch, calibrate
+from armcal.run.pipeline import calibrate
+from armcal.run.prepare import Stopwatch
 from typing_extensions import override
 
 from armcal_online.mission.errors import error_curve

@@ -14,8 +14,9 @@ from armcal.base.pose_settings import quaternion_of
 from armcal.estimate.estimator import Estimate
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import Stopwatch, _Means, prepare
 from armcal.run.pipeline import _fitted as fitted_of
+from armcal.run.pipeline import _Means
+from armcal.run.prepare import Stopwatch, prepare
 from scipy.spatial.transform import Rotation
 
 ARM = Path(__file__).resolve().parents[3] / "configs" / "camera" / "arm.yaml"

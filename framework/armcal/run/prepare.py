@@ -1,0 +1,274 @@
+"""A problem ready to solve: data read and checked against the model, records split, functions compiled."""
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from armcal.base.dataset import Dataset
+from armcal.config.system import System
+from armcal.diagnose.noise_findings import Finding
+from armcal.diagnose.permuted_axes import MUCH_BETTER, find_permuted_axes
+from armcal.errors import ConfigError, DataError, Location, ProblemError
+from armcal.estimate.estimator import Progress, no_progress
+from armcal.estimate.nuisance import restricted, started
+from armcal.estimate.profile import profiled
+from armcal.estimate.proposing import with_proposals
+from armcal.estimate.start import Start, aligned_start
+from armcal.estimate.structure import require_solvable
+from armcal.estimate.validation import (
+    Split,
+    error_unit,
+    folds,
+    hold_out,
+    split_by_id,
+    split_by_label,
+)
+from armcal.measure.id_list import read_ids
+from armcal.measure.measurement import GroupedMeasurement
+from armcal.problem.drift import with_drift
+from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.readings import with_joint_noise
+from armcal.run.experiment import Experiment
+from armcal.run.pose_residual import unlearned
+
+_MEND = {
+    True: "the order or the directions of the joints in the model",
+    False: "how the tracker's frame lies",
+}
+_REACH_RATIO = 10.0
+_ALIKE = 0.35
+"""In powers of ten: so alike are two distances of one unit."""
+_FEWEST_ROWS, _NEARLY_ALL, _NEAREST = 3, 0.95, 1e-6
+
+
+@dataclass(frozen=True)
+class Stopwatch:
+    """Seconds of each stage."""
+
+    began: float = field(default_factory=time.perf_counter)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a stage; a stage entered twice adds up."""
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+    def total(self) -> float:
+        """Since it was made."""
+        return time.perf_counter() - self.began
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A problem ready to solve: data read and checked, functions compiled."""
+
+    dataset: Dataset
+    problem: Problem
+    records: tuple[FactorRecords, ...]
+    split: Split
+    warnings: tuple[str, ...]
+    start: Start
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def training(self) -> tuple[FactorRecords, ...]:
+        """The training records."""
+        return self.problem.subset(self.records, self.split.train)
+
+
+def prepare(
+    experiment: Experiment, watch: Stopwatch, accept: bool = False, progress: Progress = no_progress
+) -> Prepared:
+    """Everything that can be done and refused before solving; see ``assemble``.
+
+    Raises:
+        InputError: data, units, counts or rank do not allow a calibration.
+    """
+    ready = assemble(experiment, watch, accept, progress)
+    with watch.stage("check"):
+        problems = require_solvable(ready.problem, ready.training, ready.problem.parameters.nominal())
+    return replace(ready, warnings=(*ready.warnings, *problems))
+
+
+def assemble(
+    experiment: Experiment, watch: Stopwatch, accept: bool = False, progress: Progress = no_progress
+) -> Prepared:
+    """Data read and checked, and the problem that it makes, whether or not it can be solved.
+
+    With ``accept``, data that look mixed up are not refused, but a bad finding.
+
+    Raises:
+        InputError: data, units or counts do not allow a calibration.
+    """
+    with watch.stage("read"):
+        dataset = experiment.read(progress)
+        experiment = experiment.of_records(dataset)
+    system = experiment.system
+    with watch.stage("build"):
+        settings = (experiment.parameters, system.environment)
+        problem = Problem.build(system.arms, system.measurements, *settings, dataset, experiment.settings.evaluator)
+        records = problem.records(dataset)
+        start = with_proposals(aligned_start(problem, records, dataset), records, dataset)
+        problem = started(start.problem, records)
+        records = acting(problem, records, dataset)
+    with watch.stage("check"):
+        unlearned(system)
+        mixed_up = check_permuted_axes(problem, records, dataset, accept)
+        check_reach(problem, records, dataset)
+        split = split_of(experiment, dataset)
+        if not len(split.train):
+            raise ProblemError("no record is left to train on.", hint="Hold fewer out, or measure more poses.")
+        if experiment.settings.validation.limit is not None and error_unit(problem) != "mm":
+            where = experiment.source.where(("validation", "limit"))
+            hint = "Leave it out: records are explained that miss by far more than the median."
+            raise ConfigError("it is a length, and nothing that is measured is one.", where=where, hint=hint)
+        problem = restricted(problem, problem.subset(records, split.train))
+        profiled(problem, experiment.settings.uncertainty.profile)
+    texts = (*experiment.warnings, *dataset.warnings, *start.warnings)
+    ready = Prepared(dataset, problem, records, split, texts, start, tuple(mixed_up))
+    if experiment.settings.validation.folds:
+        folds_of(experiment, ready)  # refused before the fit rather than after it
+    return ready
+
+
+def acting(problem: Problem, records: tuple[FactorRecords, ...], dataset: Dataset) -> tuple[FactorRecords, ...]:
+    """Records with the noise of joint readings and the drift that they share."""
+    records = with_joint_noise(problem, records, problem.parameters.nominal())
+    return with_drift(problem, records, dataset, problem.parameters.nominal())
+
+
+def split_of(experiment: Experiment, dataset: Dataset) -> Split:
+    """Which records train, and which are held out, as configured."""
+    validation = experiment.settings.validation
+    if validation.train_groups:
+        return split_by_label(labels_of(experiment, dataset), validation.train_groups)
+    if validation.train_ids is not None:
+        return split_by_id(dataset.ids, read_ids(validation.train_ids))
+    return hold_out(len(dataset), validation.holdout, validation.seed, experiment.poses(dataset))
+
+
+def folds_of(experiment: Experiment, ready: Prepared) -> tuple[Split, ...]:
+    """Folds of the training records."""
+    settings, training = experiment.settings.validation, ready.dataset.subset(ready.split.train)
+    return folds(len(training), settings.folds, settings.seed, experiment.poses(training))
+
+
+def label_of(experiment: Experiment) -> str | None:
+    """The text column that separates groups; None if there is none."""
+    text = experiment.settings.validation.group_by
+    if text is not None:
+        return text
+    labels = [
+        measurement.group_labels
+        for measurement in experiment.system.measurements.values()
+        if isinstance(measurement, GroupedMeasurement)
+    ]
+    return next((label[0] for label in labels if label), None)
+
+
+def labels_of(experiment: Experiment, dataset: Dataset) -> tuple[str, ...]:
+    """Which group each record belongs to.
+
+    Raises:
+        ConfigError: no column separates groups.
+    """
+    label = label_of(experiment)
+    if label is None or label not in dataset.extra:
+        raise ConfigError(
+            f"found no column {label or 'of groups'} in the records; they have {', '.join(dataset.extra) or 'none'}.",
+            where=experiment.source.where(("validation",)),
+            hint="Name a text column of the data: group_by: NAME.",
+        )
+    return group_texts(dataset, label)
+
+
+def group_texts(dataset: Dataset, label: str) -> tuple[str, ...]:
+    """A text column as groups are named by it: spaces about a text mean nothing."""
+    return tuple(text.strip() for text in dataset.extra[label])
+
+
+def check_reach(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> None:
+    """Positions ten times farther out, or nearer, than the model's: a unit is wrong."""
+    shown = problem.predict(problem.parameters.nominal(), records)
+    for kernel, values in zip(problem.kernels, shown, strict=True):
+        channels = kernel.factor.output_channels
+        if [channel.rpartition(".")[2] for channel in channels] != ["x", "y", "z"]:
+            continue
+        far, distances = (np.linalg.norm(x, axis=0) for x in (values[:3], dataset.stacked(channels)))
+        ratio, name = distances / np.maximum(far, _NEAREST), kernel.factor.name
+        # Some records as far out as the model (ratio 1), all others a thousand or ten times farther or nearer.
+        orders = np.log10(np.where(ratio > 0, ratio, np.nan))
+        right = np.abs(orders) < _ALIKE
+        for power in (3, -3, 1, -1):
+            wrong = np.abs(orders - power) < _ALIKE
+            if min(right.sum(), wrong.sum()) >= _FEWEST_ROWS and np.mean(right | wrong) >= _NEARLY_ALL:
+                first = int(np.argmax(wrong))
+                raise DataError(
+                    f"{name}: {wrong.sum()} of {len(dataset)} positions are about {10.0**power:g} times as far from "
+                    f"the base frame as the model's tip, the others as far (the first: record {dataset.ids[first]}).",
+                    where=Location(dataset.source, row=dataset.rows[first] if dataset.rows else None),
+                    hint="Write all rows in the unit of the column names.",
+                )
+        reach, measured = float(np.median(far)), float(np.median(distances))
+        if measured > _REACH_RATIO * reach or reach > _REACH_RATIO * measured:
+            raise DataError(
+                f"{name}: positions are typically {measured:.4g} m from the base frame, the model's tip {reach:.4g} m.",
+                where=Location(dataset.source),
+                hint="Check the unit in the column names (x_mm or x_m) and the frame of the measurements.",
+            )
+
+
+def check_permuted_axes(
+    problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, accept: bool = False
+) -> list[Finding]:
+    """Positions that do not fit the model, but do once one exchange is undone; with ``accept`` a bad finding.
+
+    Raises:
+        DataError: they are such, and not accepted; it names what looks mixed up.
+    """
+    reading = find_permuted_axes(problem, records, dataset)
+    if reading is None:
+        return []
+    text = (
+        f"{reading.measurement}: as they stand, the data are typically {reading.as_given_mm:.3g} mm off the model, "
+        f"however its free parameters adapt; with {', or with '.join(reading.readings)}, they are "
+        f"{reading.left_mm:.3g} mm off."
+    )
+    mend = _MEND[reading.of_joints]
+    hint = f"Check the unit in the column names; mend columns in the file or by data.columns, or {mend}."
+    if accept:
+        return [Finding("bad", text, f"limit {MUCH_BETTER:g} times", hint)]
+    hint += (
+        " If the data are right, the model's nominal values are far off: give better ones, or calibrate as it "
+        "stands: armcal run --accept."
+    )
+    raise DataError(text, where=Location(dataset.source), hint=hint)
+
+
+def gravity_findings(system: System, dataset: Dataset) -> list[Finding]:
+    """A warning where springs bend under weights and the direction of gravity is not stated.
+
+    A tracker's frame may stand in any way: gravity that is turned with it makes wrong compliances, and fits as well.
+    """
+    if system.statics.gravity is not None or dataset.has("gravity_z"):
+        return []
+    payload = bool(system.statics.payload) or (dataset.has("payload") and bool(dataset.column("payload").any()))
+    bent = [name for name, arm in system.arms.items() if arm.deflection_size and (arm.masses or payload)]
+    if not bent:
+        return []
+    x, y, z = system.environment.gravity
+    text = (
+        f"The direction of gravity is not stated: for the springs of {', '.join(bent)} it was assumed to be "
+        f"({x:g}, {y:g}, {z:g}) m/s^2 in the frame of the measurements, z up. If that frame is tilted, compliances are "
+        "wrong."
+    )
+    action = (
+        "State statics.gravity_m_s2 in that frame, or add the columns gravity_x_m_s2, gravity_y_m_s2 and gravity_z_m_s2"
+        " to the records."
+    )
+    return [Finding("warning", text, action=action)]
