@@ -9,7 +9,7 @@ import numpy as np
 
 from armcal.base.domains import Array
 from armcal.errors import NotConvergedError, ProblemError
-from armcal.estimate.blocks import BlockLength, automatic_block_length, standard_error_of_mean
+from armcal.estimate.bootstrap import BlockLength, automatic_block_length, standard_error_of_mean
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.validation import (
     ErrorSummary,

@@ -15,8 +15,7 @@ from armcal.errors import ConfigError, DataError, Location, ProblemError
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.nuisance import restricted, started
 from armcal.estimate.profile import profiled
-from armcal.estimate.proposing import with_proposals
-from armcal.estimate.start import Start, aligned_start
+from armcal.estimate.start import Start, aligned_start, with_proposals
 from armcal.estimate.structure import require_solvable
 from armcal.estimate.validation import (
     Split,
