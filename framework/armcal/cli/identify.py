@@ -152,7 +152,7 @@ def _show(console: Console, content: dict[str, Any]) -> None:
     condition = content["scaled_condition"]
     console.line(
         f"{content['experiment']}: {content['records']} records, {content['equations']} equations, {free} free "
-        f"parameters.",
+        f"parameters."
     )
     by_qr = f" ({content['rank_by_qr']} by QR)" if content["rank_by_qr"] != rank else ""
     text = f", scaled condition {condition:.3g}" if condition is not None else ""

@@ -131,13 +131,7 @@ def _plugin_commands() -> dict[str, tuple[str, str]]:
 
 @click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="armcal")
-@click.option(
-    "--plugin",
-    "plugins",
-    multiple=True,
-    metavar="FILE",
-    help="Load a plugin, or a folder of them.",
-)
+@click.option("--plugin", "plugins", multiple=True, metavar="FILE", help="Load a plugin, or a folder of them.")
 @click.option("--disable-plugin", "disabled", multiple=True, metavar="NAME", help="Leave a plugin out.")
 def cli(plugins: tuple[str, ...], disabled: tuple[str, ...]) -> None:
     """Find what a robot arm really is: its geometry, its joints, its compliance, and how sure that is."""

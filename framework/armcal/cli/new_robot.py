@@ -89,7 +89,7 @@ def begin(console: Console, name: str, source: Source, folder: Path) -> None:
         console.line(f"limits were assumed for {', '.join(assumed)}: correct them in plan.yaml before the arm moves")
     console.line(
         f"held-out tips of simulated records: nominal {trial.nominal_mm:.3f} mm, calibrated "
-        f"{trial.calibrated_mm:.3f} mm (the noise alone: {trial.noise_mm:.3f} mm)",
+        f"{trial.calibrated_mm:.3f} mm (the noise alone: {trial.noise_mm:.3f} mm)"
     )
     findings = [f for f in trial.result.verdict.findings if f.grade in ("bad", "warning")]
     for finding in findings:
@@ -146,8 +146,7 @@ def ask_rows(conventions: Mapping[str, Convention]) -> tuple[Convention, tuple[R
         return conventions[chosen], tuple(_row(number) for number in range(1, count + 1))
     except click.Abort as fault:
         raise ConfigError(
-            "the answers ended before the last question.",
-            hint="Answer all of them, or give --dh FILE or --urdf FILE.",
+            "the answers ended before the last question.", hint="Answer all of them, or give --dh FILE or --urdf FILE."
         ) from fault
 
 

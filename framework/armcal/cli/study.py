@@ -8,7 +8,7 @@ from armcal.cli.common import FILE, Console, command_line, data, overrides, para
 from armcal.cli.console import columned
 from armcal.io.folder import reserved
 from armcal.io.parallel import Executor
-from armcal.report.study_page import conclusions, render_study, render_transfer, transfer_conclusions, transfer_table
+from armcal.report.study_page import conclusions, render_study, transfer_conclusions, transfer_table
 from armcal.run import study_result
 from armcal.run.load_transfer import transfer
 from armcal.run.model_study import compare
@@ -44,8 +44,7 @@ def study(
     for stage, seconds in result.seconds.items():
         console.detail(f"{stage}: {seconds:.3f} s")
     result.seconds["total"] = watch.total()
-    page = render_study(result) if isinstance(result, StudyResult) else render_transfer(result)
-    kept.place(study_result.files(result, configured, page))
+    kept.place(study_result.files(result, configured, render_study(result)))
     console.result({**result.as_dict(), "folder": str(folder)})
     if isinstance(result, StudyResult):
         _show_study(console, result)

@@ -46,7 +46,14 @@ def ladder(result: StudyResult) -> Figure:
         for place, v in enumerate(result.variants):
             y = start + 4 + _ROW * (place + 0.5)
             parts.append(svg.text(left - 9, y + 4, svg.shorten(v.name, most), "mono", "end"))
-            parts += _errors(v, x, y)
+            ends = [n for n in (v.train.mean, v.crossed.p95) if n is not None]
+            parts += [svg.line(x.of(min(ends)), y, x.of(max(ends)), y, "stem")] if ends else []
+            if v.crossed.p95 is not None:
+                parts.append(svg.marks(np.array([x.of(v.crossed.p95)]), np.array([y]), _DIAMOND, "diamond"))
+            if v.train.mean is not None:
+                parts.append(svg.circle(x.of(v.train.mean), y, 5, "hollow"))
+            if v.crossed.mean is not None:
+                parts.append(svg.circle(x.of(v.crossed.mean), y, 4, "solid"))
         if beside:
             right = Box(width - beside + _GAP - 14, start + 4, width - 14, bottom)
             parts += _changes(result, spreads, right)
@@ -65,18 +72,6 @@ def _axis(numbers: Sequence[float], box: Box) -> Axis:
     if high / low > _LOG_FROM:
         return Axis(low * 0.85, high * 1.15, box.left, box.right, log=True)
     return Axis(0, high * 1.05, box.left, box.right)
-
-
-def _errors(v: VariantResult, x: Axis, y: float) -> list[str]:
-    ends = [n for n in (v.train.mean, v.crossed.p95) if n is not None]
-    parts = [svg.line(x.of(min(ends)), y, x.of(max(ends)), y, "stem")] if ends else []
-    if v.crossed.p95 is not None:
-        parts.append(svg.marks(np.array([x.of(v.crossed.p95)]), np.array([y]), _DIAMOND, "diamond"))
-    if v.train.mean is not None:
-        parts.append(svg.circle(x.of(v.train.mean), y, 5, "hollow"))
-    if v.crossed.mean is not None:
-        parts.append(svg.circle(x.of(v.crossed.mean), y, 4, "solid"))
-    return parts
 
 
 def _spread(result: StudyResult, v: VariantResult) -> Array:

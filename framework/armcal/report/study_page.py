@@ -5,7 +5,6 @@ from typing import Any
 from armcal.report import study_figures
 from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural
 from armcal.report.page import rendered
-from armcal.report.svg import Figure
 from armcal.report.tables import TextTable, provenance_facts
 from armcal.run.study_result import StudyResult, TransferCell, TransferResult, VariantResult
 from armcal.version import __version__
@@ -13,30 +12,16 @@ from armcal.version import __version__
 _SAME_MM = 1e-6
 
 
-def render_study(result: StudyResult) -> str:
-    """One self-contained HTML file of a comparison."""
-    title = f"{result.name}: {plural(len(result.variants), 'variant')}"
-    listed = [(v.name, v.change) for v in result.variants if v.change]
-    return _render(result, title, conclusions(result), _variants(result), study_figures.ladder(result), listed)
-
-
-def render_transfer(result: TransferResult) -> str:
-    """One self-contained HTML file of a load transfer study."""
-    title = f"{result.name}: trained at one load, judged at another"
-    return _render(
-        result, title, transfer_conclusions(result), transfer_table(result), study_figures.transfers(result), []
-    )
-
-
-def _render(
-    result: StudyResult | TransferResult,
-    title: str,
-    sentences: list[str],
-    table: TextTable,
-    figure: Figure,
-    changes: list[Any],
-) -> str:
-    facts = provenance_facts(result.provenance)
+def render_study(result: StudyResult | TransferResult) -> str:
+    """One self-contained HTML file of a comparison, or of a load transfer study."""
+    changes: list[tuple[str, Any]] = []
+    if isinstance(result, StudyResult):
+        title, sentences = f"{result.name}: {plural(len(result.variants), 'variant')}", conclusions(result)
+        table, figure = _variants(result), study_figures.ladder(result)
+        changes = [(v.name, v.change) for v in result.variants if v.change]
+    else:
+        title, sentences = f"{result.name}: trained at one load, judged at another", transfer_conclusions(result)
+        table, figure = transfer_table(result), study_figures.transfers(result)
     content = {
         "result": result,
         "title": title,
@@ -45,7 +30,7 @@ def _render(
         "figure": figure,
         "changes": changes,
         "version": __version__,
-        "facts": [f for f in facts if not f.long],
+        "facts": [fact for fact in provenance_facts(result.provenance) if not fact.long],
         "seconds": [(name, duration(value)) for name, value in result.seconds.items()],
     }
     return rendered("study.html.j2", content)

@@ -100,10 +100,7 @@ def document(ident: str, size: tuple[float, float], title: str, desc: str, parts
 
 
 def both(
-    ident: str,
-    words: tuple[str, str, str],
-    draw: Callable[[float], tuple[float, list[str]]],
-    wide: float = WIDE,
+    ident: str, words: tuple[str, str, str], draw: Callable[[float], tuple[float, list[str]]], wide: float = WIDE
 ) -> Figure:
     """Draw a figure at both widths.
 

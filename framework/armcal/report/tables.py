@@ -11,16 +11,7 @@ from numpy.typing import NDArray
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.validation import ErrorSummary
 from armcal.estimate.variance import VarianceComponents
-from armcal.report.numbers import (
-    MINUS,
-    NONE,
-    common_decimals,
-    decimals_for,
-    entry_unit,
-    fixed,
-    ratio,
-    shown_unit,
-)
+from armcal.report.numbers import MINUS, NONE, common_decimals, decimals_for, entry_unit, fixed, ratio, shown_unit
 from armcal.run.errors import ErrorTable
 from armcal.run.result import GroupError, RunResult
 

@@ -11,13 +11,7 @@ from armcal.diagnose.evidence import Evidence, priors_alone, unseen_poses
 from armcal.diagnose.evidence_findings import worse_than_nominal
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.gross import MOST_RECORDS, figure_of, thinned
-from armcal.diagnose.gross_findings import (
-    contradicting,
-    displacement_findings,
-    gross_error,
-    overfitted,
-    size_findings,
-)
+from armcal.diagnose.gross_findings import contradicting, displacement_findings, gross_error, overfitted, size_findings
 from armcal.diagnose.hidden_payload import hidden_payload, hidden_payload_findings
 from armcal.diagnose.large_errors import Judged, large_errors
 from armcal.diagnose.majority import minority, moved_findings, moved_groups
@@ -46,11 +40,7 @@ _AT_REST = ", as in a new recording (its drift not known)"
 
 
 def verdict_of(
-    run: FittedRecords,
-    errors: RecordErrors,
-    intervals: IntervalResult,
-    system: System,
-    limit: float | None,
+    run: FittedRecords, errors: RecordErrors, intervals: IntervalResult, system: System, limit: float | None
 ) -> tuple[Verdict, Evidence]:
     """The verdict on a fit, and what it rests on.
 

@@ -66,11 +66,7 @@ def calibration_name(result: RunResult, accepted: bool) -> str:
 
 
 def write(
-    result: RunResult,
-    experiment: Experiment,
-    folder: Path,
-    render: Callable[[RunResult], str],
-    accepted: bool = False,
+    result: RunResult, experiment: Experiment, folder: Path, render: Callable[[RunResult], str], accepted: bool = False
 ) -> None:
     """Write all files; those of an earlier run in the same place move to ``earlier/``.
 
@@ -149,11 +145,7 @@ def metrics(result: RunResult) -> dict[str, Any]:
         },
         "noise": _noise(result),
         "solver": asdict(estimate.verdict),
-        "verdict": {
-            "usable": not result.verdict.bad,
-            "grade": result.verdict.grade,
-            **asdict(result.verdict),
-        },
+        "verdict": {"usable": not result.verdict.bad, "grade": result.verdict.grade, **asdict(result.verdict)},
         "structure": result.evidence.as_dict(),
         "prediction_intervals": result.intervals.as_dict(),
         "bootstrap": _bootstrap_metrics(result),
@@ -191,11 +183,7 @@ def calibration_content(result: RunResult, experiment: Experiment, accepted: boo
         experiment=result.name,
         converged=estimate.verdict.converged,
         software=dict(provenance["versions"]),
-        identity={
-            "arm": provenance["arm_sha256"],
-            "data": provenance["data_sha256"],
-            "source": provenance["data"],
-        },
+        identity={"arm": provenance["arm_sha256"], "data": provenance["data_sha256"], "source": provenance["data"]},
         environment_columns=tuple(filter(result.dataset.has, surroundings(result.system.arms))),
         noise=in_unit(_noise(result), unit),
         quality_mm=result.table.as_dict() if unit == "mm" else {},
@@ -280,11 +268,7 @@ def bootstrap_text(resampled: Bootstrap, result: RunResult) -> str:
 
 def log_text(result: RunResult) -> str:
     """What happened, in sentences."""
-    lines = [
-        f"experiment: {result.name}",
-        f"command: {result.command}",
-        f"verdict: {result.verdict.headline}",
-    ]
+    lines = [f"experiment: {result.name}", f"command: {result.command}", f"verdict: {result.verdict.headline}"]
     lines += [f"{finding.grade}: {finding.whole}" for finding in result.verdict.findings]
     lines += [f"warning: {text}" for text in result.warnings]
     lines += result.odd_records

@@ -14,11 +14,7 @@ from armcal.estimate.estimator import Progress, no_progress, spread
 from armcal.estimate.polish import hopeless, typical_off
 from armcal.estimate.profile import Profile, profiles
 from armcal.estimate.start import FAR
-from armcal.estimate.validation import (
-    CrossValidation,
-    Split,
-    cross_validate,
-)
+from armcal.estimate.validation import CrossValidation, Split, cross_validate
 from armcal.estimate.weighing import WeighedFit, fit, plain_fit
 from armcal.io.parallel import Executor
 from armcal.plugins import PluginRegistry

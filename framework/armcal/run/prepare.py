@@ -17,14 +17,7 @@ from armcal.estimate.nuisance import restricted, started
 from armcal.estimate.profile import profiled
 from armcal.estimate.start import Start, aligned_start, with_proposals
 from armcal.estimate.structure import require_solvable
-from armcal.estimate.validation import (
-    Split,
-    error_unit,
-    folds,
-    hold_out,
-    split_by_id,
-    split_by_label,
-)
+from armcal.estimate.validation import Split, error_unit, folds, hold_out, split_by_id, split_by_label
 from armcal.measure.id_list import read_ids
 from armcal.measure.measurement import GroupedMeasurement
 from armcal.problem.drift import with_drift
@@ -33,10 +26,7 @@ from armcal.problem.readings import with_joint_noise
 from armcal.run.experiment import Experiment
 from armcal.run.pose_residual import unlearned
 
-_MEND = {
-    True: "the order or the directions of the joints in the model",
-    False: "how the tracker's frame lies",
-}
+_MEND = {True: "the order or the directions of the joints in the model", False: "how the tracker's frame lies"}
 _REACH_RATIO = 10.0
 _ALIKE = 0.35
 """In powers of ten: so alike are two distances of one unit."""

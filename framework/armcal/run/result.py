@@ -18,7 +18,7 @@ from armcal.estimate.estimator import Estimate
 from armcal.estimate.nuisance import settled, untrained
 from armcal.estimate.profile import Profile
 from armcal.estimate.residual_spread import ResidualSpread, residual_spread
-from armcal.estimate.validation import Indices, Split
+from armcal.estimate.validation import Split
 from armcal.estimate.variance import VarianceComponents
 from armcal.estimate.weighing import WeighedFit
 from armcal.measure.groups import Groups
@@ -240,8 +240,3 @@ class RunResult:
             for s in self.noise.suspicious
         )
         return (*aside, *suspicious)
-
-    @property
-    def train(self) -> Indices:
-        """Indices of the training records."""
-        return self.split.train

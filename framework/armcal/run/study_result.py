@@ -118,20 +118,14 @@ class NestedResult:
     errors_mm: Array
 
 
-@dataclass(frozen=True)
-class StudyResult:
-    """A finished comparison.
+@dataclass(frozen=True, kw_only=True)
+class _Judged:
+    """What every finished study has.
 
     Attributes:
         name: of the study.
         command: how to repeat it.
         dataset: the records.
-        folds: how many.
-        repeats: how often they were drawn.
-        variants: in the order written.
-        best: the variant with the lowest cross-validated mean error, of those whose fits all converged.
-        simplest: the one with the fewest parameters within one standard error of it.
-        nested: if it was asked for.
         warnings: of configs, data and problems.
         seconds: of each stage.
         provenance: hashes and versions.
@@ -141,16 +135,36 @@ class StudyResult:
     name: str
     command: str
     dataset: Dataset
+    warnings: tuple[str, ...]
+    seconds: dict[str, float]
+    provenance: dict[str, Any]
+    unit: str = "mm"
+
+    def content(self, kind: str, **own: Any) -> dict[str, Any]:
+        """For JSON, with what is this kind's own."""
+        ends = {"warnings": list(self.warnings), "seconds": dict(self.seconds), "provenance": self.provenance}
+        return dict(in_unit({"study": self.name, "kind": kind, **own, **ends}, self.unit))
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyResult(_Judged):
+    """A finished comparison.
+
+    Attributes:
+        folds: how many.
+        repeats: how often they were drawn.
+        variants: in the order written.
+        best: the variant with the lowest cross-validated mean error, of those whose fits all converged.
+        simplest: the one with the fewest parameters within one standard error of it.
+        nested: if it was asked for.
+    """
+
     folds: int
     repeats: int
     variants: tuple[VariantResult, ...]
     best: str
     simplest: str
     nested: NestedResult | None
-    warnings: tuple[str, ...]
-    seconds: dict[str, float]
-    provenance: dict[str, Any]
-    unit: str = "mm"
 
     def variant(self, name: str) -> VariantResult:
         """One by its name."""
@@ -159,21 +173,16 @@ class StudyResult:
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         nested = self.nested
-        content = {
-            "study": self.name,
-            "kind": "models",
-            "records": len(self.dataset),
-            "folds": self.folds,
-            "repeats": self.repeats,
-            "variants": [variant.as_dict() for variant in self.variants],
-            "lowest": self.best,
-            "simplest_within_one_standard_error": self.simplest,
-            "nested": nested and {"error_mm": nested.crossed.as_dict(), "chosen": list(nested.chosen)},
-            "warnings": list(self.warnings),
-            "seconds": dict(self.seconds),
-            "provenance": self.provenance,
-        }
-        return dict(in_unit(content, self.unit))
+        return self.content(
+            "models",
+            records=len(self.dataset),
+            folds=self.folds,
+            repeats=self.repeats,
+            variants=[variant.as_dict() for variant in self.variants],
+            lowest=self.best,
+            simplest_within_one_standard_error=self.simplest,
+            nested=nested and {"error_mm": nested.crossed.as_dict(), "chosen": list(nested.chosen)},
+        )
 
 
 @dataclass(frozen=True)
@@ -205,37 +214,25 @@ class TransferCell:
         }
 
 
-@dataclass(frozen=True)
-class TransferResult:
+@dataclass(frozen=True, kw_only=True)
+class TransferResult(_Judged):
     """A finished load transfer study; ``errors_mm`` by variant and payloads trained at, record by record."""
 
-    name: str
-    command: str
-    dataset: Dataset
     simulated: bool
     payloads_g: tuple[float, ...]
     counts: tuple[int, ...]
     cells: tuple[TransferCell, ...]
     errors_mm: dict[tuple[str, tuple[float, ...]], Array]
-    warnings: tuple[str, ...]
-    seconds: dict[str, float]
-    provenance: dict[str, Any]
-    unit: str = "mm"
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        content = {
-            "study": self.name,
-            "kind": "load_transfer",
-            "simulated": self.simulated,
-            "payloads_g": list(self.payloads_g),
-            "records": list(self.counts),
-            "cells": [cell.as_dict() for cell in self.cells],
-            "warnings": list(self.warnings),
-            "seconds": dict(self.seconds),
-            "provenance": self.provenance,
-        }
-        return dict(in_unit(content, self.unit))
+        return self.content(
+            "load_transfer",
+            simulated=self.simulated,
+            payloads_g=list(self.payloads_g),
+            records=list(self.counts),
+            cells=[cell.as_dict() for cell in self.cells],
+        )
 
 
 def files(result: StudyResult | TransferResult, study: Study, page: str) -> dict[str, str]:
