@@ -11,11 +11,10 @@ import numpy as np
 from armcal.base.config_text import finite
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.base.units import display_unit, to_unit
 from armcal.cli.common import FILE, Console, data, overrides, speaking
 from armcal.diagnose.minimal import Dropped, minimal_set
 from armcal.errors import ConfigError, Location
-from armcal.estimate.combination import Combination
+from armcal.estimate.combination import Combination, Measure
 from armcal.estimate.identifiability import CORRELATED, Identifiability, correlated_pairs, expected_covariance
 from armcal.estimate.structure import CAUSES, explain, held_by_nothing, identify_from
 from armcal.estimate.validation import error_unit
@@ -24,8 +23,6 @@ from armcal.problem.projection import factor_at_zero
 from armcal.run.experiment import Experiment
 from armcal.run.fixed_parameters import FixedParameters, FreedStep, fixed_parameters
 from armcal.run.prepare import Prepared, Stopwatch, assemble
-
-_DIMENSIONS = {"m": "length", "rad": "angle"}
 
 
 @click.command()
@@ -263,7 +260,5 @@ def show_fixed(console: Console, content: dict[str, Any]) -> None:
 
 
 def _shown(numbers: list[float], unit: str) -> str:
-    dimension = _DIMENSIONS.get(unit)
-    name = display_unit(dimension).name if dimension else unit
-    factors = [to_unit(number, name) if dimension else number for number in numbers]
-    return f"{', '.join(f'{number:.2g}' for number in factors)} {'' if name == '1' else name}".strip()
+    measure = Measure(unit, 1.0)
+    return f"{', '.join(f'{measure.shown(number)[0]:.2g}' for number in numbers)} {measure.shown(0.0)[1]}".strip()

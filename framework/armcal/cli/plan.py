@@ -10,11 +10,10 @@ import click
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from armcal.base.units import display_unit, to_unit
 from armcal.cli.common import FILE, Console, overrides, speaking
 from armcal.cli.console import columned
-from armcal.config.selection import DIMENSION_OF_UNIT
 from armcal.errors import ConfigError, InputError, Location
+from armcal.estimate.combination import Measure
 from armcal.measure.csv_writer import write_csv
 from armcal.planning.criterion import GOALS
 from armcal.run.experiment import Experiment
@@ -173,10 +172,9 @@ def _show(console: Console, content: dict[str, Any]) -> None:
     table = columned("Predicted standard deviations, the largest first", columns, left=("unit",))
     worst = np.argsort([-p["sd_in_ordinary_sizes"] for p in parameters], kind="stable")[:_SHOWN]
     for p in (parameters[i] for i in worst):
-        dimension = DIMENSION_OF_UNIT.get(p["unit"])
-        unit = display_unit(dimension).name if dimension else p["unit"]
-        texts = ["-" if p[k] is None else f"{to_unit(p[k], unit):.3g}" for k in ("sd_before", "sd_after")]
-        table.add_row(p["name"], *texts, unit)
+        shown, measure = ("sd_before", "sd_after"), Measure(p["unit"], 1.0)
+        texts = ["-" if p[key] is None else f"{measure.shown(p[key])[0]:.3g}" for key in shown]
+        table.add_row(p["name"], *texts, measure.shown(0.0)[1] or p["unit"])
     out.print(table)
     console.line(f"least determined: {content['weakest']}.")
     visit = content["visit"]

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.base.units import display_unit, to_unit
 from armcal.diagnose.dependences import Dependence, Records, dependences
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.noise_trend import NoiseTrend, noise_trend
@@ -25,6 +24,7 @@ from armcal.diagnose.predictable import Predictable, predictable
 from armcal.diagnose.score_tests import FamilyTest, Fit, family_test, linear_fit, own_basis
 from armcal.diagnose.smooth import TimeOrPose, left_out, pose_kernels, smooth, time_kernels
 from armcal.estimate.bootstrap import automatic_block_length
+from armcal.estimate.combination import Measure
 from armcal.estimate.estimator import Estimate
 from armcal.problem.motion import Motion
 from armcal.problem.problem import FactorRecords, Problem
@@ -293,13 +293,11 @@ def _size(one: Dependence, coefficients: Array) -> str:
     """Its coefficients in a customary unit, of levels the largest."""
     if not one.labels or not one.unit:
         return ""
-    unit = {"rad": display_unit("angle"), "m": display_unit("length")}.get(one.unit)
     numbers = coefficients[: len(one.labels)]
 
     def shown(number: float) -> str:
-        if one.unit == "1":
-            return f"{100 * number:.2g} %"
-        return f"{to_unit(number, unit.name):.2g} {unit.name}" if unit else f"{number:.2g} {one.unit}"
+        value, unit = (100 * number, "%") if one.unit == "1" else Measure(one.unit, 1.0).shown(number)
+        return f"{value:.2g} {unit}"
 
     if one.kind == "level":
         largest = int(np.argmax(np.abs(numbers)))
