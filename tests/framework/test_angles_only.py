@@ -113,9 +113,7 @@ def test_before_a_run_too(place: Path) -> None:
 
 def test_a_limit_in_mm_means_nothing_there(place: Path) -> None:
     told = armcal("run", "arm.yaml", "--set", "validation.limit_mm=1", code=2).stderr
-    assert "validation.limit" in told and "it is a length, and nothing that is measured is one" in " ".join(
-        told.split()
-    )
+    assert "validation.limit" in told and "found a length, and nothing measured is a length" in " ".join(told.split())
 
 
 @pytest.mark.slow

@@ -138,7 +138,7 @@ def smooth(lrm):
 def test_what_is_not_among_the_causes_is_not_given_the_name_of_one(smooth):
     found = smooth
     assert graded(found, "smooth") != "wrong" and found.is_predictable
-    assert "is no noise: other records predict it" in said(found)
+    assert "is not noise: other records predict it" in said(found)
 
 
 def test_in_short_nothing_is_left_only_where_no_function_of_the_pose_is(smooth):
@@ -149,7 +149,7 @@ def test_in_short_nothing_is_left_only_where_no_function_of_the_pose_is(smooth):
         left = replace(found, structures=(), lag_after_p=1.0, predictable=predicted)
         return " ".join(_in_short("", sure, Finding("good", ""), Evidence(left), (), ()))
 
-    assert "is no noise: other records predict it" in short(found.predictable)
+    assert "is not noise: other records predict it" in short(found.predictable)
     assert "nothing" not in short(found.predictable) and "nothing" not in short(None)
     assert "nothing that was recorded predicts them" in short(replace(found.predictable, p_value=0.5))
 
@@ -159,7 +159,7 @@ def test_what_is_significant_but_less_likely_than_chance_is_no_finding(lrm):
     """Of noise: the one recording in twenty or so of which the best of 200 causes has a family-wise p of 0.01."""
     found = found_in(lrm, "none", 62)
     assert found.more is False and not found.structures
-    assert "none explains the error left" in said(found)
+    assert "explains the remaining error" in said(found)
 
 
 @pytest.mark.slow

@@ -159,7 +159,7 @@ def run(tmp_path, residual):
 @pytest.mark.skipif(not UR10.exists(), reason="measured data that are not published here")
 def test_an_industrial_arm_leaves_what_joints_predict_and_learning_takes_it_away(tmp_path):
     content, before = run(tmp_path, False)
-    told = next(f for f in content["verdict"]["findings"] if "is no noise" in f["text"])
+    told = next(f for f in content["verdict"]["findings"] if "is not noise" in f["text"])
     assert before["share"] > 0.8 and {one["kind"] for one in before["carriers"]} == {"joint"}
     assert told["grade"] == "warning" and "gaussian_process" in told["action"]
     assert "nothing" not in content["verdict"]["paragraph"].lower()

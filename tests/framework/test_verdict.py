@@ -57,7 +57,7 @@ def test_sound_data_gives_no_warning() -> None:
     assert "warning:" not in told and "bad:" not in told
     assert "good: Residuals are as large as the declared noise" in told
     assert "good: Residuals of neighbouring records do not correlate" in told
-    assert "good: Of" in told and "none explains the error left" in told
+    assert "good: None of the" in told and "explains the remaining error" in told
 
 
 @pytest.mark.slow

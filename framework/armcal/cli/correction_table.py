@@ -56,7 +56,7 @@ def correction_table(
     console.result({**figures, "point": bench.point, "out": str(out)})
     console.line(f"{figures['reached']} of {figures['nodes']} nodes are reached: {out}")
     if not with_table.size:
-        console.warn("no cell has all its corners: nothing between the nodes could be tried")
+        console.warn("no cell of the grid is reached at all its corners: the table was not tried between nodes")
         return
     text = f"between nodes {figures['error_mm']:.3g} mm (95 %: {figures['error_95_mm']:.3g} mm)"
     if figures["nominal_error_mm"] is not None:

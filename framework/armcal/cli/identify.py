@@ -50,7 +50,7 @@ def identify(
     fixed: bool,
     overrides: tuple[str, ...],
 ) -> None:
-    """Report which combinations of CONFIG's free parameters its poses determine. Refuses no rank.
+    """Report which combinations of CONFIG's free parameters its poses determine, whatever their rank.
 
     Solves nothing, but with --fixed.
     """

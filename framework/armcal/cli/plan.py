@@ -179,8 +179,8 @@ def _show(console: Console, content: dict[str, Any]) -> None:
     console.line(f"least determined: {content['weakest']}.")
     visit = content["visit"]
     hot = visit["peak_squared_torque"]
-    heat_text = f", squared torque averaged over 5 poses at most {hot:.2f} of the largest" if hot is not None else ""
-    console.line(f"visited by {visit['order']}: {visit['travel_s']:.0f} s on the way{heat_text}.")
+    heat_text = f"; squared torque, averaged over 5 poses, at most {hot:.2f} of the largest" if hot is not None else ""
+    console.line(f"order of visit: {visit['order']}, {visit['travel_s']:.0f} s between poses{heat_text}.")
     console.line(f"plan: {content['out']}  ({content['seconds']:.1f} s)")
 
 

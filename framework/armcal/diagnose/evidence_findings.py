@@ -115,9 +115,10 @@ def structure_findings(structure: ResidualStructure | None, unit: str = _MM) -> 
     test, kept = f"score test, {level}, and likelier than chance", structure.worthwhile
     findings = [_structure_finding(s, structure, unit, test) for s in kept]
     if not findings and not structure.is_predictable:
-        slight = f" {_plural(len(structure.structures), 'dependence', 'dependences')} found would not lower it by 1 %."
-        text = f"Of {structure.tested} things that residuals might depend on none explains the error left."
-        findings.append(Finding("good", text + (slight if structure.structures else ""), test))
+        text = f"None of the {structure.tested} causes that were tested explains the remaining error."
+        if structure.structures:
+            text += f" {_plural(len(structure.structures), 'would', 'would each')} lower it by less than 1 %."
+        findings.append(Finding("good", text, test))
     if kept and structure.more:
         text = "Residuals depend on more than these; model them first, then look again."
         findings.append(Finding("note", text, test))
@@ -128,7 +129,7 @@ def _predictable_finding(structure: ResidualStructure) -> Finding:
     """What other records predict of the residuals, whatever its cause is."""
     predicted = structure.predictable
     if predicted is None:
-        text = "Whether the pose still predicts the residuals is not known: the distinct poses are too few."
+        text = "There are too few distinct poses to test whether the pose still predicts the residuals."
         return Finding("note", text, f"at least {FEWEST_POSES} distinct poses", "Measure more poses.")
     test = (
         f"{predicted.records} records of {predicted.poses} poses, each predicted by the poses of other folds; "
@@ -149,7 +150,7 @@ def _predictable_finding(structure: ResidualStructure) -> Finding:
 
 def predicted_in_short(predicted: Predictable) -> str:
     """How much of the residuals is no noise."""
-    share = f"{percent(predicted.share)} of the variance of the residuals is no noise"
+    share = f"{percent(predicted.share)} of the variance of the residuals is not noise"
     names = [carrier.words for carrier in predicted.carriers]
     listed = " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
     return f"{share}: other records predict it, mostly from {listed} (chance: below {percent(predicted.chance)})."
@@ -226,7 +227,7 @@ def neighbour_findings(structure: ResidualStructure | None, estimate: Estimate, 
     if structure.lag_after_p > structure.level:
         return [Finding("note", f"{text}; what was found above explains it.", test)]
     after = f", by {structure.lag_after:.2f} still beside what was found" if structure.structures else ""
-    text += f"{after}: they are no noise. {what_neighbours_cost(estimate)}"
+    text += f"{after}: they are not noise. {what_neighbours_cost(estimate)}"
     alike = structure.alike
     if alike is None:
         return [Finding("warning", text, test, _TELL_APART["open"])]
@@ -236,8 +237,8 @@ def neighbour_findings(structure: ResidualStructure | None, estimate: Estimate, 
         f"{alike.time:.0f} and {alike.pose:.0f})"
     )
     if max(alike.time_imitated, alike.pose_imitated) > IMITATED:
-        shares = f"the pose predicts {_share(alike.time_imitated)} of the one, time {_share(alike.pose_imitated)} of "
-        text += f"; {shares}the other, as the poses were visited in an order"
+        shares = f"the pose predicts {_share(alike.time_imitated)} of the first, time {_share(alike.pose_imitated)} of "
+        text += f"; as the poses were visited in an order, {shares}the second"
     return [Finding("warning", f"{text}.", test, _TELL_APART[alike.cause])]
 
 
@@ -245,11 +246,11 @@ def what_neighbours_cost(estimate: Estimate) -> str:
     """What correlated neighbours do to the intervals of the parameters."""
     factors = estimate.widened
     if not factors:
-        return "The intervals of the parameters need no widening, in the order in which these poses were measured."
+        return "In the order in which these poses were measured that does not widen the intervals of the parameters."
     widest = int(np.argmax(factors))
     return (
-        "By independent errors the intervals of the parameters would be too narrow; they are wider by a factor of "
-        f"{float(np.median(factors)):.1f} (median), at most {max(factors):.1f} ({estimate.names[widest]})."
+        "Intervals that assume independent errors would be too narrow; those of the parameters are wider, by a factor "
+        f"of {float(np.median(factors)):.1f} (median), at most {max(factors):.1f} ({estimate.names[widest]})."
     )
 
 

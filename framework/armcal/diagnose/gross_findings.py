@@ -96,7 +96,7 @@ def overfitted(trained_mm: Array, judged_mm: Array, equations: int, freedom: flo
         return []
     text = (
         f"Overfitted: records that did not train have an error of {after:.3g} {unit}, {after / noise:.1f} times what "
-        f"those that trained let expect ({noise:.3g} {unit})."
+        f"the training records lead one to expect ({noise:.3g} {unit})."
     )
     test = f"medians; {equations - freedom:.0f} of {equations} equations are spent on parameters; limit {OVERFITTED:g}"
     return [

@@ -180,10 +180,10 @@ def _left(seen: Evidence) -> list[str]:
         )
         sentences.append(f"Residuals still depend on {listed}.")
     elif not sentences and left.lag_after_p <= left.level:
-        text = f"No cause that was looked for explains the residuals, yet neighbours correlate by {left.lag_after:.2f}."
-        sentences.append(text)
+        text = "None of the tested causes explains the residuals, yet neighbours correlate by "
+        sentences.append(f"{text}{left.lag_after:.2f}.")
     elif left.predictable is None:
-        sentences.append("No cause that was looked for explains the residuals; for others the poses are too few.")
+        sentences.append("None of the tested causes explains the residuals; for others the poses are too few.")
     elif not sentences:
         sentences.append("The residuals look like noise: nothing that was recorded predicts them.")
     return sentences
@@ -241,7 +241,7 @@ def _size(estimate: Estimate, seen: Evidence) -> Finding:
         if seen.structure is not None:
             known = "some of it is the model's: what residuals depend on is named below"
             is_seen = seen.structure.structures or seen.structure.is_predictable
-            why += f"; {known if is_seen else 'no cause that was looked for is in it'}"
+            why += f"; {known if is_seen else 'none of the causes that were tested is in it'}"
         text = f"Residuals are {ratio:.1f} times the declared noise: {why}. Intervals are widened to the residuals."
         action = (
             "Repeat some poses, each from elsewhere: the spread of the repeats is noise, the rest the model's error."
@@ -265,7 +265,7 @@ def _neighbours(whitened: Array, train: NDArray[np.intp], estimate: Estimate) ->
     lag_one, test = float(np.mean(products)) / spread, "lag-one correlation, 5 %"
     if abs(lag_one) < ndtri(1 - LEVEL / 2) / np.sqrt(products.size):
         return [Finding("good", "Residuals of neighbouring records do not correlate.", test)]
-    text = f"Residuals of neighbouring records correlate by {lag_one:.2f}: they are no noise."
+    text = f"Residuals of neighbouring records correlate by {lag_one:.2f}: they are not noise."
     text += f" {what_neighbours_cost(estimate)}" if estimate.widened is not None else ""
     return [Finding("warning", text, test, "Repeat one pose at the start, in the middle and at the end.")]
 

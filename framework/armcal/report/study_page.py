@@ -73,7 +73,7 @@ def _nested_words(result: StudyResult, best: VariantResult) -> list[str]:
     if result.nested is None:
         if len(result.variants) == 1:
             return []
-        return ["It was picked by the records that judge it: study.nested: true judges the choice itself."]
+        return ["The records that judge it also picked it; study.nested: true judges the choice itself."]
     chosen = result.nested.chosen
     listed = ", ".join(f"{name} in {chosen.count(name)}" for name in dict.fromkeys(chosen))
     return [

@@ -11,7 +11,16 @@ from armcal.base.domains import Array
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.bootstrap import BlockLength, automatic_block_length, standard_error_of_mean
 from armcal.estimate.estimator import Progress, no_progress
-from armcal.estimate.validation import ErrorSummary, JudgedFit, Split, error_unit, errors_and_turns, folds, summarise
+from armcal.estimate.validation import (
+    ErrorSummary,
+    Indices,
+    JudgedFit,
+    Split,
+    error_unit,
+    errors_and_turns,
+    folds,
+    summarise,
+)
 from armcal.io.parallel import Executor
 from armcal.run.prepare import Prepared, Stopwatch, prepare
 from armcal.run.study import PREVIOUS, ModelStudySettings, Study, interpreted_first, judged_fits, naming
@@ -43,10 +52,7 @@ def compare(
     dataset, first = next(iter(ready.values())).dataset, next(iter(study.experiments.values()))
     every, poses = np.arange(len(dataset), dtype=np.intp), first.poses(dataset)
     drawn = [folds(len(dataset), settings.folds, settings.seed + r, poses) for r in range(settings.repeats)]
-    inner = []  # of each fold, folds of its training records
-    for train in (outer.train for outer in drawn[0] if settings.nested):
-        parts = folds(len(train), settings.folds, settings.seed, poses[train])
-        inner.append(tuple(Split(train[part.train], train[part.holdout]) for part in parts))
+    inner = [_inside(outer.train, settings, poses) for outer in drawn[0]] if settings.nested else []
     splits = [Split(every, every), *chain.from_iterable(drawn), *chain.from_iterable(inner)]
     fits = judged_fits(study, ready, [(name, split) for name in ready for split in splits], executor, progress, watch)
     by_name = {name: fits[i * len(splits) : (i + 1) * len(splits)] for i, name in enumerate(ready)}
@@ -67,6 +73,12 @@ def compare(
         provenance=first.provenance(dataset),
         unit=error_unit(next(iter(ready.values())).problem),
     )
+
+
+def _inside(train: Indices, settings: ModelStudySettings, poses: Indices) -> tuple[Split, ...]:
+    """Folds of the training records of a fold."""
+    inner = folds(len(train), settings.folds, settings.seed, poses[train])
+    return tuple(Split(train[split.train], train[split.holdout]) for split in inner)
 
 
 def _judged(name: str, ready: Prepared, fits: Sequence[JudgedFit], drawn: Sequence[Sequence[Split]]) -> VariantResult:

@@ -119,8 +119,9 @@ def make_plan(
         again = same_poses(pool.dataset.stacked(space.channels), given.stacked(space.channels))
         pool = pool.without(again, "measured already")
     if len(pool.dataset) * settings.repeats < count:
+        left_out = f" ({counts_text(pool.left_out)} left out)" if pool.left_out else ""
         raise ProblemError(
-            f"{count} poses of {len(pool.dataset)} candidates ({counts_text(pool.left_out)}).",
+            f"found {len(pool.dataset)} candidates{left_out}, too few for {count} poses.",
             hint="Ask for fewer poses, give more candidates, or allow plan.repeats.",
         )
     context = plan_context(experiment, settings, space, parameters, given)
@@ -156,8 +157,8 @@ def _chosen(task: Task, settings: PlanSettings, parameters: Parameters) -> Plan:
     numbers = task.count * candidates.rows.shape[1]
     if numbers < candidates.size - before:
         raise ProblemError(
-            f"{task.count} poses give {numbers} numbers, and {candidates.size - before} of {candidates.size} "
-            "parameters are open.",
+            f"{task.count} poses give {numbers} equations, and {candidates.size - before} of {candidates.size} "
+            "parameters are not determined yet.",
             hint=_MORE,
         )
     plan = choose(task, settings.starts, settings.seed)

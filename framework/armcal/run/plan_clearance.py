@@ -153,7 +153,7 @@ def clearance_check(settings: ClearanceSettings, arms: Mapping[str, Arm], source
             raise ConfigError(f"no part is called {unknown[0]!r}.", where=where, hint=hint)
         if not pairs:
             raise ConfigError(
-                f"the rule between {' and '.join(rule.between)} is about no pair of parts.",
+                f"the rule between {' and '.join(rule.between)} matches no pair of parts.",
                 where=where,
                 hint="Parts with at most one joint between them do not count; name others, or remove the rule.",
             )

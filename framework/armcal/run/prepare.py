@@ -115,7 +115,7 @@ def assemble(
         if experiment.settings.validation.limit is not None and error_unit(problem) != "mm":
             where = experiment.source.where(("validation", "limit"))
             hint = "Leave it out: records are explained that miss by far more than the median."
-            raise ConfigError("it is a length, and nothing that is measured is one.", where=where, hint=hint)
+            raise ConfigError("found a length, and nothing measured is a length.", where=where, hint=hint)
         problem = restricted(problem, problem.subset(records, split.train))
         profiled(problem, experiment.settings.uncertainty.profile)
     texts = (*experiment.warnings, *dataset.warnings, *start.warnings)

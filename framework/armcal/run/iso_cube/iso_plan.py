@@ -56,7 +56,7 @@ def visits(
         begun = {name: _begun(compensator, placed, NAMES.index(name), axis) for name in DIRECTED}
         lost = [name for name, before in begun.items() if before is None]
         if lost:
-            warnings.append(f"{', '.join(lost)}: no approach along {'xyz'[axis]} within limits; left out.")
+            warnings.append(f"{', '.join(lost)}: no approach along {'xyz'[axis]} lies within limits; it is left out.")
         for cycle in range(1, cycles + 1):
             for name, before in begun.items():
                 if before is not None:
