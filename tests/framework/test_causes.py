@@ -18,7 +18,7 @@ from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.odds import UNLISTED
 from armcal.diagnose.outside import predicted_positions
 from armcal.diagnose.residual_structure import LEVEL, structure
-from armcal.diagnose.scales import scale_deviation
+from armcal.diagnose.unseen import scale_deviation
 from armcal.diagnose.verdict import _in_short
 from armcal.estimate.weighing import fit
 from armcal.problem.motion import Motion, recorded_position

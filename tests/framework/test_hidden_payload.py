@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import oracle
 import pytest
-from armcal.diagnose.hidden_payload import hidden_payload, hidden_payload_findings
+from armcal.diagnose.unseen import hidden_payload, hidden_payload_findings
 from armcal.estimate.weighing import fit
 from armcal.problem.motion import Motion
 from armcal_ipopt.estimator import IpoptEstimator

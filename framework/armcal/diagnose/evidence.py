@@ -8,9 +8,9 @@ import numpy as np
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.diagnose.hidden_payload import HiddenPayload
 from armcal.diagnose.large_errors import LargeErrors
 from armcal.diagnose.residual_structure import ResidualStructure
+from armcal.diagnose.unseen import HiddenPayload
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.prediction import NewRecording
 from armcal.planning.candidates import whitened_rows

@@ -12,14 +12,13 @@ from armcal.diagnose.evidence_findings import worse_than_nominal
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.gross import MOST_RECORDS, figure_of, thinned
 from armcal.diagnose.gross_findings import contradicting, displacement_findings, gross_error, overfitted, size_findings
-from armcal.diagnose.hidden_payload import hidden_payload, hidden_payload_findings
 from armcal.diagnose.large_errors import Judged, large_errors
 from armcal.diagnose.majority import minority, moved_findings, moved_groups
 from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.outside import predicted_positions
 from armcal.diagnose.residual_structure import structure
-from armcal.diagnose.scales import MOST_RECORDS as MOST_FOR_SCALES
-from armcal.diagnose.scales import held_scales, scale_deviation, scale_findings
+from armcal.diagnose.unseen import MOST_RECORDS as MOST_FOR_SCALES
+from armcal.diagnose.unseen import held_scales, hidden_payload, hidden_payload_findings, scale_deviation, scale_findings
 from armcal.diagnose.verdict import Verdict, judge
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.start import certificates
