@@ -11,7 +11,6 @@ import numpy as np
 
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.pose_settings import quaternion_of
 from armcal.base.units import DIMENSIONLESS, split_suffix, to_unit
 from armcal.calibration.calibration import Calibration
@@ -23,6 +22,7 @@ from armcal.measure.csv_writer import column_names, write_csv
 from armcal.measure.environment import noticed
 from armcal.measure.reader import ReadRequest, RequestedChannel, requested_channels
 from armcal.plugins import PluginRegistry
+from armcal.run.compensate import short_texts
 
 _MOST_BYTES, _LONGEST_HEADER = 1 << 31, 1 << 20
 _MOST_NAMED = 8
@@ -191,15 +191,10 @@ def _half_widths(
     for channel, (column, unit) in column_names(shown).items():
         if channel in plus_minus.half_widths:
             widths = to_unit(plus_minus.half_widths[channel], unit)
-            columns[f"plus_minus_{column}"] = _texts(widths)
+            columns[f"plus_minus_{column}"] = short_texts(widths)
             if np.isfinite(widths).any():
                 medians[column] = float(np.nanmedian(widths))
-    for name, radius in plus_minus.radii.items():
-        columns["radius95_mm" if len(plus_minus.radii) == 1 else f"{name}.radius95_mm"] = _texts(to_unit(radius, "mm"))
-    for name, turn in plus_minus.turns.items():
-        columns["turn90_deg" if len(plus_minus.turns) == 1 else f"{name}.turn90_deg"] = _texts(to_unit(turn, "deg"))
+    for column, unit, own in (("radius95", "mm", plus_minus.radii), ("turn90", "deg", plus_minus.turns)):
+        for name, values in own.items():
+            columns[f"{'' if len(own) == 1 else f'{name}.'}{column}_{unit}"] = short_texts(to_unit(values, unit))
     return columns, medians
-
-
-def _texts(values: Array) -> tuple[str, ...]:
-    return tuple(f"{value:.6g}" if np.isfinite(value) else "" for value in values.tolist())

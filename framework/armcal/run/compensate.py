@@ -235,21 +235,21 @@ def _columns(compensator: Compensator, assessed: Assessed) -> Iterator[tuple[str
             if joint in compensator.expression.servos:
                 tick = compensator.expression.servos[joint][1].tick
                 yield f"{joint}_counts", tuple(str(count) for count in commands.counts[:, i])
-                yield f"{joint}_pulse_us", _texts(1e6 * tick * commands.counts[:, i])
+                yield f"{joint}_pulse_us", short_texts(1e6 * tick * commands.counts[:, i])
     yield "reached", tuple(_ENGLISH[bool(reached)] for reached in commands.reached)
     yield from _pose("tool", assessed.tools)
-    yield "error_mm", _texts(1000 * commands.distances)
-    yield "error_deg", _texts(np.asarray(np.degrees(commands.turns)))
+    yield "error_mm", short_texts(1000 * commands.distances)
+    yield "error_deg", short_texts(np.asarray(np.degrees(commands.turns)))
     if assessed.radii is not None:
-        yield "radius95_mm", _texts(1000 * assessed.radii)
-    yield "nominal_error_mm", _texts(1000 * assessed.nominal_distances)
+        yield "radius95_mm", short_texts(1000 * assessed.radii)
+    yield "nominal_error_mm", short_texts(1000 * assessed.nominal_distances)
     if commands.moves is not None:
         kinds = [compensator.expression.arm.commanded[joint] for joint in compensator.joints]
         for kind, unit, scale in (("angle", "deg", 180 / np.pi), ("length", "mm", 1000.0)):
             own = [i for i, text in enumerate(kinds) if text == kind]
             if own:
-                yield f"longest_move_{unit}", _texts(scale * np.abs(commands.moves[:, own]).max(axis=1))
-    yield "bound_mm", _texts(1000 * commands.bounds)
+                yield f"longest_move_{unit}", short_texts(scale * np.abs(commands.moves[:, own]).max(axis=1))
+    yield "bound_mm", short_texts(1000 * commands.bounds)
     yield "reason", commands.reasons
     yield from _pose("tell_nominal", assessed.nominal_T_tool)
 
@@ -262,6 +262,6 @@ def _pose(name: str, poses: Array) -> Iterator[tuple[str, tuple[str, ...]]]:
         yield f"{name}_q{axis}", tuple(repr(float(x)) for x in turns[:, i])
 
 
-def _texts(values: NDArray[Any]) -> tuple[str, ...]:
+def short_texts(values: NDArray[Any]) -> tuple[str, ...]:
     """Short numbers; empty where there is none."""
     return tuple(f"{value:.6g}" if np.isfinite(value) else "" for value in values.tolist())

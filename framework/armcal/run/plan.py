@@ -27,7 +27,6 @@ from armcal.run.plan_approaches import (
     with_approaches,
     with_poses_between,
 )
-from armcal.run.plan_clearance import clearance_check
 from armcal.run.plan_context import (
     PlanContext,
     as_if_measured,
@@ -36,7 +35,16 @@ from armcal.run.plan_context import (
     plan_context,
     problem_of,
 )
-from armcal.run.plan_poses import JointSpace, Pool, counts_text, dataset_of, given_records, pool_of, same_poses
+from armcal.run.plan_poses import (
+    JointSpace,
+    Pool,
+    clearance_of,
+    counts_text,
+    dataset_of,
+    given_records,
+    pool_of,
+    same_poses,
+)
 from armcal.run.settings import PlanSettings
 
 _MORE = "Plan more poses, give the records that are there already (--given), or give priors."
@@ -106,9 +114,7 @@ def make_plan(
     settings = experiment.settings.plan or PlanSettings()
     space = JointSpace.of(experiment)
     parameters = parameters_of(experiment, calibration)
-    check = None
-    if settings.clearance is not None:
-        check = clearance_check(settings.clearance, experiment.system.arms, experiment.source)
+    check = clearance_of(experiment)
     progress("candidates", 0.0)
     pool = pool_of(experiment, settings, space, listed, check)
     both = come_from_both_sides(pool, space, space.limits(settings), settings.seed)

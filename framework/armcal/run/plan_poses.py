@@ -93,6 +93,14 @@ class Pool:
         return replace(self, dataset=self.dataset.subset(np.flatnonzero(~faulty)), left_out=left_out)
 
 
+def clearance_of(experiment: Experiment) -> ClearanceCheck | None:
+    """The check of its plan's clearance; None where none is stated."""
+    plan = experiment.settings.plan
+    if plan is None or plan.clearance is None:
+        return None
+    return clearance_check(plan.clearance, experiment.system.arms, experiment.source)
+
+
 def pool_of(
     experiment: Experiment, settings: PlanSettings, space: JointSpace, listed: Path | None, check: ClearanceCheck | None
 ) -> Pool:
@@ -278,7 +286,5 @@ def workspace_of(path: Path, joints: Sequence[str], registry: PluginRegistry) ->
         )
     stated = zip(space.names, space.limits(plan), strict=True)
     limits = {name: (float(low), float(high)) for name, (low, high) in stated if np.isfinite([low, high]).any()}
-    if plan.clearance is None:
-        return Workspace(limits)
-    check = clearance_check(plan.clearance, experiment.system.arms, experiment.source)
-    return Workspace(limits, lambda commands: check(commands).allowed)
+    check = clearance_of(experiment)
+    return Workspace(limits, None if check is None else lambda commands: check(commands).allowed)

@@ -17,9 +17,8 @@ from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment
 from armcal.run.iso_cube.placement import DIRECTED, NAMES, Cube, Placed, placed
 from armcal.run.plan_approaches import approach_channels
-from armcal.run.plan_clearance import clearance_check
 from armcal.run.plan_context import values_about
-from armcal.run.plan_poses import JointSpace, spread
+from armcal.run.plan_poses import JointSpace, clearance_of, spread
 from armcal.run.settings import PlanSettings
 
 PATH = "path"
@@ -136,11 +135,9 @@ def make_iso_plan(
     arm, space = next(iter(arms.values())), JointSpace.of(experiment)
     settings = experiment.settings.plan or PlanSettings()
     # Of each joint, stated or the model's own; ``spread`` refuses a joint without.
-    own, stated, check = joint_limits(arm.nominal_chain), space.limits(settings), None
+    own, stated, check = joint_limits(arm.nominal_chain), space.limits(settings), clearance_of(experiment)
     model = np.array([own.get(joint) or (-np.inf, np.inf) for joint in arm.commanded], dtype=float)
     limits = np.where(np.isfinite(stated), stated, model)
-    if settings.clearance is not None:
-        check = clearance_check(settings.clearance, arms, experiment.source)
     parameters = values_about(experiment, calibration)
     plain = replace(arm, effects={}, masses=()) if calibration is None else arm
     compensator = Compensator(
