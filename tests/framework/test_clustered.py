@@ -61,7 +61,7 @@ def test_along_a_path_intervals_grow_and_the_verdict_says_by_how_much() -> None:
     inverse = np.linalg.inv(wide.square_root_information)
     np.testing.assert_allclose(np.sqrt(np.sum(inverse**2, axis=1)), wide.deviations, rtol=1e-6)
     text = what_neighbours_cost(wide)
-    assert "wider by a factor of" in text and wide.names[int(np.argmax(wide.widened))] in text
+    assert "wider, by a factor of" in text and wide.names[int(np.argmax(wide.widened))] in text
 
 
 def test_in_random_order_they_do_not_and_nobody_says_so() -> None:
@@ -70,7 +70,7 @@ def test_in_random_order_they_do_not_and_nobody_says_so() -> None:
     assert wide.widened is not None
     assert np.median(wide.widened or (1.0,)) < 1.15
     if not wide.widened:
-        assert "need no widening" in what_neighbours_cost(wide)
+        assert "does not widen" in what_neighbours_cost(wide)
 
 
 @pytest.mark.slow

@@ -235,7 +235,7 @@ def test_the_same_command_gives_the_same_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--poses", "5"], "5 poses give 15 numbers, and 28 of 28"),
+        (["--poses", "5"], "5 poses give 15 equations, and 28 of 28"),
         (["--poses", "9999"], "found 200 candidates"),
         (["--poses", "50", "--candidates", "nowhere.csv"], "nowhere.csv"),
         (["--poses", "50", "--given", "nowhere.csv"], "nowhere.csv"),
