@@ -161,16 +161,19 @@ def find_steps(calibration: Calibration, observer: Observer, values: Array) -> S
         motions_of = {name: _sensor_motion(problem, values, records, name, complete, slopes) for name in factors}
     except ArmcalError:
         return Steps((), (), {})
-    # Of causes the coordinates that move a prediction in some pose.
-    seen = np.sum(slopes**2, axis=0) > _CUT * len(slopes)
-    causes = find_causes(calibration, space, {step.parameter for step in steps.values() if step})
-    narrowed = [replace(cause, coordinates=tuple(i for i in cause.coordinates if seen[i])) for cause in causes]
     return Steps(
         tuple(step for step in steps.values() if step is not None),
         tuple(channel for channel, step in steps.items() if step is None),
         {name: motion for name, motion in motions_of.items() if motion is not None},
-        tuple(cause for cause in narrowed if cause.coordinates),
+        _seen_causes(find_causes(calibration, space, {step.parameter for step in steps.values() if step}), slopes),
     )
+
+
+def _seen_causes(causes: Sequence[Cause], slopes: Array) -> tuple[Cause, ...]:
+    """Causes with the coordinates that move a prediction in some pose; none where no pose shows any."""
+    seen = np.sum(slopes**2, axis=0) > _CUT * len(slopes)
+    narrowed = [replace(cause, coordinates=tuple(i for i in cause.coordinates if seen[i])) for cause in causes]
+    return tuple(cause for cause in narrowed if cause.coordinates)
 
 
 def _probing_poses(arms: Iterable[Arm]) -> Dataset:
