@@ -7,7 +7,7 @@ slipped tooth is no small step. Each record may also be an outlier, of any size,
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, combinations, pairwise
 
@@ -21,7 +21,7 @@ from scipy.linalg import cho_factor, cho_solve
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.hypotheses import Candidate, Explanation, Hypothesis, Recent
 from armcal_online.tracking.joint_density import JointDensity, log_density_of_outlier
-from armcal_online.tracking.observer import Observer, RecordObservation, linearised
+from armcal_online.tracking.observer import Observer, linearised
 from armcal_online.tracking.process_noise import ProcessNoise
 from armcal_online.tracking.settings import OutlierSettings
 
@@ -47,12 +47,11 @@ class Weighed:
 
 
 class RecordsSince:
-    """Records since a change, and the belief before them.
+    """Records since a change, about the belief before the first of them.
 
     Args:
-        before: the belief when the first of them came.
-        observations: of the records, about the belief's origin.
-        passed: the distance of each from the one before, by channel; the first one's is not used.
+        records: in order; the distance to the first from the one before is not used.
+        observer: of the problem.
         process_noise: of beliefs.
         outlier_covariances: of an outlier's error of the stated size, a record each.
         share: of outliers.
@@ -61,27 +60,28 @@ class RecordsSince:
 
     def __init__(
         self,
-        before: Belief,
-        observations: Sequence[RecordObservation],
-        passed: Sequence[Mapping[str, float]],
+        records: Sequence[Recent],
+        observer: Observer,
         process_noise: ProcessNoise,
         outlier_covariances: Sequence[Array],
         share: float,
         freedom: float,
     ) -> None:
-        self._observations, self._freedom, self._n = observations, freedom, len(process_noise.rates)
-        gaussian = before.gaussian
+        self._freedom, self._n = freedom, len(process_noise.rates)
+        belief = before = records[0].before
+        self._observations = [observer.observation(before, r.readings, r.joint_noise) for r in records]
+        gaussian, count = before.gaussian, len(records)
         kept, self._means, self._priors = [], [gaussian.mean], [gaussian.covariance]
-        belief = before
-        for step in passed[1:]:
-            belief = process_noise.faded(belief, step)
-            kept.append(process_noise.gauss_markov.kept(step))
+        for record in records[1:]:
+            belief = process_noise.faded(belief, record.passed)
+            kept.append(process_noise.gauss_markov.kept(record.passed))
             self._means.append(belief.gaussian.mean)
             self._priors.append(belief.gaussian.covariance)
-        self._left = np.ones((len(passed), len(passed), len(gaussian.mean) - self._n))
-        for i, j in combinations(range(len(passed)), 2):
+        self._left = np.ones((count, count, len(gaussian.mean) - self._n))
+        for i, j in combinations(range(count), 2):
             self._left[i, j] = np.prod(kept[i:j], axis=0)
-        self._unmoved = linearised(observations, self._means)
+        self._unmoved = linearised(self._observations, self._means)
+        self._roots: dict[tuple[bytes, float], tuple[Array, bool]] = {}
         # An outlier says nothing about the arm: its density is the same whatever has changed.
         self._log_outliers = (
             math.log(1 - share),
@@ -124,7 +124,10 @@ class RecordsSince:
 
     def _likeliest_shift(self, directions: Array, shift: Array, fits: NDArray[np.bool_], factor: float) -> Array:
         """By the records that fit (k; in standard deviations), weighted as without the change."""
-        root, chosen = cho_factor(self._stacked(self._unmoved, fits, factor)[2]), np.flatnonzero(fits).tolist()
+        key, chosen = (fits.tobytes(), factor), np.flatnonzero(fits).tolist()
+        if key not in self._roots:  # most changes are weighed with the same records, as good as stated
+            self._roots[key] = cho_factor(self._stacked(self._unmoved, fits, factor)[2])
+        root = self._roots[key]
         for _ in range(_STEPS):
             records = self._records(directions, shift)
             across = np.concatenate([records[i].slope for i in chosen]) @ directions
@@ -201,7 +204,9 @@ class HypothesisFilter:
         likeliest: dict[int, Explanation] = {}
         for onset in large[-_MOST_ONSETS : len(large) + 1 - least]:
             records = recent[onset:]
-            since = self._records_since(records)
+            errors, known = [self._outlier_covariance(r) for r in records], min(map(self.freedom, records))
+            parts = (self._observer, self._process_noise, errors, self._outliers.fraction, known)
+            since = RecordsSince(records, *parts)
             none = since.weigh(np.zeros((self._observer.size, 0))).log_likelihood
             misfits = [i - onset for i in large if i >= onset]
             rejected = [i for i in misfits if records[i].rejected]
@@ -218,18 +223,6 @@ class HypothesisFilter:
                     wrong = int((~weighed.fits).sum()), len(records)
                     likeliest[place] = Explanation(change, onset, odds, share, *counts, wrong)
         return sorted(likeliest.values(), key=lambda explanation: -explanation.log_odds)
-
-    def _records_since(self, records: Sequence[Recent]) -> RecordsSince:
-        before = records[0].before
-        return RecordsSince(
-            before,
-            [self._observer.observation(before, r.readings, r.joint_noise) for r in records],
-            [r.passed for r in records],
-            self._process_noise,
-            [self._outlier_covariance(r) for r in records],
-            self._outliers.fraction,
-            min(map(self.freedom, records)),
-        )
 
     def follow(self, place: int, recent: Sequence[Recent], directions: Array, factor: float = 1.0) -> Candidate:
         """A change before the first of some records that reopens ``directions``, followed through them."""
