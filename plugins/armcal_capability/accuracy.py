@@ -99,7 +99,16 @@ def _tools(expression: ToolExpression, commands: Array, choice: EvaluatorChoice)
 
 def _known_to(calibration: Calibration, commands: Array, choice: EvaluatorChoice) -> Array:
     """Root mean square distance of the tool that the parameters' covariance, and a new drift, leave open (N; m)."""
-    root = _spread_root(calibration)
+    kept = calibration.record.prediction
+    if kept is None:
+        raise TypeError("the calibration keeps no covariance")
+    covariance, scale = kept.symmetric_covariance, float(calibration.record.noise["scale"])
+    for name, drift in (kept.recording.drifts if kept.recording else {}).items():
+        for i, entry in enumerate(kept.entries):
+            if entry.partition("[")[0] == name:
+                covariance[i, i] += (scale * drift.sd) ** 2
+    variances, directions = np.linalg.eigh(covariance)
+    root = directions * np.sqrt(np.maximum(variances, 0.0))
     free = {e.name.partition("[")[0] for e in calibration.record.parameters if e.free}
     parameters = calibration.parameters.with_free(free)
     arm = next(iter(calibration.system.arms))
@@ -120,18 +129,3 @@ def _known_to(calibration: Calibration, commands: Array, choice: EvaluatorChoice
             moved = np.tensordot(root, block, axes=([0], [1]))
             parts.append(np.sqrt(np.sum(moved**2, axis=(0, 1))))
     return np.concatenate(parts)[: commands.shape[1]]
-
-
-def _spread_root(calibration: Calibration) -> Array:
-    """L (n_v x n) with L L' the covariance of the free canonical entries, a drift in a new recording included."""
-    kept = calibration.record.prediction
-    if kept is None:
-        raise TypeError("the calibration keeps no covariance")
-    covariance = kept.symmetric_covariance
-    scale = float(calibration.record.noise["scale"])
-    for name, drift in (kept.recording.drifts if kept.recording else {}).items():
-        for i, entry in enumerate(kept.entries):
-            if entry.partition("[")[0] == name:
-                covariance[i, i] += (scale * drift.sd) ** 2
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

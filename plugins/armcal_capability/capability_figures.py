@@ -2,13 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from typing import Any
 
 import numpy as np
 from armcal.base.domains import Array
 
 from armcal_capability.cells import Voxels
-from armcal_capability.drawing import GRID, INK, empty_figure, png_of, style
+from armcal_capability.drawing import INK, LABEL_POINTS, empty_figure, png_of, style
 from armcal_capability.quantities import BY_NAME
 from armcal_capability.settings import AreaSettings, CapabilitySettings
 from armcal_capability.survey import Survey
@@ -84,10 +85,10 @@ def _figure(
         axis.plot(points[:, 0], points[:, 1], "-o", color=_ARM, lw=2.0, ms=3.5, zorder=6)
         axis.plot(points[-1, 0], points[-1, 1], "s", color=_ARM, mec="white", ms=6, zorder=6)
         where = f"{_NAMES[section.cut]} = {section.at * _MM:.0f} mm ± {survey.voxels.size * _MM:.0f} mm"
-        axis.set_title(f"section at {where}", fontsize=9.5, color=INK)
+        axis.set_title(f"section at {where}", fontsize=LABEL_POINTS, color=INK)
         _plain_axes(axis, section)
     bar = figure.colorbar(mesh, ax=list(axes), shrink=0.85, pad=0.02, extend="max" if "vmax" in how else "neither")
-    bar.set_label(label, fontsize=9.5, color=INK)
+    bar.set_label(label, fontsize=LABEL_POINTS, color=INK)
     bar.ax.tick_params(labelsize=8.5, colors=INK)
     figure.suptitle(title, x=0.01, ha="left", fontsize=12, color=INK)
     handles = [_line(_LIMIT, "-", "limit of the tool, at any depth"), _line(_ARM, "-o", "arm, joints at mid travel")]
@@ -102,22 +103,22 @@ def designs_figure(surveys: Mapping[str, Survey], tables: Mapping[str, Any], set
     figure = empty_figure((11.0, 5.2))
     side, bars = figure.subplots(1, 2, width_ratios=(1.15, 1.0))
     section = _Section(0, 2, 1, settings.sections.y)
-    for (_, survey), colour in zip(surveys.items(), _colours(len(surveys)), strict=True):
+    for survey, colour in zip(surveys.values(), cycle(_DESIGN_COLOURS), strict=False):
         _limits(side, survey.voxels, section, colour, 1.4)
         points = survey.outline * _MM
         side.plot(points[:, 0], points[:, 2], "-o", color=colour, lw=1.2, ms=2.5, zorder=6)
     _areas(side, settings.areas, section)
-    side.set_title("limits of the tool, and the arms at mid travel", fontsize=9.5, color=INK)
+    side.set_title("limits of the tool, and the arms at mid travel", fontsize=LABEL_POINTS, color=INK)
     _plain_axes(side, section)
     _bars(bars, tables, list(settings.areas))
-    handles = [_line(c, "-", name) for name, c in zip(surveys, _colours(len(surveys)), strict=True)]
+    handles = [_line(c, "-", name) for name, c in zip(surveys, cycle(_DESIGN_COLOURS), strict=False)]
     figure.legend(handles=handles, loc="outside lower left", ncols=4, fontsize=8.5, frameon=False)
     return png_of(figure)
 
 
 def _bars(axes: Any, tables: Mapping[str, Any], areas: Sequence[str]) -> None:
     width = 0.8 / max(len(tables), 1)
-    for row, (by_area, colour) in enumerate(zip(tables.values(), _colours(len(tables)), strict=True)):
+    for row, (by_area, colour) in enumerate(zip(tables.values(), cycle(_DESIGN_COLOURS), strict=False)):
         at = np.arange(len(areas)) + (row - (len(tables) - 1) / 2) * width
         reached = [100 * by_area[area]["reached"] for area in areas]
         axes.bar(at, reached, width * 0.92, color=colour, alpha=0.35, lw=0)
@@ -128,11 +129,10 @@ def _bars(axes: Any, tables: Mapping[str, Any], areas: Sequence[str]) -> None:
             axes.annotate(f"{height:.0f}", (x, height), ha="center", va="bottom", fontsize=8, color=INK)
     axes.set_xticks(range(len(areas)), labels=list(areas))
     axes.set_ylim(0, 108)
-    axes.set_ylabel("share of the area, %", fontsize=9.5, color=INK)
     held_text = any(area["held"] is not None for table in tables.values() for area in table.values())
     words = "reached" + ("; the dark part: held by the servos too" if held_text else "")
-    axes.set_title(words, fontsize=9.5, color=INK)
-    style(axes)
+    axes.set_title(words, fontsize=LABEL_POINTS, color=INK)
+    style(axes, up="share of the area, %", grid="")
 
 
 def _map(axes: Any, voxels: Voxels, cells: Array, section: _Section, how: Mapping[str, Any]) -> Any:
@@ -182,14 +182,7 @@ def _areas(axes: Any, areas: Mapping[str, AreaSettings], section: _Section) -> N
 
 def _plain_axes(axes: Any, section: _Section) -> None:
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel(f"{_NAMES[section.across]}, mm", fontsize=9.5, color=INK)
-    axes.set_ylabel(f"{_NAMES[section.up]}, mm", fontsize=9.5, color=INK)
-    axes.grid(color=GRID, lw=0.6)
-    style(axes)
-
-
-def _colours(count: int) -> list[str]:
-    return [_DESIGN_COLOURS[i % len(_DESIGN_COLOURS)] for i in range(count)]
+    style(axes, f"{_NAMES[section.across]}, mm", f"{_NAMES[section.up]}, mm")
 
 
 def _line(colour: str, style: str, label: str) -> Any:

@@ -1,8 +1,6 @@
 """The page of a survey, its tables and sentences: what the arm reaches, how well, and which design is best where."""
 
-import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +12,7 @@ from armcal.version import __version__
 from rich.box import SIMPLE_HEAD
 from rich.table import Table as ScreenTable
 
+from armcal_capability.drawing import Picture
 from armcal_capability.quantities import BY_NAME
 
 _SHOWN_OF_DESIGNS = ("sag_mm", "deflection_mm", "effort_ratio", "smallest_mm_per_rad")
@@ -75,21 +74,6 @@ def number(value: float | None) -> str:
 def share(value: float | None) -> str:
     """In per cent."""
     return "-" if value is None else f"{100 * value:.1f} %"
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure: PNG, title, and words for those who do not see it."""
-
-    name: str
-    title: str
-    png: bytes
-    description: str
-
-    @property
-    def data(self) -> str:
-        """As it stands in the page."""
-        return base64.b64encode(self.png).decode()
 
 
 def conclusions(name: str, summary: Mapping[str, Any], designs: Mapping[str, Any]) -> list[str]:

@@ -8,20 +8,14 @@ from typing import Any
 import click
 from armcal.base.config_text import as_json
 from armcal.cli.common import Console, command_line, overrides, speaking
-from armcal.io.folder import Reservation, reserved
+from armcal.io.folder import reserved
 from armcal.run.prepare import Stopwatch
 
-from armcal_capability import outputs
 from armcal_capability.capability_figures import DRAWN, designs_figure, quantity_figure, reach_figure
-from armcal_capability.capability_page import (
-    Picture,
-    areas_table,
-    conclusions,
-    quantity_table,
-    render_page,
-    show_table,
-)
+from armcal_capability.capability_page import areas_table, conclusions, quantity_table, render_page, show_table
+from armcal_capability.drawing import Picture
 from armcal_capability.loading import Task, load_task
+from armcal_capability.outputs import data_files
 from armcal_capability.quantities import BY_NAME
 from armcal_capability.summary import design_summaries, summary_of
 from armcal_capability.survey import Survey, survey
@@ -71,7 +65,9 @@ def capability(console: Console, source: Path, out: Path, settings: Path | None,
     facts = {"command": command_line(), "files": ", ".join(sorted({str(file) for file in task.files}))}
     facts |= {"samples": str(task.settings.samples), "seed": str(task.settings.seed)}
     page = render_page("Capability", task.subject.name, sentences, tables, pictures, facts)
-    _write(kept, surveyed, designs, content, page, pictures)
+    files: dict[str, str | bytes] = {f"{picture.name}.png": picture.png for picture in pictures}
+    files |= data_files(surveyed, designs, content)
+    kept.place({**files, "capability.json": as_json(content) + "\n", "capability.html": page})
     console.result({**content, "folder": str(out)})
     for table in tables:
         show_table(console, table)
@@ -99,25 +95,3 @@ def _pictures(
             title = quantity.words[0].upper() + quantity.words[1:]
             pictures.append(Picture(name, title, quantity_figure(surveyed, task.settings, name), text))
     return tuple(pictures)
-
-
-def _write(
-    kept: Reservation,
-    surveyed: Survey,
-    designs: Mapping[str, Survey],
-    content: Mapping[str, Any],
-    page: str,
-    pictures: tuple[Picture, ...],
-) -> None:
-    columns = outputs.map_columns(surveyed)
-    texts: dict[str, str | bytes] = {f"{picture.name}.png": picture.png for picture in pictures}
-    texts |= {"map.npz": outputs.npz_bytes(columns), "map.csv": outputs.map_text(columns)}
-    if surveyed.areas:
-        texts["areas.csv"] = outputs.areas_text(designs or {surveyed.subject.name: surveyed})
-    if designs:
-        texts["designs.csv"] = outputs.table_text(
-            *outputs.design_rows({name: design["areas"] for name, design in content["designs"].items()})
-        )
-    texts["capability.json"] = as_json(content) + "\n"
-    texts["capability.html"] = page
-    kept.place(texts)

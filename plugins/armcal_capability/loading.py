@@ -50,15 +50,14 @@ def load_task(
     registry = registry or discover()
     given = load_config(path)
     is_calibration = "armcal_calibration" in given.data
-    if rules is not None:
-        config = load_config(rules, overrides)
-    elif is_calibration:
-        config = _nothing_but(overrides, path)
+    if rules is not None or not is_calibration:
+        config = load_config(rules or path, overrides)
     else:
-        config = load_config(path, overrides)
-    settings = CapabilitySettings()
-    if SECTION in config.data:
-        settings = validate(CapabilitySettings, config, (SECTION,))
+        tree = Node(Origin(str(path), path.parent, path.parent.resolve()), 1, {})
+        for text in overrides:
+            tree = override(tree, text)
+        config = as_source(tree, path, Reader(path.parent.resolve()))
+    settings = validate(CapabilitySettings, config, (SECTION,)) if SECTION in config.data else CapabilitySettings()
     corrections: Corrections | None = None
     if is_calibration:
         subject = of_calibration(Calibration.load(path, registry), config, path.name)
@@ -81,7 +80,9 @@ def load_task(
             designs[name] = of_config(_with_rules(source, config), registry, name, corrections)
         except ConfigError as fault:
             raise ConfigError(f"design {name!r}: {fault.message}", where=fault.where, hint=fault.hint) from fault
-    return Task(settings, _with_servos(subject, settings), designs, (path, *given.files, *config.files))
+    if settings.servos is not None:
+        subject = _with_servos(subject, settings.servos)
+    return Task(settings, subject, designs, (path, *given.files, *config.files))
 
 
 def load_designs(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, ConfigSource]:
@@ -128,21 +129,11 @@ def _with_rules(source: ConfigSource, config_source: ConfigSource) -> ConfigSour
     return replace(source, data=data, marks=marks)
 
 
-def _nothing_but(overrides: Sequence[str], path: Path) -> ConfigSource:
-    """What the command line sets, alone."""
-    tree = Node(Origin(str(path), path.parent, path.parent.resolve()), 1, {})
-    for text in overrides:
-        tree = override(tree, text)
-    return as_source(tree, path, Reader(path.parent.resolve()))
-
-
-def _with_servos(subject: Subject, settings: CapabilitySettings) -> Subject:
-    """With the steps of its servos, from a servo file if one is given."""
-    if settings.servos is None:
-        return subject
-    file = load_servo_file(settings.servos)
+def _with_servos(subject: Subject, path: Path) -> Subject:
+    """With the steps of its servos, from a servo file."""
+    file = load_servo_file(path)
     if fault := unknown_joint(file.servos, subject.arm.commanded):
-        raise ConfigError(f"{fault}.", where=Location(str(settings.servos)))
+        raise ConfigError(f"{fault}.", where=Location(str(path)))
     calibrated = {joint: file.calibrated(joint) for joint in file.servos}
     servos = {joint: (servo.table, servo.clock) for joint, servo in calibrated.items()}
     return replace(subject, expression=replace(subject.expression, servos=servos))

@@ -15,26 +15,27 @@ _STATISTICS = ("best", "mean", "worst")
 _PLACES = ("x_mm", "y_mm", "z_mm")
 
 
-def map_columns(survey: Survey) -> dict[str, Array]:
-    """The map as columns (cells each): centre, postures, and best, mean and worst of each quantity."""
-    columns: dict[str, Array] = _centres(survey.voxels.centres)
-    return {**columns, "postures": survey.voxels.counts.astype(float), **_statistics(survey.voxels.values)}
+def data_files(survey: Survey, designs: Mapping[str, Survey], content: Mapping[str, Any]) -> dict[str, str | bytes]:
+    """Files by name: the map, areas of the arm or of its designs, and designs by their summaries (``content``)."""
+    voxels, stream = survey.voxels, io.BytesIO()
+    columns = _columns(voxels.centres, {"postures": voxels.counts.astype(float)}, voxels.values)
+    np.savez_compressed(stream, **columns)  # type: ignore[arg-type]
+    files: dict[str, str | bytes] = {"map.npz": stream.getvalue(), "map.csv": table_text([*columns], _rows(columns))}
+    if survey.areas:
+        files["areas.csv"] = _areas_text(designs or {survey.subject.name: survey})
+    if designs:
+        files["designs.csv"] = _designs_text({name: design["areas"] for name, design in content["designs"].items()})
+    return files
 
 
-def map_text(columns: Mapping[str, Array]) -> str:
-    """The map as CSV."""
-    return table_text([*columns], _rows(columns))
-
-
-def areas_text(surveys: Mapping[str, Survey]) -> str:
+def _areas_text(surveys: Mapping[str, Survey]) -> str:
     """The areas of all designs in one CSV: a row a cell."""
     headings: list[str] = []
     rows: list[Sequence[Any]] = []
     for design, survey in surveys.items():
         for name, area in survey.areas.items():
             held = {} if area.held is None else {"held": area.held.astype(float)}
-            counted = {"postures": area.counts.astype(float), **held}
-            columns = {**_centres(area.centres), **counted, **_statistics(area.values)}
+            columns = _columns(area.centres, {"postures": area.counts.astype(float), **held}, area.values)
             headings = headings or ["design", "area", *columns]
             rows += [(design, name, *row) for row in _rows(columns)]
     return table_text(headings, rows)
@@ -45,8 +46,8 @@ def table_text(headings: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     return csv_text([headings, *rows], ".6g")
 
 
-def design_rows(designs: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], list[list[Any]]]:
-    """Headings and rows of designs.csv: a row a design and area, every quantity with all its statistics."""
+def _designs_text(designs: Mapping[str, Mapping[str, Any]]) -> str:
+    """A row a design and area, every quantity with all its statistics."""
     cells = [area for areas in designs.values() for area in areas.values()]
     names = list(dict.fromkeys(name for area in cells for name in area["quantities"]))
     keys = ("mean", "p95", "best_posture_mean", "best_posture_p95", "worst")
@@ -58,23 +59,14 @@ def design_rows(designs: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], li
             row = [design, name, *(area[key] for key in ("reached", "held", "postures_per_cell"))]
             row += [area["quantities"].get(quantity, {}).get(key) for quantity in names for key in keys]
             rows.append(row)
-    return headings, rows
-
-
-def npz_bytes(columns: Mapping[str, Array]) -> bytes:
-    """Columns as a compressed npz; the same columns give the same bytes' content."""
-    stream = io.BytesIO()
-    np.savez_compressed(stream, **{name: np.asarray(column) for name, column in columns.items()})  # type: ignore[arg-type]
-    return stream.getvalue()
+    return table_text(headings, rows)
 
 
 def _rows(columns: Mapping[str, Array]) -> list[tuple[float, ...]]:
     return list(zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True))
 
 
-def _centres(centres: Array) -> dict[str, Array]:
-    return {name: centres[:, i] * _MM for i, name in enumerate(_PLACES)}
-
-
-def _statistics(values: Mapping[str, Array]) -> dict[str, Array]:
-    return {f"{name}_{text}": rows[i] for name, rows in values.items() for i, text in enumerate(_STATISTICS)}
+def _columns(centres: Array, counts: Mapping[str, Array], values: Mapping[str, Array]) -> dict[str, Array]:
+    """Of cells: centre, counts, and best, mean and worst of each quantity."""
+    columns = {name: centres[:, i] * _MM for i, name in enumerate(_PLACES)} | dict(counts)
+    return columns | {f"{name}_{text}": rows[i] for name, rows in values.items() for i, text in enumerate(_STATISTICS)}

@@ -1,9 +1,8 @@
 """The arm that is surveyed: from a calibration, a configuration, or a design of one, with limits and clearance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from armcal.arm.assembly import Arm
@@ -68,37 +67,6 @@ class Subject:
         return np.array([stated.get(name, np.inf) for name in names])
 
 
-def of_calibration(calibration: Calibration, rules: ConfigSource | None, name: str) -> Subject:
-    """A calibrated arm; ``rules`` is a configuration whose section ``plan`` has limits and clearance.
-
-    Raises:
-        ConfigError: there are several arms, no limits, or the clearance is refused.
-    """
-    arm = _only(calibration.system, name)
-    nominal = calibration.parameters.with_nominal(np.array([e.nominal for e in calibration.record.parameters]))
-    plain = arm_expression(arm, nominal, calibration.system.environment)
-    limits, check = _rules(arm, calibration.system, rules, name)
-    return Subject(name, arm, calibration.expression(), plain, limits, check, calibration)
-
-
-def of_config(
-    source: ConfigSource, registry: PluginRegistry, name: str, corrections: Corrections | None = None
-) -> Subject:
-    """A configured arm, corrected if corrections are given.
-
-    Raises:
-        ConfigError: the configuration is refused, there are several arms, or no limits.
-        PluginError: a component is missing or broken.
-    """
-    system = build_system(source, registry)
-    arm = _only(system, name)
-    parameters = system.parameters()
-    if corrections is not None:
-        parameters = corrections.applied(parameters)
-    limits, check = _rules(arm, system, source, name)
-    return Subject(name, arm, arm_expression(arm, parameters, system.environment), None, limits, check)
-
-
 @dataclass(frozen=True)
 class Corrections:
     """How a real arm differs from its description: its stated parameters, and the corrected ones."""
@@ -107,7 +75,7 @@ class Corrections:
     corrected: Parameters
 
     @classmethod
-    def read(cls, path: Path, described: ConfigSource, registry: PluginRegistry) -> Corrections:
+    def read(cls, path: Path, described: ConfigSource, registry: PluginRegistry) -> Self:
         """From a calibration, which knows what was stated; or from values (``arm.mdh.d1: 47 mm``) of a described arm.
 
         Raises:
@@ -144,12 +112,48 @@ class Corrections:
         return design.replaced(blocks)
 
 
-def _only(system: System, name: str) -> Arm:
+def of_calibration(calibration: Calibration, rules: ConfigSource | None, name: str) -> Subject:
+    """A calibrated arm; ``rules`` is a configuration whose section ``plan`` has limits and clearance.
+
+    Raises:
+        ConfigError: there are several arms, no limits, or the clearance is refused.
+    """
+    arm = only_arm(calibration.system, name)
+    nominal = calibration.parameters.with_nominal(np.array([e.nominal for e in calibration.record.parameters]))
+    plain = arm_expression(arm, nominal, calibration.system.environment)
+    limits, check = _rules(arm, calibration.system, rules, name)
+    return Subject(name, arm, calibration.expression(), plain, limits, check, calibration)
+
+
+def of_config(
+    source: ConfigSource, registry: PluginRegistry, name: str, corrections: Corrections | None = None
+) -> Subject:
+    """A configured arm, corrected if corrections are given.
+
+    Raises:
+        ConfigError: the configuration is refused, there are several arms, or no limits.
+        PluginError: a component is missing or broken.
+    """
+    system = build_system(source, registry)
+    arm = only_arm(system, name)
+    parameters = system.parameters()
+    if corrections is not None:
+        parameters = corrections.applied(parameters)
+    limits, check = _rules(arm, system, source, name)
+    return Subject(name, arm, arm_expression(arm, parameters, system.environment), None, limits, check)
+
+
+def only_arm(system: System, name: str) -> Arm:
+    """The arm of a system that has one.
+
+    Raises:
+        ConfigError: it has several; ``name`` is of its file.
+    """
     if len(system.arms) != 1:
         raise ConfigError(
             f"found {len(system.arms)} arms ({', '.join(system.arms)}), expected one.",
             where=Location(name),
-            hint="Describe the arm that is to be surveyed alone.",
+            hint="Describe the arm to be examined alone.",
         )
     return next(iter(system.arms.values()))
 

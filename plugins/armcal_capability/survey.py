@@ -64,19 +64,24 @@ def survey(subject: Subject, settings: CapabilitySettings, progress: Progress = 
     choice: EvaluatorChoice = "compiled" if settings.samples >= WORTH_COMPILING else "interpreted"
     weights = Weights(subject.slides, settings.length, subject.holding(settings.holding))
     progress("sampling", 0.0)
-    _require_few_cells_in_areas(settings)
+    _require_few_cells(settings)
     function = MechanicsFunction(subject.expression, settings.loads, choice)
     commands = spread(subject.limits, settings.samples, settings.seed)
     commands = commands[:, subject.allowed(commands)]
-    _require(commands.shape[1], f"none of {settings.samples} postures keeps its clearance.", "Check plan.clearance.")
+    _require(commands.size > 0, f"none of {settings.samples} postures keeps its clearance.", "Check plan.clearance.")
     progress("postures", 0.2)
     postures = postures_at(function, commands, weights)
     _require(
-        len(postures),
+        len(postures) > 0,
         "no posture has an elastic equilibrium under the load.",
         "Check the payload and the force, their units, and the compliances.",
     )
-    _require_few_cells(postures, settings.voxel)
+    across = float(np.ptp(postures.positions, axis=0).max()) / settings.voxel
+    _require(
+        across <= MOST_ACROSS,
+        f"the map would have {across:.0f} cells from side to side, expected {MOST_ACROSS} at most.",
+        f"Make capability.voxel_mm {1000 * settings.voxel * across / MOST_ACROSS:.2g} or larger.",
+    )
     search = AreaSearch(function, subject.limits, subject.allowed, weights, postures)
     progress("areas", 0.5)
     areas = {name: search(area, settings.voxel, settings.postures) for name, area in settings.areas.items()}
@@ -116,25 +121,16 @@ def outline(subject: Subject) -> Array:
     return np.array([np.asarray(ca.evalf(ca.densify(ca.SX(point))).full()).ravel() for point in points])
 
 
-def _require(count: int, message: str, hint: str) -> None:
-    if not count:
-        raise ProblemError(message, hint=hint)
-
-
-def _require_few_cells_in_areas(settings: CapabilitySettings) -> None:
+def _require_few_cells(settings: CapabilitySettings) -> None:
     for name, area in settings.areas.items():
         cells = float(np.prod(np.ceil(np.subtract(area.high, area.low) / settings.voxel)))
         _require(
-            int(cells <= MOST_IN_AREA),
+            cells <= MOST_IN_AREA,
             f"the area {name} would have {cells:.3g} cells, expected {MOST_IN_AREA} at most.",
             "Make capability.voxel_mm larger, or the area smaller; check their units.",
         )
 
 
-def _require_few_cells(postures: Postures, size: float) -> None:
-    across = float(np.ptp(postures.positions, axis=0).max()) / size
-    _require(
-        int(across <= MOST_ACROSS),
-        f"the map would have {across:.0f} cells from side to side, expected {MOST_ACROSS} at most.",
-        f"Make capability.voxel_mm {1000 * size * across / MOST_ACROSS:.2g} or larger.",
-    )
+def _require(holds: bool, message: str, hint: str) -> None:
+    if not holds:
+        raise ProblemError(message, hint=hint)

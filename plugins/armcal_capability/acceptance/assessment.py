@@ -81,7 +81,10 @@ def _distances(visits: Visits, comparisons: Mapping[str, Comparison]) -> Iterato
     poses = visits.poses
     pairs = combinations(poses, 2) if len(poses) <= _MOST_PAIRED else pairwise(poses)
     for names in pairs:
-        ends = _same_cycles(visits, *(visits.main(name) for name in names))
+        groups = [visits.main(name).members for name in names]
+        cycles = [visits.cycles[members] for members in groups]
+        _, *places = np.intersect1d(cycles[0], cycles[1], return_indices=True)
+        ends = [members[place] for members, place in zip(groups, places, strict=True)]
         if len(ends[0]) < FEWEST:
             continue
         attained = np.linalg.norm(first.attained[ends[0]] - first.attained[ends[1]], axis=1)
@@ -90,13 +93,6 @@ def _distances(visits: Visits, comparisons: Mapping[str, Comparison]) -> Iterato
             commanded = np.linalg.norm(comparison.commanded[ends[0]] - comparison.commanded[ends[1]], axis=1)
             models[name] = {"AD_mm": of.mean_figure(attained - commanded).times(MM)}
         yield Row(names, len(ends[0]), {"RD_mm": of.spread_figure(attained).times(MM)}, models)
-
-
-def _same_cycles(visits: Visits, first: Group, second: Group) -> tuple[Indices, Indices]:
-    """Records of two groups in the cycles that both have."""
-    cycles = (visits.cycles[first.members], visits.cycles[second.members])
-    _, one, other = np.intersect1d(cycles[0], cycles[1], return_indices=True)
-    return first.members[one], second.members[other]
 
 
 def _directions(visits: Visits, comparisons: Mapping[str, Comparison]) -> Iterator[Row]:

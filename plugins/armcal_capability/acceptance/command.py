@@ -59,7 +59,9 @@ def acceptance(console: Console, source: Path, records: Path, out: Path, frame: 
     drawn = pictures(assessment, visits, comparisons)
     facts = {"command": command_line(), "files": ", ".join(map(str, (*subject.files, records)))}
     facts |= {"sha256 of the records": visits.dataset.sha256, "poses are": content["poses_named_by"]}
-    page = render_page("Acceptance", subject.name, [*texts, *map(_sentence, warnings)], shown, drawn, facts)
+    page = render_page(
+        "Acceptance", subject.name, [*texts, *(text[:1].upper() + text[1:] for text in warnings)], shown, drawn, facts
+    )
     files: dict[str, str | bytes] = {f"{picture.name}.png": picture.png for picture in drawn}
     files |= {"acceptance.csv": table_text(*csv_rows(assessment)), "acceptance.html": page}
     kept.place({**files, "acceptance.json": as_json({"source": str(source), **content}) + "\n"})
@@ -71,8 +73,3 @@ def acceptance(console: Console, source: Path, records: Path, out: Path, frame: 
     for text in texts:
         console.line(text)
     console.line(f"page: {out / 'acceptance.html'}")
-
-
-def _sentence(text: str) -> str:
-    """A warning as it stands on the page."""
-    return text[:1].upper() + text[1:]

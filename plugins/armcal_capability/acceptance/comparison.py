@@ -11,7 +11,7 @@ from armcal.errors import DataError, Location, NotConvergedError
 from armcal.estimate.placing import placings
 from armcal.estimate.start import BETTER, FAR, pose_words
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.rigid_alignment import FEWEST, Alignment, Tools, alignments, undetermined
+from armcal.problem.rigid_alignment import FEWEST, Tools, alignments, undetermined
 from armcal.problem.sighting import Sighting, sighting_of, tools_of
 from armcal.problem.tool_motion import nearest_turn
 from armcal.report.numbers import plural
@@ -36,13 +36,11 @@ class Frame:
         aligned: whether these records placed the instrument, else the description or the calibration did.
         words: where the base is in the instrument's frame, and what was found beside it.
         fitted: how many numbers were found from the positions.
-        axes: whether the mounting of the measured body was found from the orientations.
     """
 
     aligned: bool
     words: str
     fitted: int = 0
-    axes: bool = False
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,12 @@ def _compared(subject: ArmToJudge, model: str, visits: Visits, choice: FrameChoi
         tools = tools_of(problem, parameters.nominal(), records[0], 0)
         strangers: tuple[str, ...] = ()
         if model == "nominal":
-            tools = _stated_commands(tools, visits)
+            if dataset.has(COMMANDED[0]):
+                tools = replace(tools, places=dataset.stacked(COMMANDED))
+            if dataset.has(COMMANDED_TURN[0]):
+                quaternions = dataset.stacked(COMMANDED_TURN).T
+                turned = np.array([rotation_matrix(q / np.linalg.norm(q)) for q in quaternions])
+                tools = replace(tools, rotations=turned)
             reach = float(np.median(np.linalg.norm(tools.places, axis=0)))
             strangers = refuse_strangers(visits, sighting.measured.T, reach)
             strangers += moved_commands(visits, tools.places.T, sighting.measured.T)
@@ -109,17 +112,6 @@ def _compared(subject: ArmToJudge, model: str, visits: Visits, choice: FrameChoi
         raise DataError(f"the {model} arm has no equilibrium ({fault.message})", where=where, hint=hint) from fault
     compared = _as_stated(tools, sighting) if basis is None else _aligned(tools, sighting, basis, axes, where)
     return replace(compared, warnings=(*strangers, *(f"{model}: {text}" for text in compared.warnings)))
-
-
-def _stated_commands(tools: Tools, visits: Visits) -> Tools:
-    """With the commanded poses that the records state, in place of those of the joint angles."""
-    dataset = visits.dataset
-    places = dataset.stacked(COMMANDED) if dataset.has(COMMANDED[0]) else tools.places
-    rotations = tools.rotations
-    if dataset.has(COMMANDED_TURN[0]):
-        quaternions = dataset.stacked(COMMANDED_TURN).T
-        rotations = np.array([rotation_matrix(q / np.linalg.norm(q)) for q in quaternions])
-    return Tools(places, rotations)
 
 
 def _basis(
@@ -175,21 +167,16 @@ def _aligned(tools: Tools, sighting: Sighting, basis: Array, axes: bool, where: 
     if gauges:
         ways = plural(len(gauges), "direction")
         words += f" (these poses leave open in {ways} which of base and target it is; that changes no figure)"
-    turns, axes = None, axes and sighting.turned is not None
+    turns = None
     if sighting.turned is not None:
-        turns, mounted = _turns_of(tools, sighting.turned, best, axes)
+        seen, mounted = best.turn.T @ sighting.turned, np.eye(3)
         if axes:
+            mounted = nearest_turn(np.einsum("nji,njk->ik", tools.rotations, seen))
             a, b, c = Rotation.from_matrix(mounted).as_rotvec(degrees=True)
             words += f", turned by ({a:.2f}, {b:.2f}, {c:.2f}) deg"
+        turns = _turns(tools.rotations @ mounted, seen)
     attained = best.back(sighting.measured).T
-    return Comparison(Frame(True, words, fitted, axes), commanded, attained, turns, _left_over(fitted, poses))
-
-
-def _turns_of(tools: Tools, turned: Array, best: Alignment, axes: bool) -> tuple[Array, Array]:
-    """Turns from commanded to attained (N x 3), and how the body is mounted (3 x 3), found if ``axes``."""
-    seen = np.swapaxes(best.turn[None], 1, 2) @ turned
-    mounted = nearest_turn(np.einsum("nji,njk->ik", tools.rotations, seen)) if axes else np.eye(3)
-    return _turns(tools.rotations @ mounted, seen), mounted
+    return Comparison(Frame(True, words, fitted), commanded, attained, turns, _left_over(fitted, poses))
 
 
 def _turns(commanded: Array, attained: Array) -> Array:

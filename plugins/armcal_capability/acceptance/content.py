@@ -81,10 +81,22 @@ def tables(assessment: Assessment) -> Iterator[Table]:
         "directions": "Several directions of approach: variation of accuracy vAP (mm, deg), 95 % interval",
         "drifts": f"Drift from the first {SERIES} cycles to the last {SERIES} (mm), 95 % intervals",
     }
-    for name, rows in _sections(assessment).items():
-        if rows:
-            more = f"; the first {_MOST_ROWS} of {len(rows)}" if len(rows) > _MOST_ROWS else ""
-            yield _table(captions[name] + more, rows[:_MOST_ROWS], name)
+    for section, members in _sections(assessment).items():
+        if not members:
+            continue
+        more = f"; the first {_MOST_ROWS} of {len(members)}" if len(members) > _MOST_ROWS else ""
+        first, rows = members[0], members[:_MOST_ROWS]
+        shown = [i for i in range(2) if any(row.names[i] for row in rows)]
+        headings = [(_NAMES[section][i].capitalize(), False) for i in shown]
+        headings.append(("Series" if section == "drifts" else "Cycles", True))
+        headings += [(_heading(name, model), True) for model, figures in first.models.items() for name in figures]
+        headings += [(_heading(name, ""), True) for name in (*first.measured, *first.numbers.get("measured", ()))]
+        cells = []
+        for row in rows:
+            figures = [figure for model in (*row.models.values(), row.measured) for figure in model.values()]
+            numbers = [f"{x:.3g}" for x in row.numbers.get("measured", {}).values()]
+            cells.append((*(row.names[i] for i in shown), str(row.count), *map(_text, figures), *numbers))
+        yield Table(captions[section] + more, tuple(headings), tuple(cells))
 
 
 def sentences(content: Mapping[str, Any], name: str) -> list[str]:
@@ -100,9 +112,10 @@ def sentences(content: Mapping[str, Any], name: str) -> list[str]:
         )
     cycles = content["cycles"]
     if cycles["least"] < ISO_CYCLES:
+        times = " to ".join(map(str, sorted({*cycles.values()})))
         texts.append(
-            f"Poses were visited {_from_to(cycles['least'], cycles['most'])} times; ISO 9283 asks for {ISO_CYCLES} "
-            "cycles. These are its formulas, not its test: read the intervals."
+            f"Poses were visited {times} times; ISO 9283 asks for {ISO_CYCLES} cycles. These are its formulas, "
+            "not its test: read the intervals."
         )
     return texts
 
@@ -135,23 +148,6 @@ def _row(row: Row, names: Sequence[str]) -> dict[str, Any]:
     return content
 
 
-def _table(caption: str, rows: Sequence[Row], section: str) -> Table:
-    shown = [i for i in range(2) if any(row.names[i] for row in rows)]
-    first, models = rows[0], rows[0].models
-    headings = [(_NAMES[section][i].capitalize(), False) for i in shown]
-    headings.append(("Series" if section == "drifts" else "Cycles", True))
-    headings += [(_heading(name, model), True) for model in models for name in models[model]]
-    headings += [(_heading(name, ""), True) for name in first.measured]
-    headings += [(_heading(name, ""), True) for name in first.numbers.get("measured", {})]
-    return Table(caption, tuple(headings), tuple(_cells(row, shown) for row in rows))
-
-
-def _cells(row: Row, shown: Sequence[int]) -> tuple[str, ...]:
-    figures = [figure for model in row.models.values() for figure in model.values()] + [*row.measured.values()]
-    numbers = row.numbers.get("measured", {}).values()
-    return (*(row.names[i] for i in shown), str(row.count), *map(_text, figures), *(f"{x:.3g}" for x in numbers))
-
-
 def _heading(name: str, model: str) -> str:
     words, _, unit = name.rpartition("_")
     if unit not in ("mm", "deg"):
@@ -164,7 +160,3 @@ def _text(figure: Figure) -> str:
     decimals = min(decimals_for(max(figure.value - figure.low, abs(figure.value) / 100)), 4)
     high = f"{figure.high:.{decimals}f}" if figure.high < _LARGEST else "?"
     return f"{figure.value:.{decimals}f} ({figure.low:.{decimals}f} to {high})"
-
-
-def _from_to(least: int, most: int) -> str:
-    return str(least) if least == most else f"{least} to {most}"

@@ -8,8 +8,7 @@ from armcal_capability.acceptance import characteristics as of
 from armcal_capability.acceptance.assessment import MM, Assessment, series_of
 from armcal_capability.acceptance.comparison import Comparison
 from armcal_capability.acceptance.records import Visits
-from armcal_capability.capability_page import Picture
-from armcal_capability.drawing import GRID, INK, empty_figure, png_of, style
+from armcal_capability.drawing import INK, Picture, empty_figure, png_of, style
 
 _COLOURS = {"nominal": "#d95f02", "calibrated": "#1b6ca8", "RP": "#777777"}
 _CLOUDS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999", "#000000")
@@ -55,11 +54,9 @@ def _by_pose(assessment: Assessment) -> bytes:
         axes.vlines(at, *ends, color=INK, lw=1.0)
     names = [" ".join(filter(None, row.names)) for row in rows]
     axes.set_xticks(range(len(rows)), labels=names, rotation=0 if len(rows) < 16 else 90)
-    axes.set_ylabel("mm", fontsize=9.5, color=INK)
     axes.set_ylim(0, None)
-    axes.grid(axis="y", color=GRID, lw=0.6)
     axes.legend(fontsize=8.5, frameon=False, ncols=len(columns), loc="upper left", bbox_to_anchor=(0, 1.12))
-    style(axes)
+    style(axes, up="mm", grid="y")
     return png_of(figure)
 
 
@@ -72,13 +69,10 @@ def _shares(assessment: Assessment) -> bytes:
         values = np.sort([one.value for one in figures])
         shares = 100 * np.arange(1, len(values) + 1) / len(values)
         axes.step(values, shares, color=_COLOURS[label.split()[-1]], label=label)
-    axes.set_xlabel("mm", fontsize=9.5, color=INK)
-    axes.set_ylabel("share of the poses, %", fontsize=9.5, color=INK)
     axes.set_xlim(0, None)
     axes.set_ylim(0, 100)
-    axes.grid(color=GRID, lw=0.6)
     axes.legend(fontsize=8.5, frameon=False, loc="lower right")
-    style(axes)
+    style(axes, "mm", "share of the poses, %")
     return png_of(figure)
 
 
@@ -98,10 +92,7 @@ def _visits(visits: Visits, comparisons: Mapping[str, Comparison]) -> bytes:
             angles = np.linspace(0, 2 * np.pi, 73)
             axes.plot(radius * np.cos(angles), radius * np.sin(angles), color=colour, lw=1.0, label=pose)
         axes.set_aspect("equal", adjustable="datalim")
-        axes.set_xlabel(f"{'xyz'[across]}, mm", fontsize=9.5, color=INK)
-        axes.set_ylabel(f"{'xyz'[up]}, mm", fontsize=9.5, color=INK)
-        axes.grid(color=GRID, lw=0.6)
-        style(axes)
+        style(axes, f"{'xyz'[across]}, mm", f"{'xyz'[up]}, mm")
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower left", ncols=8, fontsize=8.5, frameon=False)
     return png_of(figure)
@@ -122,11 +113,8 @@ def _over_time(visits: Visits, comparisons: Mapping[str, Comparison]) -> bytes:
         spread = [of.repeatability(first.attained[own]).value * MM for own in series]
         right.plot(hours, spread, "-", color=colour, lw=1.2)
     for axes, words in ((left, "AP, mm"), (right, "RP, mm")):
-        axes.set_xlabel("hours", fontsize=9.5, color=INK)
-        axes.set_ylabel(words, fontsize=9.5, color=INK)
         axes.set_ylim(0, None)
-        axes.grid(color=GRID, lw=0.6)
-        style(axes)
+        style(axes, "hours", words)
     handles, labels = left.get_legend_handles_labels()
     figure.legend(handles[:12], labels[:12], loc="outside lower left", ncols=6, fontsize=8, frameon=False)
     return png_of(figure)

@@ -91,7 +91,8 @@ def read_visits(subject: ArmToJudge, registry: PluginRegistry, path: Path) -> Vi
     channels = (*requested_channels(arms, subject.system.measurements, measured=True), *_OWN)
     section = dict(source.data["data"])
     if subject.columns:
-        names = _header(path, str(section.get("delimiter", ",")))
+        with input_file(path, _MOST_BYTES, "a table of records") as stream:
+            names = _split(stream.readline(1 << 20), str(section.get("delimiter", ",")))
         known = {name: own for name, own in subject.columns.items() if own in names and name not in names}
         section["columns"] = {**known, **section.get("columns", {})}
     reader: Reader
@@ -109,7 +110,11 @@ def visits_of(dataset: Dataset, joints: Sequence[str], path: Path, section: Mapp
         DataError: a cycle is no whole number or occurs twice, or a pose has too few visits.
     """
     labelled, numbered = POSE in dataset.extra, dataset.has(CYCLE)
-    poses = [text.strip() for text in dataset.extra[POSE]] if labelled else _numbered_poses(dataset, joints)
+    poses = (
+        [text.strip() for text in dataset.extra[POSE]]
+        if labelled
+        else [f"pose {n + 1}" for n in pose_numbers(dataset, joints)]
+    )
     directions = [text.strip() for text in dataset.extra.get(DIRECTION, ("",) * len(dataset))]
     if labelled and "" in poses:
         _refuse(dataset, poses.index(""), POSE, "no pose is named.", "Name the pose of every record, or of none.")
@@ -134,10 +139,6 @@ def visits_of(dataset: Dataset, joints: Sequence[str], path: Path, section: Mapp
     return Visits(dataset, cycles, kept, labelled, numbered, tuple(warnings))
 
 
-def _numbered_poses(dataset: Dataset, joints: Sequence[str]) -> list[str]:
-    return [f"pose {number + 1}" for number in pose_numbers(dataset, joints).tolist()]
-
-
 def _cycles(dataset: Dataset, members: Mapping[tuple[str, str], Sequence[int]]) -> Indices:
     """The number of each record's cycle: its column, or which visit of its pose it is."""
     if not dataset.has(CYCLE):
@@ -156,7 +157,8 @@ def _cycles(dataset: Dataset, members: Mapping[tuple[str, str], Sequence[int]]) 
             before = seen.setdefault(stated[i], i)
             if before != i:
                 place = _line(dataset, before)
-                text = f"found cycle {stated[i]:g} of {_named(pose, direction)} again; the first is in line {place}."
+                named = f"{pose} from {direction}" if direction else pose
+                text = f"found cycle {stated[i]:g} of {named} again; the first is in line {place}."
                 _refuse(dataset, i, CYCLE, text, "Number each visit of a pose once.")
     return np.asarray(stated, dtype=np.intp)
 
@@ -198,11 +200,6 @@ def _lost_labels(dataset: Dataset, path: Path, delimiter: str) -> dict[str, list
     return lost
 
 
-def _header(path: Path, delimiter: str) -> list[str]:
-    with input_file(path, _MOST_BYTES, "a table of records") as stream:
-        return [cell.strip() for cell in _split(stream.readline(1 << 20), delimiter)]
-
-
 def _split(raw: bytes, delimiter: str) -> list[str]:
     line = raw.decode("utf-8-sig", "replace").rstrip("\r\n")
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
@@ -218,10 +215,6 @@ def _require_whole(dataset: Dataset, names: Sequence[str]) -> None:
             where=Location(dataset.source, line=1, field=missing),
             hint="Give the whole commanded pose, or none: then it is that of the commanded joint angles.",
         )
-
-
-def _named(pose: str, direction: str) -> str:
-    return f"{pose} from {direction}" if direction else pose
 
 
 def _line(dataset: Dataset, index: int) -> int:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from armcal.base.parameters import Parameters
@@ -14,6 +14,8 @@ from armcal.errors import ConfigError, Location
 from armcal.measure.measurement import Measurement
 from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment, with_data
+
+from armcal_capability.subject import only_arm
 
 CSV = {"type": "csv"}
 
@@ -65,37 +67,29 @@ class ArmToJudge:
         rules = None if settings is None else load_config(settings, overrides)
         if "armcal_calibration" in given.data:
             calibration = Calibration.load(path, registry, accept)
-            source = with_data(rules or _without_data(given), records)
-            return cls._of_calibration(calibration, source, path, rules is None)
+            source = with_data(rules or replace(given, data={**given.data, "data": dict(CSV)}), records)
+            record, kept = calibration.record, calibration.record.prediction
+            free = {e.name.partition("[")[0] for e in record.parameters if e.free and not e.held_by_prior}
+            fitted = calibration.parameters.with_free(free)
+            nominal = fitted.with_nominal(np.array([e.nominal for e in record.parameters]))
+            models, system = {"nominal": nominal, "calibrated": fitted}, calibration.system
+            columns = dict(kept.columns) if kept and rules is None else {}
+            files, trained_on = _files(path, source), record.identity.get("data", "")
+            return cls(path.name, _judged(system, path), models, source, columns, trained_on, files)
         experiment = Experiment.load(path, overrides if rules is None else (), records, registry)
         source = with_data(rules, records) if rules else experiment.source
         free = {b.name for b in experiment.parameters.free if b.prior_sd is None and not b.nuisance}
         models = {"nominal": experiment.parameters.with_free(free)}
-        files = tuple({path: None, **dict.fromkeys(map(Path, source.files))})
-        return cls(path.name, _judged(experiment.system, path), models, source, files=files)
+        return cls(path.name, _judged(experiment.system, path), models, source, files=_files(path, source))
 
-    @classmethod
-    def _of_calibration(cls, calibration: Calibration, source: ConfigSource, path: Path, own_columns: bool) -> Self:
-        record = calibration.record
-        free = {e.name.partition("[")[0] for e in record.parameters if e.free and not e.held_by_prior}
-        fitted = calibration.parameters.with_free(free)
-        nominal = fitted.with_nominal(np.array([e.nominal for e in record.parameters]))
-        kept = record.prediction
-        columns = dict(kept.columns) if kept and own_columns else {}
-        models = {"nominal": nominal, "calibrated": fitted}
-        files = tuple({path: None, **dict.fromkeys(map(Path, source.files))})
-        trained = record.identity.get("data", "")
-        return cls(path.name, _judged(calibration.system, path), models, source, columns, trained, files)
+
+def _files(path: Path, source: ConfigSource) -> tuple[Path, ...]:
+    return tuple(dict.fromkeys((path, *map(Path, source.files))))
 
 
 def _judged(system: System, path: Path) -> System:
     """With the measurement that reads positions of a target on the only arm."""
-    if len(system.arms) != 1:
-        raise ConfigError(
-            f"found {len(system.arms)} arms ({', '.join(system.arms)}), expected one.",
-            where=Location(str(path)),
-            hint="Describe the arm that is to be judged alone.",
-        )
+    only_arm(system, str(path))
     chosen = {name: m for name, m in system.measurements.items() if {c.name for c in m.channels()}.issuperset("xyz")}
     if not chosen:
         raise ConfigError(
@@ -105,8 +99,3 @@ def _judged(system: System, path: Path) -> System:
         )
     first = next(iter(chosen))
     return replace(system, measurements={first: chosen[first]})
-
-
-def _without_data(source: ConfigSource) -> ConfigSource:
-    data: dict[str, Any] = {key: value for key, value in source.data.items() if key != "data"}
-    return replace(source, data={**data, "data": dict(CSV)})
