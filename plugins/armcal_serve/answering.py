@@ -1,19 +1,18 @@
 """From a request to its answer, by one calibration. Every request has an answer; none raises."""
 
-from __future__ import annotations
-
 import difflib
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from armcal.base.domains import Array
 from armcal.base.pose_settings import PoseSettings, quaternion_of
 from armcal.base.quaternions import rotation_matrix
 from armcal.base.units import to_unit
+from armcal.calibration.compensation.compensator import Compensator
 from armcal.calibration.compensation.request import Commands, Targets
 from armcal.errors import ArmcalError, DataError, Location
 
@@ -34,9 +33,6 @@ from armcal_serve.protocol import (
 )
 from armcal_serve.reading import parsed, request_of
 from armcal_serve.served_arm import TEMPERATURE, TEMPERATURE_KEY, ServedArm
-
-if TYPE_CHECKING:
-    from armcal.calibration.compensation.compensator import Compensator
 
 Clock = Callable[[], float]
 
@@ -195,8 +191,9 @@ def _targets(arm: ServedArm, request: CompensateRequest) -> Targets:
             where=Location(field=f"targets.{odd}"),
             hint="Ask for them in two requests.",
         )
-    rotations = np.array([_rotation(target, i) for i, target in enumerate(targets)]) if turned else None
-    count = len(targets)
+    rotations, count = None, len(targets)
+    if turned:
+        rotations = np.array([_rotation(target, i) for i, target in enumerate(targets)])
     approach = arm.approach(request, count)
     for i, target in enumerate(targets):
         if target.approach is not None:

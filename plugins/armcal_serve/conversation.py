@@ -1,7 +1,5 @@
 """One client's requests and answers: answers go out in the order in which requests came."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 
@@ -24,7 +22,7 @@ class Ticket:
         answer: None before there is one.
     """
 
-    def __init__(self, number: int, line: bytes, arrived: float, conversation: Conversation) -> None:
+    def __init__(self, number: int, line: bytes, arrived: float, conversation: "Conversation") -> None:
         self.number = number
         self.line = line
         self.arrived = arrived

@@ -1,23 +1,19 @@
 """An arm that requests are about: its joints by name, in their units, and what acts on it."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 from armcal.arm.loading import LOAD_CHANNELS
 from armcal.base.domains import Array
 from armcal.base.units import from_unit, split_suffix, to_unit
+from armcal.calibration.compensation.compensator import Compensator
+from armcal.calibration.measured_point import Point
 from armcal.errors import DataError, Location
 
 from armcal_serve.protocol import Acting
-
-if TYPE_CHECKING:
-    from armcal.calibration.compensation.compensator import Compensator
-    from armcal.calibration.measured_point import Point
 
 TEMPERATURE = "temperature"
 TEMPERATURE_KEY = "temperature_C"
@@ -189,5 +185,5 @@ def _refuse(message: str, field: str, hint: str) -> NoReturn:
     raise DataError(message, where=Location(field=field), hint=hint)
 
 
-def _short(text: Any) -> str:
+def _short(text: str) -> str:
     return text if len(text) <= 40 else f"{text[:37]}..."

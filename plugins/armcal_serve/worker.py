@@ -24,7 +24,7 @@ ABOUT_ITSELF = 0
 _HEAD = struct.Struct("!IQd")
 _NICENESS = 19
 """Requests come first."""
-_CHUNK = 256 * 1024
+CHUNK = 256 * 1024
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def main(descriptor: int) -> None:
 
 def _messages(link: socket.socket) -> Iterator[Message]:
     cutter = Unpacker()
-    while data := link.recv(_CHUNK):
+    while data := link.recv(CHUNK):
         yield from cutter.feed(data)
 
 

@@ -11,11 +11,10 @@ from typing import Any
 
 from armcal_serve.conversation import Ticket
 from armcal_serve.poller import Poller
-from armcal_serve.worker import ABOUT_ITSELF, Message, Unpacker
+from armcal_serve.worker import ABOUT_ITSELF, CHUNK, Message, Unpacker
 
 # -P: a file of the working directory called like a library is not taken for it, as it is not by the command.
 _COMMAND = (sys.executable, "-P", "-c", "import sys; from armcal_serve.worker import main; main(int(sys.argv[1]))")
-_CHUNK = 256 * 1024
 _TO_END_S = 5.0
 
 
@@ -105,7 +104,7 @@ class WorkerProcess:
 
     def _read(self) -> None:
         try:
-            data = self._link.recv(_CHUNK)
+            data = self._link.recv(CHUNK)
         except BlockingIOError:
             return
         except OSError:

@@ -1,4 +1,4 @@
-"""A client at a stream of bytes: lines in, lines out, with bounded memory for both; and standard input and output."""
+"""Clients at streams of bytes: lines in, lines out, with bounded memory for both; and standard input and output."""
 
 import os
 import time
@@ -22,9 +22,10 @@ CHUNK = 64 * 1024
 MOST_UNREAD_BYTES = 1024**2
 """A client that leaves so much unread is not listened to until it reads."""
 
-Receive = Callable[[], bytes | None]
-"""What has come: nothing where the stream has ended, None where it turns out that there is none."""
+Receive = Callable[[], bytes]
+"""What has come: nothing where the stream has ended; raises BlockingIOError where nothing has come."""
 Send = Callable[[memoryview], int]
+"""How many bytes were taken; 0, or BlockingIOError, where none can be."""
 
 
 class StreamClient:
@@ -32,7 +33,7 @@ class StreamClient:
 
     Args:
         incoming, outgoing: descriptors, or what has one; the same for a socket.
-        receive, send: raise OSError when the client is gone.
+        receive, send: raise another OSError when the client is gone.
 
     Attributes:
         ended: whether the client is gone.
@@ -54,7 +55,7 @@ class StreamClient:
         self._cutter = LineCutter(MAX_LINE_BYTES)
         self._lines: deque[bytes | None] = deque()
         self._out = bytearray()
-        self.conversation = Conversation(self._queue)
+        self.conversation = Conversation(self._answer)
         self.arrange()
 
     @property
@@ -119,10 +120,10 @@ class StreamClient:
     def _read(self) -> None:
         try:
             data = self._receive()
+        except BlockingIOError:
+            return
         except OSError:
             self.end()
-            return
-        if data is None:
             return
         began = not self._cutter.begun
         lines = self._cutter.feed(data)
@@ -136,7 +137,7 @@ class StreamClient:
                 self._lines.append(self._cutter.rest())
         self.arrange()
 
-    def _queue(self, answer: bytes) -> None:
+    def _answer(self, answer: bytes) -> None:
         if not self._out:
             self.progress_at = time.monotonic()
         self._out += answer
@@ -152,6 +153,8 @@ class StreamClient:
                     break
                 del self._out[:sent]
                 self.progress_at = time.monotonic()
+        except BlockingIOError:
+            pass
         except OSError:
             self.end()
             return

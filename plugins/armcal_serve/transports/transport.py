@@ -4,30 +4,23 @@ from typing import Protocol
 
 
 class Transport(Protocol):
-    """A way by which requests come.
-
-    Attributes:
-        name: as the server's first line has it.
-        clients: the number of clients now.
-        ended: whether no request will ever come again by it.
-        finished: whether all requests were answered, and the answers taken.
-    """
+    """A way by which requests come."""
 
     @property
     def name(self) -> str:
-        """See above."""
+        """As the server's first line has it."""
 
     @property
     def clients(self) -> int:
-        """See above."""
+        """How many there are now."""
 
     @property
     def ended(self) -> bool:
-        """See above."""
+        """Whether no request will ever come again by it."""
 
     @property
     def finished(self) -> bool:
-        """See above."""
+        """Whether all requests were answered, and the answers taken."""
 
     def open(self) -> None:
         """Begin to take requests."""

@@ -116,24 +116,23 @@ class UnixSocket(Transport):
                 self._opens_at = time.monotonic() + _PAUSE_S
             return
         connection.setblocking(False)
-        if self._staying >= MOST_CLIENTS and not self._make_room(f"{MOST_CLIENTS} clients are connected"):
+        if len(self._staying) >= MOST_CLIENTS and not self._make_room(f"{MOST_CLIENTS} clients are connected"):
             fault = ArmcalError(f"{MOST_CLIENTS} clients are connected.", hint="Close connections that are not used.")
             with contextlib.suppress(OSError):
                 connection.send(as_bytes(refusal(None, fault)) + b"\n")
             connection.close()
             return
-        receive, send = partial(_received, connection), partial(_sent, connection)
+        receive, send = partial(connection.recv, CHUNK), connection.send
         client = StreamClient(connection, connection, receive, send, self._poller, self._dispatcher)
         self._clients[connection] = client
 
     @property
-    def _staying(self) -> int:
-        return sum(not client.input_ended for client in self._clients.values())
+    def _staying(self) -> list[StreamClient]:
+        return [client for client in self._clients.values() if not client.input_ended]
 
     def _make_room(self, why: str) -> bool:
         """Disconnect the client that has been idle for longest; False where none is idle."""
-        staying = [client for client in self._clients.values() if not client.input_ended]
-        idlest = max(staying, key=lambda client: client.idle_s, default=None)
+        idlest = max(self._staying, key=lambda client: client.idle_s, default=None)
         if idlest is None or idlest.idle_s < _LEAST_IDLE_S:
             return False
         _dismiss(idlest, f"{why}, and this one asked nothing for {idlest.idle_s:.0f} s")
@@ -142,17 +141,3 @@ class UnixSocket(Transport):
 
 def _dismiss(client: StreamClient, why: str) -> None:
     client.dismiss(ArmcalError(f"{why}: the connection is closed.", hint="Connect anew when there is a request."))
-
-
-def _received(connection: socket.socket) -> bytes | None:
-    try:
-        return connection.recv(CHUNK)
-    except BlockingIOError:
-        return None
-
-
-def _sent(connection: socket.socket, data: memoryview) -> int:
-    try:
-        return connection.send(data)
-    except BlockingIOError:
-        return 0
