@@ -81,9 +81,9 @@ class CExporter:
             files.test: test_source(expression, reference_of(expression, CASES), prefix, places),
         }
         named = {name: text.encode("ascii") for name, text in sources.items()}
-        remarks = [*_remarks(request, self._settings.conditions), *compiled_and_run(named, files)]
+        remarks = (*_remarks(request, self._settings.conditions), *compiled_and_run(named, files))
         content = named.pop(files.source)
-        return Exported(content, changed_numbers(request), companions=named, remarks=tuple(remarks))
+        return Exported(content, changed_numbers(request), companions=named, remarks=remarks)
 
 
 def _remarks(request: ExportRequest, conditions: Sequence[str]) -> list[str]:

@@ -58,25 +58,24 @@ def c_function(function: ca.Function, name: str, inputs: Sequence[str], outputs:
         elif operation == "INPUT":
             values[o[0]] = f"{inputs[i[0]]}[{i[1]}]"
         elif operation == "CONST":
-            value = function.instruction_constant(k)
-            values[o[0]] = c_number(value) if value >= 0 else f"({c_number(value)})"
+            constant = function.instruction_constant(k)
+            values[o[0]] = c_number(constant) if constant >= 0 else f"({c_number(constant)})"
         else:
-            lines.append(f"const double w{k} = {_written(operation, [values[slot] for slot in i])};")
+            operands = [values[slot] for slot in i]
+            if operation in _OPERATORS:
+                value = _OPERATORS[operation].format(*operands)
+            elif operation in _LIBRARY:
+                value = f"{_LIBRARY[operation]}({', '.join(operands if operation in TWO_ARGUMENTS else operands[:1])})"
+            else:
+                raise ConfigError(
+                    f"the arm's expression has the operation {operation}, which has no form in C99.",
+                    hint="Leave the effect that brings it out of the calibration.",
+                )
+            lines.append(f"const double w{k} = {value};")
             values[o[0]] = f"w{k}"
     arguments = [*(f"const double *{text}" for text in inputs), *(f"double *{output}" for output in outputs)]
     body = "\n".join(f"  {line}" for line in lines)
     return f"static void {name}({', '.join(arguments)})\n{{\n{body}\n}}\n"
-
-
-def _written(operation: str, arguments: list[str]) -> str:
-    if operation in _OPERATORS:
-        return _OPERATORS[operation].format(*arguments)
-    if operation in _LIBRARY:
-        return f"{_LIBRARY[operation]}({', '.join(arguments if operation in TWO_ARGUMENTS else arguments[:1])})"
-    raise ConfigError(
-        f"the arm's expression has the operation {operation}, which has no form in C99.",
-        hint="Leave the effect that brings it out of the calibration.",
-    )
 
 
 def filled(template: str, prefix: str, **values: str) -> str:

@@ -58,20 +58,20 @@ def _entry(effect: str, spring: Spring, chain: Chain) -> SpringEntry:
     given = ca.densify(ca.SX(spring.law(load, command)))
     law = ca.Function("law", [load, recorded], [given, ca.densify(ca.jacobian(given, load))])
     compliance = np.asarray(law(np.zeros(spring.size), _COMMANDS[0])[1].full())
+    linear = True
+    for loads in np.outer(_LOADS, np.arange(1.0, spring.size + 1)):
+        for at in _COMMANDS:
+            deflection = np.asarray(law(loads, at)[0].full()).ravel()
+            rounding = _LINEAR * float(np.abs(compliance).max())
+            linear &= np.allclose(deflection, compliance @ loads, rtol=_LINEAR, atol=rounding)
     return SpringEntry(
         effect=effect,
         site=spring.site,
         axes=axes.tolist(),
         along=not spring.directions and joint is not None and not joint.is_revolute,
         compliance=compliance.tolist(),
-        linear=all(_follows(law, compliance, size, at) for size in _LOADS for at in _COMMANDS),
+        linear=linear,
     )
-
-
-def _follows(law: ca.Function, compliance: Array, size: float, command: tuple[float, float]) -> bool:
-    load = size * np.arange(1.0, compliance.shape[0] + 1)
-    given = np.asarray(law(load, command)[0].full()).ravel()
-    return bool(np.allclose(given, compliance @ load, rtol=_LINEAR, atol=_LINEAR * float(np.abs(compliance).max())))
 
 
 def chain_of(request: ExportRequest) -> Chain:

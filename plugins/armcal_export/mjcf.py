@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 from armcal.base.domains import Array
 from armcal.base.pose_settings import quaternion_of
-from armcal.calibration.rigid_chain import RigidChain, RigidJoint
+from armcal.calibration.rigid_chain import RigidChain
 
 from armcal_export.description import ArmDescription
 
@@ -55,7 +55,9 @@ def mjcf(
     here = rigid.base_T_mount
     for number, joint in enumerate(rigid.joints, start=1):
         body = _body(body, f"{arm_description.arm}_{joint.name}", np.linalg.inv(here) @ joint.base_T_joint)
-        _joint(body, joint, drive)
+        limits = {} if joint.limits is None else {"range": _row(joint.limits)}
+        kind, axis, rotor = "slide" if joint.slides else "hinge", _row(joint.axis), _n(drive.armature)
+        ElementTree.SubElement(body, "joint", name=joint.name, type=kind, axis=axis, armature=rotor, **limits)
         _add_springs(body, joint.name, springs.get(number, ()))
         _inertial(body, arm_description, number, joint.base_T_joint)
         here = joint.base_T_joint
@@ -67,8 +69,7 @@ def mjcf(
         carried = ElementTree.SubElement(body, "body", name="payload", pos=_row(at))
         ball = _row([0.4 * payload * _RADIUS_M**2] * 3)
         ElementTree.SubElement(carried, "inertial", pos="0 0 0", mass=_n(payload), diaginertia=ball)
-    _couplings(root, rigid)
-    _actuators(root, rigid, drive)
+    _drive(root, rigid, drive)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
 
@@ -84,13 +85,6 @@ def _body(above: ElementTree.Element, name: str, pose: Array) -> ElementTree.Ele
 
 def _placed(pose: Array) -> dict[str, str]:
     return {"pos": _row(pose[:3, 3]), "quat": _row(quaternion_of(pose[:3, :3]))}
-
-
-def _joint(body: ElementTree.Element, joint: RigidJoint, drive: Drive) -> None:
-    limits = {} if joint.limits is None else {"range": _row(joint.limits)}
-    kind = "slide" if joint.slides else "hinge"
-    axis = _row(joint.axis)
-    ElementTree.SubElement(body, "joint", name=joint.name, type=kind, axis=axis, armature=_n(drive.armature), **limits)
 
 
 def _add_springs(body: ElementTree.Element, site: str, hinges: Sequence[Hinge]) -> None:
@@ -126,17 +120,14 @@ def _inertial(body: ElementTree.Element, arm_description: ArmDescription, number
     body.insert(place, element)
 
 
-def _couplings(root: ElementTree.Element, rigid: RigidChain) -> None:
-    following = [joint for joint in rigid.joints if joint.mimic is not None]
+def _drive(root: ElementTree.Element, rigid: RigidChain, drive: Drive) -> None:
+    """A position actuator for each joint; one that follows another is coupled to it."""
+    following = [(joint.name, joint.mimic) for joint in rigid.joints if joint.mimic is not None]
     if following:
         equality = ElementTree.SubElement(root, "equality")
-        for joint in following:
-            assert joint.mimic is not None
-            law = _row([joint.mimic.offset, joint.mimic.multiplier, 0.0, 0.0, 0.0])
-            ElementTree.SubElement(equality, "joint", joint1=joint.name, joint2=joint.mimic.master, polycoef=law)
-
-
-def _actuators(root: ElementTree.Element, rigid: RigidChain, drive: Drive) -> None:
+        for name, mimic in following:
+            law = _row([mimic.offset, mimic.multiplier, 0.0, 0.0, 0.0])
+            ElementTree.SubElement(equality, "joint", joint1=name, joint2=mimic.master, polycoef=law)
     actuators = ElementTree.SubElement(root, "actuator")
     for joint in rigid.joints:
         if joint.mimic is None:

@@ -67,8 +67,20 @@ class Ros2Exporter:
         parameters = {before + name: value for name, value in _parameters(request, arm_description, rigid).items()}
         comment = in_comment(f"The arm {request.name} as calibrated: {request.origin.experiment}.")
         text = ros2_text(self._settings.node, parameters, comment)
-        _compare(request, read_ros2(text), {self._settings.node: parameters}, before)
-        return Exported(text.encode("utf-8"), changed_numbers(request), _left_out(request, arm_description))
+        again = read_ros2(text)
+        if again != {self._settings.node: parameters}:
+            raise ProblemError("the parameters do not read back as they were written.", hint=REPORT)
+        read = {name.removeprefix(before): value for name, value in again[self._settings.node].items()}
+        require_same_tools(request, lambda commands: rebuilt_tools(read, commands))
+        # settings that ROS 2 has no type for; pulse tables are set joint by joint
+        left_out = tuple(
+            f"{setting} of {effect.name}"
+            for effect in arm_description.effects
+            if not isinstance(request.arm.effects[effect.name], SteppedEffect)
+            for setting, value in effect.settings.items()
+            if value not in (None, [], {}) and not _is_flat(value)
+        )
+        return Exported(text.encode("utf-8"), changed_numbers(request), left_out)
 
 
 def _parameters(request: ExportRequest, arm_description: ArmDescription, rigid: RigidChain) -> dict[str, Value]:
@@ -91,20 +103,20 @@ def _parameters(request: ExportRequest, arm_description: ArmDescription, rigid: 
             entries |= {"mimic.joint": mimic.joint, "mimic.multiplier": mimic.multiplier, "mimic.offset": mimic.offset}
         if abs(joint.pitch) > NEGLIGIBLE or abs(joint.scale - 1) > NEGLIGIBLE:
             entries |= {"pitch": joint.pitch, "scale": joint.scale}
-        compliance = _own_compliance(arm_description, number, joint.axis)
+        compliance = 0.0  # what its linear springs give about its own axis (rad/(N m)), or along it (m/N)
+        for spring in arm_description.springs:
+            if spring.site == number and spring.linear:
+                lever = np.array(spring.axes) @ np.array(joint.axis)
+                compliance += float(lever @ np.array(spring.compliance) @ lever)
         if compliance:
             entries["compliance"] = compliance
         _add(parameters, f"joints.{name}", entries)
         here = placed.base_T_joint
     _add(parameters, "tool", _placed(np.linalg.inv(here) @ rigid.base_T_tool))
     _add(parameters, "gravity", {"base": arm_description.statics.gravity_m_s2})
-    return (
-        parameters
-        | _of_servos(arm_description)
-        | _of_masses(arm_description)
-        | _of_settings(arm_description)
-        | _of_effects(request)
-    )
+    _add_details(parameters, arm_description)
+    _add_effects(parameters, request)
+    return parameters
 
 
 def _add(parameters: dict[str, Value], where: str, entries: Mapping[str, Any]) -> None:
@@ -119,34 +131,23 @@ def _placed(matrix: Array) -> dict[str, list[float]]:
     return {"xyz": [float(x) for x in matrix[:3, 3]], "rpy": [float(angle) for angle in rpy_of(matrix[:3, :3])]}
 
 
-def _own_compliance(arm_description: ArmDescription, number: int, axis: list[float]) -> float:
-    """What the linear springs of a joint give about its own axis (rad/(N m)), or along it (m/N)."""
-    total = 0.0
-    for spring in arm_description.springs:
-        if spring.site == number and spring.linear:
-            lever = np.array(spring.axes) @ np.array(axis)
-            total += float(lever @ np.array(spring.compliance) @ lever)
-    return total
+def _add_details(parameters: dict[str, Value], arm_description: ArmDescription) -> None:
+    """Servos (``joints.q2.servo.angles`` in rad, pulses and tick in s), masses, and settings that ROS 2 has a type for.
 
-
-def _of_servos(arm_description: ArmDescription) -> dict[str, Value]:
-    """``joints.q2.servo.angles`` (rad), ``.pulses`` (s), ``.tick`` (s)."""
-    parameters: dict[str, Value] = {}
+    Of a mass ``links.hand.base_com`` is its centre in the base frame at zero commands.
+    """
     for servo in arm_description.servos:
         table = {"angles": servo.angles_rad, "pulses": servo.pulses_s, "tick": servo.tick_s}
         _add(parameters, f"joints.{_word(servo.joint)}.servo", table)
-    return parameters
-
-
-def _of_settings(arm_description: ArmDescription) -> dict[str, Value]:
-    """``effects.servo.type``, ``effects.servo.settings.gains``: what ROS 2 has a type for."""
-    parameters: dict[str, Value] = {}
+    for mass in arm_description.masses:
+        moved_by = arm_description.joints[mass.moved_by - 1].name if mass.moved_by else "mount"
+        entries = {"mass": mass.mass_kg, "base_com": mass.com_m, "moved_by": moved_by}
+        _add(parameters, f"links.{_word(mass.name)}", entries)
     for effect in arm_description.effects:
         where = f"effects.{_word(effect.name)}"
         _add(parameters, where, {"type": effect.type or "unknown"})
         flat = {_word(name): value for name, value in effect.settings.items() if _is_flat(value)}
         _add(parameters, f"{where}.settings", flat)
-    return parameters
 
 
 def _is_flat(value: Any) -> bool:
@@ -154,22 +155,8 @@ def _is_flat(value: Any) -> bool:
     return len({type(entry) for entry in entries}) == 1 and isinstance(entries[0], (bool, int, float, str))
 
 
-def _of_masses(arm_description: ArmDescription) -> dict[str, Value]:
-    """``links.hand.mass``, its centre in the base frame at zero commands, and the joint that moves it."""
-    parameters: dict[str, Value] = {}
-    for mass in arm_description.masses:
-        moved_by = arm_description.joints[mass.moved_by - 1].name if mass.moved_by else "mount"
-        _add(
-            parameters,
-            f"links.{_word(mass.name)}",
-            {"mass": mass.mass_kg, "base_com": mass.com_m, "moved_by": moved_by},
-        )
-    return parameters
-
-
-def _of_effects(request: ExportRequest) -> dict[str, Value]:
+def _add_effects(parameters: dict[str, Value], request: ExportRequest) -> None:
     """Every number of the effects: ``effects.servo.gain1``, ``effects.flex.C0_xx``."""
-    parameters: dict[str, Value] = {}
     blocks = {block.name: block for block in request.arm.parameters()}
     for effect in request.arm.effects:
         before = f"{request.name}.{effect}."
@@ -178,36 +165,10 @@ def _of_effects(request: ExportRequest) -> dict[str, Value]:
             for suffix, number in zip(blocks[full].domain.entries, request.values[full], strict=True):
                 name = _word(f"{local}_{suffix}" if suffix else local)
                 _add(parameters, f"effects.{_word(effect)}", {name: float(number)})
-    return parameters
 
 
 def _word(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_]", "_", name)
-
-
-def _left_out(request: ExportRequest, arm_description: ArmDescription) -> tuple[str, ...]:
-    """Settings that ROS 2 has no type for; pulse tables are set joint by joint."""
-    return tuple(
-        f"{setting} of {effect.name}"
-        for effect in arm_description.effects
-        if not isinstance(request.arm.effects[effect.name], SteppedEffect)
-        for setting, value in effect.settings.items()
-        if value not in (None, [], {}) and not _is_flat(value)
-    )
-
-
-def _compare(
-    request: ExportRequest,
-    again: Mapping[str, Mapping[str, Value]],
-    parameters_by_node: Mapping[str, Mapping[str, Value]],
-    before: str,
-) -> None:
-    """All parameters to the last bit, and the tool of the chain that they make."""
-    if again != parameters_by_node:
-        raise ProblemError("the parameters do not read back as they were written.", hint=REPORT)
-    (parameters,) = again.values()
-    tool_parameters = {name.removeprefix(before): value for name, value in parameters.items()}
-    require_same_tools(request, lambda commands: rebuilt_tools(tool_parameters, commands))
 
 
 def rebuilt_tools(parameters: Mapping[str, Any], commands: Array) -> Array:

@@ -81,14 +81,7 @@ def _scalar(value: bool | int | float | str) -> str:
 
 
 def _quoted(text: str) -> str:
-    return (
-        '"'
-        + "".join(
-            _ESCAPES.get(character, character if character.isprintable() else f"\\U{ord(character):08x}")
-            for character in text
-        )
-        + '"'
-    )
+    return '"' + "".join(_ESCAPES.get(c, c if c.isprintable() else f"\\U{ord(c):08x}") for c in text) + '"'
 
 
 def _entries(node: Any, what: str) -> list[tuple[str, Any]]:
@@ -107,18 +100,14 @@ def _flat(node: Any, above: str) -> list[tuple[str, Value]]:
         if isinstance(value, yaml.MappingNode):
             entries += _flat(value, name)
         elif isinstance(value, yaml.SequenceNode):
-            entries.append((name, _list(value, name)))
+            if any(not isinstance(item, yaml.ScalarNode) for item in value.value):
+                raise ValueError(f"{name} is a list of lists or of mappings")
+            items: Any = [_typed(item, name) for item in value.value]
+            if len({type(item) for item in items}) != 1:
+                raise ValueError(f"{name} is an empty list, or one of several types")
+            entries.append((name, items))
         else:
             entries.append((name, _typed(value, name)))
-    return entries
-
-
-def _list(node: Any, name: str) -> Any:
-    if any(not isinstance(item, yaml.ScalarNode) for item in node.value):
-        raise ValueError(f"{name} is a list of lists or of mappings")
-    entries = [_typed(item, name) for item in node.value]
-    if len({type(entry) for entry in entries}) != 1:
-        raise ValueError(f"{name} is an empty list, or one of several types")
     return entries
 
 
