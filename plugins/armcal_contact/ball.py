@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import casadi as ca
@@ -95,7 +96,7 @@ class BallInSocket(OneArmContact):
                 position, slash, socket = first.rpartition("/")
                 second = f"{position}{slash}{known.between[1]}"
                 if socket == known.between[0] and second in groups:
-                    ties.append(Tie((first, second), _distance(known.distance), (known.noise,)))
+                    ties.append(Tie((first, second), partial(_beyond, known.distance), (known.noise,)))
         return tuple(ties)
 
     def residual(self, arms: Mapping[str, ArmState], measured: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
@@ -114,11 +115,7 @@ class BallInSocket(OneArmContact):
         return self.base_T_tool(arms).apply(point_expression("centre", values))
 
 
-def _distance(known: float) -> Any:
-    """What is left of a known distance (m) between two sockets."""
-
-    def residual(first: Mapping[str, Any], second: Mapping[str, Any]) -> Any:
-        apart = ca.vertcat(*[second[axis] - first[axis] for axis in "xyz"])
-        return ca.sqrt(ca.dot(apart, apart)) - known
-
-    return residual
+def _beyond(distance: float, first: Mapping[str, Any], second: Mapping[str, Any]) -> Any:
+    """By how much two sockets are farther apart than a known distance (m)."""
+    apart = ca.vertcat(*[second[axis] - first[axis] for axis in "xyz"])
+    return ca.sqrt(ca.dot(apart, apart)) - distance

@@ -4,8 +4,6 @@ Each step solves exactly the Gauss-Newton model within the bounds, damped (Leven
 does not fall; cvxpy knows nothing of poses, only one small triangular matrix.
 """
 
-from __future__ import annotations
-
 import time
 import warnings
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Joints whose recorded places lag behind what was measured beside them: by how long, of an arm that moved."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """The iterated extended Kalman filter [Bell1993] and the unscented one [Julier2004], on filterpy's [Labbe2020]."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 

@@ -5,8 +5,6 @@ records by their curvature. Here the newest records are held back, and only a re
 for good, linearised at a point that the records after it have improved.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar

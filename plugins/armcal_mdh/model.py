@@ -5,10 +5,8 @@ Rot_z(theta) Trans_z(d) Trans_x(a) Rot_x(alpha) [Denavit1955], ``craig`` rows ar
 Rot_x(alpha) Trans_x(a) Rot_z(theta) Trans_z(d) [Craig2005].
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from armcal.arm.model import Attachment, Chain, Joint
 from armcal.base import se3
@@ -34,7 +32,7 @@ class Step(Settings):
     frame: str | None = None
 
     @model_validator(mode="after")
-    def _one_thing(self) -> Step:
+    def _one_thing(self) -> Self:
         given = [name for name in (*_MOTIONS, "frame") if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"a step is one transform or one frame name, found {given or 'none'}; write several steps")
@@ -68,7 +66,7 @@ class MdhSettings(Settings):
     joints: tuple[str, ...] = ()
 
     @model_validator(mode="after")
-    def _consistent(self) -> MdhSettings:
+    def _consistent(self) -> Self:
         if self.joints and len(self.joints) != len(self.rows):
             raise ValueError(f"{len(self.joints)} joint names for {len(self.rows)} rows")
         if len(set(self.joints)) < len(self.joints):

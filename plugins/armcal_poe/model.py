@@ -4,8 +4,6 @@ Two ways to give it parameters. Minimal: axes that stay axes, updated on the gro
 joint, so that a joint may have pitch and scale.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar

@@ -1,8 +1,6 @@
 """The settings of an arm in screws."""
 
-from __future__ import annotations
-
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from armcal.base.pose_settings import PoseSettings
@@ -82,7 +80,7 @@ class PoeSettings(Settings):
         return tuple(joint.name or f"q{i}" for i, joint in enumerate(self.joints, start=1))
 
     @model_validator(mode="after")
-    def _each_name_once(self) -> PoeSettings:
+    def _each_name_once(self) -> Self:
         names = self.joint_names
         twice = [name for name in names if names.count(name) > 1]
         if twice:

@@ -7,12 +7,12 @@ neither a long file nor a broken one takes much memory. A single bad cell is loo
 import csv
 import hashlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, Literal, NoReturn, Self
+from typing import Any, BinaryIO, ClassVar, Literal, Self
 
 import numpy as np
 from armcal.base.dataset import Dataset
@@ -148,9 +148,14 @@ def _load(rows: Iterator[tuple[int, list[str]]], header: Header, plan: Plan, has
     texts: dict[str, list[str]] = {column.known_as: [] for column in plan.extra}
     while block := list(islice(rows, _ROWS_AT_ONCE)):
         lines = [line for line, _ in block]
-        ragged = next(((line, cells) for line, cells in block if len(cells) != len(header.columns)), None)
-        if ragged is not None:
-            _refuse_ragged(*ragged, header)
+        for line, row in block:
+            count, expected = len(row), len(header.columns)
+            if count != expected:
+                mend = "Fill in what is missing, leave a cell empty if its value is not known."
+                if count > expected:
+                    mend = "Quote text that holds the delimiter, write numbers with a decimal point (12.5), no comma."
+                message = f"found {count} cells, expected {expected} as in the header."
+                raise DataError(message, where=Location(header.source, line=line), hint=mend)
         table = list(zip(*(cells for _, cells in block), strict=True))
         for channel, (column, unit) in plan.channels.items():
             cells = table[column.index]
@@ -173,14 +178,6 @@ def _load(rows: Iterator[tuple[int, list[str]]], header: Header, plan: Plan, has
         return dataset
     warning = f"{header.source}: {len(nameless)} records without an id were set aside. Give each its own id."
     return replace(dataset.without(nameless), warnings=(warning,))
-
-
-def _refuse_ragged(line: int, cells: Sequence[str], header: Header) -> NoReturn:
-    mend = "Fill in what is missing, leave a cell empty if its value is not known."
-    if len(cells) > len(header.columns):
-        mend = "Quote text that holds the delimiter, and write numbers with a decimal point (12.5), not a comma."
-    message = f"found {len(cells)} cells, expected {len(header.columns)} as in the header."
-    raise DataError(message, where=Location(header.source, line=line), hint=mend)
 
 
 def _number(cell: str, line: int, column: Column, header: Header, has_commas: bool) -> float:

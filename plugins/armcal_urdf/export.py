@@ -61,7 +61,7 @@ class UrdfExporter:
         old = model.settings
         text = with_origins(old.text, placed)
         written = UrdfModel(UrdfSettings.model_validate({**old.to_config(), "text": text}))
-        _compare(request, model, written, values)
+        _require_same_frames(request.arm, model, written, values)
         changed = sum(
             before != now
             for joint in placed
@@ -85,9 +85,9 @@ def _nominal(model: UrdfModel) -> dict[str, float]:
     return {block.name: float(block.nominal[0]) for block in model.parameters()}
 
 
-def _compare(request: ExportRequest, model: UrdfModel, written: UrdfModel, values: Mapping[str, float]) -> None:
+def _require_same_frames(arm: Arm, model: UrdfModel, written: UrdfModel, values: Mapping[str, float]) -> None:
     """All frames in random poses within the limits, as calibrated and as written."""
-    arm, commands = request.arm, random_commands(request.arm)
+    commands = random_commands(arm)
     calibrated, again = _frames(arm, model, values, commands), _frames(arm, written, _nominal(written), commands)
     shift = float(np.linalg.norm(calibrated[..., :3, 3] - again[..., :3, 3], axis=-1).max())
     apart = np.linalg.norm(calibrated[..., :3, :3] - again[..., :3, :3], axis=(-2, -1)).max()

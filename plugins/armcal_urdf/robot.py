@@ -124,12 +124,10 @@ def read_robot(text: str, label: str) -> Robot:
     joints: dict[str, UrdfJoint] = {}
     for element in top.all("link"):
         link = _link(element)
-        _once(element, "link", links.get(link.name))
-        links[link.name] = link
+        _refuse_second(element, links.setdefault(link.name, link))
     for element in top.all("joint"):
         joint = _joint(element)
-        _once(element, "joint", joints.get(joint.name))
-        joints[joint.name] = joint
+        _refuse_second(element, joints.setdefault(joint.name, joint))
     if not links:
         top.refuse("found no <link> in <robot>, expected links and joints.", "Give a whole URDF.")
     robot = Robot(links, joints)
@@ -137,10 +135,10 @@ def read_robot(text: str, label: str) -> Robot:
     return robot
 
 
-def _once(element: Element, kind: str, before: UrdfLink | UrdfJoint | None) -> None:
-    if before is not None:
-        hint = f"The first is at line {before.element.line}; rename one."
-        element.refuse(f"the {kind} {before.name!r} stands twice.", hint)
+def _refuse_second(element: Element, first: UrdfLink | UrdfJoint) -> None:
+    if first.element is not element:
+        hint = f"The first is at line {first.element.line}; rename one."
+        element.refuse(f"the {element.tag} {first.name!r} stands twice.", hint)
 
 
 def _link(element: Element) -> UrdfLink:
