@@ -168,7 +168,7 @@ def refuse_missing(header: Header, w: RequestedChannel, unused: Sequence[str]) -
     written = " or ".join(spellings(replace(w, columns=(min(w.columns, key=len),))))
     header.refuse(
         f"found no column for {w.what}, expected {written}{_nearest(written.split(' or '), unused)}.",
-        f"Add it, or say which column it is: columns: {{{written.split(' or ')[0]}: NAME}} in the data section.",
+        f"Add it, or say which column it is: columns: {{{written.split(' or ')[0]}: NAME}} in the configuration.",
         written,
     )
 
