@@ -46,6 +46,13 @@ class Dataset:
     warnings: tuple[str, ...] = ()
     files: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
+    @classmethod
+    def of_rows(cls, channels: Sequence[str], rows: Sequence[Sequence[float]], source: str) -> Self:
+        """Records that were kept as rows of SI values; they are called by their number."""
+        columns = np.array(rows, dtype=float).reshape(len(rows), len(channels)).T
+        content = {name: np.ascontiguousarray(column) for name, column in zip(channels, columns, strict=True)}
+        return cls(tuple(str(i) for i in range(1, len(rows) + 1)), content, source=source)
+
     def __len__(self) -> int:
         return len(self.ids)
 

@@ -1,4 +1,4 @@
-"""Unit quaternions (w, x, y, z) as arrays of numbers. [Murray1994]"""
+"""Rotations as arrays of numbers: unit quaternions (w, x, y, z) and matrices. [Murray1994]"""
 
 import math
 
@@ -37,6 +37,12 @@ def left_jacobian(vector: Array) -> Array:
         return np.asarray(np.eye(3) + (0.5 - angle**2 / 24) * cross + (1 / 6 - angle**2 / 120) * cross @ cross)
     first, second = (1 - math.cos(angle)) / angle**2, (angle - math.sin(angle)) / angle**3
     return np.asarray(np.eye(3) + first * cross + second * cross @ cross)
+
+
+def nearest_turn(matrix: Array) -> Array:
+    """The rotation nearest to a matrix (3x3). [Umeyama1991]"""
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))]) @ right)
 
 
 def rotation_matrix(q: Array) -> Array:

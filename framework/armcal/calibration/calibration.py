@@ -20,21 +20,20 @@ from armcal.calibration.measured_point import Point, pointed
 from armcal.calibration.physics import (
     SHARE,
     UNSTATED_M,
-    ComponentRecord,
-    absent,
     check_record,
     components,
     differences,
     movement,
     predict,
     readable,
+    require_present,
 )
 from armcal.calibration.tool_expression import ToolExpression, arm_expression
 from armcal.config.system import System, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource
 from armcal.diagnose.coverage import Recording
-from armcal.errors import ArmcalError, CalibrationWarning, ConfigError, DataError, Location, PluginError
+from armcal.errors import ArmcalError, CalibrationWarning, ConfigError, DataError, Location
 from armcal.estimate.variance import Component
 from armcal.measure.measurement import Measurement
 from armcal.plugins import PluginRegistry, discover
@@ -101,9 +100,7 @@ class Calibration:
         if identity_of(description) != record.identity.get("arm"):
             text = "the description of the arm does not match its identity: the file was edited or damaged."
             raise ConfigError(text, where=where, hint="Change the experiment's configuration and run it again.")
-        missing = absent(record.components, registry)
-        if missing is not None:
-            raise _absent(missing, path)
+        require_present(record.components, registry, where)
         system = build_system(source, registry)
         parameters = system.parameters(record.groups)
         changed = differences(record.components, components(system, registry))
@@ -354,18 +351,6 @@ def arm_named(calibration: Calibration, arm: str | None) -> str:
     if name not in arms:
         raise ConfigError(f"no arm is called {name!r}.", hint=f"The arms are {', '.join(arms)}.")
     return name
-
-
-def _absent(missing: ComponentRecord, path: str | Path) -> PluginError:
-    """What is wrong with a calibration whose plugin is not there."""
-    given = f"{missing.distribution or missing.plugin} {missing.version}".strip()
-    is_file = missing.distribution.endswith(".py")
-    return PluginError(
-        f"it was made with the {missing.kind} {missing.name!r} of the plugin{' file' if is_file else ''} {given}, "
-        "which is not loaded.",
-        where=Location(str(path)),
-        hint=f"Give that file: --plugin {missing.distribution}." if is_file else "Install that plugin.",
-    )
 
 
 def _values(parameters: Parameters, record: CalibrationFile, path: str | Path, changed: Sequence[str]) -> Array:

@@ -21,7 +21,6 @@ from armcal.estimate.estimator import Estimate
 SCHEMA = 1
 UNMOVED_SD = 1e-4
 """In standard deviations: a step that ignores the bounds and is shorter than this is the solver's own tolerance."""
-_Seal = Literal["whole", "broken", "absent"]
 _LAST_LINE = "# sha256 of the lines above: "
 _CHANGED_HINT = (
     "Take a whole copy, or run the calibration again; if it was edited on purpose: armcal calibration accept FILE."
@@ -108,8 +107,17 @@ def parameter_records(estimate: Estimate) -> tuple[ParameterRecord, ...]:
     place = {name: i for i, name in enumerate(estimate.names)}
     records = []
     for position, name in enumerate(parameters.entry_names):
-        i = place.get(name)
-        known = {} if i is None else _uncertainty(estimate, i)
+        known: dict[str, Any] = {}
+        if (i := place.get(name)) is not None:
+            interval, sd, free = estimate.intervals[i], float(estimate.deviations[i]), float(estimate.unconstrained[i])
+            known = {
+                "sd": finite(sd),
+                "lower": finite(float(interval.lower)),
+                "upper": finite(float(interval.upper)),
+                "determined": estimate.identified_by_data[i],
+                "held_by_prior": estimate.determined[i] and not estimate.identified_by_data[i],
+                "unconstrained": free if abs(free - estimate.values[position]) > UNMOVED_SD * sd else None,
+            }
         records.append(
             ParameterRecord(
                 name=name,
@@ -141,10 +149,12 @@ def read_record(path: str | Path, changed: bool = False) -> tuple[ConfigSource, 
     Raises:
         ConfigError: it cannot be read, is not a calibration of this schema, or was changed since it was written.
     """
-    states: list[_Seal] = []
+    states: list[Literal["whole", "broken", "absent"]] = []
 
     def look(text: str) -> None:
-        states.append(_seal(text))
+        # Line ends may have become those of another system.
+        above, marker, kept = text.replace("\r\n", "\n").rpartition(_LAST_LINE)
+        states.append("absent" if not marker else "whole" if kept == f"{_hash(above)}\n" else "broken")
         if states == ["broken"] and not changed:
             reason = "its content is not what armcal wrote: it was edited or damaged."
             raise ConfigError(reason, where=Location(str(path)), hint=_CHANGED_HINT)
@@ -164,14 +174,6 @@ def read_record(path: str | Path, changed: bool = False) -> tuple[ConfigSource, 
             hint=_CHANGED_HINT,
         )
     return source, states == ["whole"]
-
-
-def _seal(text: str) -> _Seal:
-    """What a text's last line is; line ends may have become those of another system."""
-    above, marker, kept = text.replace("\r\n", "\n").rpartition(_LAST_LINE)
-    if not marker:
-        return "absent"
-    return "whole" if kept == f"{_hash(above)}\n" else "broken"
 
 
 def _hash(text: str) -> str:
@@ -195,19 +197,6 @@ def _in_line(dumper: yaml.SafeDumper, entries: list[Any]) -> yaml.SequenceNode:
 
 _Dumper.add_representer(str, _quoted)
 _Dumper.add_representer(list, _in_line)
-
-
-def _uncertainty(estimate: Estimate, index: int) -> dict[str, Any]:
-    interval, free = estimate.intervals[index], float(estimate.unconstrained[index])
-    moved = abs(free - estimate.values[estimate.free_entries[index]])
-    return {
-        "unconstrained": free if moved > UNMOVED_SD * estimate.deviations[index] else None,
-        "sd": finite(float(estimate.deviations[index])),
-        "lower": finite(float(interval.lower)),
-        "upper": finite(float(interval.upper)),
-        "determined": estimate.identified_by_data[index],
-        "held_by_prior": estimate.determined[index] and not estimate.identified_by_data[index],
-    }
 
 
 def lost_calibration(record: CalibrationFile, path: str | Path) -> ConfigError:

@@ -58,25 +58,21 @@ def urdf_text(chain: RigidChain, name: str) -> str:
         ProblemError: a joint has pitch or scale.
     """
     require_plain_axes(chain, "a URDF")
-    return "\n".join([f"<robot name={_attribute(name)}>", *_elements(chain), "</robot>", ""])
-
-
-def _elements(chain: RigidChain) -> Iterator[str]:
-    yield f'  <link name="{BASE}"/>'
-    parent, here = BASE, np.eye(4)
+    lines, parent, here = [f"<robot name={_attribute(name)}>", f'  <link name="{BASE}"/>'], BASE, np.eye(4)
     for number, joint in enumerate(chain.joints, start=1):
         child = f"link{number}"
-        yield f"  <joint name={_attribute(joint.name)} type={_attribute(_kind(joint))}>"
-        yield from _placed(here, joint.base_T_joint, parent, child)
-        yield f'    <axis xyz="{_words(numbers(joint.axis))}"/>'
-        yield from _bounds(joint)
-        yield "  </joint>"
-        yield f'  <link name="{child}"/>'
+        # A turning joint without known limits is written as one that has none.
+        turning = "revolute" if joint.limits and not joint.endless else "continuous"
+        lines.append(f'  <joint name={_attribute(joint.name)} type="{"prismatic" if joint.slides else turning}">')
+        lines += _placed(here, joint.base_T_joint, parent, child)
+        lines.append(f'    <axis xyz="{_words(numbers(joint.axis))}"/>')
+        lines += [*_bounds(joint), "  </joint>", f'  <link name="{child}"/>']
         parent, here = child, joint.base_T_joint
-    yield f'  <joint name={_attribute(_unused("tip", chain))} type="fixed">'
-    yield from _placed(here, chain.base_T_tool, parent, TIP)
-    yield "  </joint>"
-    yield f'  <link name="{TIP}"/>'
+    tip, taken = "tip", {joint.name for joint in chain.joints}
+    while tip in taken:
+        tip += "_"
+    lines += [f'  <joint name={_attribute(tip)} type="fixed">', *_placed(here, chain.base_T_tool, parent, TIP)]
+    return "\n".join([*lines, "  </joint>", f'  <link name="{TIP}"/>', "</robot>", ""])
 
 
 def _placed(base_T_parent: Array, base_T_child: Array, parent: str, child: str) -> Iterator[str]:
@@ -88,13 +84,6 @@ def _placed(base_T_parent: Array, base_T_child: Array, parent: str, child: str) 
     yield f'    <child link="{child}"/>'
 
 
-def _kind(joint: RigidJoint) -> str:
-    """A turning joint without known limits is written as one that has none."""
-    if joint.slides:
-        return "prismatic"
-    return "revolute" if joint.limits and not joint.endless else "continuous"
-
-
 def _bounds(joint: RigidJoint) -> Iterator[str]:
     if joint.limits and not joint.endless:
         lower, upper = (repr(float(end)) for end in joint.limits)
@@ -104,13 +93,6 @@ def _bounds(joint: RigidJoint) -> Iterator[str]:
     if joint.mimic is not None:
         numbers = (f'{key}="{getattr(joint.mimic, key)!r}"' for key in ("multiplier", "offset"))
         yield f"    <mimic joint={_attribute(joint.mimic.master)} {' '.join(numbers)}/>"
-
-
-def _unused(name: str, chain: RigidChain) -> str:
-    taken = {joint.name for joint in chain.joints}
-    while name in taken:
-        name += "_"
-    return name
 
 
 def _words(values: list[float]) -> str:

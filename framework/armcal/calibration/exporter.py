@@ -16,7 +16,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.calibration.calibration import Calibration, arm_named
-from armcal.calibration.calibration_file import CalibrationFile, ParameterRecord
+from armcal.calibration.calibration_file import ParameterRecord
 from armcal.calibration.rigid_chain import tool_poses
 from armcal.calibration.tool_expression import ToolExpression, arm_expression
 from armcal.errors import NotConvergedError
@@ -158,7 +158,12 @@ def request_of(calibration: Calibration, arm: str | None, out: str = "") -> Expo
     arms, name = calibration.system.arms, arm_named(calibration, arm)
     values = {block.name: np.array(block.nominal) for block in calibration.parameters.blocks}
     own = {block.name for block in arms[name].parameters()}
-    record = calibration.record
+    record, instruments = calibration.record, {}
+    for instrument, settings in record.measurements.items():
+        scope = f"{instrument}."
+        kept = {e.name.removeprefix(scope): e for e in record.parameters if e.name.startswith(scope)}
+        numbers = {local: entry.value for local, entry in kept.items()}
+        instruments[instrument] = Instrument(settings, numbers, {local: entry.sd for local, entry in kept.items()})
     return ExportRequest(
         name,
         arms[name],
@@ -170,14 +175,8 @@ def request_of(calibration: Calibration, arm: str | None, out: str = "") -> Expo
         entries=tuple(e for e in record.parameters if e.name.partition("[")[0] in own),
         origin=Origin(record.experiment, record.created, record.software, record.identity),
         out=out,
-        instruments={name: _instrument(record, name) for name in record.measurements},
+        instruments=instruments,
     )
-
-
-def _instrument(record: CalibrationFile, name: str) -> Instrument:
-    own = {e.name.removeprefix(f"{name}."): e for e in record.parameters if e.name.startswith(f"{name}.")}
-    numbers = {local: entry.value for local, entry in own.items()}
-    return Instrument(record.measurements[name], numbers, {local: entry.sd for local, entry in own.items()})
 
 
 def random_commands(arm: Arm, count: int = POSES, seed: int = 1) -> Array:

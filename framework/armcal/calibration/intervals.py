@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -50,6 +49,11 @@ class RecordingRecord(Settings):
     channels: tuple[str, ...]
     records: tuple[tuple[float, ...], ...]
     weights: tuple[tuple[float, ...], ...] = ()
+
+    @property
+    def dataset(self) -> Dataset:
+        """The records."""
+        return Dataset.of_rows(self.channels, self.records, "the recording that the calibration keeps")
 
 
 class StretchRecord(Settings):
@@ -173,7 +177,7 @@ class Uncertainty:
             near = self._near(recording_record, commands)
         parts = [self._apart(problem, commands.subset(chunk), chunk) for chunk in _chunks(np.flatnonzero(~near))]
         if recording_record is not None and near.any():
-            recorded = _dataset(recording_record)
+            recorded = recording_record.dataset
             along = chain(problem, recorded, commands.subset(np.flatnonzero(near)))
             drift = self._known_drift(recording_record, recorded, along)
             for chunk in _chunks(np.flatnonzero(near)):
@@ -183,7 +187,13 @@ class Uncertainty:
     def _apart(self, problem: Problem, commands: Dataset, places: Indices) -> _Part:
         """Where nothing is told of a drift."""
         records = with_joint_noise(problem, problem.records(commands), self.values, self.noise_scale)
-        spreads = self._predictor(problem, None).in_new_recording(self._whitened(problem, records))
+        whitened = records
+        if self.components:  # with the noise that the calibration estimated
+            instruments = {component.name for component in self.components if component.kind == "instrument"}
+            axes: Axes = "together" if instruments <= set(self.system.measurements) else "apart"
+            estimated = VarianceComponents(self.components, (), (), 0.0)
+            whitened = apply_components(problem, self.values, records, estimated, axes)
+        spreads = self._predictor(problem, None).in_new_recording(whitened)
         recording: Recording = "same" if self.record.recording is None else "new"
         still = tuple(np.zeros_like(spread.deviations) for spread in spreads)
         return _Part(places, recording, still, spreads, reading_slopes(problem, self.values, records))
@@ -224,40 +234,21 @@ class Uncertainty:
         unread = dict.fromkeys(names, np.zeros(len(commands)))
         blank = replace(commands, channels={**commands.channels, **unread})
         problem = self._problem(blank)
-        shown = problem.predict(self.values, problem.records(blank))
-        read = {
-            channel: values[row]
-            for kernel, values in zip(problem.kernels, shown, strict=True)
-            for row, channel in enumerate(kernel.factor.output_channels)
-        }
+        read = problem.by_channel(problem.predict(self.values, problem.records(blank)))
         return problem, replace(commands, channels={**unread, **commands.channels, **read})
 
     def _problem(self, dataset: Dataset) -> Problem:
-        system = self.system
-        parts = (system.arms, system.measurements, self._drifting, system.environment, dataset)
-        return Problem.build(*parts, "interpreted", groups={})
-
-    @cached_property
-    def _drifting(self) -> Parameters:
-        recording = self.record.recording
+        system, recording = self.system, self.record.recording
         drifts = {} if recording is None else recording.drifts
-        return self.parameters.replaced(
+        drifting = self.parameters.replaced(
             {n: replace(self.parameters[n], drift=Drift(d.sd, d.over, d.channel)) for n, d in drifts.items()}
         )
-
-    def _whitened(self, problem: Problem, records: tuple[FactorRecords, ...]) -> tuple[FactorRecords, ...]:
-        """With the noise that the calibration estimated, if it did."""
-        if not self.components:
-            return records
-        instruments = [c.name for c in self.components if c.kind == "instrument"]
-        axes: Axes = "together" if set(instruments) <= set(self.system.measurements) else "apart"
-        variance_components = VarianceComponents(self.components, (), (), 0.0)
-        return apply_components(problem, self.values, records, variance_components, axes)
+        parts = (system.arms, system.measurements, drifting, system.environment, dataset)
+        return Problem.build(*parts, "interpreted", groups={})
 
     def _near(self, recording: RecordingRecord, commands: Dataset) -> Array:
         """Whether the recording says anything of each record's drift (N)."""
-        near = np.ones(len(commands), dtype=bool)
-        recorded = _dataset(recording)
+        near, recorded = np.ones(len(commands), dtype=bool), recording.dataset
         for name, drift in recording.drifts.items():
             if not commands.has(drift.channel):
                 raise DataError(
@@ -329,12 +320,3 @@ def _joined(
 
 def _chunks(places: Indices) -> list[Indices]:
     return [places[start : start + _AT_ONCE] for start in range(0, len(places), _AT_ONCE)]
-
-
-def _dataset(recording: RecordingRecord) -> Dataset:
-    rows = np.array(recording.records, dtype=float).reshape(len(recording.records), len(recording.channels))
-    return Dataset(
-        tuple(str(i) for i in range(1, len(rows) + 1)),
-        {name: np.ascontiguousarray(column) for name, column in zip(recording.channels, rows.T, strict=True)},
-        source="the recording that the calibration keeps",
-    )

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from armcal.calibration.calibration import Calibration
-from armcal.calibration.calibration_file import ParameterRecord
 from armcal.errors import InputError, Location
 from armcal.plugins import PluginRegistry
 
@@ -42,21 +41,17 @@ def zeros_of(path: Path, arm: str | None, registry: PluginRegistry) -> tuple[dic
     for entry in loaded.record.parameters:
         match = _MODEL_ZERO.fullmatch(entry.name.removeprefix(f"{chosen.name}.{chosen.model_name}."))
         number = stated.get(entry.name, int(match[2]) if match and entry.unit == "rad" else 0)
-        if number and (joint := chosen.joint_names[number - 1]) in chosen.commanded:
-            _take(zeros, reasons, joint, entry, entry.name in stated)
+        if not number or (joint := chosen.joint_names[number - 1]) not in chosen.commanded:
+            continue
+        if entry.free and (entry.sd is None or not entry.determined):
+            reasons[joint] = f"the records do not determine {entry.name}"
+            continue
+        value = entry.value if entry.name in stated else entry.value - entry.nominal
+        if entry.free or (entry.name in stated and value):
+            before = zeros.get(joint, Zero(0.0, 0.0))
+            sd = math.hypot(before.sd_deg, math.degrees(entry.sd or 0.0))
+            zeros[joint] = Zero(before.degrees + math.degrees(value), sd)
     if not zeros:
         hint = "Free them in parameters.free (arm.EFFECT.offset*, of an effect servo_map), and run again."
         raise InputError("found no calibrated zero of a joint.", where=where, hint=hint)
     return zeros, {joint: reason for joint, reason in reasons.items() if joint not in zeros}
-
-
-def _take(zeros: dict[str, Zero], reasons: dict[str, str], joint: str, entry: ParameterRecord, is_map: bool) -> None:
-    if entry.free and (entry.sd is None or not entry.determined):
-        reasons[joint] = f"the records do not determine {entry.name}"
-        return
-    value = entry.value if is_map else entry.value - entry.nominal
-    if not entry.free and not (is_map and value):
-        return
-    before = zeros.get(joint, Zero(0.0, 0.0))
-    sd = math.hypot(before.sd_deg, math.degrees(entry.sd or 0.0))
-    zeros[joint] = Zero(before.degrees + math.degrees(value), sd)

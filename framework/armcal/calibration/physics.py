@@ -6,10 +6,9 @@ explain what they find.
 
 import hashlib
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from armcal.base.settings import Settings
 from armcal.calibration.intervals import PlusMinus
 from armcal.calibration.tool_expression import poses_of
 from armcal.config.system import System
+from armcal.errors import Location, PluginError
 from armcal.estimate.validation import Indices
 from armcal.measure.contact import ArmsAlone
 from armcal.measure.measurement import Measurement
@@ -69,9 +69,7 @@ class CheckRecord(Settings):
     @property
     def commands(self) -> Dataset:
         """The records."""
-        rows = np.array(self.records, dtype=float).reshape(len(self.records), len(self.channels))
-        columns = {name: np.ascontiguousarray(column) for name, column in zip(self.channels, rows.T, strict=True)}
-        return Dataset(tuple(str(i) for i in range(1, len(rows) + 1)), columns, source="the check poses")
+        return Dataset.of_rows(self.channels, self.records, "the check poses")
 
 
 @dataclass(frozen=True)
@@ -106,12 +104,7 @@ def predict(system: System, parameters: Parameters, commands: Dataset) -> tuple[
     parts = (system.arms, measurements, fixed, system.environment, commands)
     problem = Problem.build(*parts, "interpreted", groups={})
     shown = problem.predict(fixed.nominal(), problem.records(commands))
-    channels = {
-        channel: values[row]
-        for kernel, values in zip(problem.kernels, shown, strict=True)
-        for row, channel in enumerate(kernel.factor.output_channels)
-    }
-    return channels, poses_of(shown[0][len(problem.kernels[0].factor.output_channels) :])
+    return problem.by_channel(shown), poses_of(shown[0][len(problem.kernels[0].factor.output_channels) :])
 
 
 def components(system: System, registry: PluginRegistry) -> tuple[ComponentRecord, ...]:
@@ -125,8 +118,12 @@ def components(system: System, registry: PluginRegistry) -> tuple[ComponentRecor
         version=__version__,
         source=_source(assembly.__name__),
     )
-    records = {("core", "arm"): core}
-    for kind, name in _types(system.description):
+    records, used = {("core", "arm"): core}, list[tuple[str, str]]()
+    for arm in system.description["arms"].values():
+        used.append(("model", arm["model"]["type"]))
+        used += [("effect", effect["type"]) for effect in arm.get("effects", {}).values()]
+    used += [("measurement", measurement["type"]) for measurement in system.description["measurements"].values()]
+    for kind, name in used:
         component = registry.find(kind, name)
         plugin = plugins[component.plugin, component.module]
         records[kind, name] = ComponentRecord(
@@ -140,10 +137,19 @@ def components(system: System, registry: PluginRegistry) -> tuple[ComponentRecor
     return tuple(records.values())
 
 
-def absent(kept: tuple[ComponentRecord, ...], registry: PluginRegistry) -> ComponentRecord | None:
-    """The first component that no plugin offers."""
+def require_present(kept: tuple[ComponentRecord, ...], registry: PluginRegistry, where: Location) -> None:
+    """Raise PluginError for the first component that no plugin offers."""
     offered = {(component.kind, component.name) for component in registry.components} | {("core", "arm")}
-    return next((record for record in kept if (record.kind, record.name) not in offered), None)
+    for record in kept:
+        if (record.kind, record.name) not in offered:
+            given = f"{record.distribution or record.plugin} {record.version}".strip()
+            is_file = record.distribution.endswith(".py")
+            raise PluginError(
+                f"it was made with the {record.kind} {record.name!r} of the plugin{' file' if is_file else ''} "
+                f"{given}, which is not loaded.",
+                where=where,
+                hint=f"Give that file: --plugin {record.distribution}." if is_file else "Install that plugin.",
+            )
 
 
 def differences(kept: tuple[ComponentRecord, ...], now: tuple[ComponentRecord, ...]) -> list[str]:
@@ -233,15 +239,6 @@ def movement(system: System, parameters: Parameters, kept: CheckRecord) -> Movem
             shares[name] = float(np.abs(after - kept.predicted[name]).max()) / width
     worst = max(shares, key=lambda name: np.inf if np.isnan(shares[name]) else shares[name])
     return Movement(tool_m, float(np.nan_to_num(shares[worst], nan=np.inf)), worst)
-
-
-def _types(description: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    for arm in description["arms"].values():
-        yield "model", arm["model"]["type"]
-        for effect in arm.get("effects", {}).values():
-            yield "effect", effect["type"]
-    for measurement in description["measurements"].values():
-        yield "measurement", measurement["type"]
 
 
 def _source(module: str) -> str:

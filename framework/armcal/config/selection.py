@@ -94,20 +94,16 @@ def _with_drift(
                     hint="Let free numbers drift: add it to parameters.free, under a prior if need be.",
                 )
             deviation = _deviation(block, stated.sd, source, (*at, glob, "sd"))
-            over, channel = _distance(stated.over, source, (*at, glob, "over"))
-            parameters = parameters.replaced({name: replace(block, drift=Drift(deviation, over, channel))})
+            timed, where = isinstance(stated.over, str), source.where((*at, glob, "over"))
+            try:
+                over = parse_quantity(stated.over, "time") if isinstance(stated.over, str) else float(stated.over)
+            except ValueError as fault:
+                raise ConfigError(f"{fault}", where=where, hint="Write records (10) or a time (20 min).") from fault
+            if not over > 0 or not math.isfinite(over):
+                raise ConfigError(f"found {stated.over}, expected a distance above zero.", where=where)
+            drift = Drift(deviation, over, "time" if timed else "sequence")
+            parameters = parameters.replaced({name: replace(block, drift=drift)})
     return parameters
-
-
-def _distance(text: str | float, source: ConfigSource, at: Path) -> tuple[float, str]:
-    """A number of records, or a time in s; and the channel that counts it."""
-    try:
-        over, channel = (parse_quantity(text, "time"), "time") if isinstance(text, str) else (float(text), "sequence")
-    except ValueError as fault:
-        raise ConfigError(f"{fault}", where=source.where(at), hint="Write records (10) or a time (20 min).") from fault
-    if not over > 0 or not math.isfinite(over):
-        raise ConfigError(f"found {text}, expected a distance above zero.", where=source.where(at))
-    return over, channel
 
 
 def _deviation(block: ParameterBlock, text: str | float, source: ConfigSource, at: Path) -> float:

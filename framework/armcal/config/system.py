@@ -144,8 +144,15 @@ def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
         measurements[name], described[name] = build_component(source, registry, "measurement", at, tuple(arms))
         carried = measurements[name]
         if isinstance(carried, Carried):
+            carrier = arms[carried.arms[0]]
+            moved = [frame for frame, joint in frame_names(carrier.nominal_chain).items() if joint]
             for setting, frame in carried.carriers.items():
-                _check_carrier(source, (*at, setting), frame, arms[measurements[name].arms[0]])
+                if frame not in moved:
+                    raise ConfigError(
+                        f"no frame that a joint of {carrier.name} moves is called {frame!r}.",
+                        where=source.where((*at, setting)),
+                        hint=f"Such frames are {', '.join(moved)}.",
+                    )
     for name, measurement in measurements.items():
         if isinstance(measurement, Borrowing) and measurement.lender is not None:
             _check_lender(source, ("measurements", name), measurement, measurements)
@@ -236,17 +243,6 @@ def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm
     if settings.placement:
         described["placement"] = settings.placement.to_config()
     return arm, described
-
-
-def _check_carrier(source: ConfigSource, at: Path, frame: str, arm: Arm) -> None:
-    """Refuse a frame that the arm does not have, or that none of its joints moves."""
-    moved = [name for name, joint in frame_names(arm.nominal_chain).items() if joint]
-    if frame not in moved:
-        raise ConfigError(
-            f"no frame that a joint of {arm.name} moves is called {frame!r}.",
-            where=source.where(at),
-            hint=f"Such frames are {', '.join(moved)}.",
-        )
 
 
 def _check_lender(source: ConfigSource, at: Path, borrower: Borrowing, measurements: Mapping[str, Measurement]) -> None:

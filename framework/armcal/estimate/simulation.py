@@ -55,12 +55,7 @@ def measured_without_noise(request: SimulationRequest, commands: Dataset) -> Map
     problem = Problem.build(
         request.arms, request.measurements, fixed, request.environment, commands, evaluator="interpreted"
     )
-    shown = problem.predict(fixed.nominal(), problem.records(commands))
-    return {
-        channel: values[row]
-        for kernel, values in zip(problem.kernels, shown, strict=True)
-        for row, channel in enumerate(kernel.factor.output_channels)
-    }
+    return problem.by_channel(problem.predict(fixed.nominal(), problem.records(commands)))
 
 
 def measured_with_noise(

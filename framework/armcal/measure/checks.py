@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from armcal.base.dataset import Dataset
 from armcal.base.units import split_suffix, to_unit
 from armcal.errors import DataError, Location
+from armcal.measure.groups import first_of_pose
 from armcal.measure.layout import Layout, joints_by_arm, layout_of, set_aside, warned
 from armcal.measure.missing import set_aside_not_finite
-from armcal.measure.poses import first_of_pose
 from armcal.measure.reader import CYCLE, RequestedChannel
 
 __all__ = [

@@ -11,7 +11,6 @@ from types import MappingProxyType
 from typing import TextIO
 
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.units import DIMENSIONLESS, display_unit, to_unit, units_of
 from armcal.errors import DataError, Location
 from armcal.io.plain_files import check_output
@@ -63,8 +62,11 @@ def _columns(
         )
     columns: dict[str, Sequence[str]] = {ID_COLUMN: dataset.ids}
     names = column_names([w for w in requested_channels if dataset.has(w.channel)], units)
-    written = [(column, _texts(dataset.channels[channel], unit)) for channel, (column, unit) in names.items()]
-    for name, texts in [*written, *dataset.extra.items()]:
+    written: dict[str, Sequence[str]] = {}
+    for channel, (column, unit) in names.items():
+        values = to_unit(dataset.channels[channel], unit).tolist()
+        written[column] = [_text(int(x) if unit == "1" and x.is_integer() else x) for x in values]
+    for name, texts in [*written.items(), *dataset.extra.items()]:
         if name in columns:
             raise DataError(
                 f"two columns would be called {name}.",
@@ -95,13 +97,6 @@ def column_names(
                 raise ValueError(f"{unit!r} is not a unit of {w.dimension}; expected one of {', '.join(known)}.")
         columns[w.channel] = (name if unit == "1" else f"{name}_{unit}", unit)
     return columns
-
-
-def _texts(values: Array, unit: str) -> list[str]:
-    numbers = to_unit(values, unit).tolist()
-    if unit == "1":
-        return [_text(int(x) if x.is_integer() else x) for x in numbers]
-    return [_text(x) for x in numbers]
 
 
 def _text(number: float) -> str:

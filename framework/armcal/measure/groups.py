@@ -1,4 +1,7 @@
-"""Which group of records each record belongs to, and the parameters that the groups bring."""
+"""Which group of records each record belongs to, and the parameters that the groups bring; which are of one pose.
+
+Records of one pose tell of noise, and nothing of a model that another of them does not.
+"""
 
 import fnmatch
 from collections.abc import Mapping, Sequence
@@ -6,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock
@@ -166,7 +170,10 @@ def ties_of(measurements: Mapping[str, Measurement], groups: Groups) -> tuple[Ow
         if isinstance(measurement, GroupedMeasurement):
             owner = owner_of(instance, measurement)
             for tie in measurement.ties(groups.get(owner, ())):
-                first, second = (_names(owner, measurement, key) for key in tie.groups)
+                first, second = (
+                    {block.name: group_name(owner, key, block.name) for block in measurement.group_parameters(key)}
+                    for key in tie.groups
+                )
                 owned_ties.append(OwnedTie((first, second), tie))
     return tuple(owned_ties)
 
@@ -188,6 +195,37 @@ def _check_owner(instance: str, measurement: GroupedMeasurement, measurements: M
         )
 
 
-def _names(owner: str, measurement: GroupedMeasurement, key: str) -> dict[str, str]:
-    blocks: Sequence[ParameterBlock] = measurement.group_parameters(key)
-    return {block.name: group_name(owner, key, block.name) for block in blocks}
+_OF_RANGE, _LEAST, _MOST = 0.005, 5e-4, 5e-3
+"""Of a joint's range, and in rad or m: two records nearer than this in all joints are of one pose. Encoders at a pose
+differ by less, poses chosen apart by more."""
+_LOADS = ("gravity_", "payload", "force_", "torque_")
+
+
+def first_of_pose(dataset: Dataset, joints: Sequence[str]) -> NDArray[np.intp]:
+    """For each record the first one of its pose (N): near in all joint channels, and under the same load.
+
+    Nearness is to that first record, so that a slow sweep falls into many poses.
+    """
+    count = len(dataset)
+    loads = [name for name in dataset.channels if name.startswith(_LOADS)]
+    if not joints or not count:
+        return np.arange(count, dtype=np.intp)
+    angles = np.nan_to_num(dataset.stacked(joints))
+    tolerance = np.clip(_OF_RANGE * np.ptp(angles, axis=1), _LEAST, _MOST)
+    near = [angles / tolerance[:, None]]
+    if loads:
+        # Other loads are far away: nearness is within one.
+        _, alike = np.unique(np.round(np.nan_to_num(dataset.stacked(loads)), 6), axis=1, return_inverse=True)
+        near.append(2.0 * np.reshape(alike, (1, count)))
+    points = np.vstack(near).T
+    tree, first = cKDTree(points), np.full(count, -1, dtype=np.intp)
+    for i in range(count):
+        if first[i] < 0:
+            around = np.array(tree.query_ball_point(points[i], 1.0, p=np.inf), dtype=np.intp)
+            first[around[first[around] < 0]] = i
+    return first
+
+
+def pose_numbers(dataset: Dataset, joints: Sequence[str]) -> NDArray[np.intp]:
+    """Numbers of the poses (N), from 0 in the order in which they first appear."""
+    return np.asarray(np.unique(first_of_pose(dataset, joints), return_inverse=True)[1], dtype=np.intp)

@@ -1,14 +1,17 @@
-"""Readers and simulators: where datasets come from."""
+"""Readers: where datasets come from, the channels that they are asked for, and lists of record ids."""
 
+import csv
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.base.units import DIMENSIONLESS, units_of
 from armcal.io.parallel import Report, unreported
+from armcal.io.plain_files import input_bytes, refuse, text_of
 from armcal.measure.measurement import Measurement, noise_channels
 from armcal.measure.points import PointMeasurement
 
@@ -178,3 +181,30 @@ def _arm_channels(arm: Arm, alone: bool, parts: tuple[str, ...]) -> Iterator[Req
 
 def _names(own: str, short: Sequence[str], alone: bool) -> tuple[str, ...]:
     return (own, *short) if alone else (own,)
+
+
+MAX_ID_LIST_BYTES = 1 << 26
+_ID_HEADER = "Give a header pose_id and an id a line."
+
+
+def read_ids(path: Path) -> tuple[str, ...]:
+    """The ids in a file, in its order.
+
+    Raises:
+        DataError: no such file, no text, no ids, or an id stands twice.
+    """
+    text = text_of(input_bytes(path, MAX_ID_LIST_BYTES, "a list of ids"), path, "Save it as CSV text in UTF-8.")
+    rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
+    if not rows:
+        refuse(path, "it is empty.", _ID_HEADER)
+    header = [cell.strip().lower() for cell in rows[0]]
+    column = next((header.index(name) for name in ID_NAMES if name in header), None)
+    if column is None:
+        refuse(path, f"found the columns {', '.join(rows[0])}.", _ID_HEADER)
+    ids = [row[column].strip() for row in rows[1:] if len(row) > column]
+    if not ids:
+        refuse(path, "it lists no ids.", "Give an id a line below the header.")
+    twice = sorted({record for record in ids if ids.count(record) > 1}) if len(set(ids)) < len(ids) else []
+    if twice:
+        refuse(path, f"the id {twice[0]} stands twice.", "List each record once.")
+    return tuple(ids)

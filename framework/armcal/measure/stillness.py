@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from armcal.base.domains import Array
+from armcal.base.quaternions import nearest_turn
 
 LEVER_M = 0.1
 """A turn counts as much as it moves points this far from the target."""
@@ -85,9 +86,7 @@ def _spatial_median(points: Array) -> Array:
 
 def mean_rotation(rotations: Array) -> Array:
     """The rotation (3 x 3) whose matrix is nearest to all (N x 3 x 3, N > 0) in the sum of squares. [Moakher2002]"""
-    left, _, right = np.linalg.svd(rotations.mean(axis=0))
-    handed = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    return np.asarray((left * handed) @ right)
+    return nearest_turn(rotations.mean(axis=0))
 
 
 def turns_from(mean: Array, rotations: Array) -> Array:

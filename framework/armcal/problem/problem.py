@@ -250,6 +250,11 @@ class Problem:
         pairs = zip(self.grouped, records, strict=True)
         return tuple(grouped.predict(values, record)[:, : record.count] for grouped, record in pairs)
 
+    def by_channel(self, shown: Sequence[Array]) -> dict[str, Array]:
+        """Of what ``predict`` gives, the outputs by channel (N each)."""
+        names = [kernel.factor.output_channels for kernel in self.kernels]
+        return {name: row for own, rows in zip(names, shown, strict=True) for name, row in zip(own, rows, strict=False)}
+
     def nuisance_starts(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
         """Where each record alone has its group's parameters start, one (entries x N) matrix a factor."""
         pairs = zip(self.grouped, records, strict=True)

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from armcal.base.domains import Array
-from armcal.problem.tool_motion import nearest_turn, rigid_fit, spread_of
+from armcal.base.quaternions import nearest_turn
+from armcal.problem.tool_motion import rigid_fit, spread_of
 
 FEWEST = 8
 """Records: with fewer, nine numbers explain anything."""

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from armcal.base.domains import Array
+from armcal.base.quaternions import nearest_turn
 from armcal.problem.problem import FactorRecords, Problem
 
 _STEP = 1e-4

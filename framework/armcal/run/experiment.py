@@ -24,10 +24,8 @@ from armcal.errors import ConfigError
 from armcal.estimate.estimator import Estimator, Progress, no_progress
 from armcal.estimate.simulation import SimulationRequest, Simulator
 from armcal.estimate.weighing import weighed
-from armcal.measure.environment import noticed, require_conditions
-from armcal.measure.groups import grouped_instances, groups_of, unmatched
-from armcal.measure.limits import warn_beyond_limits
-from armcal.measure.poses import pose_numbers
+from armcal.measure.environment import noticed, require_conditions, warn_beyond_limits
+from armcal.measure.groups import grouped_instances, groups_of, pose_numbers, unmatched
 from armcal.measure.reader import Reader, ReadRequest, requested_channels
 from armcal.plugins import PluginRegistry, discover
 from armcal.run.settings import ExperimentSettings

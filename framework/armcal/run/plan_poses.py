@@ -17,8 +17,7 @@ from armcal.calibration.compensation.finder import Allowed
 from armcal.config.system import build_component
 from armcal.errors import ConfigError, DataError, Location, ProblemError
 from armcal.io.plain_files import input_file
-from armcal.measure.id_list import MAX_BYTES, read_ids
-from armcal.measure.reader import Reader
+from armcal.measure.reader import MAX_ID_LIST_BYTES, Reader, read_ids
 from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment, with_data
 from armcal.run.plan_clearance import clearance_check
@@ -158,7 +157,7 @@ def given_records(experiment: Experiment, path: Path) -> Dataset:
         DataError: refused, or an id is not in the data.
     """
     try:
-        with input_file(path, MAX_BYTES, "a list of ids") as stream:
+        with input_file(path, MAX_ID_LIST_BYTES, "a list of ids") as stream:
             line = stream.readline(1000).decode("utf-8-sig", "replace")
     except DataError:
         return read_poses(experiment, path)  # the reader reports what is wrong

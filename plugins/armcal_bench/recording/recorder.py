@@ -13,7 +13,7 @@ from armcal.devices.joint_stream import JointSample, JointStream
 from armcal.devices.line_source import refused_lines_text
 from armcal.errors import InputError
 from armcal.io.file_set import write_over
-from armcal.measure.limits import warn_beyond_limits
+from armcal.measure.environment import warn_beyond_limits
 
 from armcal_bench.bench import Bench
 from armcal_bench.recording.advice import Advice

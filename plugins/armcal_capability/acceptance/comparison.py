@@ -6,14 +6,13 @@ from typing import Literal, get_args
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.base.quaternions import rotation_matrix
+from armcal.base.quaternions import nearest_turn, rotation_matrix
 from armcal.errors import DataError, Location, NotConvergedError
 from armcal.estimate.placing import placings
 from armcal.estimate.start import BETTER, FAR, pose_words
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.rigid_alignment import FEWEST, Tools, alignments, undetermined
 from armcal.problem.sighting import Sighting, sighting_of, tools_of
-from armcal.problem.tool_motion import nearest_turn
 from armcal.report.numbers import plural
 from armcal.run.prepare import check_reach
 from scipy.spatial.transform import Rotation

@@ -12,7 +12,7 @@ from armcal.config.system import build_component
 from armcal.errors import DataError, Location
 from armcal.io.plain_files import input_file
 from armcal.measure.environment import noticed
-from armcal.measure.poses import pose_numbers
+from armcal.measure.groups import pose_numbers
 from armcal.measure.reader import CYCLE, Reader, ReadRequest, RequestedChannel, requested_channels
 from armcal.plugins import PluginRegistry
 from numpy.typing import NDArray

@@ -113,7 +113,10 @@ class Finder:
         for todo in _chunks(np.arange(record.shape[1]), wide):
             rows, first = np.repeat(todo, wide), np.arange(len(todo)) * wide
             attempts = self._nothing(len(rows))
-            picks = self._picked_for(target[:, todo], at[:, todo], wide).ravel()[:, None]
+            # Seeds near to targets, and near to commands too.
+            moved = _apart(self._seeds.commands[:, None, :], at[:, todo, None])
+            cost = self._seeds.apart(target[:, todo], self._solver.length) + _MOVED * self._solver.length**2 * moved
+            picks = np.argpartition(cost, wide - 1, axis=1)[:, :wide].reshape(-1, 1)
             records, targets, preferred = (chosen_of(array, rows) for array in (record, target, at))
             self._round(records, targets, np.arange(len(rows)), picks, attempts, None, preferred)
             self.towards(records, targets, preferred, attempts)
@@ -154,13 +157,6 @@ class Finder:
         near = np.argpartition(apart, last, axis=1)[:, : used + wide]
         order = np.argsort(np.take_along_axis(apart, near, axis=1), axis=1)
         return np.asarray(np.take_along_axis(near, order, axis=1)[:, used:])
-
-    def _picked_for(self, target: Array, at: Array, wide: int) -> NDArray[np.intp]:
-        """Seeds near to targets, and near to commands too (N x wide)."""
-        apart = self._seeds.apart(target, self._solver.length)
-        moved = _apart(self._seeds.commands[:, None, :], at[:, :, None])
-        cost = apart + _MOVED * self._solver.length**2 * moved
-        return np.asarray(np.argpartition(cost, wide - 1, axis=1)[:, :wide])
 
     def _round(
         self,

@@ -89,8 +89,9 @@ class Descent:
 
     def _step(self, record: Array, commands: Array, states: Array, trust: Array) -> Array:
         """Least squares of what is to be small along commands that keep the target; joints at limits stay (n x N)."""
-        small, slopes_of_small, slopes_of_tool = self._function(with_commands(record, commands), states)
-        slope, held = (_by_record(array, len(commands)) for array in (slopes_of_small, slopes_of_tool))
+        small, *by_commands = self._function(with_commands(record, commands), states)
+        # Slopes of several rows by commands, column by column, as N x rows x n.
+        slope, held = (s.reshape(len(commands), -1, s.shape[1]).transpose(2, 1, 0) for s in by_commands)
         pull = -np.einsum("nki,kn->ni", slope, small)
         low, high = self._solver.limits[:, 0], self._solver.limits[:, 1]
         at = commands.T
@@ -110,8 +111,3 @@ class Descent:
         length = np.abs(step).max(axis=1, keepdims=True)
         step *= np.minimum(1.0, trust[:, None] / np.maximum(length, 1e-300))
         return np.asarray(np.clip(at + step, low, high) - at).T
-
-
-def _by_record(slopes: Array, count: int) -> Array:
-    """Slopes of several rows by commands, column by column (rows n x N), as N x rows x n."""
-    return slopes.reshape(count, -1, slopes.shape[1]).transpose(2, 1, 0)
