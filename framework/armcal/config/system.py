@@ -144,7 +144,7 @@ def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
         measurements[name], described[name] = build_component(source, registry, "measurement", at, tuple(arms))
         carried = measurements[name]
         if isinstance(carried, Carried):
-            carrier = arms[carried.arms[0]]
+            carrier = arms[measurements[name].arms[0]]
             moved = [frame for frame, joint in frame_names(carrier.nominal_chain).items() if joint]
             for setting, frame in carried.carriers.items():
                 if frame not in moved:

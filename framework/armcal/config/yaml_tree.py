@@ -80,9 +80,14 @@ def set_at(node: Node, steps: tuple[str, ...], value: Node) -> Node:
         return value
     step, rest = steps[0], steps[1:]
     if isinstance(node.value, tuple):
-        index = _index(node.value, step, value.origin)
         items = list(node.value)
-        items[index] = set_at(items[index], rest, value)
+        if not (step.isascii() and step.isdecimal() and len(step) < 10 and int(step) < len(items)):
+            raise ConfigError(
+                f"found the index {step!r} into a list of {len(items)} values.",
+                where=value.origin.at(None),
+                hint=f"Write an index from 0 to {len(items) - 1}." if items else "Override the whole list.",
+            )
+        items[int(step)] = set_at(items[int(step)], rest, value)
         return replace(node, value=tuple(items))
     if node.value is not None and not isinstance(node.value, dict):
         raise ConfigError(
@@ -96,13 +101,3 @@ def set_at(node: Node, steps: tuple[str, ...], value: Node) -> Node:
     else:
         entries[step] = set_at(entries.get(step, Node(value.origin, 1, None)), rest, value)
     return replace(node, value=entries)
-
-
-def _index(items: tuple[Node, ...], step: str, origin: Origin) -> int:
-    if step.isascii() and step.isdecimal() and len(step) < 10 and int(step) < len(items):
-        return int(step)
-    raise ConfigError(
-        f"found the index {step!r} into a list of {len(items)} values.",
-        where=origin.at(None),
-        hint=f"Write an index from 0 to {len(items) - 1}." if items else "Override the whole list.",
-    )

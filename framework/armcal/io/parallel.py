@@ -70,8 +70,8 @@ class Automatic:
             left = len(tasks) - number
             worth_it = number and left > 1 and spent / number * left > self.worth_s
             if worth_it and _picklable((work, task)):
-                rest = partial(_report_rest, report, number / len(tasks))
-                return results + Workers().map(work, tasks[number:], rest)
+                done = number / len(tasks)
+                return results + Workers().map(work, tasks[number:], lambda more: report(done + (1 - done) * more))
             results.append(work(task))
         report(1.0)
         return results
@@ -132,33 +132,22 @@ class Workers:
             options["inner_max_num_threads"] = 1
         if self.backend == "ray":
             _join_ray(self.address)
-        if self.backend != "dask":
-            with _safe_path(), joblib.parallel_config(**options):
+        if self.backend == "dask":
+            with _dask_client(self.address) as client, joblib.parallel_config(**options, client=client):
                 yield
             return
-        with _dask_client(self.address) as client, joblib.parallel_config(**options, client=client):
-            yield
-
-
-@contextmanager
-def _safe_path() -> Iterator[None]:
-    """Processes started meanwhile do not take a file of the working directory for a library, as the command does not.
-
-    Loky starts them by ``python -m``, which looks there first, and has no argument for it.
-    """
-    before = os.environ.get(_SAFE_PATH)
-    os.environ[_SAFE_PATH] = "1"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[_SAFE_PATH]
-        else:
-            os.environ[_SAFE_PATH] = before
-
-
-def _report_rest(report: Report, before: float, done: float) -> None:
-    report(before + (1 - before) * done)
+        # Processes started meanwhile do not take a file of the working directory for a library, as the command does
+        # not. Loky starts them by ``python -m``, which looks there first, and has no argument for it.
+        before = os.environ.get(_SAFE_PATH)
+        os.environ[_SAFE_PATH] = "1"
+        try:
+            with joblib.parallel_config(**options):
+                yield
+        finally:
+            if before is None:
+                del os.environ[_SAFE_PATH]
+            else:
+                os.environ[_SAFE_PATH] = before
 
 
 def parse_executor(text: str) -> Executor:

@@ -44,7 +44,8 @@ def input_file(
     elif not S_ISREG(status.st_mode):
         message, hint = f"it is a device or pipe, expected {expected}.", "Save what it gives to a file, and give that."
     elif status.st_size > most:
-        message, hint = f"it is larger than {_size_text(most)}, expected {expected}.", "Check the path, or split it."
+        size, unit = next(((size, unit) for size, unit in _UNITS if most >= size), (1, "bytes"))
+        message, hint = f"it is larger than {most / size:.3g} {unit}, expected {expected}.", "Check the path, or split it."
     if message:
         os.close(descriptor)
         raise refusal(message, where=where, hint=hint)
@@ -104,9 +105,3 @@ def check_output(path: Path, refusal: type[InputError] = DataError) -> None:
         where=Location(str(path)),
         hint="Give the path of the file itself.",
     )
-
-
-def _size_text(count: int) -> str:
-    """A number of bytes as people read it."""
-    unit, name = next(((unit, name) for unit, name in _UNITS if count >= unit), (1, "bytes"))
-    return f"{count / unit:.3g} {name}"

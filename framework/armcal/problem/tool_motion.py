@@ -56,9 +56,3 @@ def rigid_fit(points: Array, others: Array) -> tuple[Array, Array]:
     middle, other = points.mean(axis=1), others.mean(axis=1)
     turn = nearest_turn((others - other[:, None]) @ (points - middle[:, None]).T)
     return turn, other - turn @ middle
-
-
-def nearest_turn(matrix: Array) -> Array:
-    """The rotation nearest to a matrix (3 x 3). [Umeyama1991]"""
-    left, _, right = np.linalg.svd(matrix)
-    return np.asarray(left @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(left @ right)))]) @ right)
