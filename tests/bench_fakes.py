@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from armcal.devices.device import DeviceIdentity, DeviceState
-from armcal.devices.faults import DeviceLostError
+from armcal.devices.device import DeviceIdentity, DeviceLostError, DeviceState
 from armcal_bench.settling import Settled
 
 COUNT_RAD = 0.0093

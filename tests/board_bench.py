@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from armcal.config.servo_file import BoardSettings, ServoFile, ServoSettings, servo_file_text
-from armcal.devices.faults import DeviceError
+from armcal.devices.device import DeviceError
 from armcal.devices.link import LinkIdentity
 from armcal_simulation.boards.firmata_board import FirmataBoard
 from armcal_simulation.boards.framed_board import BoardIdentity, FramedBoard

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from armcal.errors import DataError
-from armcal.io.standard_output import StandardOutput
+from armcal.io.lines import StandardOutput
 from armcal.measure.reader import ReadRequest, RequestedChannel
 from armcal_online.commands.recalibrate import open_source
 from armcal_online.running.loop import Pace

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from armcal.config.servo_file import load_servo_file
-from armcal.devices.device import DeviceIdentity, DeviceState
-from armcal.devices.faults import DeviceLostError
+from armcal.devices.device import DeviceIdentity, DeviceLostError, DeviceState
 from armcal.run.experiment import Experiment
 from armcal_bench.bench import Bench
 from armcal_bench.servo.setup import Setup

@@ -242,14 +242,14 @@ COMPONENTS: Mapping[str, ComponentKind] = MappingProxyType(
             "armcal.devices.device:JointDevice",
             ("armcal.devices.device:PulseDevice", "armcal.devices.device:MeasuringDevice"),
         ),
-        "tracker": ComponentKind("armcal_register_trackers", "Tracker(settings)", "armcal.devices.tracker:Tracker"),
+        "tracker": ComponentKind("armcal_register_trackers", "Tracker(settings)", "armcal.devices.live:Tracker"),
         "joints": ComponentKind(
             "armcal_register_joint_streams",
             "Stream(settings)",
-            "armcal.devices.joint_stream:JointStream",
-            ("armcal.devices.joint_stream:RestStream",),
+            "armcal.devices.live:JointStream",
+            ("armcal.devices.live:RestStream",),
         ),
-        "camera": ComponentKind("armcal_register_cameras", "Camera(settings)", "armcal.devices.camera:LiveCamera"),
+        "camera": ComponentKind("armcal_register_cameras", "Camera(settings)", "armcal.devices.live:LiveCamera"),
         "bench": ComponentKind("armcal_register_benches", "Bench(settings)", "armcal.devices.simulated:SimulatedBench"),
         "command": ComponentKind("armcal_register_commands", "Command", "armcal.hooks:Command"),
         "report_section": ComponentKind(

@@ -9,12 +9,10 @@ from armcal.arm.assembly import Arm
 from armcal.base.settings import InputPath, Settings
 from armcal.config.system import build_component
 from armcal.config.validate import validate
-from armcal.devices.camera import LiveCamera
 from armcal.devices.clock import Clock, RealClock, SimulatedClock
 from armcal.devices.device import JointDevice
-from armcal.devices.joint_stream import JointStream
+from armcal.devices.live import JointStream, LiveCamera, Tracker
 from armcal.devices.simulated import SimulatedBench
-from armcal.devices.tracker import Tracker
 from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment
 from pydantic import Field

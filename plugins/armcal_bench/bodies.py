@@ -8,7 +8,7 @@ import numpy as np
 from armcal.base.domains import Array
 from armcal.base.pose_settings import PoseSettings
 from armcal.base.settings import Settings
-from armcal.devices.tracker import TrackerFrame
+from armcal.devices.live import TrackerFrame
 from armcal.measure.stillness import far_off, mean_rotation
 from pydantic import Field, model_validator
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Protocol
 
-from armcal.io.line_cutter import LineCutter
+from armcal.io.lines import LineCutter
 from typing_extensions import override
 
 _LONGEST = 1024

@@ -8,9 +8,9 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from armcal.base.config_text import resolve_path
 from armcal.base.settings import Settings
-from armcal.devices.camera import LiveCamera, Shot
 from armcal.devices.clock import Clock
-from armcal.devices.faults import DeviceRefusedError
+from armcal.devices.device import DeviceRefusedError
+from armcal.devices.live import LiveCamera, Shot
 from armcal.errors import ConfigError, DataError, InputError, Location
 from armcal.io.plain_files import input_bytes
 from armcal.measure.measurement import Measurement

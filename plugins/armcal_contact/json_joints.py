@@ -6,8 +6,8 @@ from typing import Any, ClassVar, Literal
 from armcal.base.settings import Settings
 from armcal.base.units import split_suffix
 from armcal.devices.clock import Clock
-from armcal.devices.joint_stream import JointSample
 from armcal.devices.line_source import Begin, LineJointStream, SourceName, open_lines
+from armcal.devices.live import JointSample
 from armcal.errors import ConfigError
 from pydantic import Field, field_validator
 from typing_extensions import override
@@ -43,7 +43,7 @@ class JsonLinesJointSettings(Settings):
 
 
 class JsonLinesJoints(LineJointStream):
-    """Joint readings as ``json_joint_message`` reads them. See ``armcal.devices.joint_stream.JointStream``."""
+    """Joint readings as ``json_joint_message`` reads them. See ``armcal.devices.live.JointStream``."""
 
     Settings: ClassVar[type[JsonLinesJointSettings]] = JsonLinesJointSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"source": "udp:0", "unit": "rad"}

@@ -9,8 +9,8 @@ import numpy as np
 from armcal.base.domains import Array
 from armcal.base.units import from_unit
 from armcal.devices.clock import Clock
-from armcal.devices.joint_stream import JointSample, RestStream
 from armcal.devices.line_source import Begin, FileLines, LineJointStream, SourceName, open_lines
+from armcal.devices.live import JointSample, RestStream
 from armcal.errors import ConfigError, DataError
 from armcal.measure.rests import LiveRests, Rows
 from typing_extensions import override
@@ -91,7 +91,7 @@ class LiveTable:
 
 
 class TwoArmLogStream(LineJointStream, RestStream):
-    """Readings, or with ``still`` the means of rests. See ``armcal.devices.joint_stream.JointStream``."""
+    """Readings, or with ``still`` the means of rests. See ``armcal.devices.live.JointStream``."""
 
     Settings: ClassVar[type[TwoArmStreamSettings]] = TwoArmStreamSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {

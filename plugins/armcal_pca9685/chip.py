@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 
 from armcal.arm.servo import COUNTS
 from armcal.devices.clock import Clock
-from armcal.devices.faults import DeviceError, DeviceRefusedError, DeviceResetError
+from armcal.devices.device import DeviceError, DeviceRefusedError, DeviceResetError
 from armcal.devices.link import Link
 from armcal.errors import Location
 

@@ -11,8 +11,14 @@ from armcal.arm.servo import COUNTS, PulseClock, PulseTable, quantised
 from armcal.base.settings import InputPath, Settings
 from armcal.config.servo_file import CalibratedServo, ServoFile, digest, load_servo_file
 from armcal.devices.clock import Clock
-from armcal.devices.device import DeviceIdentity, DeviceState, JointDevice, PulseDevice
-from armcal.devices.faults import DeviceLostError, DeviceRefusedError
+from armcal.devices.device import (
+    DeviceIdentity,
+    DeviceLostError,
+    DeviceRefusedError,
+    DeviceState,
+    JointDevice,
+    PulseDevice,
+)
 from armcal.devices.link import GuardedLink, Link
 from armcal.errors import Location
 from typing_extensions import override

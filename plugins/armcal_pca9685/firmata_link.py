@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 from armcal.base.settings import Duration
 from armcal.devices.clock import Clock
-from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
+from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
 from armcal.devices.link import Link, LinkIdentity
 from armcal.devices.serial_port import SerialPort, SerialPortSettings
 from armcal.errors import Location

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NoReturn
 
 from armcal.base.settings import Duration
 from armcal.devices.clock import Clock
-from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
+from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
 from armcal.devices.framed import messages
 from armcal.devices.framed.frames import DELIMITER, MAX_PAYLOAD, Frame, FrameDecoder, encoded
 from armcal.devices.framed.messages import Code, Flag, Kind

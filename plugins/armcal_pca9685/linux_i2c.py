@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 
 from armcal.base.settings import Settings
 from armcal.devices.clock import Clock
-from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError
+from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError
 from armcal.devices.link import Link, LinkIdentity
 from armcal.errors import Location
 from armcal.extras import library

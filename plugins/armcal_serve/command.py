@@ -15,8 +15,8 @@ from armcal.calibration.measured_point import Point
 from armcal.cli.common import Console, accept, point, speaking
 from armcal.errors import InputError
 from armcal.functions.batch_function import EvaluatorChoice
+from armcal.io.lines import StandardOutput
 from armcal.io.signals import Signals
-from armcal.io.standard_output import StandardOutput
 
 from armcal_serve.protocol import Notify
 from armcal_serve.server import Opening, Server

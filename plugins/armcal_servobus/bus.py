@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, NoReturn
 
 from armcal.base.settings import Duration
-from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError
+from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError
 from armcal.devices.serial_port import SerialPort, SerialPortSettings
 from armcal.errors import Location
 from pydantic import Field

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from armcal.devices.faults import DeviceLostError, DeviceRefusedError
+from armcal.devices.device import DeviceLostError, DeviceRefusedError
 
 from armcal_servobus.bus import Bus
 from armcal_servobus.finding import looked_at, present, read_number

@@ -7,8 +7,14 @@ from typing import Annotated, Any, ClassVar
 from armcal.base.settings import Temperature
 from armcal.calibration.calibration_file import identity_of
 from armcal.devices.clock import Clock, RealClock
-from armcal.devices.device import DeviceIdentity, DeviceState, JointDevice, MeasuringDevice
-from armcal.devices.faults import DeviceLostError, DeviceRefusedError
+from armcal.devices.device import (
+    DeviceIdentity,
+    DeviceLostError,
+    DeviceRefusedError,
+    DeviceState,
+    JointDevice,
+    MeasuringDevice,
+)
 from armcal.devices.link import Link
 from pydantic import Field
 from typing_extensions import override

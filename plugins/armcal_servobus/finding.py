@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
-from armcal.devices.faults import DeviceError, DeviceRefusedError
+from armcal.devices.device import DeviceError, DeviceRefusedError
 
 from armcal_servobus.bus import Bus
 from armcal_servobus.models import BASE_MODELS, ServoModel, model_of

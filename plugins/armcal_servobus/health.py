@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import NoReturn
 
-from armcal.devices.faults import DeviceError, DeviceResetError, DeviceUnwellError
+from armcal.devices.device import DeviceError, DeviceResetError, DeviceUnwellError
 
 from armcal_servobus.checks import Eeprom
 from armcal_servobus.joints import ServoJoint

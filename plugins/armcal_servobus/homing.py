@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from armcal.devices.faults import DeviceError
+from armcal.devices.device import DeviceError
 from armcal.errors import InputError, Location
 from armcal.io.file_set import write_new
 

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from armcal.base.quantities import UnitOf
 from armcal.base.settings import Settings
-from armcal.devices.faults import DeviceRefusedError
+from armcal.devices.device import DeviceRefusedError
 from armcal.errors import Location
 from pydantic import Field, field_validator, model_validator
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from armcal.devices.faults import DeviceError
+from armcal.devices.device import DeviceError
 
 from armcal_servobus.bus import Bus
 from armcal_servobus.finding import alarms_of, read_number

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 from armcal.devices.clock import Clock
-from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError
-from armcal.devices.joint_stream import JointSample, JointStream
+from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError
+from armcal.devices.live import JointSample, JointStream
 from armcal.errors import ConfigError
 from pydantic import Field
 from typing_extensions import override
@@ -31,7 +31,7 @@ class ServoStreamSettings(ServoJointsSettings):
 
 
 class ServoBusStream(JointStream):
-    """Readings of all joints at a time. See ``armcal.devices.joint_stream.JointStream``."""
+    """Readings of all joints at a time. See ``armcal.devices.live.JointStream``."""
 
     Settings: ClassVar[type[ServoStreamSettings]] = ServoStreamSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {

@@ -7,8 +7,8 @@ from typing import Annotated, Any, ClassVar
 
 from armcal.base.settings import Settings
 from armcal.devices.clock import Clock
-from armcal.devices.faults import DeviceRefusedError
-from armcal.devices.tracker import TrackerFrame
+from armcal.devices.device import DeviceRefusedError
+from armcal.devices.live import TrackerFrame
 from armcal.errors import InputError, Location
 from armcal.io.udp import bound
 from pydantic import Field, field_validator
@@ -52,7 +52,7 @@ class DTrackSettings(Settings):
 
 
 class DTrackTracker(CountingTracker):
-    """Listens on a port; what DTrack is to send is set up in DTrack. See ``armcal.devices.tracker.Tracker``."""
+    """Listens on a port; what DTrack is to send is set up in DTrack. See ``armcal.devices.live.Tracker``."""
 
     Settings: ClassVar[type[DTrackSettings]] = DTrackSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"port": 0}

@@ -9,7 +9,7 @@ import numpy as np
 from armcal.base.domains import Array
 from armcal.base.quaternions import rotation_matrix
 from armcal.devices.clock import Clock
-from armcal.devices.tracker import REPEATED, Tracker
+from armcal.devices.live import REPEATED, Tracker
 from typing_extensions import override
 
 OFF_UNIT = 1e-3

@@ -7,9 +7,9 @@ from typing import Annotated, Any, ClassVar, Self
 
 from armcal.base.settings import InputPath, Settings
 from armcal.devices.clock import Clock
-from armcal.devices.faults import DeviceRefusedError
+from armcal.devices.device import DeviceRefusedError
 from armcal.devices.line_source import LONGEST_LINE_BYTES, Begin, FileLines, UdpLines
-from armcal.devices.tracker import TrackerFrame
+from armcal.devices.live import TrackerFrame
 from armcal.errors import DataError, Location
 from pydantic import Field, field_validator, model_validator
 from typing_extensions import override
@@ -51,7 +51,7 @@ class GrowingCsvSettings(Settings):
 
 
 class LineTracker(CountingTracker):
-    """Frames of the lines of a source. See ``armcal.devices.tracker.Tracker``."""
+    """Frames of the lines of a source. See ``armcal.devices.live.Tracker``."""
 
     def __init__(self) -> None:
         super().__init__()

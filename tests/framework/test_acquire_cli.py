@@ -14,7 +14,7 @@ import forked
 import numpy as np
 import pytest
 from armcal.cli.main import cli
-from armcal.devices.faults import DeviceRefusedError
+from armcal.devices.device import DeviceRefusedError
 from armcal.errors import InputError
 from armcal_bench.acquisition.rehearsal import overrides_for
 from armcal_bench.acquisition.session import RunOptions, acquire

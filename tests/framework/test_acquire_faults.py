@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from armcal.devices.clock import SimulatedClock
-from armcal.devices.faults import DeviceLostError, DeviceRefusedError
+from armcal.devices.device import DeviceLostError, DeviceRefusedError
 from armcal.devices.serial_port import SerialPort, SerialPortSettings
 
 from tests.bench_runs import BenchRun, positions

@@ -17,7 +17,7 @@ from armcal.arm.clearance import Checked
 from armcal.cli.main import cli
 from armcal.config.servo_file import load_servo_file
 from armcal.devices.clock import SimulatedClock
-from armcal.devices.faults import DeviceError, DeviceRefusedError
+from armcal.devices.device import DeviceError, DeviceRefusedError
 from armcal.errors import ArmcalError, InputError
 from armcal.io.journal.journal import Journal, JournalFailedError, JournalFullError
 from armcal.run.experiment import Experiment

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from armcal.devices.faults import DeviceError, DeviceLostError, DeviceUnwellError
+from armcal.devices.device import DeviceError, DeviceLostError, DeviceUnwellError
 from armcal_bench.acquisition.acquisition_run import AcquisitionRun
 from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.heat import HeatModel

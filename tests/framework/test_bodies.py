@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from armcal.devices.tracker import TrackerFrame
+from armcal.devices.live import TrackerFrame
 from armcal.measure.stillness import mean_rotation, turns_from
 from armcal_bench.bodies import BodySettings, in_base, repeats
 from hypothesis import given

@@ -20,7 +20,7 @@ from armcal.estimate.estimator import no_progress
 from armcal.functions.compiler import find_compiler
 from armcal.io.journal.journal import JournalLimits
 from armcal.io.journal.reader import read_entries, read_segments, read_until
-from armcal.io.standard_output import StandardOutput
+from armcal.io.lines import StandardOutput
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 from armcal_online.commands.recalibrate import setup_of

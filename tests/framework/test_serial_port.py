@@ -13,7 +13,7 @@ import tty
 import pytest
 import serial
 from armcal.base.config_text import ConfigText
-from armcal.devices.faults import DeviceLostError, DeviceRefusedError
+from armcal.devices.device import DeviceLostError, DeviceRefusedError
 from armcal.devices.serial_port import SerialPort, SerialPortSettings
 from pydantic import ValidationError
 from serial.tools import list_ports

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from armcal.config.servo_file import BoardSettings, ServoFile, load_servo_file
-from armcal.devices.device import DeviceIdentity
-from armcal.devices.faults import DeviceError
+from armcal.devices.device import DeviceError, DeviceIdentity
 from armcal.errors import ArmcalError, DataError, InputError
 from armcal_bench.acquisition.heat import HeatModel, ThermalState
 from armcal_bench.acquisition.recovery import DeviceLost

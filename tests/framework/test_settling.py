@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 import pytest
-from armcal.devices.tracker import REPEATED, TrackerFrame
+from armcal.devices.live import REPEATED, TrackerFrame
 from armcal.measure.stillness import deviations_of_mean, mean_pose
 from armcal_bench.acquisition.settings import SettleSettings
 from armcal_bench.acquisition.tracker_monitor import TrackerHealth

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.errors import DataError, InputError
-from armcal.io.line_cutter import LineCutter
+from armcal.io.lines import LineCutter
 from armcal_online.commands.recalibrate import open_source
 from armcal_online.running.state_replayer import MAX_FILES, Progress
 from armcal_online.sources.csv_file import CsvFile

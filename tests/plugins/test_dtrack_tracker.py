@@ -8,8 +8,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from armcal.devices.faults import DeviceRefusedError
-from armcal.devices.tracker import REPEATED, TrackerFrame
+from armcal.devices.device import DeviceRefusedError
+from armcal.devices.live import REPEATED, TrackerFrame
 from armcal_simulation.bench.dtrack_sender import DTrackSender, DTrackSenderSettings, angles_deg, datagram
 from armcal_tracker.dtrack import DTrackSettings, DTrackTracker
 from pydantic import ValidationError

@@ -6,7 +6,7 @@ import math
 import os
 
 import pytest
-from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
+from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
 from armcal.devices.link import GuardedLink
 from armcal_pca9685 import firmata_link
 from armcal_pca9685.device import Pca9685Device

@@ -6,7 +6,7 @@ import math
 import os
 
 import pytest
-from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
+from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
 from armcal.devices.framed import messages
 from armcal.devices.framed.frames import Frame, FrameDecoder, encoded
 from armcal.devices.link import GuardedLink

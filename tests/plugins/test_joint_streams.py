@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.arm.assembly import Arm
-from armcal.devices.joint_stream import RestStream
+from armcal.devices.live import RestStream
 from armcal.errors import ConfigError, InputError
 from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.measure.rests import LiveRests, Rows, StillSettings, rests

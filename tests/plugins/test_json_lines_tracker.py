@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.devices.clock import RealClock
-from armcal.devices.faults import DeviceRefusedError
+from armcal.devices.device import DeviceRefusedError
 from armcal.errors import DataError
 from armcal_tracker.frame_table import frame_table, row_of
 from armcal_tracker.frames import UnreadableError

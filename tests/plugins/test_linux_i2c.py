@@ -8,7 +8,7 @@ import sys
 import types
 
 import pytest
-from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError
+from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError
 from armcal.errors import PluginError
 from armcal_pca9685.device import Pca9685Device
 from armcal_pca9685.linux_i2c import LinuxI2cLink

@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 from armcal.arm.servo import PulseClock, PulseTable, quantised
 from armcal.config.servo_file import ServoFile
-from armcal.devices.device import JointDevice, PulseDevice
-from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
+from armcal.devices.device import (
+    DeviceError,
+    DeviceLostError,
+    DeviceRefusedError,
+    DeviceResetError,
+    JointDevice,
+    PulseDevice,
+)
 from armcal.errors import ConfigError
 from armcal_pca9685.device import Pca9685Device
 from board_bench import JOINTS, LRM_PULSES_US, Clock, ModelLink, servo_file, written

@@ -12,7 +12,7 @@ import armcal_pca9685.device
 import pytest
 from armcal.arm.servo import PulseClock
 from armcal.config.servo_file import CalibratedServo
-from armcal.devices.faults import DeviceError
+from armcal.devices.device import DeviceError
 from armcal_pca9685.chip import Channel, Chip, channel_register
 from armcal_pca9685.device import Pca9685Device
 from board_bench import JOINTS, LRM_PULSES_US, Clock, ModelLink, servo_file, written

@@ -7,12 +7,16 @@ from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 import casadi as ca
+import numpy as np
 
 from armcal.arm.effects import Condition, JointCommand, JointEffect, Spring
 from armcal.arm.elastic import deflections, elastic_sites, split_deflection
+from armcal.arm.environment import Environment
 from armcal.arm.model import ArmModel, Chain, forward
-from armcal.arm.pose_residual import OF_TOOL, PoseResidual, corrected
+from armcal.arm.pose_residual import OF_TOOL, SURROUNDINGS, PoseResidual, Postures, corrected, correction_names
 from armcal.arm.statics import Load, Mass, joint_efforts, wrenches
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.pose_blocks import pose_transform
 from armcal.base.se3 import Expression, Transform
@@ -128,6 +132,24 @@ class Arm:
             else math.copysign(joint.mimic.multiplier != 0, joint.mimic.multiplier) * content[joint.mimic.master]
             for joint in self.nominal_chain.joints
         ]
+
+    @property
+    def correction_channels(self) -> tuple[str, ...]:
+        """Channels of records that carry corrections of its tool and joints (see ``pose_residual``)."""
+        return tuple(f"{self.name}.{name}" for name in correction_names(self.joint_names))
+
+    def postures(self, dataset: Dataset, environment: Environment) -> Postures:
+        """Where all joints were commanded to go, those that follow others too, and from where, and what was around."""
+        stated = {"payload": environment.payload_mass}
+
+        def column(channel: str) -> Array:
+            default = np.full(len(dataset), stated.get(channel, 0.0))
+            return np.nan_to_num(dataset.column(channel)) if dataset.has(channel) else default
+
+        commands = [column(f"{self.name}.{joint}") for joint in self.commanded]
+        approaches = [column(f"{self.name}.approach.{joint}") for joint in self.commanded]
+        around = {name: column(name) for name in SURROUNDINGS if name in stated or dataset.has(name)}
+        return Postures(np.array(self.joint_commands(commands)), np.array(self.joint_approaches(approaches)), around)
 
     @cached_property
     def joint_dimensions(self) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from armcal.base.settings import Settings
 OF_TOOL = ("shift_x", "shift_y", "shift_z", "turn_x", "turn_y", "turn_z")
 """Corrections of a tool: shifts (m) in the arm's base frame, a rotation vector (rad) in the tool's."""
 CORRECTION = "correction."
-"""Of channels of records that carry corrections: ``ARM.correction.shift_x`` and so on; see ``corrections.py``."""
+"""Of channels of records that carry corrections, ``ARM.correction.shift_x`` and so on: ``Arm.correction_channels``."""
 SURROUNDINGS = ("payload", "temperature")
 """What errors may depend on beside commands and approaches, where it was recorded (kg, deg C)."""
 _Settings = Settings

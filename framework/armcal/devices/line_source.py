@@ -14,10 +14,10 @@ from pydantic import BeforeValidator
 from typing_extensions import override
 
 from armcal.base.config_text import resolve_path
-from armcal.devices.faults import DeviceRefusedError
-from armcal.devices.joint_stream import JointStream
+from armcal.devices.device import DeviceRefusedError
+from armcal.devices.live import JointStream
 from armcal.errors import ConfigError, InputError, Location
-from armcal.io.line_cutter import LineCutter
+from armcal.io.lines import LineCutter
 from armcal.io.udp import UDP_KINDS, listening, parsed
 
 STANDARD_INPUT = "-"

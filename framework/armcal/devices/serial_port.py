@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from armcal.base.config_text import ConfigText
 from armcal.base.settings import Settings
-from armcal.devices.faults import DeviceLostError, DeviceRefusedError
+from armcal.devices.device import DeviceLostError, DeviceRefusedError
 from armcal.errors import Location
 
 _AT_ONCE = 1 << 16

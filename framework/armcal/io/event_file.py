@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from armcal.io.line_cutter import LineCutter
+from armcal.io.lines import LineCutter
 
 MAX_BYTES = 4 * 1024**2
 EVENTS = "events.jsonl"

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Protocol, TypeVar
 
 from armcal.errors import ArmcalError, InputError, Location
@@ -65,16 +64,16 @@ class Automatic:
         results: list[R] = []
         began = time.perf_counter()
         for number, task in enumerate(tasks):
-            report(number / len(tasks))
+            done, left = number / len(tasks), len(tasks) - number
+            report(done)
             spent = time.perf_counter() - began
-            left = len(tasks) - number
-            worth_it = number and left > 1 and spent / number * left > self.worth_s
-            if worth_it and _picklable((work, task)):
-                done = number / len(tasks)
-                return results + Workers().map(work, tasks[number:], lambda more: report(done + (1 - done) * more))
+            if number and left > 1 and spent / number * left > self.worth_s and _picklable((work, task)):
+                break
             results.append(work(task))
-        report(1.0)
-        return results
+        else:
+            report(1.0)
+            return results
+        return results + Workers().map(work, tasks[number:], lambda more: report(done + (1 - done) * more))
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,10 @@ def input_file(
         message, hint = f"it is a device or pipe, expected {expected}.", "Save what it gives to a file, and give that."
     elif status.st_size > most:
         size, unit = next(((size, unit) for size, unit in _UNITS if most >= size), (1, "bytes"))
-        message, hint = f"it is larger than {most / size:.3g} {unit}, expected {expected}.", "Check the path, or split it."
+        message, hint = (
+            f"it is larger than {most / size:.3g} {unit}, expected {expected}.",
+            "Check the path, or split it.",
+        )
     if message:
         os.close(descriptor)
         raise refusal(message, where=where, hint=hint)

@@ -8,6 +8,7 @@ import numpy as np
 
 from armcal.arm.assembly import Arm
 from armcal.arm.environment import Environment
+from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.measure.groups import Groups, group_name, owner_of, ties_of
@@ -29,6 +30,21 @@ class Blueprint:
     environment: Environment
     channels: frozenset[str]
     groups: Groups = field(default_factory=dict)
+
+    def with_corrections(self, dataset: Dataset) -> Dataset:
+        """The records with corrections of the arms that have a pose residual: zero where it has not learned.
+
+        They depend on what was commanded alone, so they are made once, in batches, and no expression holds what was
+        learned.
+        """
+        channels = dict(dataset.channels)
+        for arm in self.arms.values():
+            if arm.residual is not None and arm.residual.is_learned:
+                corrections = arm.residual.corrections(arm.postures(dataset, self.environment))
+                channels |= zip(arm.correction_channels, corrections, strict=True)
+            elif arm.residual is not None:
+                channels |= dict.fromkeys(arm.correction_channels, np.zeros(len(dataset)))
+        return replace(dataset, channels=channels) if len(channels) > len(dataset.channels) else dataset
 
     def kernels(self, records: int, choices: Mapping[str, EvaluatorChoice]) -> tuple[Kernel, ...]:
         """A kernel for each measurement, for about so many records, by the evaluator chosen for it."""

@@ -9,7 +9,6 @@ from armcal.arm.assembly import Arm
 from armcal.arm.pose_residual import OF_TOOL, PoseResidual, Postures
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.problem.corrections import correction_channels, postures_of
 from armcal.problem.problem import FactorRecords, Problem
 
 
@@ -20,7 +19,7 @@ def corrected_records(
     result = []
     for kernel, own in zip(problem.kernels, records, strict=True):
         content = own.record.copy()
-        for channel, row in zip(correction_channels(arm), corrections, strict=True):
+        for channel, row in zip(arm.correction_channels, corrections, strict=True):
             if channel in kernel.factor.channels:
                 content[kernel.factor.channels.index(channel), : own.count] = row
         result.append(replace(own, record=content, state=own.state.copy()))
@@ -46,8 +45,8 @@ def moved_by(problem: Problem, values: Array, records: Sequence[FactorRecords], 
     """
     place = next(i for i, k in enumerate(problem.kernels) if arm.name in _arms_of(problem, k.factor.name))
     own, channels = records[place], problem.kernels[place].factor.channels
-    size, known = len(correction_channels(arm)), dict(zip(channels, own.record[:, : own.count], strict=True))
-    corrections = np.array([known.get(channel, np.zeros(own.count)) for channel in correction_channels(arm)])
+    size, known = len(arm.correction_channels), dict(zip(channels, own.record[:, : own.count], strict=True))
+    corrections = np.array([known.get(channel, np.zeros(own.count)) for channel in arm.correction_channels])
 
     def tools(rows: Sequence[int]) -> Array:
         some = np.zeros((size, own.count))
@@ -84,11 +83,11 @@ def unexplained(
         residual, postures = (learned or {}).get(arm.name, (arm.residual, None))
         if residual is None or not residual.is_learned:
             continue
-        slopes = problem.channel_slopes(values, records, correction_channels(arm))
+        slopes = problem.channel_slopes(values, records, arm.correction_channels)
         for i, (kernel, own, slope) in enumerate(zip(problem.kernels, records, slopes, strict=True)):
             known = dict(zip(kernel.factor.channels, own.record[:, : own.count], strict=True))
             whole = Dataset(("",) * own.count, known)
-            here = postures_of(arm, whole, problem.blueprint.environment) if postures is None else postures
+            here = arm.postures(whole, problem.blueprint.environment) if postures is None else postures
             spread = slope * residual.deviations(here)
             total[i] += np.einsum("rcn,scn->nrs", spread, spread)
     return total

@@ -20,7 +20,6 @@ from armcal.measure.measurement import Measurement
 from armcal.measure.partners import with_partners
 from armcal.problem import factor_records
 from armcal.problem.blueprint import Blueprint
-from armcal.problem.corrections import with_corrections
 from armcal.problem.factor_records import FactorRecords, correlation_of, mean_shares, transformed
 from armcal.problem.grouped_kernel import GroupedKernel
 from armcal.problem.kernel import Kernel
@@ -113,7 +112,7 @@ class Problem:
     def records(self, dataset: Dataset, weights: Array | None = None) -> tuple[FactorRecords, ...]:
         """A dataset as the kernels read it; ``weights`` (N) multiply each record's squared residual."""
         plan = self.blueprint
-        dataset = with_partners(with_corrections(dataset, plan.arms, plan.environment), plan.measurements)
+        dataset = with_partners(plan.with_corrections(dataset), plan.measurements)
         factors = [kernel.factor for kernel in self.kernels]
         numbers = [group_numbers(dataset, name, m, plan.groups) for name, m in plan.measurements.items()]
         masks = [factor_records.applicable(f, dataset, n) for f, n in zip(factors, numbers, strict=True)]

@@ -33,7 +33,6 @@ from armcal.io.parallel import Executor
 from armcal.measure.contact import Contact
 from armcal.measure.partners import PairedMeasurement
 from armcal.problem.corrected import Moved, corrected_records, unexplained
-from armcal.problem.corrections import correction_channels, postures_of
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.run.experiment import Experiment
 
@@ -211,7 +210,7 @@ def layer_of(system: System, dataset: Dataset) -> Layer | None:
     arm = unlearned(system)
     if arm is None or arm.residual is None:
         return None
-    return Layer(arm.name, arm.residual, postures_of(arm, dataset, system.environment))
+    return Layer(arm.name, arm.residual, arm.postures(dataset, system.environment))
 
 
 def learned_residual(
@@ -299,8 +298,8 @@ def model_errors(
     """What a fit leaves of its records, at rest where something drifts; None where no record shows the tool."""
     values = fitted.estimate.values
     raw = problem.whitened(problem.residuals(values, records), records)
-    by_correction = problem.channel_slopes(values, records, correction_channels(arm))
-    count = len(correction_channels(arm))
+    by_correction = problem.channel_slopes(values, records, arm.correction_channels)
+    count = len(arm.correction_channels)
     columns = [problem.whitened([slope[:, i] for slope in by_correction], records) for i in range(count)]
     acting = [np.sqrt(np.where(own.measured, weight, 0.0)) for own, weight in zip(records, fitted.weights, strict=True)]
     left = np.vstack([own * root for own, root in zip(raw, acting, strict=True)]).T

@@ -5,8 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from armcal.devices.clock import Clock, RealClock
-from armcal.devices.device import JointDevice
-from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError
+from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError, JointDevice
 from armcal.devices.link import GuardedLink, LinkIdentity
 from armcal.errors import InputError
 from armcal.testing.results import ContractError, NotRun, Recorder, expect, raises_only
@@ -75,7 +74,7 @@ def check_device(record: Recorder, subject: Subject) -> None:
                 standing = device.standing({JOINTS[0]: angle})
             except InputError:
                 continue
-            raise ContractError(f"found {standing}, expected armcal.devices.faults.DeviceRefusedError")
+            raise ContractError(f"found {standing}, expected armcal.devices.device.DeviceRefusedError")
     _check_on_a_bus(record, subject)
 
 
@@ -150,7 +149,7 @@ def _expect_lost(call: Callable[[], object], *others: type[Exception]) -> None:
             call()
     except expected:
         return
-    raise ContractError("found no error, expected armcal.devices.faults.DeviceError")
+    raise ContractError("found no error, expected armcal.devices.device.DeviceError")
 
 
 class _MemoryLink:

@@ -12,10 +12,10 @@ import click
 
 from armcal.hooks import KINDS
 from armcal.plugins import Component, PluginInfo, PluginRegistry
+from armcal.testing.arm_checks import check_exporter, check_simulator
 from armcal.testing.board_checks import check_bench, check_device, check_link
 from armcal.testing.effect_checks import check_effect
 from armcal.testing.estimator_checks import check_estimator
-from armcal.testing.exporter_checks import check_exporter
 from armcal.testing.live_checks import check_camera, check_joint_stream, check_tracker
 from armcal.testing.manners import watched
 from armcal.testing.measurement_checks import check_measurement
@@ -25,7 +25,6 @@ from armcal.testing.reader_checks import check_reader
 from armcal.testing.residual_checks import check_residual
 from armcal.testing.results import CheckResult, ContractError, Recorder, expect
 from armcal.testing.settings_checks import Subject, check_settings
-from armcal.testing.simulator_checks import check_simulator
 
 __all__ = ["KNOWN_CHECKS", "CheckResult", "assert_contract", "check_component", "check_plugin"]
 

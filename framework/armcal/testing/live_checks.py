@@ -12,8 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from armcal.devices.clock import RealClock
-from armcal.devices.joint_stream import JointSample
-from armcal.devices.tracker import TrackerFrame
+from armcal.devices.live import JointSample, TrackerFrame
 from armcal.errors import InputError
 from armcal.testing.results import ContractError, NotRun, Recorder, expect, raises_only
 from armcal.testing.settings_checks import Subject

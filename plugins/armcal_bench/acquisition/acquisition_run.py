@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from armcal.base.domains import Array
-from armcal.devices.device import DeviceIdentity
-from armcal.devices.faults import DeviceUnwellError
+from armcal.devices.device import DeviceIdentity, DeviceUnwellError
 
 from armcal_bench.acquisition import run_log as entry
 from armcal_bench.acquisition.arrival import Arrival

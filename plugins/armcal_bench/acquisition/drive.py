@@ -8,8 +8,7 @@ from itertools import pairwise
 import numpy as np
 from armcal.base.domains import Array
 from armcal.devices.clock import Clock
-from armcal.devices.device import JointDevice, MeasuringDevice
-from armcal.devices.faults import DeviceError, DeviceRefusedError
+from armcal.devices.device import DeviceError, DeviceRefusedError, JointDevice, MeasuringDevice
 
 from armcal_bench.acquisition.heat import HeatModel, ThermalState, Torques
 from armcal_bench.acquisition.path_planner import JointPath, PathPlanner

@@ -11,8 +11,7 @@ from armcal.arm.joints import joint_limits, unknown_joint
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.calibration.rigid_chain import tool_poses
-from armcal.devices.device import JointDevice, MeasuringDevice
-from armcal.devices.faults import DeviceRefusedError
+from armcal.devices.device import DeviceRefusedError, JointDevice, MeasuringDevice
 from armcal.errors import ConfigError, DataError, Location
 from armcal.run.experiment import Experiment
 from armcal.run.plan_approaches import approach_channels

@@ -3,8 +3,7 @@
 from collections.abc import Callable
 from typing import TypeVar
 
-from armcal.devices.device import DeviceIdentity, JointDevice
-from armcal.devices.faults import DeviceError, DeviceRefusedError, DeviceUnwellError
+from armcal.devices.device import DeviceError, DeviceIdentity, DeviceRefusedError, DeviceUnwellError, JointDevice
 
 from armcal_bench.acquisition.tracker_monitor import MotionGate
 

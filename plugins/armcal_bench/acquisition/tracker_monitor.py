@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from armcal.devices.clock import Clock
-from armcal.devices.faults import DeviceRefusedError
-from armcal.devices.tracker import REPEATED, TrackerFrame
+from armcal.devices.device import DeviceRefusedError
+from armcal.devices.live import REPEATED, TrackerFrame
 
 from armcal_bench.acquisition.settings import LostSettings
 from armcal_bench.bench import Bench

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.units import to_unit
-from armcal.devices.camera import LiveCamera
+from armcal.devices.live import LiveCamera
 from armcal.errors import ArmcalError, ConfigError
 from armcal.measure.measurement import Measurement
 from armcal.run.experiment import Experiment

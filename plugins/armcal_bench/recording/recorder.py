@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from armcal.devices.camera import LiveCamera, Shot
 from armcal.devices.clock import Clock
-from armcal.devices.joint_stream import JointSample, JointStream
 from armcal.devices.line_source import refused_lines_text
+from armcal.devices.live import JointSample, JointStream, LiveCamera, Shot
 from armcal.errors import InputError
 from armcal.io.file_set import write_over
 from armcal.measure.environment import warn_beyond_limits

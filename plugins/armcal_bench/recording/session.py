@@ -5,9 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from armcal.devices.camera import LiveCamera
 from armcal.devices.clock import Clock
-from armcal.devices.joint_stream import JointStream, RestStream
+from armcal.devices.live import JointStream, LiveCamera, RestStream
 from armcal.errors import ConfigError
 
 from armcal_bench.bench import SECTION, Bench

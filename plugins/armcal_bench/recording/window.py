@@ -10,7 +10,7 @@ import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.base.settings import Angle, Duration, Length, Settings
 from armcal.base.units import display_unit, to_unit
-from armcal.devices.joint_stream import JointSample
+from armcal.devices.live import JointSample
 from pydantic import Field, model_validator
 
 _FULL_TURN = 2 * math.pi * (1 + 1e-9)

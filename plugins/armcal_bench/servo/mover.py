@@ -6,8 +6,7 @@ from itertools import pairwise, permutations
 from typing import Protocol, TypeVar
 
 from armcal.arm.servo import PulseClock, PulseTable
-from armcal.devices.device import DeviceIdentity, JointDevice, PulseDevice
-from armcal.devices.faults import DeviceError, DeviceRefusedError
+from armcal.devices.device import DeviceError, DeviceIdentity, DeviceRefusedError, JointDevice, PulseDevice
 from armcal.errors import InputError
 
 from armcal_bench.acquisition.drive import Motion

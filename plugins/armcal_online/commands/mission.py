@@ -13,7 +13,7 @@ from armcal.calibration.calibration import Calibration
 from armcal.cli.common import Console, overrides, speaking
 from armcal.cli.console import columned
 from armcal.io.folder import reserved
-from armcal.io.standard_output import StandardOutput
+from armcal.io.lines import StandardOutput
 from armcal.plugins import PluginRegistry
 from armcal.run.prepare import Stopwatch
 from rich.table import Table

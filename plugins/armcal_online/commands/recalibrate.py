@@ -10,7 +10,7 @@ from armcal.calibration.calibration import Calibration
 from armcal.cli.common import Console, overrides, speaking
 from armcal.errors import InputError, Location
 from armcal.io.journal.journal import JournalLimits
-from armcal.io.standard_output import StandardOutput
+from armcal.io.lines import StandardOutput
 from armcal.io.udp import UDP_KINDS, parsed
 
 from armcal_online.running.loop import Pace

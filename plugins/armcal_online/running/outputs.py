@@ -10,7 +10,7 @@ from typing import Any
 from armcal.base.config_text import as_line
 from armcal.io.event_file import EventFile
 from armcal.io.journal.files import REAL_FILES, FileLayer, is_full, write_whole
-from armcal.io.standard_output import StandardOutput
+from armcal.io.lines import StandardOutput
 
 CALIBRATION = "calibration.yaml"
 STATUS = "status.json"

@@ -15,7 +15,7 @@ from armcal.io.folder import check_folder
 from armcal.io.journal.files import REAL_FILES, FileLayer
 from armcal.io.journal.journal import Journal, JournalLimits
 from armcal.io.journal.reader import read_until, verify
-from armcal.io.standard_output import StandardOutput
+from armcal.io.lines import StandardOutput
 
 from armcal_online.running.control import SOCKET, ControlServer, answer
 from armcal_online.running.loop import Pace, Recalibration

@@ -11,7 +11,7 @@ from typing import BinaryIO
 from zlib import crc32
 
 from armcal.errors import DataError, InputError, Location
-from armcal.io.line_cutter import MAX_LINE_BYTES
+from armcal.io.lines import MAX_LINE_BYTES
 from armcal.io.plain_files import input_file
 from typing_extensions import override
 

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, BinaryIO
 
-from armcal.io.line_cutter import LineCutter
+from armcal.io.lines import LineCutter
 
 from armcal_online.sources.row_parser import LineParser, RowParser, faulty
 from armcal_online.sources.source import Clock, Incoming, Place

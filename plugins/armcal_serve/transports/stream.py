@@ -8,8 +8,7 @@ from functools import partial
 from typing import Any
 
 from armcal.errors import ArmcalError, DataError
-from armcal.io.line_cutter import LineCutter
-from armcal.io.standard_output import write_ready
+from armcal.io.lines import LineCutter, write_ready
 from typing_extensions import override
 
 from armcal_serve.conversation import MOST_WAITING, Conversation

@@ -13,10 +13,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 from armcal.base.settings import InputPath, Settings
-from armcal.devices.device import DeviceIdentity, DeviceState
-from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError
-from armcal.devices.joint_stream import JointSample
-from armcal.devices.tracker import TrackerFrame
+from armcal.devices.device import DeviceError, DeviceIdentity, DeviceLostError, DeviceRefusedError, DeviceState
+from armcal.devices.live import JointSample, TrackerFrame
 
 _BOARD, _LIMIT = 0x20, 3.0
 

@@ -6,7 +6,7 @@ import os
 import time
 
 import pytest
-from armcal.devices.faults import DeviceError, DeviceLostError, DeviceRefusedError
+from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError
 from armcal_servobus.bus import Bus, BusSettings
 from armcal_servobus.finding import find
 

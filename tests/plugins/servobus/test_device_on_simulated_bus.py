@@ -10,7 +10,7 @@ import threading
 import tty
 
 import pytest
-from armcal.devices.faults import DeviceError
+from armcal.devices.device import DeviceError
 from armcal_servobus.bus import Bus, BusSettings
 from armcal_servobus.device import ServoBusDevice
 from armcal_servobus.finding import find

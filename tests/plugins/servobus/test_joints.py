@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from armcal.devices.faults import DeviceRefusedError
+from armcal.devices.device import DeviceRefusedError
 from armcal_servobus.device import ServoBusSettings
 from armcal_servobus.joints import ServoJoint, check_offset, drivable
 from armcal_servobus.models import MODELS

@@ -6,13 +6,13 @@ import math
 from collections.abc import Callable
 
 import pytest
-from armcal.devices.device import MeasuringDevice
-from armcal.devices.faults import (
+from armcal.devices.device import (
     DeviceError,
     DeviceLostError,
     DeviceRefusedError,
     DeviceResetError,
     DeviceUnwellError,
+    MeasuringDevice,
 )
 from armcal_servobus.device import ServoBusDevice
 

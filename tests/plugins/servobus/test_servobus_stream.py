@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from armcal.devices.faults import DeviceRefusedError
+from armcal.devices.device import DeviceRefusedError
 from armcal.errors import ConfigError
 from armcal_servobus.stream import ServoBusStream
 

@@ -1,0 +1,167 @@
+"""What a bench is measured with, live: joint readings of arms guided by hand, trackers, cameras."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+from armcal.base.domains import Array
+from armcal.devices.clock import Clock
+from armcal.measure.measurement import Measurement
+
+
+@dataclass(frozen=True)
+class JointSample:
+    """One reading of all joints.
+
+    Attributes:
+        arrived: when it came, by the bench's clock (s).
+        stamp: when it was taken, by the source's own clock (s), where it says so.
+        angles: by channel (``arm.q1``; rad, or m of sliding joints).
+        labels: text that came with it (a socket's name).
+    """
+
+    arrived: float
+    stamp: float | None
+    angles: Mapping[str, float]
+    labels: Mapping[str, str] = field(default_factory=dict)
+
+
+class JointStream(Protocol):
+    """A live source of joint readings."""
+
+    def open(self, clock: Clock, channels: tuple[str, ...]) -> None:
+        """Begin to listen for these channels.
+
+        Raises:
+            DeviceRefusedError: the source is not there or is taken.
+            ConfigError: its settings name no such channel, or leave one out.
+        """
+
+    def samples(self) -> list[JointSample]:
+        """All that came since the last call; it never waits. What cannot be read is counted in ``refused``."""
+
+    @property
+    def ended(self) -> bool:
+        """Nothing more will come."""
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """How many lines were passed over, by reason."""
+
+    def close(self) -> None:
+        """Stop. May be called twice."""
+
+
+@runtime_checkable
+class RestStream(Protocol):
+    """What a joint stream may provide beside the rest: each sample is then the mean of a whole rest, once it is over.
+
+    Attributes:
+        gives_rests: whether it is set to do so.
+    """
+
+    @property
+    def gives_rests(self) -> bool:
+        """See above."""
+
+    def lasting(self) -> list[JointSample]:
+        """The rest that still lasts, if it is one already; for when nobody waits for its end. It is given once."""
+
+
+REPEATED = "a repeated frame number"
+"""The reason in ``Tracker.refused`` for frames that came before, by their number."""
+
+
+@dataclass(frozen=True)
+class TrackerFrame:
+    """One moment, as a tracker saw it.
+
+    Attributes:
+        counter: the tracker's frame number; rises by one from frame to frame, more where frames were lost.
+        arrived: when it came, by the bench's clock (``Clock.now``, s).
+        stamp: when it was taken, by the tracker's own clock (s), where it says so.
+        bodies: ``world_T_body`` (4 x 4, m) by the tracker's own name of the body; None: not seen in this frame. The
+            rotation is NaN where only a position is known.
+    """
+
+    counter: int
+    arrived: float
+    stamp: float | None
+    bodies: Mapping[str, Array | None] = field(default_factory=dict)
+
+
+class Tracker(Protocol):
+    """A live source of frames."""
+
+    def open(self, clock: Clock) -> None:
+        """Begin to listen.
+
+        Raises:
+            DeviceRefusedError: the port is taken, or the file is not there.
+        """
+
+    def frames(self) -> list[TrackerFrame]:
+        """All that came since the last call, in the order of arrival; it never waits, and never raises for what came.
+
+        What cannot be read is passed over and counted in ``refused``.
+        """
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """How many datagrams or lines were passed over, by reason."""
+
+    def close(self) -> None:
+        """Stop. May be called twice."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One image and what it says.
+
+    Attributes:
+        content: of the image file that is to be kept.
+        suffix: of its name, ``.png``.
+        seen: what it shows, for people; without a full stop.
+        values: what was read, by channel (``camera.u_3``, SI); what was not seen is left out.
+        fault: why it says nothing, a sentence; empty if it does.
+    """
+
+    content: bytes
+    suffix: str
+    seen: str
+    values: Mapping[str, float] = field(default_factory=dict)
+    fault: str = ""
+
+
+class LiveCamera(Protocol):
+    """A live source of images.
+
+    Attributes:
+        measurement: the instance whose channels it gives; known once it is open.
+        gives_shots: whether images come by themselves, one for each posture; else they are asked for.
+    """
+
+    measurement: str
+    gives_shots: bool
+
+    def open(self, clock: Clock, measurements: Mapping[str, Measurement]) -> None:
+        """Begin.
+
+        Args:
+            clock: the bench's.
+            measurements: by instance; one of them is this camera's.
+
+        Raises:
+            DeviceRefusedError: there is no such camera, or it is taken.
+            ConfigError: none of the measurements is a camera's, or several are and none is named.
+            PluginError: a library is not there.
+        """
+
+    def shots(self) -> list[Shot]:
+        """All that came by themselves since the last call; it never waits for one."""
+
+    def shoot(self) -> Shot:
+        """An image taken now; one with a fault where the camera gives none."""
+
+    def close(self) -> None:
+        """Stop. May be called twice."""
