@@ -13,7 +13,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.pose_settings import nearest_rotation
 from armcal.base.units import DIMENSIONLESS
-from armcal.errors import DataError, Location
+from armcal.errors import DataError
 from armcal.io.cells import is_number
 from armcal.io.plain_files import input_bytes, refuse, text_of
 from armcal.measure.checks import check_dataset, layout_of
@@ -136,7 +136,7 @@ def _with_rates(dataset: Dataset, rates: Sequence[RequestedChannel]) -> Dataset:
     if len(steps) < 2 or steps.min() <= 0 or steps.max() > _LONGEST_STEP_S:
         spacing = f"rows up to {steps.max():.3g} s apart" if len(steps) else "no times"
         message = f"found {spacing}, expected how fast joints were: {missing[0].what}."
-        raise DataError(message, where=Location(dataset.source or None), hint=hint)
+        raise DataError(message, where=dataset.where(), hint=hint)
     joints = {name.rpartition(".")[2]: name for name in dataset.channels}
     rows = [
         np.gradient(dataset.column(joints[w.channel.removesuffix("_rate")]), dataset.column("time")) for w in missing

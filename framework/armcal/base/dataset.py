@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armcal.base.domains import Array
-from armcal.errors import DataError
+from armcal.errors import DataError, Location
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,14 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.ids)
 
+    def row(self, index: int) -> int:
+        """Where a record stood in its source, from 1."""
+        return self.rows[index] if self.rows else index + 1
+
+    def where(self, index: int | None = None, field: str | None = None) -> Location:
+        """The place of the dataset, or of one of its records, perhaps of a column, for an error."""
+        return Location(self.source or None, row=None if index is None else self.row(index), field=field)
+
     def column(self, channel: str) -> Array:
         """One channel.
 
@@ -95,6 +103,5 @@ class Dataset:
         if not faulty:
             return self
         kept = self.subset([i for i in range(len(self)) if i not in faulty])
-        row = self.rows or tuple(range(1, len(self) + 1))
-        listed = tuple(SetAside(row[i], self.ids[i], reason) for i, reason in sorted(faulty.items()))
+        listed = tuple(SetAside(self.row(i), self.ids[i], reason) for i, reason in sorted(faulty.items()))
         return replace(kept, set_aside=self.set_aside + listed)

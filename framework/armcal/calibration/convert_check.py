@@ -114,11 +114,7 @@ def _named(source: ConfigSource, arm: str | None) -> str:
             f"no arm is called {name!r}.", where=source.where(("arms",)), hint=f"The arms are {', '.join(arms)}."
         )
     if not isinstance(arms[name], dict) or "model" not in arms[name]:
-        raise ConfigError(
-            f"the arm {name!r} has no model.",
-            where=source.where(("arms", name)),
-            hint="Write model: {type: NAME, ...}.",
-        )
+        source.refuse(("arms", name), f"the arm {name!r} has no model.", "Write model: {type: NAME, ...}.")
     return name
 
 

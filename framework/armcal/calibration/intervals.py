@@ -19,7 +19,7 @@ from armcal.base.parameters import Drift, Parameters
 from armcal.base.settings import Settings
 from armcal.config.system import System
 from armcal.diagnose.coverage import Recording, Stretch, level_name
-from armcal.errors import DataError, Location
+from armcal.errors import DataError
 from armcal.estimate.prediction import LEVELS, POSITION, STATED, TURN, KnownDrift, Predictor, Spread, is_position
 from armcal.estimate.validation import Indices
 from armcal.estimate.variance import Axes, Component, VarianceComponents, apply_components
@@ -253,7 +253,7 @@ class Uncertainty:
             if not commands.has(drift.channel):
                 raise DataError(
                     f"{name} drifts over {drift.channel}, and the poses do not say theirs.",
-                    where=Location(commands.source or None),
+                    where=commands.where(),
                     hint=f"Add a column {drift.channel}, name the one that is, or predict in a new recording.",
                 )
             at, known = commands.column(drift.channel), recorded.column(drift.channel)

@@ -88,10 +88,10 @@ def _with_drift(
         for name in _matching(parameters, glob, source, (*at, glob)):
             block = parameters[name]
             if not block.free or block.size != 1:
-                raise ConfigError(
+                source.refuse(
+                    (*at, glob),
                     f"{name} cannot drift: it is {'a matrix' if block.size != 1 else 'not free'}.",
-                    where=source.where((*at, glob)),
-                    hint="Let free numbers drift: add it to parameters.free, under a prior if need be.",
+                    "Let free numbers drift: add it to parameters.free, under a prior if need be.",
                 )
             deviation = _deviation(block, stated.sd, source, (*at, glob, "sd"))
             timed, where = isinstance(stated.over, str), source.where((*at, glob, "over"))
@@ -109,10 +109,10 @@ def _with_drift(
 def _deviation(block: ParameterBlock, text: str | float, source: ConfigSource, at: Path) -> float:
     deviation = quantity(block, text, source, at)
     if not deviation > 0 or not math.isfinite(deviation):
-        raise ConfigError(
+        source.refuse(
+            at,
             f"found {text}, expected a standard deviation above zero.",
-            where=source.where(at),
-            hint="Give how far from the nominal value the parameter may well be.",
+            "Give how far from the nominal value the parameter may well be.",
         )
     return deviation
 

@@ -148,10 +148,10 @@ def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
             moved = [frame for frame, joint in frame_names(carrier.nominal_chain).items() if joint]
             for setting, frame in carried.carriers.items():
                 if frame not in moved:
-                    raise ConfigError(
+                    source.refuse(
+                        (*at, setting),
                         f"no frame that a joint of {carrier.name} moves is called {frame!r}.",
-                        where=source.where((*at, setting)),
-                        hint=f"Such frames are {', '.join(moved)}.",
+                        f"Such frames are {', '.join(moved)}.",
                     )
     for name, measurement in measurements.items():
         if isinstance(measurement, Borrowing) and measurement.lender is not None:
@@ -173,11 +173,7 @@ def build_component(
     for step in at:
         section = section[step]
     if not isinstance(section, dict) or not isinstance(section.get("type"), str):
-        raise ConfigError(
-            f"found no type for this {kind}.",
-            where=source.where(at),
-            hint="Write type: NAME; see armcal plugins list.",
-        )
+        source.refuse(at, f"found no type for this {kind}.", "Write type: NAME; see armcal plugins list.")
     name = str(section["type"])
     try:
         registered = registry.find(kind, name)
@@ -249,34 +245,26 @@ def _check_lender(source: ConfigSource, at: Path, borrower: Borrowing, measureme
     """Refuse a lender that is not there, that borrows itself, or whose parameters mean something else."""
     lender, others = measurements.get(str(borrower.lender)), [name for name in measurements if name != at[-1]]
     if lender is None or borrower.lender == at[-1]:
-        raise ConfigError(
+        source.refuse(
+            at,
             f"found {borrower.lender!r}, whose parameters are to be used, expected another measurement.",
-            where=source.where(at),
-            hint=f"The others are {', '.join(others) or 'none'}.",
+            f"The others are {', '.join(others) or 'none'}.",
         )
     if isinstance(lender, Borrowing) and lender.lender is not None:
-        raise ConfigError(
-            f"{borrower.lender} has the parameters of {lender.lender} itself.",
-            where=source.where(at),
-            hint=f"Name {lender.lender}.",
-        )
+        source.refuse(at, f"{borrower.lender} has the parameters of {lender.lender} itself.", f"Name {lender.lender}.")
     _refusable(source, at, lambda: borrower.check_lender(lender))
 
 
 def _check_link(source: ConfigSource, at: Path, link: LinkSettings, known: Mapping[str, int], joints: int) -> None:
     if link.frame not in known:
-        raise ConfigError(
-            f"no frame is called {link.frame!r}.",
-            where=source.where((*at, "frame")),
-            hint=f"The frames are {', '.join(known)}.",
-        )
+        source.refuse((*at, "frame"), f"no frame is called {link.frame!r}.", f"The frames are {', '.join(known)}.")
     if link.mass < 0:
-        raise ConfigError("found a mass below zero.", where=source.where((*at, "mass")), hint="Give the mass.")
+        source.refuse((*at, "mass"), "found a mass below zero.", "Give the mass.")
     if link.loads_up_to_joint is not None and not 0 <= link.loads_up_to_joint <= joints:
-        raise ConfigError(
+        source.refuse(
+            (*at, "loads_up_to_joint"),
             f"found joint {link.loads_up_to_joint}, expected 0 to {joints}.",
-            where=source.where((*at, "loads_up_to_joint")),
-            hint="Joints count from 1; 0 is the mount.",
+            "Joints count from 1; 0 is the mount.",
         )
 
 
@@ -285,12 +273,12 @@ def _instance_names(source: ConfigSource, names: list[str]) -> None:
     for name in names:
         section: Path = ("arms", name) if name in source.data.get("arms", {}) else ("measurements", name)
         if names.count(name) > 1 or name == STATICS:
-            raise ConfigError(f"{name!r} names two things.", where=source.where(section), hint="Rename one.")
+            source.refuse(section, f"{name!r} names two things.", "Rename one.")
         if not name.isidentifier():
-            raise ConfigError(
+            source.refuse(
+                section,
                 f"{name!r} is no instance name.",
-                where=source.where(section),
-                hint="Use letters, digits and underscores, beginning with a letter.",
+                "Use letters, digits and underscores, beginning with a letter.",
             )
 
 

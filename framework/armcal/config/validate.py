@@ -94,10 +94,10 @@ def _part(settings_class: type[Settings], source: ConfigSource, at: tuple[Step, 
     for step in at:
         key = find_key(value, step)
         if key is None:
-            raise ConfigError(
+            source.refuse(
+                at,
                 f"found no {dotted(at)!r}, expected keys and values.",
-                where=source.where(at),
-                hint=f"Write '{at[-1]}:' with some of {', '.join(settings_class.keys())}.",
+                f"Write '{at[-1]}:' with some of {', '.join(settings_class.keys())}.",
             )
         value = value[key]
     return value

@@ -63,6 +63,10 @@ class ConfigSource:
             value = value[key]
         return self.marks[tuple(steps)]
 
+    def refuse(self, path: tuple[Step, ...], message: str, hint: str = "") -> NoReturn:
+        """Raise a ConfigError at the place of a path."""
+        raise ConfigError(message, where=self.where(path), hint=hint)
+
 
 def find_key(value: Any, step: Step) -> Step | None:
     """The key or index of a config value that a step means: itself, or that name with a unit after it."""

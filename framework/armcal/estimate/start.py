@@ -16,7 +16,7 @@ from armcal.arm.statics import BASE_FRAME, TOOL_FRAME
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock
-from armcal.errors import Location, NotConvergedError, ProblemError
+from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.placing import Placing, placings
 from armcal.measure.measurement import Carried, borrowed_names
 from armcal.measure.points import Certifying, Proposing, Reading
@@ -190,7 +190,7 @@ def _with_proposal(
     proposal = measurement.propose(_reading(problem, nominal, before, records, dataset, number))
     if any(own[local].prior_sd is None for local in proposal.undetermined):
         hint = f"{proposal.close} Or give priors, or hold {', '.join(proposal.undetermined)}."
-        raise ProblemError(f"{name}: {proposal.open}", where=Location(dataset.source or None), hint=hint)
+        raise ProblemError(f"{name}: {proposal.open}", where=dataset.where(), hint=hint)
     if not proposal.values:
         return start
     vector, moved = before.copy(), nominal.copy()

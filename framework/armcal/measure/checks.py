@@ -111,7 +111,7 @@ def require_records(dataset: Dataset) -> Dataset:
     why = f"all {len(dataset.set_aside)} were set aside, the first because {first.reason}" if first else "it is empty"
     raise DataError(
         f"found no usable record: {why}.",
-        where=Location(dataset.source or None),
+        where=dataset.where(),
         hint="Correct the values, or remove an optional column that is empty.",
     )
 

@@ -26,7 +26,7 @@ def require_conditions(dataset: Dataset, requested_channels: Sequence[RequestedC
         if channel.effects and channel.required and not dataset.has(channel.channel):
             raise DataError(
                 f"found no {channel.what}.",
-                where=Location(dataset.source or None, field=channel.channel),
+                where=dataset.where(field=channel.channel),
                 hint="Use a source that records it, or remove the effect.",
             )
 

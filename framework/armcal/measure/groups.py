@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock
-from armcal.errors import ConfigError, DataError, Location
+from armcal.errors import ConfigError, DataError
 from armcal.measure.measurement import GroupedMeasurement, Measurement, NamesGroups, Tie
 
 Groups = Mapping[str, tuple[str, ...]]
@@ -86,7 +86,7 @@ def record_keys(dataset: Dataset, measurement: GroupedMeasurement) -> tuple[str,
         if label not in dataset.extra:
             raise DataError(
                 f"found no column {label}, expected it to say which group a record belongs to.",
-                where=Location(dataset.source or None, field=label),
+                where=dataset.where(field=label),
                 hint=f"Add a text column {label}, or map one: columns: {{{label}: NAME}} in the data section.",
             )
         columns.append([cell.strip() for cell in dataset.extra[label]])
@@ -96,7 +96,7 @@ def record_keys(dataset: Dataset, measurement: GroupedMeasurement) -> tuple[str,
         if any(forbidden.intersection(cell) or not cell.isprintable() for cell in cells):
             raise DataError(
                 f"found the label {'/'.join(cells)[:60]!r}, which is no name.",
-                where=Location(dataset.source or None, row=dataset.rows[index] if dataset.rows else index + 1),
+                where=dataset.where(index),
                 hint="Use letters, digits, dashes and underscores.",
             )
     return tuple("/".join(cells) if all(cells) else "" for cells in zip(*columns, strict=True))
@@ -129,7 +129,7 @@ def refuse_lost(dataset: Dataset, measurements: Mapping[str, Measurement], lost:
     raise DataError(
         f"found {int(lost.sum())} records that no measurement applies to, the first: {dataset.ids[first]}; "
         f"expected a reading, or labels of a group in {named}.",
-        where=Location(dataset.source or None, row=dataset.rows[first] if dataset.rows else first + 1),
+        where=dataset.where(first),
         hint="Fill in the labels, or leave the record out.",
     )
 

@@ -45,23 +45,18 @@ class Layout:
         """What a channel is called in the source."""
         return self.columns.get(channel, channel)
 
-    def row(self, dataset: Dataset, index: int) -> int:
-        """Where a record stood in its source, from 1."""
-        return dataset.rows[index] if dataset.rows else index + 1
-
     def place(self, dataset: Dataset, index: int) -> str:
         """Where a record stood, in words."""
         if self.by_id:
             return dataset.ids[index]
-        return f"{'line' if self.by_line else 'row'} {self.row(dataset, index)}"
+        return f"{'line' if self.by_line else 'row'} {dataset.row(index)}"
 
     def where(self, dataset: Dataset, index: int, channel: str | None = None) -> Location:
         """A record's place, for an error."""
-        at = self.row(dataset, index)
         column = self.column(channel) if channel else None
         if self.by_line:
-            return Location(dataset.source or None, line=at, field=column)
-        return Location(dataset.source or None, row=at, field=column)
+            return Location(dataset.source or None, line=dataset.row(index), field=column)
+        return dataset.where(index, column)
 
     def shown(self, channel: str, si_value: float) -> str:
         """A value in the unit its source declares."""

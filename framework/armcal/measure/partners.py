@@ -8,7 +8,7 @@ import numpy as np
 
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.errors import DataError, Location
+from armcal.errors import DataError
 from armcal.measure.measurement import Measurement
 
 OTHER = "@other"
@@ -55,7 +55,7 @@ def _partners(dataset: Dataset, label: str) -> Array:
         if place.get(name, i) == i:
             raise DataError(
                 f"found {name[:40]!r}, expected the id of another record.",
-                where=Location(dataset.source or None, row=dataset.rows[i] if dataset.rows else i + 1, field=label),
+                where=dataset.where(i, field=label),
                 hint="Correct it, or leave it empty; the other record may have been set aside.",
             )
         partners[i] = place[name]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import Drift, ParameterBlock
-from armcal.errors import DataError, Location
+from armcal.errors import DataError
 from armcal.problem.correlation import Correlation
 from armcal.problem.factor_records import noise_roots
 from armcal.problem.problem import FactorRecords, Problem
@@ -60,7 +60,7 @@ def chain(problem: Problem, *datasets: Dataset) -> Chain | None:
         if not dataset.has(drift.channel):
             raise DataError(
                 f"{block.name} drifts over {drift.channel}, and the records do not carry it.",
-                where=Location(dataset.source or None),
+                where=dataset.where(),
                 hint=f"Add a column {drift.channel}, or name the one that is: columns: {{{drift.channel}: pose_id}}.",
             )
     columns = [np.concatenate([dataset.column(name) for dataset in datasets]) for name in channels]
@@ -69,7 +69,7 @@ def chain(problem: Problem, *datasets: Dataset) -> Chain | None:
     if not np.all(np.all(steps >= 0, axis=0) | np.all(steps <= 0, axis=0)):
         raise DataError(
             f"the records do not have the same order by {' and by '.join(channels)}, and parameters drift over both.",
-            where=Location(datasets[0].source or None),
+            where=datasets[0].where(),
             hint="Correct the columns, or let all parameters drift over the same one.",
         )
     return Chain(channels, places)
