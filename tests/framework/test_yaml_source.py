@@ -108,7 +108,8 @@ def test_every_value_knows_its_file_line_and_field(sample: ConfigSource, tmp_pat
         ("note",): (here, 19),
     }
     for path, place in expected.items():
-        mark = sample.marks[path]
+        assert path in sample.marks
+        mark = sample.where(path)
         assert (mark.file, mark.line) == place, path
         assert mark.field == ".".join(map(str, path))
     assert sample.marks[("again",)].line == 18

@@ -39,7 +39,7 @@ class ConfigSource:
 
     Attributes:
         data: plain nested dicts, lists and scalars; every text is a `ConfigText`.
-        marks: the place of the value at each path, such as ``("rows", 2, "d_mm")``; ``()`` is the whole.
+        marks: file and line of the value at each path, such as ``("rows", 2, "d_mm")``; ``()`` is the whole.
         path: the config that was asked for.
         root: the directory that no path in it may leave.
         files: every file read, the one asked for first.
@@ -55,13 +55,13 @@ class ConfigSource:
         """The place of a path, or of its nearest parent that was written; ``("d",)`` also finds ``d_mm``."""
         steps: list[Step] = []
         value: Any = self.data
-        for index, step in enumerate(path):
+        for step in path:
             key = find_key(value, step)
             if key is None or (*steps, key) not in self.marks:
-                return replace(self.marks[tuple(steps)], field=dotted((*steps, *path[index:])))
+                break
             steps.append(key)
             value = value[key]
-        return self.marks[tuple(steps)]
+        return replace(self.marks[tuple(steps)], field=dotted((*steps, *path[len(steps) :])) or None)
 
     def refuse(self, path: tuple[Step, ...], message: str, hint: str = "") -> NoReturn:
         """Raise a ConfigError at the place of a path."""
@@ -224,7 +224,7 @@ def parents_of(node: Node) -> list[ConfigText]:
 
 
 def _build(node: Node, path: tuple[Step, ...], marks: dict[tuple[Step, ...], Location]) -> Any:
-    marks[path] = node.origin.at(node.line, path)
+    marks[path] = node.origin.at(node.line, ())
     if isinstance(node.value, dict):
         return {key: _build(entry, (*path, key), marks) for key, entry in node.value.items()}
     if isinstance(node.value, tuple):
