@@ -18,7 +18,6 @@ from armcal.errors import ConfigError
 
 FIT_NAME = re.compile(r"""[^\s.*?\[\]<>"'\\@]+""")
 """What a part of a parameter's name may be: dots join parts, brackets name entries, the others make patterns."""
-_EVERYWHERE = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True)
@@ -227,30 +226,32 @@ class Parameters:
         places, entries, increments = np.array(numbers, dtype=np.intp).reshape(-1, 3).T
         return _Layout(places, entries, increments, tuple(others), (entry, increment))
 
-    def _per_increment(self, of: Mapping[str, float]) -> Array:
-        return np.array([of[block.name] for block in self.free for _ in range(block.domain.dof)])
+    def _per_increment(self, of: Callable[[ParameterBlock], float]) -> Array:
+        return np.array([number for block in self.free for number in [of(block)] * block.domain.dof])
 
     def scales(self) -> Array:
         """The typical scale of each coordinate."""
-        return self._per_increment({block.name: block.scale for block in self.free})
+        return self._per_increment(lambda block: block.scale)
 
     def increment_scales(self) -> Array:
         """The typical scale of each increment."""
-        return self._per_increment({b.name: b.domain.increment_scale(b.scale) for b in self.free})
+        return self._per_increment(lambda block: block.domain.increment_scale(block.scale))
 
     def prior_information(self) -> Array:
         """1/sd^2 of each coordinate's prior, 0 where there is none."""
-        return self._per_increment(
-            {block.name: 0.0 if block.prior_sd is None else block.prior_sd**-2 for block in self.free}
-        )
+        return self._per_increment(lambda block: 0.0 if block.prior_sd is None else block.prior_sd**-2)
 
     def increment_bounds(self) -> tuple[Array, Array]:
         """Lower and upper bound of each increment from the nominal values; infinite for all but intervals."""
-        lower, upper = {}, {}
-        for block in self.free:
-            ends = (block.domain.lower, block.domain.upper) if isinstance(block.domain, Interval) else _EVERYWHERE
-            lower[block.name], upper[block.name] = (end - block.nominal[0] for end in ends)
-        return self._per_increment(lower), self._per_increment(upper)
+
+        def ends(block: ParameterBlock) -> tuple[float, float]:
+            domain = block.domain
+            return (domain.lower, domain.upper) if isinstance(domain, Interval) else (-math.inf, math.inf)
+
+        return (
+            self._per_increment(lambda block: ends(block)[0] - block.nominal[0]),
+            self._per_increment(lambda block: ends(block)[1] - block.nominal[0]),
+        )
 
     def retract(self, delta: Array) -> Array:
         """The value vector that an increment of the free blocks leads to from the nominal values."""

@@ -156,19 +156,16 @@ class Predictor:
 
     def in_new_recording(self, records: Sequence[FactorRecords]) -> tuple[Spread, ...]:
         """Spread about predictions without drift, where nothing is known of it; one a factor."""
-        return tuple(
-            Spread(noise + values + drift, self.freedom)
-            for noise, values, drift in self._parts_in_new_recording(records)
-        )
+        parts = self._parts_in_new_recording(records)
+        return tuple(Spread(noise + values + drift, self.freedom) for noise, values, drift in parts)
 
     def in_recording(self, records: Sequence[FactorRecords]) -> tuple[Spread, ...]:
         """Spread about predictions with the drift of the recording of the fit; one a factor.
 
         The records must be on the same chain as those of the fit.
         """
-        return tuple(
-            Spread(noise + values + drift, self.freedom) for noise, values, drift in self._parts_in_recording(records)
-        )
+        parts = self._parts_in_recording(records)
+        return tuple(Spread(noise + values + drift, self.freedom) for noise, values, drift in parts)
 
     def left_out_of_recording(
         self, fitted: Sequence[FactorRecords], unknown: Sequence[Array] | None = None

@@ -5,7 +5,6 @@ half are laid out, and the pairs of them that cancel best are tried on the arm i
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,19 +26,6 @@ _WIDEST = 2
 _ROUNDED_AT_ONCE = 64
 TRIED = 4
 """Combinations that are tried on the arm."""
-
-
-@dataclass(frozen=True)
-class Settable:
-    """What can be set near some commands.
-
-    Attributes:
-        counts: n x o x N; zeros on joints without a pulse table.
-        angles: what they make (n x o x N; rad).
-    """
-
-    counts: Counts
-    angles: Array
 
 
 class ServoCounts:
@@ -72,8 +58,8 @@ class ServoCounts:
                 made[i] = _piecewise(counts[i] * clock.tick, table.pulses[order], table.angles[order])
         return made
 
-    def near(self, commands: Array, limits: Array, held: tuple[int, ...] = ()) -> Settable:
-        """Counts to either side of commands (n x N).
+    def near(self, commands: Array, limits: Array, held: tuple[int, ...] = ()) -> tuple[Counts, Array]:
+        """Counts to either side of commands (n x N), and what they make (n x o x N each; rad).
 
         None beyond the limits (n x 2), where the nearest stands in, and none beside the nearest of ``held`` joints.
         """
@@ -89,13 +75,13 @@ class ServoCounts:
         inside = np.where(beyond, np.inf, np.abs(angles - exact)).argmin(axis=1, keepdims=True)
         counts = np.where(beyond, np.take_along_axis(counts, inside, axis=1), counts)
         angles = np.where(beyond, np.take_along_axis(angles, inside, axis=1), angles)
-        return Settable(counts, angles)
+        return counts, angles
 
-    def best(self, near: Settable, commands: Array, slopes: Array, left: Array) -> tuple[Counts, Array]:
+    def best(self, near: tuple[Counts, Array], commands: Array, slopes: Array, left: Array) -> tuple[Counts, Array]:
         """The combinations with the least error to first order.
 
         Args:
-            near: what can be set about the commands.
+            near: what can be set about the commands, as ``near`` has it.
             commands: the exact ones (n x N).
             slopes: of the tool, its weighted rows (N x m x n).
             left: what the exact commands leave (m x N).
@@ -103,7 +89,8 @@ class ServoCounts:
         Returns:
             counts and angles (n x N x TRIED), the best first.
         """
-        moved = (near.angles - commands[:, None, :]).transpose(2, 0, 1)
+        counts, angles = near
+        moved = (angles - commands[:, None, :]).transpose(2, 0, 1)
         half = (len(self._stepped) + 1) // 2
         parts = self._stepped[:half], self._stepped[half:]
         first, second = (_sums(slopes, moved, part) for part in parts)
@@ -116,7 +103,7 @@ class ServoCounts:
         place = np.full((len(commands), *few.shape), len(self._offsets) // 2)
         place[self._stepped] = chosen.transpose(2, 0, 1)
         joint, target = np.arange(len(commands))[:, None, None], np.arange(len(cost))[None, :, None]
-        return near.counts[joint, place, target], near.angles[joint, place, target]
+        return counts[joint, place, target], angles[joint, place, target]
 
 
 def _sums(slopes: Array, moved: Array, joints: Sequence[int]) -> tuple[Array, NDArray[np.intp]]:
