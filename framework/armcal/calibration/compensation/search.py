@@ -14,7 +14,6 @@ from armcal.calibration.compensation.step import (
     REACHED,
     Slopes,
     progress_places,
-    rough_slopes,
     search_function,
     slopes,
 )
@@ -212,7 +211,7 @@ class Solver:
         self.length, self.turns, self.limits, self.held = length, turns, limits, held
         self._near = Near(*tolerance, _REST)
         self._exact = Search(expression, slopes(expression), limits, turns, length, choice)
-        rough = rough_slopes(expression) if expression.state.numel() else None
+        rough = slopes(expression, rough=True) if expression.state.numel() else None
         self._rough = None if rough is None else Search(expression, rough, limits, turns, length, choice)
 
     def __call__(self, goal: Goal, manner: Manner = QUICK) -> Solutions:

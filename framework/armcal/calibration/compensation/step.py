@@ -56,25 +56,20 @@ class Slopes:
     corrected: Expression
 
 
-def slopes(expression: ToolExpression) -> Slopes:
-    """By implicit differentiation at a state near the equilibrium. [Griewank2008]"""
+def slopes(expression: ToolExpression, rough: bool = False) -> Slopes:
+    """By implicit differentiation at a state near the equilibrium. [Griewank2008]
+
+    ``rough``: as if the state did not follow the commands. A third of the work, and good enough far from a target.
+    """
     commands, state = expression.commands, expression.state
     pose = ca.densify(ca.vertcat(ca.vec(expression.base_T_tool.rotation), expression.base_T_tool.translation))
     by_commands = ca.jacobian(pose, expression.record)[:, : commands.numel()]
-    if not state.numel():
-        return Slopes(ca.SX(0, 1), ca.SX(0, commands.numel()), by_commands, pose)
+    if rough or not state.numel():
+        return Slopes(expression.next_state - state, ca.SX(state.numel(), commands.numel()), by_commands, pose)
     following = ca.jacobian(expression.next_state, expression.record)[:, : commands.numel()]
     left, moved = expression.to_equilibrium(expression.next_state - state, following)
     by_state = ca.jacobian(pose, state)
     return Slopes(left, moved, by_commands + ca.mtimes(by_state, moved), pose + ca.mtimes(by_state, left))
-
-
-def rough_slopes(expression: ToolExpression) -> Slopes:
-    """As if the elastic state did not follow the commands: a third of the work, and good enough far from a target."""
-    commands, state = expression.commands, expression.state
-    pose = ca.densify(ca.vertcat(ca.vec(expression.base_T_tool.rotation), expression.base_T_tool.translation))
-    by_commands = ca.jacobian(pose, expression.record)[:, : commands.numel()]
-    return Slopes(expression.next_state - state, ca.SX(state.numel(), commands.numel()), by_commands, pose)
 
 
 def twists(own_slopes: Slopes) -> Expression:
