@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.base.pose_settings import quaternion_of
-from armcal.base.quaternions import rotation_matrix
+from armcal.base.quaternions import quaternion_of, rotation_matrix
 from armcal.measure.points import Proposal, Reading
 
 from armcal_camera.certificate import sentence

@@ -11,7 +11,7 @@ import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.base.pose_settings import nearest_rotation
+from armcal.base.quaternions import nearest_rotation
 from armcal.base.units import DIMENSIONLESS
 from armcal.errors import DataError
 from armcal.io.cells import is_number

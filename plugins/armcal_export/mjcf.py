@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.base.pose_settings import quaternion_of
+from armcal.base.quaternions import quaternion_of
 from armcal.calibration.rigid_chain import RigidChain
 
 from armcal_export.description import ArmDescription

@@ -7,9 +7,10 @@ from typing import Any, ClassVar
 import numpy as np
 from armcal.arm.servo import SteppedEffect
 from armcal.base.domains import Array
+from armcal.base.quaternions import rpy_of
 from armcal.base.settings import Settings
 from armcal.calibration.exporter import Exported, ExportRequest, changed_numbers
-from armcal.calibration.rigid_chain import NEGLIGIBLE, RigidChain, rigid_chain, rpy_of
+from armcal.calibration.rigid_chain import NEGLIGIBLE, RigidChain, rigid_chain
 from armcal.errors import ConfigError, ProblemError
 from pydantic import field_validator
 from scipy.spatial.transform import Rotation

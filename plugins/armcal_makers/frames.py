@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.calibration.rigid_chain import RigidChain, RigidJoint, rpy_of
+from armcal.base.quaternions import rpy_of
+from armcal.calibration.rigid_chain import RigidChain, RigidJoint
 from scipy.spatial.transform import Rotation
 
 KEYS = ("x", "y", "z", "roll", "pitch", "yaw")

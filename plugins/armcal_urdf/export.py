@@ -8,10 +8,10 @@ import numpy as np
 from armcal.arm.assembly import PLACEMENT, Arm
 from armcal.arm.model import forward
 from armcal.base.domains import Array
-from armcal.base.quaternions import rotation_matrix
+from armcal.base.quaternions import rotation_matrix, rpy_of
 from armcal.base.settings import Settings
 from armcal.calibration.exporter import Exported, ExportRequest, random_commands
-from armcal.calibration.rigid_chain import numeric_chain, rigid_chain, rpy_of
+from armcal.calibration.rigid_chain import numeric_chain, rigid_chain
 from armcal.errors import ConfigError, ProblemError
 from scipy.spatial.transform import Rotation
 

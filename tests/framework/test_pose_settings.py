@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from armcal.base.parameters import Parameters
 from armcal.base.pose_blocks import pose_blocks, pose_transform, quaternion_expression, rotation_of
-from armcal.base.pose_settings import PRINTED, PoseSettings, nearest_rotation, quaternion_of
+from armcal.base.pose_settings import PoseSettings
+from armcal.base.quaternions import PRINTED, nearest_rotation, quaternion_of
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError

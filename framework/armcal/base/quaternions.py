@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+PRINTED = 2e-3
+"""A printed matrix may be so far from a rotation, entry by entry; it is taken for the nearest one."""
 
 
 def quaternion_matrix(q: Array) -> Array:
@@ -55,3 +57,61 @@ def rotation_matrix(q: Array) -> Array:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def nearest_rotation(matrix: Array) -> Array:
+    """The proper rotation nearest to a printed one (3x3). [Higham1989]
+
+    Raises:
+        ValueError: it is no rotation, not even a printed one.
+    """
+    left, _, right = np.linalg.svd(matrix)
+    nearest = left @ right
+    if np.linalg.det(nearest) < 0:
+        raise ValueError("found a reflection (determinant -1), expected a rotation: check the order of rows and axes")
+    worst = float(np.abs(nearest - matrix).max())
+    if worst > PRINTED:
+        raise ValueError(f"found a matrix that is no rotation: it is off by {worst:.3g}; give rows of unit length")
+    return np.asarray(nearest)
+
+
+def quaternion_of(rotation: Array) -> tuple[float, ...]:
+    """The unit quaternion (w, x, y, z; w >= 0) of a rotation matrix, from its largest component. [Shepperd1978]"""
+    trace = float(np.trace(rotation))
+    squares = np.array([trace, *np.diag(rotation)])
+    largest = int(np.argmax(squares))
+    q = np.empty(4)
+    if largest == 0:
+        q[0] = 1 + trace
+        q[1:] = [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    else:
+        i = largest - 1
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[0] = rotation[k, j] - rotation[j, k]
+        q[1 + i] = 1 + rotation[i, i] - rotation[j, j] - rotation[k, k]
+        q[1 + j], q[1 + k] = rotation[j, i] + rotation[i, j], rotation[k, i] + rotation[i, k]
+    q = q / np.linalg.norm(q)
+    return tuple(float(x) for x in (q if q[0] >= 0 else -q))
+
+
+def rpy_matrices(rpy: Array) -> Array:
+    """Rz(yaw) Ry(pitch) Rx(roll) (... x 3 x 3) from roll, pitch, yaw (... x 3; rad)."""
+    (cr, cp, cy), (sr, sp, sy) = np.moveaxis(np.cos(rpy), -1, 0), np.moveaxis(np.sin(rpy), -1, 0)
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+def rpy_of(rotation: Array) -> tuple[float, float, float]:
+    """Roll, pitch and yaw (rad) of R = Rz(yaw) Ry(pitch) Rx(roll), exact at a pitch of a right angle too.
+
+    Yaw is taken first and the rest measured in the frame that it leaves, so that its error does not add to the roll's.
+    """
+    level = math.hypot(rotation[0, 0], rotation[1, 0])
+    yaw = math.atan2(rotation[1, 0], rotation[0, 0]) if level > 1e-15 else 0.0
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    left = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ rotation
+    return math.atan2(-left[1, 2], left[1, 1]), math.atan2(-left[2, 0], left[0, 0]), yaw

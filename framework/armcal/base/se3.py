@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 
 Expression = Any
 """A CasADi ``SX`` (or a number where a constant is meant)."""
@@ -51,6 +53,11 @@ class Transform:
         """The homogeneous 4x4 matrix."""
         bottom = ca.horzcat(ca.SX(1, 3), ca.SX(1))
         return ca.vertcat(ca.horzcat(self.rotation, self.translation), bottom)
+
+
+def evaluated(expression: Expression) -> NDArray[np.float64]:
+    """The numbers of an expression without symbols, in its shape."""
+    return np.asarray(ca.evalf(ca.densify(ca.SX(expression))).full())
 
 
 def identity() -> Transform:

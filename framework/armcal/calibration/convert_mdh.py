@@ -13,7 +13,8 @@ from typing import Any, Literal
 import numpy as np
 
 from armcal.base.domains import Array
-from armcal.calibration.rigid_chain import RigidChain, require_independent, require_plain_axes, rpy_of
+from armcal.base.quaternions import rpy_of
+from armcal.calibration.rigid_chain import RigidChain, require_independent, require_plain_axes
 
 Convention = Literal["standard", "craig"]
 NEARLY_PARALLEL = 0.01

@@ -8,8 +8,8 @@ import numpy as np
 
 from armcal.base.config_text import shown
 from armcal.base.domains import Array
-from armcal.base.pose_settings import quaternion_of
-from armcal.calibration.rigid_chain import RigidChain, RigidJoint, require_independent, require_plain_axes, rpy_of
+from armcal.base.quaternions import quaternion_of, rpy_of
+from armcal.calibration.rigid_chain import RigidChain, RigidJoint, require_independent, require_plain_axes
 
 _DIGITS = 15
 BASE, TIP = "base_link", "tip_link"

@@ -12,7 +12,7 @@ from armcal.arm.model import forward
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.base.quaternions import rotation_matrix
-from armcal.base.se3 import Transform
+from armcal.base.se3 import Transform, evaluated
 from armcal.calibration.tool_expression import ToolExpression
 from armcal.config.system import System
 from armcal.errors import ConfigError
@@ -89,8 +89,8 @@ def _on_tool(
     state = ArmState(frames.base_T_tool, frames.named, ca.SX(0, 1), ca.SX.zeros(len(chain.joints)))
     read = measurement.outputs({arm.name: state}, own)
     names = ("x", "y", "z", *(_QUATERNION if set(_QUATERNION) <= set(read) else ()))
-    numbers = np.array([float(ca.evalf(ca.SX(read[name]))) for name in names])
-    base_T_tool = np.asarray(ca.evalf(ca.densify(frames.base_T_tool.matrix())).full())
+    numbers = np.array([evaluated(read[name]).item() for name in names])
+    base_T_tool = evaluated(frames.base_T_tool.matrix())
     base_T_target = base_T_tool.copy()
     base_T_target[:3, 3] = numbers[:3]
     if len(numbers) > len("xyz"):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from armcal.arm.model import ArmModel, Chain, Joint, Mimic, forward
 from armcal.base.domains import Array
-from armcal.base.se3 import Expression, Transform
+from armcal.base.se3 import Transform, evaluated
 from armcal.errors import ProblemError
 
 NEGLIGIBLE = 1e-12
@@ -147,25 +147,13 @@ def turn_between(here: Array, there: Array) -> Array:
     return vectors
 
 
-def rpy_of(rotation: Array) -> tuple[float, float, float]:
-    """Roll, pitch and yaw (rad) of R = Rz(yaw) Ry(pitch) Rx(roll), exact at a pitch of a right angle too.
-
-    Yaw is taken first and the rest measured in the frame that it leaves, so that its error does not add to the roll's.
-    """
-    level = math.hypot(rotation[0, 0], rotation[1, 0])
-    yaw = math.atan2(rotation[1, 0], rotation[0, 0]) if level > 1e-15 else 0.0
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    left = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ rotation
-    return math.atan2(-left[1, 2], left[1, 1]), math.atan2(-left[2, 0], left[0, 0]), yaw
-
-
 def _rigid(joint: Joint, placed: Array) -> RigidJoint:
     """A joint whose frame, offset included, stands here; the frame is shifted onto an axis that lies beside it."""
     facts = (joint.limits, joint.endless, joint.mimic)
     if joint.twist is None:
         axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
         return RigidJoint(joint.name, placed, axis, not joint.is_revolute, 0.0, 1.0, *facts)
-    angular, linear = (_numbers(part).ravel() for part in joint.twist)
+    angular, linear = (evaluated(part).ravel() for part in joint.twist)
     if not joint.is_revolute:
         scale = float(np.linalg.norm(linear))
         return RigidJoint(
@@ -179,8 +167,4 @@ def _rigid(joint: Joint, placed: Array) -> RigidJoint:
 
 
 def _pose(transform: Transform) -> Array:
-    return _numbers(transform.matrix())
-
-
-def _numbers(expression: Expression) -> Array:
-    return np.asarray(ca.evalf(ca.densify(ca.SX(expression))).full())
+    return evaluated(transform.matrix())

@@ -11,7 +11,7 @@ import numpy as np
 
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
-from armcal.base.pose_settings import quaternion_of
+from armcal.base.quaternions import quaternion_of
 from armcal.base.units import DIMENSIONLESS, split_suffix, to_unit
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.intervals import PlusMinus

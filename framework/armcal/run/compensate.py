@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from armcal.arm.loading import LOAD_CHANNELS
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.base.pose_settings import quaternion_of
+from armcal.base.quaternions import quaternion_of
 from armcal.base.units import UNITS
 from armcal.calibration.calibration import Calibration, arm_named
 from armcal.calibration.compensation.compensator import Compensator

@@ -10,8 +10,7 @@ from armcal.arm.loading import LOAD_CHANNELS
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
-from armcal.base.pose_settings import rpy_matrices
-from armcal.base.quaternions import rotation_matrix
+from armcal.base.quaternions import rotation_matrix, rpy_matrices
 from armcal.base.units import DIMENSIONLESS, split_suffix
 from armcal.calibration.compensation.reach import Reach
 from armcal.calibration.compensation.request import FARTHEST_M, Targets

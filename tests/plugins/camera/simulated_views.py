@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 from armcal.arm.model import forward
 from armcal.base.domains import Array
-from armcal.base.pose_settings import quaternion_of
+from armcal.base.quaternions import quaternion_of
 from armcal.estimate.estimator import Estimate
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment

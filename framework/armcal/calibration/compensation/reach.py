@@ -10,7 +10,7 @@ from armcal.arm.assembly import Arm
 from armcal.arm.joints import Limits, joint_limits, unknown_joint
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.base.se3 import Transform, identity
+from armcal.base.se3 import Transform, evaluated, identity
 from armcal.calibration.compensation.request import Mask, Targets
 from armcal.calibration.compensation.search import Rows, Solutions
 from armcal.calibration.tool_expression import ToolExpression
@@ -97,27 +97,23 @@ def reach_of(arm: Arm, parameters: Parameters, limits: Array, tool_T_point: Tran
     """
     values = {block.name: ca.SX(list(block.nominal)) for block in parameters.blocks if not block.nuisance}
     chain = arm.chain(values)
-    centre = _numbers(chain.base_T_mount.translation).ravel()
+    centre = evaluated(chain.base_T_mount.translation).ravel()
     slides = any(not joint.is_revolute for joint in chain.joints)
     if any(joint.twist is not None for joint in chain.joints) or arm.conditions or (slides and arm.effects):
         return Reach(centre, np.inf, 0.0)
-    links = [float(np.linalg.norm(_numbers(joint.parent_T_joint.translation))) for joint in chain.joints]
+    links = [float(np.linalg.norm(evaluated(joint.parent_T_joint.translation))) for joint in chain.joints]
     end = chain.tool.joint_T_frame @ (tool_T_point or identity())
-    links.append(float(np.linalg.norm(_numbers(end.translation))))
+    links.append(float(np.linalg.norm(evaluated(end.translation))))
     # how far sliding joints move at most (m)
     travel = 0.0
     places = {joint: i for i, joint in enumerate(arm.commanded)}
     for joint in chain.joints:
         if not joint.is_revolute:
             own = limits[places[joint.name]] if joint.name in places else np.array([-np.inf, np.inf])
-            travel += float(np.abs(own + float(_numbers(ca.SX(joint.offset)).item())).max())
+            travel += float(np.abs(own + evaluated(joint.offset).item()).max())
     total = sum(links) + travel
     nearest = 0.0 if travel else max(0.0, 2 * max(links) - total)
     return Reach(centre, total, nearest)
-
-
-def _numbers(expression: ca.SX) -> Array:
-    return np.asarray(ca.evalf(ca.densify(ca.SX(expression))).full())
 
 
 def why_not(
