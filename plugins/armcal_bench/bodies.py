@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.base.pose_settings import PoseSettings
+from armcal.base.poses import PoseSettings
 from armcal.base.settings import Settings
 from armcal.devices.live import TrackerFrame
 from armcal.measure.stillness import far_off, mean_rotation

@@ -12,8 +12,7 @@ from armcal.arm.assembly import ArmState
 from armcal.arm.statics import BASE_FRAME, TOOL_FRAME
 from armcal.base.domains import Array, Interval
 from armcal.base.parameters import ParameterBlock, scalar
-from armcal.base.pose_blocks import pose_transform
-from armcal.base.pose_settings import PoseSettings
+from armcal.base.poses import PoseSettings, pose_transform
 from armcal.base.se3 import identity
 from armcal.measure.instrument import InstrumentSettings
 from armcal.measure.measurement import Channel, Mistake

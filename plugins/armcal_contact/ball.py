@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import casadi as ca
 from armcal.arm.assembly import ArmState
 from armcal.base.parameters import ParameterBlock, scalar
-from armcal.base.pose_blocks import point_blocks, point_expression
+from armcal.base.poses import point_blocks, point_expression
 from armcal.base.settings import Length, Length3, Settings
 from armcal.measure.contact import ContactSettings, OneArmContact
 from armcal.measure.measurement import Channel, Tie

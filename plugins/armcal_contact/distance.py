@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar
 import casadi as ca
 from armcal.arm.assembly import ArmState
 from armcal.base.parameters import ParameterBlock
-from armcal.base.pose_blocks import point_blocks, point_expression
+from armcal.base.poses import point_blocks, point_expression
 from armcal.base.settings import Length, Length3
 from armcal.measure.instrument import Instrument, InstrumentSettings
 from armcal.measure.measurement import Channel

@@ -9,7 +9,7 @@ import numpy as np
 from armcal.arm.assembly import ArmState
 from armcal.base import se3
 from armcal.base.parameters import ParameterBlock, scalar
-from armcal.base.pose_blocks import point_blocks, point_expression
+from armcal.base.poses import point_blocks, point_expression
 from armcal.base.settings import Length, Length3
 from armcal.measure.contact import ContactSettings, OneArmContact
 from pydantic import Field, field_validator

@@ -12,8 +12,7 @@ import casadi as ca
 from armcal.arm.assembly import ArmState
 from armcal.base import se3
 from armcal.base.parameters import ParameterBlock
-from armcal.base.pose_blocks import pose_blocks, pose_transform, quaternion_expression
-from armcal.base.pose_settings import PoseSettings
+from armcal.base.poses import PoseSettings, pose_blocks, pose_transform, quaternion_expression
 from armcal.base.settings import Angle, Length, Settings
 from armcal.measure.contact import Contact
 from pydantic import Field, model_validator

@@ -14,7 +14,7 @@ from armcal.arm.model import Attachment, Chain, Joint, Vector3
 from armcal.base import se3
 from armcal.base.domains import Array, Direction, ScrewAxis
 from armcal.base.parameters import ParameterBlock, scalar
-from armcal.base.pose_blocks import pose_transform
+from armcal.base.poses import pose_transform
 from armcal.base.quaternions import rotation_matrix
 from armcal.base.se3 import Expression, Transform
 

@@ -3,7 +3,7 @@
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from armcal.base.pose_settings import PoseSettings
+from armcal.base.poses import PoseSettings
 from armcal.base.settings import Angle, Length, Length3, Settings
 from pydantic import Field, field_validator, model_validator
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from armcal.base.domains import Array
-from armcal.base.pose_settings import PoseSettings
+from armcal.base.poses import PoseSettings
 from armcal.base.quaternions import quaternion_of, rotation_matrix
 from armcal.base.units import to_unit
 from armcal.calibration.compensation.compensator import Compensator

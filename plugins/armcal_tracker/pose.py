@@ -8,7 +8,7 @@ import numpy as np
 from armcal.arm.assembly import ArmState
 from armcal.base import se3
 from armcal.base.parameters import ParameterBlock
-from armcal.base.pose_blocks import NO_TURN, pose_blocks, pose_transform, quaternion_expression, rotation_of
+from armcal.base.poses import NO_TURN, pose_blocks, pose_transform, quaternion_expression, rotation_of
 from armcal.base.settings import Angle, Angle3
 from armcal.measure.measurement import Channel
 from pydantic import field_validator

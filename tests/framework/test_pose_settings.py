@@ -6,8 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from armcal.base.parameters import Parameters
-from armcal.base.pose_blocks import pose_blocks, pose_transform, quaternion_expression, rotation_of
-from armcal.base.pose_settings import PoseSettings
+from armcal.base.poses import PoseSettings, pose_blocks, pose_transform, quaternion_expression, rotation_of
 from armcal.base.quaternions import PRINTED, nearest_rotation, quaternion_of
 from hypothesis import given
 from hypothesis import strategies as st

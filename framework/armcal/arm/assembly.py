@@ -18,7 +18,7 @@ from armcal.arm.statics import Load, Mass, joint_efforts, wrenches
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, scalar
-from armcal.base.pose_blocks import pose_transform
+from armcal.base.poses import pose_transform
 from armcal.base.se3 import Expression, Transform
 from armcal.errors import DataError
 

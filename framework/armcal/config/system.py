@@ -13,7 +13,7 @@ from armcal.arm.environment import STATICS, Environment, gravity_tilt
 from armcal.arm.pose_residual import PoseResidual
 from armcal.arm.statics import frame_names
 from armcal.base.parameters import FIT_NAME, ParameterBlock, Parameters
-from armcal.base.pose_settings import PoseSettings
+from armcal.base.poses import PoseSettings
 from armcal.base.settings import Acceleration3, Angle, Force3, Length3, Mass, Settings, Torque3
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource

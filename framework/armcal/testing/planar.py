@@ -14,7 +14,7 @@ from armcal.base import se3
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
-from armcal.base.pose_blocks import quaternion_expression
+from armcal.base.poses import quaternion_expression
 from armcal.base.se3 import Expression
 from armcal.measure.contact import Contact
 from armcal.measure.measurement import Channel

@@ -11,7 +11,7 @@ from armcal.arm.evaluator import ElasticPass, Evaluator
 from armcal.base import se3
 from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
-from armcal.base.pose_blocks import rotation_of
+from armcal.base.poses import rotation_of
 from armcal.errors import ConfigError, NotConvergedError
 from armcal.measure.measurement import Measurement
 

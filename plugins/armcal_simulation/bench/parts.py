@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self, TypeVar
 from armcal.arm.assembly import Arm
 from armcal.arm.joints import unknown_joint
 from armcal.arm.loading import holding_function
-from armcal.base.pose_settings import PoseSettings
+from armcal.base.poses import PoseSettings
 from armcal.base.settings import Angle, InputPath, Settings
 from armcal.config.selection import with_values
 from armcal.config.servo_file import ServoFile, load_servo_file

@@ -1,12 +1,17 @@
-"""A rigid motion as parameters: three coordinates, and a rotation that stays one."""
+"""A pose as a configuration states it, and as parameters: three coordinates, and a rotation that stays one."""
 
 from collections.abc import Mapping, Sequence
+from typing import Self
 
 import casadi as ca
+import numpy as np
+from pydantic import model_validator
 
-from armcal.base.domains import Rotation
+from armcal.base.domains import Array, Rotation
 from armcal.base.parameters import ParameterBlock, scalar
+from armcal.base.quaternions import PRINTED, nearest_rotation, quaternion_of, rotation_matrix, rpy_matrices
 from armcal.base.se3 import Expression, Transform
+from armcal.base.settings import Angle3, Length3, Settings
 
 LENGTH_SCALE_M = 0.01
 ANGLE_SCALE_RAD = 0.05
@@ -64,3 +69,50 @@ def quaternion_expression(rotation: Expression) -> Expression:
         chosen = ca.if_else(r[i, i] > largest, ca.vertcat(r[k, j] - r[j, k], *parts), chosen)
         largest = ca.fmax(r[i, i], largest)
     return chosen / ca.norm_2(chosen)
+
+
+_Row = tuple[float, float, float]
+
+
+class PoseSettings(Settings):
+    """A pose: ``position_m``, and at most one of ``rotation`` (three rows), ``quaternion`` (w, x, y, z) and ``rpy_deg``.
+
+    Roll, pitch and yaw turn about the fixed axes x, y and z, in this order: R = Rz(yaw) Ry(pitch) Rx(roll).
+    """  # noqa: E501
+
+    position: Length3 = (0.0, 0.0, 0.0)
+    rotation: tuple[_Row, _Row, _Row] | None = None
+    quaternion: tuple[float, float, float, float] | None = None
+    rpy: Angle3 | None = None
+
+    @model_validator(mode="after")
+    def _one_rotation(self) -> Self:
+        given = [name for name in ("rotation", "quaternion", "rpy") if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"found {' and '.join(given)}, expected one of them")
+        if self.rotation is not None:
+            nearest_rotation(np.array(self.rotation))
+        if self.quaternion is not None and abs(float(np.linalg.norm(self.quaternion)) - 1) > PRINTED:
+            raise ValueError(f"found a quaternion of length {np.linalg.norm(self.quaternion):.4f}, expected 1")
+        return self
+
+    @property
+    def unit_quaternion(self) -> tuple[float, ...]:
+        """The rotation as w, x, y, z."""
+        if self.quaternion is not None:
+            q = np.array(self.quaternion) / np.linalg.norm(self.quaternion)
+            return tuple(float(x) for x in q)
+        if self.rotation is not None:
+            return quaternion_of(nearest_rotation(np.array(self.rotation)))
+        return NO_TURN if self.rpy is None else quaternion_of(rpy_matrices(np.array(self.rpy)))
+
+    @property
+    def matrix(self) -> Array:
+        """The homogeneous matrix (4 x 4, m)."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = rotation_matrix(np.array(self.unit_quaternion)), self.position
+        return matrix
+
+    def blocks(self, name: str) -> tuple[ParameterBlock, ...]:
+        """As parameters; see ``pose_blocks``."""
+        return pose_blocks(name, self.position, self.unit_quaternion)
