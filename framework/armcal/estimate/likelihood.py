@@ -102,18 +102,18 @@ def _raised(
 
 
 def _evaluate(terms: Sequence[Term], prior: Array, theta: Array) -> _Local:
-    covariances = [np.einsum("c,cnab->nab", theta, term.bases, optimize=True) for term in terms]
-    for own in covariances:
-        np.linalg.cholesky(own)  # raises where one is not positive definite
-    inverses: list[Array] = [np.linalg.inv(own) for own in covariances]
     information = np.diag(prior).astype(float)
     pull = np.zeros(len(prior))
-    logarithm = 0.0
-    for term, inverse in zip(terms, inverses, strict=True):
+    logarithm, weighed = 0.0, []
+    for term in terms:
+        own = np.einsum("c,cnab->nab", theta, term.bases, optimize=True)
+        np.linalg.cholesky(own)  # raises where one is not positive definite
+        inverse: Array = np.linalg.inv(own)
+        slopes = np.einsum("nab,nbc->nac", inverse, term.jacobian, optimize=True)
+        weighed.append((term, inverse, slopes))
         logarithm -= float(np.linalg.slogdet(inverse)[1].sum())
-        weighed = np.einsum("nab,nbc->nac", inverse, term.jacobian, optimize=True)
-        information += np.einsum("nac,nad->cd", term.jacobian, weighed, optimize=True)
-        pull += np.einsum("nac,na->c", weighed, term.target, optimize=True)
+        information += np.einsum("nac,nad->cd", term.jacobian, slopes, optimize=True)
+        pull += np.einsum("nac,na->c", slopes, term.target, optimize=True)
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     scaled = information / np.outer(scale, scale) + 1e-14 * np.eye(len(scale))
     root = np.linalg.cholesky(scaled) if len(scale) else np.zeros((0, 0))
@@ -122,17 +122,16 @@ def _evaluate(terms: Sequence[Term], prior: Array, theta: Array) -> _Local:
     fit = covariance @ pull
     energy, slope = 0.0, np.zeros(len(theta))
     curved, reached = np.zeros((len(theta),) * 2), np.zeros((len(theta), len(prior)))
-    for term, inverse in zip(terms, inverses, strict=True):
+    for term, inverse, slopes in weighed:
         projected = np.einsum("nab,nb->na", inverse, term.target - term.jacobian @ fit)
         energy += float(np.sum(term.target * projected))
-        weighed = np.einsum("nab,nbc->nac", inverse, term.jacobian, optimize=True)
-        reduced = inverse - np.einsum("nac,cd,nbd->nab", weighed, covariance, weighed, optimize=True)
+        reduced = inverse - np.einsum("nac,cd,nbd->nab", slopes, covariance, slopes, optimize=True)
         outer = projected[:, :, None] * projected[:, None, :]
         slope += 0.5 * np.einsum("cnab,nab->c", term.bases, outer - reduced, optimize=True)
         u = np.einsum("cnab,nb->cna", term.bases, projected, optimize=True)
-        weighed = np.einsum("nab,cnb->cna", inverse, u, optimize=True)
-        curved += np.einsum("cna,dna->cd", u, weighed, optimize=True)
-        reached += np.einsum("cna,nav->cv", weighed, term.jacobian, optimize=True)
+        pulled = np.einsum("nab,cnb->cna", inverse, u, optimize=True)
+        curved += np.einsum("cna,dna->cd", u, pulled, optimize=True)
+        reached += np.einsum("cna,nav->cv", pulled, term.jacobian, optimize=True)
     # The average information: 1/2 u_c' P u_d with u_c = V_c P y.
     return _Local(-0.5 * (logarithm + energy), slope, 0.5 * (curved - reached @ covariance @ reached.T))
 
