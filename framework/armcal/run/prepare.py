@@ -18,8 +18,8 @@ from armcal.estimate.profile import profiled
 from armcal.estimate.start import Start, aligned_start, with_proposals
 from armcal.estimate.structure import require_solvable
 from armcal.estimate.validation import Split, error_unit, folds, hold_out, split_by_id, split_by_label
-from armcal.measure.reader import read_ids
 from armcal.measure.measurement import GroupedMeasurement
+from armcal.measure.reader import read_ids
 from armcal.problem.drift import with_drift
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.readings import with_joint_noise
