@@ -160,9 +160,9 @@ def _remedies(predicted: Predictable) -> Iterator[str]:
     """What takes up what each kind of carrier predicts."""
     kinds = {carrier.kind for carrier in predicted.carriers}
     if "joint" in kinds and predicted.learnable:
-        yield "Learn it: arms.NAME.residual: {type: gaussian_process}; or free more parameters of these joints."
+        yield "Learn it: arms.NAME.residual: {type: gaussian_process}; or free what armcal identify --fixed recommends."
     elif "joint" in kinds:
-        yield "Free more parameters of these joints, or add effects to them; more poses show more of it."
+        yield "Free what armcal identify --fixed recommends, or add effects to these joints; more poses show more."
     if "time" in kinds or predicted.is_in_order:
         yield "Let the base drift (parameters.drift); record the temperature, and repeat one pose from time to time."
     if "temperature" in kinds:
