@@ -11,7 +11,7 @@ import oracle
 import pytest
 from armcal.cli.main import cli
 from armcal.diagnose.evidence import Evidence
-from armcal.diagnose.evidence_findings import structure_findings
+from armcal.diagnose.evidence_findings import percent, structure_findings
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.predictable import FEWEST_POSES, predictable
 from armcal.diagnose.residual_structure import structure
@@ -182,3 +182,10 @@ def test_fits_without_structure_give_no_finding(lrm):
         above.append(predictable(problem, own.rows, own.basis, motion, dataset).above_chance)
     print(f"{sum(above)} of {len(above)}")
     assert sum(above) <= 2
+
+
+@pytest.mark.parametrize(
+    ("share", "text"), [(0.62, "62 %"), (0.097, "10 %"), (0.0949, "9 %"), (0.004, "0.4 %"), (0.0001, "0.1 %")]
+)
+def test_shares_are_written_without_an_exponent(share: float, text: str) -> None:
+    assert percent(share) == text

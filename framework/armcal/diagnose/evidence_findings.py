@@ -175,7 +175,7 @@ def _remedies(predicted: Predictable) -> Iterator[str]:
 
 def percent(share: float) -> str:
     """In words."""
-    return f"{100 * share:.0f} %" if share >= 0.0995 else f"{100 * share:.1g} %" if share > 0.0005 else "0.1 %"
+    return f"{100 * share:.0f} %" if share >= 0.095 else f"{100 * share:.1g} %" if share > 0.0005 else "0.1 %"
 
 
 def _structure_finding(s: Structure, structure: ResidualStructure, unit: str, test: str) -> Finding:
