@@ -62,7 +62,9 @@ _ALL = (
     Unit("m_s", "joint rate"),
     Unit("mm_s", "joint rate", 1.0, 1000.0),
     Unit("N", "force"),
+    Unit("mN", "force", 1.0, 1000.0),
     Unit("Nm", "torque"),
+    Unit("mNm", "torque", 1.0, 1000.0),
     Unit("C", "temperature"),
     Unit("per_K", "expansion"),
     Unit("kpx", "image"),
@@ -74,12 +76,18 @@ UNITS: Mapping[str, Unit] = MappingProxyType({unit.name: unit for unit in _ALL})
 """Every unit by name; within a dimension the SI unit comes first."""
 
 _DISPLAY: Mapping[str, str] = MappingProxyType({"length": "mm", "angle": "deg", "mass": "g", "image": "px"})
-ERROR_UNITS: Mapping[str, str] = MappingProxyType({"length": "mm", "angle": "mrad", "image": "px"})
+ERROR_UNITS: Mapping[str, str] = MappingProxyType(
+    {"length": "mm", "image": "px", "force": "mN", "torque": "mNm", "angle": "mrad"}
+)
 """What residuals may measure, and the unit of their errors: a thousandth of the one inside, in every dimension.
+
+Of several in one problem, the first that stands here is the one of its errors.
 
 That is why places in an image are held in thousands of pixels.
 """
-ERROR_NAMES: Mapping[str, str] = MappingProxyType({"mm": "Tip", "mrad": "Angle", "px": "Reprojection"})
+ERROR_NAMES: Mapping[str, str] = MappingProxyType(
+    {"mm": "Tip", "px": "Reprojection", "mN": "Force", "mNm": "Torque", "mrad": "Angle"}
+)
 """What an error in each of these units is an error of."""
 _SPELLINGS: Mapping[str, str] = MappingProxyType(
     {

@@ -60,8 +60,8 @@ class InformationRecord(Settings):
 class CalibrationFile(Settings):
     """The schema of calibration.yaml.
 
-    ``accepted`` says why and when it was last accepted by hand; errors are ``quality_px`` or ``quality_mrad`` where
-    nothing measured is a length.
+    ``accepted`` says why and when it was last accepted by hand; errors are ``quality_px``, ``quality_mN`` and so on
+    where nothing measured is a length (``ERROR_UNITS``).
     """
 
     armcal_calibration: int
@@ -75,6 +75,8 @@ class CalibrationFile(Settings):
     quality_mm: dict[str, Any] = Field(default_factory=dict)
     quality_mrad: dict[str, Any] = Field(default_factory=dict)
     quality_px: dict[str, Any] = Field(default_factory=dict)
+    quality_mN: dict[str, Any] = Field(default_factory=dict)
+    quality_mNm: dict[str, Any] = Field(default_factory=dict)
     verdict: dict[str, Any]
     arms: dict[str, Any]
     measurements: dict[str, Any]

@@ -42,15 +42,15 @@ def gross_error(
     ``whitened`` are residuals in units of the noise, nan outside of training: where some records alone are far off, and
     named for it, the others are as the noise has it.
 
-    Where nothing measured is a length, errors are in ``mrad`` and stand beside a radian: what the reach is at the
-    distance of the reach.
+    Where nothing measured is a length, angles stand beside a radian (what the reach is at the distance of the reach),
+    pixels beside a thousand. Forces and torques have no such size, and are not judged here.
     """
     seen = judged_mm[np.isfinite(judged_mm)]
-    if not len(seen) or figure.reach_mm <= 0:
+    reach = (figure.reach_mm, "the arm's reach")
+    wholes = {"mm": reach, "mrad": (1000.0, "a radian"), "px": (1000.0, "a thousand px")}
+    if not len(seen) or figure.reach_mm <= 0 or unit not in wholes:
         return []
-    mean, scale = float(np.mean(seen)), estimate.noise_scale
-    wholes = {"mm": (figure.reach_mm, "the arm's reach"), "mrad": (1000.0, "a radian")}
-    whole, name = wholes.get(unit, (1000.0, f"a thousand {unit}"))
+    mean, scale, (whole, name) = float(np.mean(seen)), estimate.noise_scale, wholes[unit]
     share = mean / whole
     error = f"The mean error of records that did not train is {mean:.3g} {unit}, {100 * share:.2g} % of {name}"
     if share > OF_REACH:

@@ -109,7 +109,7 @@ def _sizes(problem: Problem, records: Sequence[FactorRecords], raw: Sequence[Arr
 
 
 def error_unit(problem: Problem) -> str:
-    """The unit in which errors are shown, a thousandth of that inside: mm; px or mrad where no length is measured."""
+    """The unit in which errors are shown, a thousandth of that inside: mm; px, mN, ... where no length is measured."""
     return ERROR_UNITS[error_dimension(problem)]
 
 
@@ -123,9 +123,9 @@ def in_unit(content: Any, unit: str) -> Any:
 
 
 def error_dimension(problem: Problem) -> str:
-    """``length``, ``image`` where nothing measured is a length, or ``angle`` where neither is."""
+    """What errors are of: ``length`` where one is measured, else the first of ``ERROR_UNITS`` that is."""
     measured = {dimension for kernel in problem.kernels for dimension in kernel.factor.dimensions}
-    return next((dimension for dimension in ("length", "image") if dimension in measured), "angle")
+    return next(dimension for dimension in ERROR_UNITS if dimension in measured)
 
 
 def hold_out(count: int, fraction: float, seed: int, poses: Indices | None = None) -> Split:

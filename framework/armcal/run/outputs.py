@@ -186,9 +186,7 @@ def calibration_content(result: RunResult, experiment: Experiment, accepted: boo
         identity={"arm": provenance["arm_sha256"], "data": provenance["data_sha256"], "source": provenance["data"]},
         environment_columns=tuple(filter(result.dataset.has, surroundings(result.system.arms))),
         noise=in_unit(_noise(result), unit),
-        quality_mm=result.table.as_dict() if unit == "mm" else {},
-        quality_mrad=result.table.as_dict() if unit == "mrad" else {},
-        quality_px=result.table.as_dict() if unit == "px" else {},
+        **{f"quality_{unit}": result.table.as_dict()},
         verdict={
             "headline": result.verdict.headline,
             "usable": not result.verdict.bad,

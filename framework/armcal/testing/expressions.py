@@ -19,7 +19,8 @@ C = TypeVar("C")
 
 JACOBIAN_TOLERANCE = 1e-6
 _STEP = 1e-5
-_LEAST_GAIN: Mapping[str, float] = MappingProxyType({"m": 5e-3, "rad": 0.05, "kpx": 0.05})
+_LEAST_GAIN = 0.05
+_LEAST_GAIN_M = 5e-3
 _MOST_GAIN = 20.0
 """What a unit of a parameter moves, in the same unit: about one. A degree is 0.017 rad, a millimetre 0.001 m."""
 _NOTHING = 1e-9
@@ -209,8 +210,9 @@ def expect_gain(gain: float, what: str, of: str, unit: str) -> None:
         of: by which.
         unit: of both.
     """
+    least = _LEAST_GAIN_M if unit == "m" else _LEAST_GAIN
     expect(
-        gain <= _NOTHING or _LEAST_GAIN[unit] <= gain <= _MOST_GAIN,
+        gain <= _NOTHING or least <= gain <= _MOST_GAIN,
         f"found that {what} changes by {gain:.4g} {unit} for each {unit} of {of}, expected about 1: "
         "is one of them in another unit?",
     )

@@ -12,7 +12,7 @@ from armcal.arm.assembly import Arm, prefixed
 from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.se3 import Expression
-from armcal.base.units import units_of
+from armcal.base.units import ERROR_UNITS, display_unit, si_unit, units_of
 from armcal.measure.measurement import Channel, GroupedMeasurement, Measurement
 from armcal.measure.partners import OTHER
 from armcal.problem.factor import Factor, build_factor
@@ -35,7 +35,6 @@ from armcal.testing.settings_checks import Subject
 ARM_NAMES = ((ARM,), ("left", "right"))
 """The arms that a measurement is built for: one, or if it refuses that, two."""
 _RATIO = "1"
-_UNITS: Mapping[str, str] = MappingProxyType({"length": "m", "angle": "rad", "image": "kpx"})
 _NOISIEST: Mapping[str, float] = MappingProxyType({"length": 0.1, "angle": 0.5, "image": 0.05})
 """By dimension: the largest standard deviation (m, rad, kpx) of an example that is worth calibrating with."""
 _POINTS = 6
@@ -116,8 +115,8 @@ def _check_residual(record: Recorder, case: _Case) -> None:
         expect(positive, f"found the noise {factor.noise}, expected standard deviations above zero")
         for number, dimension in zip(factor.noise, factor.dimensions, strict=False):
             largest = _NOISIEST.get(dimension, math.inf)
-            unit, other = ("m", "mm") if dimension == "length" else ("rad", "deg")
-            most = f"expected up to {largest:g} {unit} in an example: is it in {other}?"
+            unit = si_unit(dimension).name
+            most = f"expected up to {largest:g} {unit} in an example: is it in {display_unit(dimension).name}?"
             expect(number <= largest, f"found a noise of {number:g} {unit}, {most}")
     with record.check("residuals depend on what is given"):
         expect_only(stacked([factor.residual, factor.outputs]), [factor.values, factor.record])
@@ -264,9 +263,9 @@ def _expect_gains(case: _Case) -> None:
         gains.append((unit, "the arm's parameters", slope[:, of_arms].max(axis=1)))
     for channel in case.channels:
         name = f"{_INSTRUMENT}.{channel.name}"
-        if name in factor.channels and channel.dimension in _UNITS:
+        if name in factor.channels and channel.dimension in ERROR_UNITS:
             column = factor.values.numel() + factor.channels.index(name)
-            gains.append((_UNITS[channel.dimension], f"the channel {channel.name}", slope[:, column]))
-    units = np.array([_UNITS.get(dimension, "") for dimension in factor.dimensions])
+            gains.append((si_unit(channel.dimension).name, f"the channel {channel.name}", slope[:, column]))
+    units = np.array([si_unit(dimension).name for dimension in factor.dimensions])
     for unit, name, column in gains:
         expect_gain(float(column[units == unit].max(initial=0.0)), "the residual", name, unit)

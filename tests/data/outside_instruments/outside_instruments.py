@@ -1,18 +1,19 @@
-"""Instruments and effects of an outsider: angles only, pixels whose residual is in rad, a column of its own."""
+"""Instruments and effects of an outsider: angles, forces, pixels whose residual is in rad, a column of its own."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import casadi as ca
 from armcal.arm.effects import Condition, JointEffect
 from armcal.arm.model import Chain
 from armcal.base.parameters import scalar
 from armcal.base.se3 import Transform
-from armcal.base.settings import Angle, Length3, Settings
+from armcal.base.settings import Angle, Length3, Settings, UnitOf
 from armcal.measure.contact import named_arm
+from armcal.measure.instrument import Instrument, InstrumentSettings
 from armcal.measure.measurement import Channel
 from pydantic import Field
 
@@ -62,6 +63,44 @@ class Theodolite:
     def dimensions(self):
         """Angles alone."""
         return ("angle", "angle")
+
+
+class LoadCellSettings(InstrumentSettings):
+    """Its noise (standard deviation of each force), and roughly how heavy the gripper is that hangs on it."""
+
+    noise: Annotated[float, UnitOf("force")]
+    weight: Annotated[float, UnitOf("force")]
+
+
+class LoadCell(Instrument):
+    """Between flange and gripper: channels ``fx``, ``fy``, ``fz``, the gripper's weight in the flange's axes."""
+
+    Settings = LoadCellSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {"noise_N": 0.02, "weight_N": 12}
+
+    def parameters(self):
+        """The weight and what it reads without one (N)."""
+        return (
+            scalar("weight", "N", self.settings.weight, 0.5),
+            *(scalar(f"bias_{axis}", "N", 0.0, 1.0) for axis in "xyz"),
+        )
+
+    def channels(self):
+        """What it reads."""
+        return tuple(Channel(f"f{axis}", "force") for axis in "xyz")
+
+    def outputs(self, arms, values):
+        """What it would read without noise (N)."""
+        force = self.base_T_tool(arms).rotation.T @ ca.vertcat(0, 0, -values["weight"])
+        return {f"f{axis}": force[i] + values[f"bias_{axis}"] for i, axis in enumerate("xyz")}
+
+    def noise(self):
+        """Of each entry (N)."""
+        return (self.settings.noise,) * 3
+
+    def dimensions(self):
+        """Forces alone."""
+        return ("force",) * 3
 
 
 class PixelCameraSettings(Settings):

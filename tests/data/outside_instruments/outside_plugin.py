@@ -6,6 +6,7 @@ from armcal.hooks import Register, hookimpl
 @hookimpl
 def armcal_register_measurements(register: Register) -> None:
     """Announce the instruments."""
+    register("load_cell", "outside_instruments:LoadCell", "the weight of the gripper in the flange's axes")
     register("theodolite", "outside_instruments:Theodolite", "two angles to a mark on the tool")
     register("pixel_camera", "outside_instruments:PixelCamera", "where a mark on the tool is in an image, in pixels")
 
