@@ -8,14 +8,14 @@ part will do. [Duda2018] [GarridoJurado2014]
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from armcal.base.domains import Array
 
-from armcal_camera.board import Board, Charuco, Chessboard
+from armcal_camera.board import FAMILIES, Board, Charuco, Chessboard
 from armcal_camera.grids import grown, is_chessboard, refined_grid, upright
 from armcal_camera.images import Grey
 from armcal_camera.library import opencv
@@ -23,7 +23,7 @@ from armcal_camera.local_map import local_map
 from armcal_camera.pattern import dictionary
 from armcal_camera.refinement import refine
 
-VERSION = 1
+VERSION = 2
 """Of the detection; it changes with the corners."""
 _SIDES_PX = (1200, 2400)
 """Largest sides of the reduced images on which boards are looked for, one after the other."""
@@ -130,11 +130,16 @@ def _other_board(image: Grey, nothing: Detection) -> Detection:
 
 def _tags(image: Grey, reduced: Grey, board: Board, nothing: Detection) -> Detection:
     seen, places, is_double = _seen_tags(reduced, board)
+    if not len(seen):
+        return _other_tags(reduced, board, nothing)
     if is_double:
         return replace(nothing, fault=f"the tag {is_double[0]} was found {is_double[1]} times")
-    if not len(seen):
-        return nothing
     known, pixels = board.tag_corners[seen, :, :2], _enlarged(places, reduced, image).reshape(-1, 4, 2)
+    if isinstance(board, Charuco) and board.rows % 2 == 0:
+        other = board.model_copy(update={"legacy": not board.legacy})
+        if _astray(other.tag_corners[seen, :, :2], pixels) < _astray(known, pixels):
+            text = f"its tags stand as on a board with legacy: {str(other.legacy).lower()}"
+            return replace(nothing, fault=f"{text} (OpenCV before 4.6 printed these otherwise)")
     pixels, off = _turned(known, pixels)
     if off > _ASTRAY:
         text = f"the tags stand elsewhere than on the {board.kind}"
@@ -152,14 +157,43 @@ def _tags(image: Grey, reduced: Grey, board: Board, nothing: Detection) -> Detec
     return replace(nothing, corners=corners, fault="", blur=float(np.nanmedian(fit.blur)))
 
 
-def _seen_tags(reduced: Grey, board: Board) -> tuple[list[int], Array, tuple[int, int] | None]:
-    """Which of the board's tags are seen (T), their corners (T x 4 x 2, px), and an id that stands there twice."""
+def _astray(known: Array, pixels: Array) -> int:
+    """How many tags (T x 4 x 2) stand elsewhere than a view of all of them has them, by half an edge and more."""
+    cv2, flat = opencv(), known.mean(axis=1)
+    if len(known) < _FEWEST:
+        return 0
+    edge = float(np.median(np.linalg.norm(known[:, 1] - known[:, 0], axis=1)))
+    found = cv2.findHomography(pixels.mean(axis=1), flat, cv2.RANSAC, 0.5 * edge)[1]
+    return len(known) - (0 if found is None else int(found.sum()))
+
+
+def _other_tags(reduced: Grey, board: Board, nothing: Detection) -> Detection:
+    """What tags are there in place of the board's; a dictionary of OpenCV begins with those that are smaller."""
+    reliable = (family for family in FAMILIES if family != "16h5")  # it is seen in anything
+    for family in (board.tag_family, *(f"DICT_{n}X{n}_1000" for n in (4, 5, 6, 7)), *reliable):
+        ids = _detected(reduced, family, getattr(board, "border_bits", 1))[1]
+        if len(set(ids)) >= _FEWEST:
+            name = family
+            if family.endswith("_1000"):
+                name = family.replace("1000", str(min(count for count in (50, 100, 250, 1000) if count > max(ids))))
+            asked = f"those of the board are {board.tag_ids[0]} to {board.tag_ids[-1]} of {board.tag_family}"
+            return replace(nothing, fault=f"{nothing.fault}, but tags {min(ids)} to {max(ids)} of {name}; {asked}")
+    return nothing
+
+
+def _detected(reduced: Grey, family: str, border_bits: int) -> tuple[Any, list[int]]:
+    """Corners of the tags of a family in an image, and their ids."""
     aruco = opencv().aruco
     parameters = aruco.DetectorParameters()
-    parameters.markerBorderBits = getattr(board, "border_bits", 1)
-    detector = aruco.ArucoDetector(dictionary(board.tag_family), parameters)
-    corners, ids, _ = detector.detectMarkers(reduced)
-    ours = [(int(i), c) for i, c in zip([] if ids is None else ids.ravel(), corners, strict=True) if i in board.tag_ids]
+    parameters.markerBorderBits = border_bits
+    corners, ids, _ = aruco.ArucoDetector(dictionary(family), parameters).detectMarkers(reduced)
+    return corners, [] if ids is None else [int(i) for i in ids.ravel()]
+
+
+def _seen_tags(reduced: Grey, board: Board) -> tuple[list[int], Array, tuple[int, int] | None]:
+    """Which of the board's tags are seen (T), their corners (T x 4 x 2, px), and an id that stands there twice."""
+    corners, ids = _detected(reduced, board.tag_family, getattr(board, "border_bits", 1))
+    ours = [(i, c) for i, c in zip(ids, corners, strict=True) if i in board.tag_ids]
     numbers = [i for i, _ in ours]
     double = next(((i, numbers.count(i)) for i in numbers if numbers.count(i) > 1), None)
     places = np.array([c.reshape(4, 2) for _, c in ours]).reshape(-1, 4, 2)
@@ -208,8 +242,3 @@ def _judged(detection: Detection, board: Board) -> Detection:
     elif detection.blur > _DULLEST * narrow:
         fault = f"it is blurred: edges are {2 * detection.blur:.1f} px wide, and squares or tags {narrow:.0f} px"
     return replace(result, fault=fault)
-
-
-def detect_all(image: Grey, boards: Sequence[Board]) -> tuple[Detection, ...]:
-    """Look for each board."""
-    return tuple(detect(image, board) for board in boards)

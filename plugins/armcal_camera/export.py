@@ -150,8 +150,8 @@ class HandEyeExporter(_CameraExporter):
             "standard_deviation_m": {axis: camera.deviations.get(f"camera_{axis}") for axis in "xyz"},
         }
         text = f"# {parent} to {child}, in metres: the camera {name}.\n" + yaml.safe_dump(content, sort_keys=False)
-        numbers = " ".join(f"{x:.9g}" for x in (*place, *quaternion))
-        command = f"ros2 run tf2_ros static_transform_publisher {numbers} {parent} {child}"
+        numbers = " ".join(f"--{k} {x:.9g}" for k, x in zip(("x", "y", "z", *keys), (*place, *quaternion), strict=True))
+        command = f"ros2 run tf2_ros static_transform_publisher {numbers} --frame-id {parent} --child-frame-id {child}"
         stem = request.out.rpartition("/")[2].rpartition(".")[0] or "camera"
         companions = {f"{stem}_joint.urdf": _urdf_joint(parent, child, pose).encode()}
         return Exported(text.encode(), 7, companions=companions, remarks=(f"To publish it: {command}",))

@@ -13,7 +13,7 @@ from armcal.measure.points import Proposal, Reading
 from armcal_camera.certificate import sentence
 from armcal_camera.hand_eye import hand_eye, open_motion
 from armcal_camera.lens import DISTORTION, normalised
-from armcal_camera.mixed_up import require_board_axes, require_one_board
+from armcal_camera.mixed_up import require_board_axes, require_form, require_one_board
 from armcal_camera.views import FEWEST_POINTS, board_pose, homography, intrinsics
 
 _INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -70,7 +70,10 @@ def first_guess(setup: Setup, reading: Reading) -> Proposal:
     known = [not free & set(_place(name)) for name in setup.names]
     is_open = _still(camera_frame) if camera_frame == board_frame else open_motion(moved, camera_frame)
     for own_poses in poses if is_open is None else ():
-        require_one_board(moved[list(own_poses)], np.array(list(own_poses.values())))
+        if len(own_poses):
+            hand, board_ = moved[list(own_poses)], np.array(list(own_poses.values()))
+            require_form(hand, board_)
+            require_one_board(hand, board_, [reading.ids[i] for i in own_poses])
     if is_open is not None and not any(own_poses for own_poses, held in zip(poses, known, strict=True) if held):
         return Proposal(proposed, *is_open, tuple(name for name in _place("camera") if name in free))
     boards = [board for board in zip(setup.names, poses, known, strict=True) if board[1]]

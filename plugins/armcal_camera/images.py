@@ -28,7 +28,8 @@ def is_image(path: Path) -> bool:
 def grey_image(content: bytes, source: str) -> Grey:
     """The grey values of an image file, as the sensor has them: an orientation that it states is not applied.
 
-    Colours are averaged as the eye sees them; of 16 bits a pixel the largest value becomes 255.
+    Colours are averaged as the eye sees them; of more than 8 bits a pixel the brightest hundredth of the image becomes
+    255, so that a few dazzling pixels do not darken the rest.
 
     Raises:
         DataError: it is no image, or cut off.
@@ -46,5 +47,5 @@ def grey_image(content: bytes, source: str) -> Grey:
         message = "the image is cut off." if cut else "it is not an image that can be read."
         raise DataError(message, where=Location(source), hint="Save it as PNG again, or remove it.")
     if image.dtype != np.uint8:
-        image = np.rint(image * (255.0 / max(float(image.max()), 1.0)))
+        image = np.rint(np.nan_to_num(image) * (255.0 / max(float(np.percentile(image, 99)), 1e-9))).clip(0, 255)
     return np.ascontiguousarray(image, dtype=np.uint8)

@@ -33,6 +33,7 @@ _FEWEST = 3
 _BLURRED = 3.0
 _NAMED = 5
 _IMAGE = "image"
+_OTHER_IMAGES = frozenset((".heic", ".heif", ".avif", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raw"))
 
 
 class ImagesSettings(Settings):
@@ -110,7 +111,7 @@ class ImagesReader:
         known = {w.channel for w in request.channels}
         for number, (name, boards) in enumerate(cameras.items()):
             report = partial(_report_one, request.report, number, len(cameras))
-            views = as_the_others(self._views(name, boards, len(cameras), report))
+            views = _taken_once(as_the_others(self._views(name, boards, len(cameras), report)))
             place = str(_own(self._settings.folder or self._settings.corners, name, len(cameras)))
             chosen = _matched(dataset, views, place, count)
             faults.append({i: views[image].fault for i, image in enumerate(chosen) if views[image].fault})
@@ -191,9 +192,15 @@ def look_at(boards: Sequence[Board], content: bytes, name: str) -> View:
 
 def _images_in(folder: Path) -> list[Path]:
     try:
-        paths = [path for path in folder.iterdir() if is_image(path)]
+        files = list(folder.iterdir())
     except OSError as fault:
         refuse(folder, f"it cannot be read as a folder ({fault.strerror}).", "Give the folder of the images.")
+    paths = [path for path in files if is_image(path)]
+    stems = {path.stem for path in paths}
+    others = sorted(p.name for p in files if p.suffix.lower() in _OTHER_IMAGES and p.stem not in stems)
+    if others:
+        text = f"found {', '.join(others[:_NAMED])} ({len(others)} in all), a kind of image that is not read here."
+        refuse(folder, text, "Save these as PNG or JPEG, or move them elsewhere.")
     if not paths:
         refuse(folder, "found no image in it.", "Give the folder of the images: PNG, JPEG, TIFF, BMP, WebP or PGM.")
     return sorted(paths, key=lambda path: _natural(path.name))
@@ -212,6 +219,18 @@ def _too_few(pixels: Array) -> str:
 def as_the_others(views: Mapping[str, View]) -> dict[str, View]:
     """Views, with a fault where the image differs from the others in size or is far less sharp."""
     return _sharp_enough(_of_one_size(views))
+
+
+def _taken_once(views: Mapping[str, View]) -> dict[str, View]:
+    """Views, with a fault where an image is the very file that another is: the camera was not asked again."""
+    first: dict[str, str] = {}
+    text = "it is the same image as {}"
+    return {
+        name: replace(view, fault=text.format(first[view.sha256]))
+        if view.path and not view.fault and first.setdefault(view.sha256, name) != name
+        else view
+        for name, view in views.items()
+    }
 
 
 def _of_one_size(views: Mapping[str, View]) -> dict[str, View]:
@@ -242,7 +261,14 @@ def _sharp_enough(views: Mapping[str, View]) -> dict[str, View]:
 def _matched(dataset: Dataset, views: Mapping[str, View], place: str, count: int) -> list[str]:
     """Each record's image: the one that it names, else the one at its place in the order of names."""
     named = dataset.extra.get(_IMAGE)
+    by_stem = {Path(name).stem: name for name in views}
     if named is None:
+        known = set(views) | set(by_stem)
+        others = [own for own, texts in dataset.extra.items() if {Path(t.strip()).name for t in texts} <= known]
+        if others:
+            refuse(
+                dataset.source, f"found the images' names in the column {others[0]}.", "Call it image.", 1, others[0]
+            )
         if count != len(views):
             message = f"found {count} poses in {dataset.source} and {len(views)} images, expected as many of each."
             hint = "Remove what does not belong, or name each record's file in a column image."
@@ -250,14 +276,15 @@ def _matched(dataset: Dataset, views: Mapping[str, View], place: str, count: int
         rows = sorted([*dataset.rows, *(record.row for record in dataset.set_aside)])
         names = list(views)
         return [names[rows.index(row)] for row in dataset.rows]
-    by_stem = {Path(name).stem: name for name in views}
-    chosen = []
+    chosen = list[str]()
     for row, text in zip(dataset.rows, named, strict=True):
         name = Path(text.strip()).name
         if name not in views and name not in by_stem:
             message = f"found the image {text.strip()[:60]!r}, which is not among the {len(views)} in {place}."
             refuse(dataset.source, message, "Correct its name, or remove the line.", row, _IMAGE)
         chosen.append(name if name in views else by_stem[name])
+        if chosen[-1] in chosen[:-1]:
+            refuse(dataset.source, f"found the image {chosen[-1]} again.", "Name each image once.", row, _IMAGE)
     return chosen
 
 
@@ -283,8 +310,10 @@ def _with_corners(dataset: Dataset, camera: str, views: Sequence[View], known: s
 
 def _left(dataset: Dataset, faulty: Mapping[int, str]) -> Dataset:
     """The dataset without images that say nothing, which are listed."""
-    reasons = [f"{dataset.ids[i]}: {reason}" for i, reason in sorted(faulty.items())]
-    shown = "; ".join(reasons[:_NAMED]) + (f"; and {len(reasons) - _NAMED} more" if len(reasons) > _NAMED else "")
+    named: dict[str, list[str]] = {}
+    for i, reason in sorted(faulty.items()):
+        named.setdefault(reason, []).append(dataset.ids[i])
+    shown = "; ".join(f"{', '.join(ids[:_NAMED])}{_more(ids)}: {reason}" for reason, ids in named.items())
     kept = len(dataset) - len(faulty)
     if kept < _FEWEST:
         message = f"found {kept} of {len(dataset)} images that can be used, expected at least {_FEWEST} ({shown})."
@@ -294,3 +323,7 @@ def _left(dataset: Dataset, faulty: Mapping[int, str]) -> Dataset:
         return dataset
     warning = f"{len(faulty)} of {len(dataset)} images are set aside: {shown}."
     return replace(dataset.without(faulty), warnings=(*dataset.warnings, warning))
+
+
+def _more(names: Sequence[str]) -> str:
+    return f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""

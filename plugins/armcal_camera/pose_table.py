@@ -31,6 +31,10 @@ _QUATERNION = ("qw", "qx", "qy", "qz")
 _LONGEST_STEP_S = 0.2
 _MAX_BYTES = 256 * 1024**2
 _INSTANCE = "flange"
+_FORMS = (
+    "Give base_T_flange row by row, or name the columns in a first line: x_mm,y_mm,z_mm,qw,qx,qy,qz. For angles write "
+    "poses: {type: pose_csv, path: FILE, rpy: {columns: [...], unit: deg}}, or euler, or rotation_vector."
+)
 _UNREACHED = "the nominal arm reaches this pose in no posture within its joints' limits"
 
 
@@ -152,7 +156,8 @@ def _reader(settings: dict[str, Any]) -> Any:
 
 def _first_line(path: Path) -> list[str]:
     text = text_of(input_bytes(path, _MAX_BYTES, "a file of poses"), path, "Save it as text in UTF-8.")
-    return next((line.replace(",", " ").split() for line in text.splitlines() if line.strip()), [])
+    lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
+    return next((line.replace(",", " ").split() for line in lines), [])
 
 
 def _flange_poses(settings: dict[str, Any], posed: _Posed, request: ReadRequest) -> Dataset:
@@ -172,18 +177,22 @@ def _flange_poses(settings: dict[str, Any], posed: _Posed, request: ReadRequest)
     return posed.in_joints(replace(dataset, channels=kept), places, turns)
 
 
+def _rows(text: str) -> list[tuple[int, list[str]]]:
+    """Lines with their numbers and cells, without empty lines and comments; four lines of four cells are one."""
+    written = ((i, line.replace(",", " ").split()) for i, line in enumerate(text.splitlines(), start=1))
+    rows = [(i, cells) for i, cells in written if cells and not cells[0].startswith("#")]
+    if len(rows) % 4 or any(len(cells) != 4 for _, cells in rows):
+        return rows
+    return [(rows[i][0], [cell for _, cells in rows[i : i + 4] for cell in cells]) for i in range(0, len(rows), 4)]
+
+
 def _table(path: Path, posed: _Posed, request: ReadRequest) -> Dataset:
-    """Rows of 12 or 16 numbers: base_T_flange row by row, metres."""
+    """base_T_flange in metres, row by row: 12 or 16 numbers a line, or a matrix in four lines of four."""
     content = input_bytes(path, _MAX_BYTES, "a table of flange poses")
     matrices, lines = [], []
-    for line, text in enumerate(content.decode("utf-8-sig").splitlines(), start=1):
-        cells = text.replace(",", " ").split()
-        if not cells:
-            continue
+    for line, cells in _rows(content.decode("utf-8-sig")):
         if len(cells) not in (12, 16) or not all(is_number(cell) for cell in cells):
-            refuse(
-                path, f"found {len(cells)} cells, expected 12 or 16 numbers.", "Give base_T_flange row by row.", line
-            )
+            refuse(path, f"found {len(cells)} cells, expected 12 or 16 numbers.", _FORMS, line)
         matrix = np.array([float(cell) for cell in cells]).reshape(-1, 4)
         if len(matrix) == 4 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
             refuse(path, "found a matrix whose last row is not 0 0 0 1.", "Give the matrix row by row.", line)

@@ -237,6 +237,7 @@ def _reading(
         {c.removeprefix(f"{name}."): dataset.column(c)[seen] for c in problem.kernels[number].factor.output_channels},
         {**{local: own_values[parameters.entries_of(block.name)] for local, block in own.items()}, **borrowed},
         frozenset(local for local, block in own.items() if block.free),
+        tuple(dataset.ids[i] for i in seen),
     )
 
 

@@ -44,12 +44,14 @@ class Reading:
         channels: each channel (N; NaN where it is missing), by local name.
         values: canonical entries of all its parameters, by local name.
         free: local names of those that may move.
+        ids: what each record is called.
     """
 
     frames: Mapping[str, Array]
     channels: Mapping[str, Array]
     values: Mapping[str, Array]
     free: frozenset[str]
+    ids: tuple[str, ...]
 
 
 @runtime_checkable

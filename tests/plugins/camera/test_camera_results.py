@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
 import json
+import shlex
 import shutil
 import subprocess
 import sys
@@ -18,6 +20,7 @@ from armcal.api import Run
 from armcal.base.domains import Array
 from armcal.calibration.exporter import request_of
 from armcal.errors import ConfigError
+from armcal_camera.export import FramesSettings, HandEyeExporter
 from scipy.spatial.transform import Rotation
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -78,6 +81,49 @@ def test_ros_files_agree_with_each_other(calibration: Path, tmp_path: Path) -> N
     info = yaml.safe_load((tmp_path / "info.yaml").read_text())
     assert (info["image_width"], info["image_height"], info["distortion_model"]) == (1280, 960, "plumb_bob")
     assert info["camera_matrix"]["data"][0] == pytest.approx(1000 * numbers(calibration)["camera.fx"])
+
+
+def test_ros_takes_its_messages_and_its_command(calibration: Path, tmp_path: Path) -> None:
+    stores = pytest.importorskip("rosbags.typesys", reason="rosbags is not installed: pip install 'armcal[ros2]'")
+    store = stores.get_typestore(stores.Stores.ROS2_HUMBLE)
+    exported(calibration, "camera_info", tmp_path / "info.yaml")
+    info, types = yaml.safe_load((tmp_path / "info.yaml").read_text()), store.types
+    names = {
+        "d": "distortion_coefficients",
+        "k": "camera_matrix",
+        "r": "rectification_matrix",
+        "p": "projection_matrix",
+    }
+    matrices = {field: np.array(info[name]["data"], dtype=float) for field, name in names.items()}
+    stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+    message = types["sensor_msgs/msg/CameraInfo"](
+        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="camera"),
+        height=info["image_height"],
+        width=info["image_width"],
+        distortion_model=info["distortion_model"],
+        binning_x=0,
+        binning_y=0,
+        roi=types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False),
+        **matrices,
+    )
+    name = "sensor_msgs/msg/CameraInfo"
+    again = store.deserialize_cdr(store.serialize_cdr(message, name), name)
+    assert again.width == 1280 and again.distortion_model == "plumb_bob" and len(again.d) == 5
+    assert again.p.reshape(3, 4)[:, :3].ravel() == pytest.approx(again.k) and again.k[0] > 100
+    exported(calibration, "hand_eye", tmp_path / "where.yaml")
+    request = request_of(armcal.Calibration.load(calibration), None)
+    (remark,) = HandEyeExporter(FramesSettings()).export(request).remarks
+    where = yaml.safe_load((tmp_path / "where.yaml").read_text())["transformation"]
+    parser = argparse.ArgumentParser()  # the options of tf2_ros static_transform_publisher, from ROS 2 Humble on
+    for key in where:
+        parser.add_argument(f"--{key}", type=float, required=True)
+    for key in ("--frame-id", "--child-frame-id"):
+        parser.add_argument(key, required=True)
+    command = shlex.split(remark.partition(": ")[2])
+    assert command[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
+    options = vars(parser.parse_args(command[4:]))
+    assert (options["frame_id"], options["child_frame_id"]) == ("tool0", "camera_optical_frame")
+    assert {key: options[key] for key in where} == pytest.approx(where, abs=1e-8)
 
 
 def test_a_camera_that_is_not_there_is_refused(calibration: Path) -> None:

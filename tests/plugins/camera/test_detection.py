@@ -112,6 +112,19 @@ def test_a_charuco_board_is_printed_as_opencv_prints_it(legacy: bool, rows: int)
     assert np.mean(ours != expected) < 0.02
 
 
+@pytest.mark.parametrize("legacy", [False, True])
+def test_tags_of_another_print_are_named(legacy: bool) -> None:
+    board = Charuco.si(type="charuco", columns=7, rows=6, square=0.03, marker=0.0225, legacy=legacy)
+    image = image_of(board, facing(board, TURN))
+    assert fault_of(image, board) == ""
+    other = board.model_copy(update={"legacy": not legacy})
+    assert f"its tags stand as on a board with legacy: {str(legacy).lower()}" in fault_of(image, other)
+    family = board.model_copy(update={"dictionary": "DICT_4X4_50"})
+    assert "but tags 0 to 20 of DICT_5X5_50; those of the board are 0 to 20 of DICT_4X4_50" in fault_of(image, family)
+    numbers = board.model_copy(update={"first_id": 40})
+    assert "but tags 0 to 20 of DICT_5X5_100; those of the board are 40 to 60" in fault_of(image, numbers)
+
+
 def fault_of(image: Grey, board: Board) -> str:
     found = detect(image, board)
     assert np.isnan(found.corners).all() or found.blur > 0
@@ -154,12 +167,14 @@ def test_columns_for_rows_are_noticed_where_tags_say_so() -> None:
     assert "check its columns, rows" in fault_of(image_of(CHARUCO, facing(CHARUCO)), turned)
 
 
-@pytest.mark.quick("colour")
-@pytest.mark.parametrize("kind", ["colour", "sixteen bits", "jpeg"])
+@pytest.mark.quick("colour", "dazzled")
+@pytest.mark.parametrize("kind", ["colour", "sixteen bits", "dazzled", "jpeg"])
 def test_images_of_every_kind_are_read(kind: str) -> None:
     pose = facing(CHESSBOARD, TURN)
     image = image_of(CHESSBOARD, pose)
     stored = {"colour": cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), "sixteen bits": image.astype(np.uint16) * 16}
+    stored["dazzled"] = image.astype(np.uint16) * 4
+    stored["dazzled"][:3, :3] = 65535
     content = cv2.imencode(".jpg" if kind == "jpeg" else ".png", stored.get(kind, image))[1].tobytes()
     found = detect(grey_image(content, "image"), CHESSBOARD)
     np.testing.assert_allclose(found.corners, truth(CHESSBOARD, pose), atol=0.15)

@@ -137,6 +137,20 @@ def test_a_column_may_name_the_image(folder: Path) -> None:
     (folder / "poses.csv").write_text("image,q1_deg,q2_deg\n12.png,1,2\n7.png,3,4\n8.png,5,6\n")
     with pytest.raises(DataError, match=r":3.*found the image '7.png'"):
         read(folder=folder, poses=folder / "poses.csv")
+    (folder / "poses.csv").write_text("image,q1_deg,q2_deg\n12.png,1,2\n12,3,4\n8.png,5,6\n")
+    with pytest.raises(DataError, match=r":3.*found the image 12.png again"):
+        read(folder=folder, poses=folder / "poses.csv")
+
+
+def test_a_file_that_is_there_twice_counts_once_and_other_kinds_are_refused(folder: Path) -> None:
+    (folder / "11.png").write_bytes((folder / "9.png").read_bytes())
+    dataset = read(folder=folder, poses=folder / "poses.csv")
+    assert dataset.set_aside[0].reason == "it is the same image as 9.png" and len(dataset) == COUNT - 1
+    (folder / "12.CR2").write_bytes(b"the sensor's own data, beside 12.png")
+    read(folder=folder, poses=folder / "poses.csv")
+    (folder / "12.png").rename(folder / "12.heic")
+    with pytest.raises(DataError, match=r"found 12.CR2, 12.heic \(2 in all\), a kind of image that is not read"):
+        read(folder=folder, poses=folder / "poses.csv")
 
 
 def test_what_says_nothing_is_set_aside_with_its_reason(folder: Path) -> None:
@@ -224,13 +238,16 @@ def test_a_file_of_corners_is_refused_with_its_line(tmp_path: Path, text: str, m
 POSES = [Rotation.from_euler("ZYX", (0.3 * i, -0.2, 3.0 + 0.1 * i)) for i in range(COUNT)]
 
 
-@pytest.mark.quick("quaternion", "three rows")
-@pytest.mark.parametrize("form", ["matrix", "three rows", "quaternion", "euler"])
+@pytest.mark.quick("quaternion", "three rows", "four lines")
+@pytest.mark.parametrize("form", ["matrix", "three rows", "four lines", "quaternion", "euler"])
 def test_flange_poses_become_coordinates(folder: Path, form: str) -> None:
     path, settings = folder / "flange.txt", None
     matrices = [np.hstack([turn.as_matrix(), [[0.1 * i], [0.2], [0.5]]]) for i, turn in enumerate(POSES)]
     if form in ("matrix", "three rows"):
         rows = [[*m.ravel(), *([0, 0, 0, 1] if form == "matrix" else [])] for m in matrices]
+        text = "# by a robot\n" + "".join(" ".join(f"{x:.12f}" for x in row) + "\n" for row in rows)
+    elif form == "four lines":
+        rows = [row for m in matrices for row in (*m, [0, 0, 0, 1], [])]
         text = "".join(" ".join(f"{x:.12f}" for x in row) + "\n" for row in rows)
     elif form == "quaternion":
         quaternions = [turn.as_quat()[[3, 0, 1, 2]] for turn in POSES]
