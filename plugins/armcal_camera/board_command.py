@@ -1,20 +1,43 @@
-"""``armcal board``: a board to print, and its settings for a configuration."""
+"""``armcal board``: a board as a page to print (PDF and SVG, to scale, with a ruler), and its settings."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
+from xml.sax.saxutils import escape
 
 import click
+import numpy as np
 import yaml
+from armcal.base.domains import Array
 from armcal.cli.common import Console, speaking
 from armcal.errors import InputError
 from armcal.io.file_set import write_new, write_over
 from pydantic import ValidationError
 
-from armcal_camera.board import Board, BoardFile
-from armcal_camera.sheet import PAPERS, pdf, sheet_of, svg
+from armcal_camera.board import Aprilgrid, Board, BoardFile, Charuco, Chessboard, Tag
+from armcal_camera.pattern import dark_rectangles, outline
 
+PAPERS = MappingProxyType(
+    {
+        "a4": (210.0, 297.0),
+        "a3": (297.0, 420.0),
+        "a2": (420.0, 594.0),
+        "a1": (594.0, 841.0),
+        "a0": (841.0, 1189.0),
+        "letter": (215.9, 279.4),
+    }
+)
+"""Width and height (mm)."""
+RULER_MM = 100.0
+_MARGIN_MM = 8.0
+_FOOT_MM = 18.0
+_TEXT_MM = 3.2
+_POINTS_PER_MM = 72 / 25.4
+_TICK_MM, _LINE_MM = 3.0, 0.3
 _HEAD = "# Measure the printed board, and write the sizes that you measured here.\n"
 
 
@@ -111,3 +134,142 @@ def _write(console: Console, kind: str, sizes: dict[str, Any], paper: str, out: 
     console.line(
         f"Print the PDF at 100 %. Its line must be 100 mm long, the board {width:g} x {height:g} mm: measure both."
     )
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A page, in millimetres from its upper left corner.
+
+    Attributes:
+        width, height: of the paper.
+        dark: rectangles of the board (N x 4: left, top, width, height).
+        ruler: the same of the ruler's lines.
+        texts: left, baseline and words of each line.
+    """
+
+    width: float
+    height: float
+    dark: Array
+    ruler: Array
+    texts: Sequence[tuple[float, float, str]]
+
+
+def sheet_of(board: Board, paper: str) -> Sheet:
+    """The page of a board, upright or lying, whichever has room.
+
+    Raises:
+        ValueError: the paper is too small; says what fits.
+        PluginError: the board has tags, and OpenCV is not there.
+    """
+    size = 1000 * np.array(board.extent)
+    quiet = 0.0 if isinstance(board, Chessboard | Charuco) else 100 * board.step  # white around tags
+    pages = [page for page in (PAPERS[paper], PAPERS[paper][::-1]) if _fits(size + 2 * quiet, page)]
+    if not pages:
+        room = " or ".join(f"{w - 2 * _MARGIN_MM:g} x {h - 2 * _MARGIN_MM - _FOOT_MM:g}" for w, h in _both(paper))
+        larger = [name for name in PAPERS if any(_fits(size + 2 * quiet, page) for page in _both(name))]
+        mend = f"take --paper {larger[0]}, or a smaller board" if larger else "take a smaller board"
+        needed = size + 2 * quiet
+        text = f"the board needs {needed[0]:g} x {needed[1]:g} mm, and {paper} has room for {room} mm"
+        raise ValueError(f"{text}: {mend}")
+    width, height = pages[0]
+    corner = np.array([width - size[0], height - _FOOT_MM - size[1]]) / 2
+    low, rectangles = outline(board), 1000 * dark_rectangles(board)
+    left, wide = rectangles[:, 0] - 1000 * low[0], rectangles[:, 2] - rectangles[:, 0]
+    is_upwards = isinstance(board, Aprilgrid)  # y of these boards points up, and that of pages down
+    top = 1000 * low[3] - rectangles[:, 3] if is_upwards else rectangles[:, 1] - 1000 * low[1]
+    dark = np.stack([corner[0] + left, corner[1] + top, wide, rectangles[:, 3] - rectangles[:, 1]], axis=1)
+    foot = height - _MARGIN_MM
+    texts = [
+        (_MARGIN_MM, foot - 12.8, _what(board)),
+        (
+            _MARGIN_MM,
+            foot - 8.6,
+            f"Print at 100 %, not fitted to the page. The line is {RULER_MM:g} mm long: measure it.",
+        ),
+        (_MARGIN_MM, foot - 1.4 - _TICK_MM, _to_measure(board)),
+    ]
+    return Sheet(width, height, dark, _ruler(_MARGIN_MM, foot), texts)
+
+
+def _both(paper: str) -> tuple[tuple[float, float], ...]:
+    return PAPERS[paper], PAPERS[paper][::-1]
+
+
+def _fits(size: Array, page: Sequence[float]) -> bool:
+    room = np.array(page) - 2 * _MARGIN_MM - np.array([0.0, _FOOT_MM])
+    return bool((size <= room + 1e-9).all())
+
+
+def _what(board: Board) -> str:
+    """The board in words."""
+    if isinstance(board, Chessboard):
+        return f"armcal: chessboard, {board.columns} x {board.rows} inner corners, square {1000 * board.square:g} mm"
+    if isinstance(board, Charuco):
+        sizes = f"square {1000 * board.square:g} mm, marker {1000 * board.marker:g} mm"
+        tags = f"{board.dictionary} from {board.first_id}"
+        return f"armcal: ChArUco, {board.columns} x {board.rows} squares, {sizes}, {tags}"
+    if isinstance(board, Aprilgrid):
+        sizes = f"tag {1000 * board.tag:g} mm, spacing {1000 * board.spacing:g} mm"
+        return f"armcal: AprilTag grid, {board.columns} x {board.rows}, {sizes}, {board.family} from {board.first_id}"
+    assert isinstance(board, Tag)
+    return f"armcal: tag {board.id} of {board.family}, edge {1000 * board.tag:g} mm"
+
+
+def _to_measure(board: Board) -> str:
+    wide, high = (1000 * extent for extent in board.extent)
+    return f"Then measure the board: {wide:g} mm wide, {high:g} mm high. Write what you measure into board.yaml."
+
+
+def _ruler(left: float, bottom: float) -> Array:
+    """A line with a tick each 10 mm; the outer edges of the first and the last tick are its ends."""
+    ticks = np.arange(11) * (RULER_MM - _LINE_MM) / 10
+    rows = [(left + tick, bottom - _TICK_MM, _LINE_MM, _TICK_MM) for tick in ticks]
+    return np.array([(left, bottom - _LINE_MM, RULER_MM, _LINE_MM), *rows])
+
+
+def svg(sheet: Sheet) -> str:
+    """The page as SVG."""
+    paths = [
+        "".join(f"M{x:.4f} {y:.4f}h{w:.4f}v{h:.4f}h{-w:.4f}z" for x, y, w, h in r) for r in (sheet.dark, sheet.ruler)
+    ]
+    texts = [
+        f'<text x="{x:g}" y="{y:g}" font-family="Helvetica, sans-serif" font-size="{_TEXT_MM}">{escape(t)}</text>'
+        for x, y, t in sheet.texts
+    ]
+    size = f'width="{sheet.width:g}mm" height="{sheet.height:g}mm" viewBox="0 0 {sheet.width:g} {sheet.height:g}"'
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" {size}>',
+        '<rect width="100%" height="100%" fill="white"/>',
+        *(f'<path d="{path}"/>' for path in paths),
+        *texts,
+        "</svg>",
+    ]
+    return "\n".join([*lines, ""])
+
+
+def pdf(sheet: Sheet) -> bytes:
+    """The page as PDF 1.4; its user space is millimetres after the first operator."""
+    parts = [f"{_POINTS_PER_MM:.9f} 0 0 {_POINTS_PER_MM:.9f} 0 0 cm", "0 g"]
+    for rectangles in (sheet.dark, sheet.ruler):
+        parts += [f"{x:.4f} {sheet.height - y - h:.4f} {w:.4f} {h:.4f} re" for x, y, w, h in rectangles]
+        parts.append("f")
+    for x, y, text in sheet.texts:
+        words = text.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
+        parts.append(f"BT /F {_TEXT_MM} Tf {x:g} {sheet.height - y:.4f} Td ({words}) Tj ET")
+    content = "\n".join(parts)
+    box = f"0 0 {sheet.width * _POINTS_PER_MM:.4f} {sheet.height * _POINTS_PER_MM:.4f}"
+    preferences = "/ViewerPreferences << /PrintScaling /None >>"
+    objects = [
+        f"<< /Type /Catalog /Pages 2 0 R {preferences} >>",
+        "<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
+        f"<< /Type /Page /Parent 2 0 R /MediaBox [{box}] /Contents 4 0 R /Resources << /Font << /F 5 0 R >> >> >>",
+        f"<< /Length {len(content)} >>\nstream\n{content}\nendstream",
+        "<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
+    ]
+    text, places = "%PDF-1.4\n", []
+    for number, item in enumerate(objects, start=1):
+        places.append(len(text))
+        text += f"{number} 0 obj\n{item}\nendobj\n"
+    table = "".join(f"{place:010d} 00000 n \n" for place in places)
+    end = f"trailer\n<< /Size {len(objects) + 1} /Root 1 0 R >>\nstartxref\n{len(text)}\n%%EOF\n"
+    return f"{text}xref\n0 {len(objects) + 1}\n0000000000 65535 f \n{table}{end}".encode("ascii")

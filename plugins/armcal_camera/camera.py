@@ -22,9 +22,8 @@ from pydantic import Field, model_validator
 
 from armcal_camera.board import Board, BoardOrFile, Chessboard, require_distinct
 from armcal_camera.first_guess import Setup, certified_place, first_guess
-from armcal_camera.intrinsics import IntrinsicsOrFile, Lens, Pixels
-from armcal_camera.lens import DISTORTION, projected
-from armcal_camera.rendered_records import rendered_records
+from armcal_camera.intrinsics import DISTORTION, IntrinsicsOrFile, Lens, Pixels, projected
+from armcal_camera.render import rendered_records
 
 _PIXELS_SCALE, _DISTORTION_SCALE, _SCALE_SCALE, _BEND_SCALE_M = 0.01, 0.05, 0.01, 1e-3
 _NEAREST_M, _LEAST_FACING, _FEWEST_POINTS = 0.02, 0.3, 4

@@ -17,11 +17,9 @@ from armcal.base.domains import Array
 
 from armcal_camera.board import FAMILIES, Board, Charuco, Chessboard
 from armcal_camera.grids import grown, is_chessboard, refined_grid, upright
-from armcal_camera.images import Grey
-from armcal_camera.library import opencv
-from armcal_camera.local_map import local_map
+from armcal_camera.images import Grey, opencv
 from armcal_camera.pattern import dictionary
-from armcal_camera.refinement import refine
+from armcal_camera.refinement import local_map, refine
 
 VERSION = 2
 """Of the detection; it changes with the corners."""

@@ -17,7 +17,7 @@ from armcal.functions.compiler import cache_directory
 
 from armcal_camera.board import Board
 from armcal_camera.detection import VERSION, Detection
-from armcal_camera.library import opencv
+from armcal_camera.images import opencv
 
 _KEPT = 20_000
 

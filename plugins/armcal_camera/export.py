@@ -15,7 +15,7 @@ from armcal.errors import ConfigError
 from scipy.spatial.transform import Rotation
 
 from armcal_camera.camera import carrying_frames
-from armcal_camera.lens import DISTORTION
+from armcal_camera.intrinsics import DISTORTION
 
 _PX = 1000.0
 _MODELS = {"pinhole": "plumb_bob", "fisheye": "equidistant"}

@@ -12,7 +12,7 @@ from armcal.measure.points import Proposal, Reading
 
 from armcal_camera.certificate import sentence
 from armcal_camera.hand_eye import hand_eye, open_motion
-from armcal_camera.lens import DISTORTION, normalised
+from armcal_camera.intrinsics import DISTORTION, normalised
 from armcal_camera.mixed_up import require_board_axes, require_form, require_one_board
 from armcal_camera.views import FEWEST_POINTS, board_pose, homography, intrinsics
 

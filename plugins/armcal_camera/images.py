@@ -1,14 +1,14 @@
-"""Images as grey values."""
+"""Images as grey values, and the library OpenCV, which only what reads images needs."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from armcal.errors import DataError, Location
+from armcal.errors import DataError, Location, PluginError
+from armcal.extras import library
 from numpy.typing import NDArray
-
-from armcal_camera.library import opencv
 
 Grey = NDArray[np.uint8]
 """An image (H x W); the centre of the pixel in column u and row v is at (u, v)."""
@@ -49,3 +49,17 @@ def grey_image(content: bytes, source: str) -> Grey:
     if image.dtype != np.uint8:
         image = np.rint(np.nan_to_num(image) * (255.0 / max(float(np.percentile(image, 99)), 1e-9))).clip(0, 255)
     return np.ascontiguousarray(image, dtype=np.uint8)
+
+
+def opencv() -> Any:
+    """The module ``cv2``.
+
+    Raises:
+        PluginError: it is not installed, or too old to know boards of tags.
+    """
+    cv2 = library("cv2", "looking at images")
+    if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
+        version = getattr(cv2, "__version__", "of an unknown version")
+        hint = "Run pip install --upgrade 'armcal[camera]'."
+        raise PluginError(f"found OpenCV {version}, expected at least 4.8.", hint=hint)
+    return cv2

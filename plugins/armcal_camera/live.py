@@ -17,9 +17,8 @@ from armcal.measure.measurement import Measurement
 from pydantic import BeforeValidator
 from typing_extensions import override
 
-from armcal_camera.images import MOST_BYTES, is_image
+from armcal_camera.images import MOST_BYTES, is_image, opencv
 from armcal_camera.images_reader import View, as_the_others, corner_channels, look_at, sees_boards
-from armcal_camera.library import opencv
 
 _WAITING = 5
 """So many images a driver may hold back: they are older than the moment of asking."""

@@ -8,7 +8,7 @@ import numpy as np
 from armcal.base.domains import Array
 
 from armcal_camera.board import FAMILIES, Board, Charuco, Chessboard, tag_modules
-from armcal_camera.library import opencv
+from armcal_camera.images import opencv
 
 
 def dictionary(family: str) -> Any:

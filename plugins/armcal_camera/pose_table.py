@@ -23,7 +23,7 @@ from armcal.measure.reader import ReadRequest, RequestedChannel
 from armcal.plugins import discover
 from scipy.spatial.transform import Rotation
 
-from armcal_camera.recovered_joints import recovered_joints
+from armcal_camera.flange_pose import recovered_joints
 
 FLANGE = ("x", "y", "z", "rz", "ry", "rx")
 """Joints of an arm whose flange's pose is read: base_T_flange turns by Rz(rz) Ry(ry) Rx(rx)."""

@@ -20,7 +20,7 @@ from armcal.problem.factor import build_factor
 from armcal.problem.many_points import as_seen, with_few_points
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal_camera.lens import normalised, pinhole, projected
+from armcal_camera.intrinsics import normalised, pinhole, projected
 from armcal_simulation.readings import measured_while_moving
 from scipy.spatial.transform import Rotation
 

@@ -14,8 +14,7 @@ pytest.importorskip("cv2")
 import cv2
 from armcal_camera.board import Board, Charuco, Chessboard
 from armcal_camera.detection import detect
-from armcal_camera.images import Grey, grey_image
-from armcal_camera.library import opencv
+from armcal_camera.images import Grey, grey_image, opencv
 from armcal_camera.pattern import dark_rectangles, outline
 from armcal_camera.render import Exposure, Lens, render
 

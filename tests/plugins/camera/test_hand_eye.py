@@ -8,7 +8,7 @@ from armcal.base.domains import Array
 from armcal.measure.points import Reading
 from armcal_camera.first_guess import Setup, first_guess
 from armcal_camera.hand_eye import hand_eye, open_motion
-from armcal_camera.lens import DISTORTION
+from armcal_camera.intrinsics import DISTORTION
 from armcal_camera.views import board_pose, homography, intrinsics
 from scipy.spatial.transform import Rotation
 

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armcal_camera.image_figures import drawn_images
-from armcal_camera.residuals import CameraResiduals
+from armcal_camera.report import CameraResiduals, drawn_images
 
 PIXELS = np.array([[100.0, 300, 500], [80, 200, 320]])
 
