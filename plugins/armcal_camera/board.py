@@ -4,8 +4,6 @@ A board's frame lies in its printed face, x along its columns and y along its ro
 columns first. Nothing here needs OpenCV.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """``armcal board``: a board as a page to print (PDF and SVG, to scale, with a ruler), and its settings."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -186,9 +184,18 @@ def sheet_of(board: Board, paper: str) -> Sheet:
             foot - 8.6,
             f"Print at 100 %, not fitted to the page. The line is {RULER_MM:g} mm long: measure it.",
         ),
-        (_MARGIN_MM, foot - 1.4 - _TICK_MM, _to_measure(board)),
+        (
+            _MARGIN_MM,
+            foot - 1.4 - _TICK_MM,
+            f"Then measure the board: {size[0]:g} mm wide, {size[1]:g} mm high. "
+            "Write what you measure into board.yaml.",
+        ),
     ]
-    return Sheet(width, height, dark, _ruler(_MARGIN_MM, foot), texts)
+    ticks = (
+        _MARGIN_MM + np.arange(11) * (RULER_MM - _LINE_MM) / 10
+    )  # the outer edges of the first and last are its ends
+    rows = [(tick, foot - _TICK_MM, _LINE_MM, _TICK_MM) for tick in ticks]
+    return Sheet(width, height, dark, np.array([(_MARGIN_MM, foot - _LINE_MM, RULER_MM, _LINE_MM), *rows]), texts)
 
 
 def _both(paper: str) -> tuple[tuple[float, float], ...]:
@@ -213,18 +220,6 @@ def _what(board: Board) -> str:
         return f"armcal: AprilTag grid, {board.columns} x {board.rows}, {sizes}, {board.family} from {board.first_id}"
     assert isinstance(board, Tag)
     return f"armcal: tag {board.id} of {board.family}, edge {1000 * board.tag:g} mm"
-
-
-def _to_measure(board: Board) -> str:
-    wide, high = (1000 * extent for extent in board.extent)
-    return f"Then measure the board: {wide:g} mm wide, {high:g} mm high. Write what you measure into board.yaml."
-
-
-def _ruler(left: float, bottom: float) -> Array:
-    """A line with a tick each 10 mm; the outer edges of the first and the last tick are its ends."""
-    ticks = np.arange(11) * (RULER_MM - _LINE_MM) / 10
-    rows = [(left + tick, bottom - _TICK_MM, _LINE_MM, _TICK_MM) for tick in ticks]
-    return np.array([(left, bottom - _LINE_MM, RULER_MM, _LINE_MM), *rows])
 
 
 def svg(sheet: Sheet) -> str:

@@ -5,8 +5,6 @@ places are put in. Rotation matrices are all that satisfies some quadratic equat
 form that is as large on them and, if it has no negative eigenvalue, bounds the sum everywhere. [Briales2017]
 """
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass
 from warnings import catch_warnings, simplefilter

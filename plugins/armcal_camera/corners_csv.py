@@ -4,8 +4,6 @@
 centre of an image's first pixel is at 0, 0.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import math

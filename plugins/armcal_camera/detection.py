@@ -5,8 +5,6 @@ version. A chessboard must be seen whole, as nothing else says which of its corn
 part will do. [Duda2018] [GarridoJurado2014]
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -149,8 +147,10 @@ def _tags(image: Grey, reduced: Grey, board: Board, nothing: Detection) -> Detec
     fit = refine(image, rough, scale, board.reach)
     corners = nothing.corners.copy()
     corners[near] = fit.corners
-    count = int(np.isfinite(corners[:, 0]).sum())
-    if count < _FEWEST or _is_line(points[np.isfinite(corners[:, 0])], board.step):
+    there = points[np.isfinite(corners[:, 0])]
+    count = len(there)
+    # in a line they do not say how the board lies
+    if count < _FEWEST or np.linalg.svd(there - there.mean(axis=0), compute_uv=False)[1] < 0.5 * board.step:
         return replace(nothing, fault=f"too few corners of the {board.kind} were found ({count} of {len(points)})")
     return replace(nothing, corners=corners, fault="", blur=float(np.nanmedian(fit.blur)))
 
@@ -214,12 +214,6 @@ def _turned(known: Array, pixels: Array) -> tuple[Array, float]:
         off = float(np.median(np.linalg.norm(expected - flat, axis=1))) / edge
         best = min(best, (turned, off), key=lambda pair: pair[1])
     return best
-
-
-def _is_line(points: Array, step: float) -> bool:
-    """Whether points of a board are all but in a line, so that they do not say how it lies."""
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(spread[1] < 0.5 * step)
 
 
 def _judged(detection: Detection, board: Board) -> Detection:

@@ -1,7 +1,5 @@
 """Detections that were made before, kept on disk by the content of the image and the settings of the board."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

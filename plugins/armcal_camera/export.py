@@ -1,7 +1,5 @@
 """Calibrated cameras in the formats of others: ROS ``camera_info``, OpenCV's YAML, and where the camera sits."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -110,8 +108,11 @@ class OpenCvExporter(_CameraExporter):
             lines += [f"image_width: {size[0]}", f"image_height: {size[1]}"]
         lines += _opencv_matrix("camera_matrix", matrix)
         lines += _opencv_matrix("distortion_coefficients", np.array([distortion]))
-        for name, pose in _poses(camera).items():
-            lines += _opencv_matrix(name, pose)
+        frames = _frames(camera)
+        lines += _opencv_matrix(f"{frames[0]}_T_camera", _pose("camera", camera.numbers))
+        turned = (entry.removesuffix("_rotation[w]") for entry in camera.numbers if entry.endswith("_rotation[w]"))
+        for board in (name for name in turned if name.startswith("board")):
+            lines += _opencv_matrix(f"{frames[1]}_T_{board}", _pose(board, camera.numbers))
         return Exported(("\n".join(lines) + "\n").encode(), 4 + len(distortion))
 
 
@@ -176,15 +177,6 @@ def _frames(camera: Instrument) -> tuple[str, str]:
     """What carries the camera and what carries the boards."""
     s = camera.settings
     return carrying_frames(s.get("mounting", "eye_in_hand"), s.get("frame", TOOL_FRAME), s.get("board_frame"))
-
-
-def _poses(camera: Instrument) -> dict[str, Array]:
-    """The camera's pose and each board's, by what they map from and to."""
-    frames = _frames(camera)
-    turned = (name.removesuffix("_rotation[w]") for name in camera.numbers if name.endswith("_rotation[w]"))
-    boards = [name for name in turned if name.startswith("board")]
-    poses = {f"{frames[0]}_T_camera": _pose("camera", camera.numbers)}
-    return {**poses, **{f"{frames[1]}_T_{board}": _pose(board, camera.numbers) for board in boards}}
 
 
 def _pose(name: str, numbers: Mapping[str, float]) -> Array:

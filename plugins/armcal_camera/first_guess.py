@@ -68,7 +68,13 @@ def first_guess(setup: Setup, reading: Reading) -> Proposal:
     proposed = {name: own[name] for name in _INTRINSICS if name in free}
     (camera_frame, board_frame), moved = setup.frames, _moved(setup, reading)
     known = [not free & set(_place(name)) for name in setup.names]
-    is_open = _still(camera_frame) if camera_frame == board_frame else open_motion(moved, camera_frame)
+    is_open = open_motion(moved, camera_frame)
+    if camera_frame == board_frame:
+        is_open = (
+            f"camera and boards are both on the frame {camera_frame} and never move against one another: where they "
+            "are is not determined.",
+            "Name a camera that moves against the same boards in boards_of, or state board_poses and hold them.",
+        )
     for own_poses in poses if is_open is None else ():
         if len(own_poses):
             hand, board_ = moved[list(own_poses)], np.array(list(own_poses.values()))
@@ -131,15 +137,6 @@ def _place(name: str) -> tuple[str, ...]:
 
 def _placed(name: str, free: frozenset[str]) -> bool:
     return set(_place(name)) <= free
-
-
-def _still(frame: str) -> tuple[str, str]:
-    """What is open of a camera that never moves against its boards, and what would close it."""
-    return (
-        f"camera and boards are both on the frame {frame} and never move against one another: where they are is not "
-        "determined.",
-        "Name a camera that moves against the same boards in boards_of, or state board_poses and hold them.",
-    )
 
 
 def _views(setup: Setup, reading: Reading) -> list[_View]:

@@ -38,7 +38,7 @@ def upright(grid: Array, crossing: Array) -> tuple[Array, Array]:
         grid, crossing = grid[:, ::-1], -crossing[:, ::-1]
     turns = (0, 1, 2, 3) if grid.shape[0] == grid.shape[1] else (0, 2)
     turned = [(np.rot90(grid, turn), np.rot90(crossing, turn) * (-1) ** turn) for turn in turns]
-    dark = [pair for pair in turned if _first_is_dark(pair[1])]
+    dark = [pair for pair in turned if _alternating(pair[1]) > 0]
     return max(dark or turned, key=lambda pair: float((pair[0][:, -1, 0] - pair[0][:, 0, 0]).mean()))
 
 
@@ -46,10 +46,6 @@ def is_chessboard(crossing: Array) -> bool:
     """Whether dark and bright quadrants change from corner to corner (R x C), as hardly anything else has it."""
     whole, seen = float(np.nansum(np.abs(crossing))), float(np.isfinite(crossing).mean())
     return seen > _MOST and abs(_alternating(crossing)) > _MOST * whole
-
-
-def _first_is_dark(crossing: Array) -> bool:
-    return _alternating(crossing) > 0
 
 
 def _alternating(crossing: Array) -> float:

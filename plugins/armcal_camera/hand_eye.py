@@ -70,7 +70,8 @@ def open_motion(a: Array, frame: str = "tool") -> tuple[str, str] | None:
 
     Two turns about axes that are not parallel determine all [Tsai1989].
     """
-    turns = _relative(a[:, :3, :3]) if len(a) > 1 else np.zeros((0, 3))
+    between = [np.swapaxes(a[:-n, :3, :3], 1, 2) @ a[n:, :3, :3] for n in (1, 2, 3) if len(a) > n]
+    turns = Rotation.from_matrix(np.concatenate(between)).as_rotvec() if between else np.zeros((0, 3))
     turns = turns[np.linalg.norm(turns, axis=1) > _TURNED_RAD]
     if not len(turns):
         return (
@@ -87,16 +88,6 @@ def open_motion(a: Array, frame: str = "tool") -> tuple[str, str] | None:
             "Turn the hand about another axis too, 30 deg and more.",
         )
     return None
-
-
-def _relative(rotations: Array) -> Array:
-    """Rotation vectors (M x 3) from each pose to the next and to the one after that, in the tool's axes."""
-    vectors = [
-        Rotation.from_matrix(np.swapaxes(rotations[:-step], 1, 2) @ rotations[step:]).as_rotvec()
-        for step in (1, 2, 3)
-        if len(rotations) > step
-    ]
-    return np.concatenate(vectors)
 
 
 def _park(a: Array, b: Array) -> tuple[Array, Array]:

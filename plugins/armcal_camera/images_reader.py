@@ -109,9 +109,12 @@ class ImagesReader:
         count = len(dataset) + len(dataset.set_aside)
         faults: list[dict[int, str]] = []
         known = {w.channel for w in request.channels}
+
+        def of_all(number: int, done: float) -> None:
+            request.report((number + done) / len(cameras))
+
         for number, (name, boards) in enumerate(cameras.items()):
-            report = partial(_report_one, request.report, number, len(cameras))
-            views = _taken_once(as_the_others(self._views(name, boards, len(cameras), report)))
+            views = _taken_once(as_the_others(self._views(name, boards, len(cameras), partial(of_all, number))))
             place = str(_own(self._settings.folder or self._settings.corners, name, len(cameras)))
             chosen = _matched(dataset, views, place, count)
             faults.append({i: views[image].fault for i, image in enumerate(chosen) if views[image].fault})
@@ -137,11 +140,6 @@ class ImagesReader:
             seen = {name: view.corners for name, view in _of_one_size(views).items() if not view.fault}
             write_over({corners: corners_text(seen, boards).encode()})
         return views
-
-
-def _report_one(report: Report, number: int, cameras: int, done: float) -> None:
-    """Report how much is done of all cameras when so much is done of one."""
-    report((number + done) / cameras)
 
 
 def sees_boards(measurement: object) -> TypeGuard[SeesBoards]:
@@ -203,12 +201,12 @@ def _images_in(folder: Path) -> list[Path]:
         refuse(folder, text, "Save these as PNG or JPEG, or move them elsewhere.")
     if not paths:
         refuse(folder, "found no image in it.", "Give the folder of the images: PNG, JPEG, TIFF, BMP, WebP or PGM.")
-    return sorted(paths, key=lambda path: _natural(path.name))
 
+    def natural(path: Path) -> list[tuple[int, str]]:  # 2.png stands before 10.png
+        parts = re.split(r"(\d+)", path.name.lower())
+        return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
-def _natural(name: str) -> list[tuple[int, str]]:
-    """A key by which 2.png stands before 10.png."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name.lower())]
+    return sorted(paths, key=natural)
 
 
 def _too_few(pixels: Array) -> str:

@@ -139,12 +139,15 @@ def require_one_board(moved: Array, seen: Array, ids: Sequence[str]) -> None:
     first = np.linalg.eigh(agree - np.mean(agree[apart]))[1][:, -1] > 0
     groups = sorted((np.flatnonzero(which) for which in (first, ~first)), key=len)
     further = max(_times_further(off, *groups), _times_further(slid, *groups)) if len(groups[0]) >= 3 else 0.0
-    if further > _CLEARLY and _is_split(agree, *groups):
-        raise ProblemError(
-            f"{len(groups[0])} of {len(moved)} images show a board that stands elsewhere than in the others: "
-            "two boards, or one that was moved.",
-            hint="Leave the images of one of them out, or state both (boards: [...]); they must not look alike.",
-        )
+    if further > _CLEARLY:
+        across = float(np.mean(~agree[np.ix_(*groups)]))
+        within = max(float(np.mean(~agree[np.ix_(group, group)])) for group in groups)
+        if across > max(_LEAST_ACROSS, _TIMES_WITHIN * within):
+            raise ProblemError(
+                f"{len(groups[0])} of {len(moved)} images show a board that stands elsewhere than in the others: "
+                "two boards, or one that was moved.",
+                hint="Leave the images of one of them out, or state both (boards: [...]); they must not look alike.",
+            )
     if np.median(off[apart]) > max(_OTHER_RAD, _OTHER_SHARE * np.median(turns[apart])):
         raise ProblemError(
             "the hand does not turn between images as the board is seen to turn: typically "
@@ -161,13 +164,6 @@ def _contradicting(agree: NDArray[np.bool_]) -> NDArray[np.intp]:
     if is_group or not 0 < len(alone) <= len(agree) / 4 or np.mean(agree[np.ix_(rest, rest)]) < _TOGETHER:
         return np.zeros(0, dtype=np.intp)
     return alone
-
-
-def _is_split(agree: NDArray[np.bool_], first: NDArray[np.intp], second: NDArray[np.intp]) -> bool:
-    """Whether pairs agree within two groups and not across."""
-    across = float(np.mean(~agree[np.ix_(first, second)]))
-    within = max(float(np.mean(~agree[np.ix_(group, group)])) for group in (first, second))
-    return across > max(_LEAST_ACROSS, _TIMES_WITHIN * within)
 
 
 def _times_further(off: Array, first: NDArray[np.intp], second: NDArray[np.intp]) -> float:

@@ -34,12 +34,9 @@ def dark_rectangles(board: Board) -> Array:
 
 def outline(board: Board) -> Array:
     """Smallest x and y, largest x and y of what is printed (4; m)."""
-    low = np.array([-board.square, -board.square]) if isinstance(board, Chessboard | Charuco) else _lowest(board)
+    is_checked = isinstance(board, Chessboard | Charuco)
+    low = np.array([-board.square, -board.square]) if is_checked else board.points[:, :2].min(axis=0)
     return np.array([*low, *(low + board.extent)])
-
-
-def _lowest(board: Board) -> Array:
-    return np.asarray(board.points[:, :2].min(axis=0))
 
 
 def _squares(board: Board) -> Array:

@@ -51,7 +51,10 @@ class Lens:
         """x/z and y/z of the rays to pixels (N x 2), by fixed-point iteration."""
         seen = (pixels - np.array(self.centre)) / np.array(self.focal)
         if self.is_fisheye:
-            return self._straightened(seen)
+            angle = radius = np.linalg.norm(seen, axis=1)
+            for _ in range(_ROUNDS):
+                angle = np.clip(angle - (self._bent(angle) - radius), 0.0, _WIDEST)
+            return np.asarray(seen * (np.tan(angle) / np.where(radius > 0, radius, 1.0))[:, None])
         ray = seen
         for _ in range(_ROUNDS):
             ray = ray - (self._distorted(ray) - seen)
@@ -75,13 +78,6 @@ class Lens:
         k1, k2, k3, k4 = self.distortion
         square = angle**2
         return np.asarray(angle * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))))
-
-    def _straightened(self, seen: Array) -> Array:
-        radius = np.linalg.norm(seen, axis=1)
-        angle = radius
-        for _ in range(_ROUNDS):
-            angle = np.clip(angle - (self._bent(angle) - radius), 0.0, _WIDEST)
-        return np.asarray(seen * (np.tan(angle) / np.where(radius > 0, radius, 1.0))[:, None])
 
 
 @dataclass(frozen=True)

@@ -114,6 +114,8 @@ def test_a_small_board_beside_a_large_one_has_its_pose_found() -> None:
     values = {**place, **turns, **{name: np.array([value]) for name, value in lens.items()}}
     read = {f"{axis}_{k}": image[:, k, j] for k in range(58) for j, axis in enumerate("uv")}
     frames = {"tool": tools, "base": np.tile(np.eye(4), (8, 1, 1))}
-    proposal = first_guess(setup, Reading(frames, read, values, frozenset({*place, *turns}), ()))
+    proposal = first_guess(
+        setup, Reading(frames, read, values, frozenset({*place, *turns}), tuple(map(str, range(len(frames["tool"])))))
+    )
     for name, expected in (("camera", x), ("board1", y), ("board2", y @ tag)):
         assert np.allclose([proposal.values[f"{name}_{a}"][0] for a in "xyz"], expected[:3, 3], atol=1e-5), name
