@@ -161,8 +161,8 @@ def _astray(known: Array, pixels: Array) -> int:
     if len(known) < _FEWEST:
         return 0
     edge = float(np.median(np.linalg.norm(known[:, 1] - known[:, 0], axis=1)))
-    found = cv2.findHomography(pixels.mean(axis=1), flat, cv2.RANSAC, 0.5 * edge)[1]
-    return len(known) - (0 if found is None else int(found.sum()))
+    consistent = cv2.findHomography(pixels.mean(axis=1), flat, cv2.RANSAC, 0.5 * edge)[1]
+    return len(known) - (0 if consistent is None else int(consistent.sum()))
 
 
 def _other_tags(reduced: Grey, board: Board, nothing: Detection) -> Detection:
@@ -174,8 +174,8 @@ def _other_tags(reduced: Grey, board: Board, nothing: Detection) -> Detection:
             name = family
             if family.endswith("_1000"):
                 name = family.replace("1000", str(min(count for count in (50, 100, 250, 1000) if count > max(ids))))
-            asked = f"those of the board are {board.tag_ids[0]} to {board.tag_ids[-1]} of {board.tag_family}"
-            return replace(nothing, fault=f"{nothing.fault}, but tags {min(ids)} to {max(ids)} of {name}; {asked}")
+            stated = f"those of the board are {board.tag_ids[0]} to {board.tag_ids[-1]} of {board.tag_family}"
+            return replace(nothing, fault=f"{nothing.fault}, but tags {min(ids)} to {max(ids)} of {name}; {stated}")
     return nothing
 
 
