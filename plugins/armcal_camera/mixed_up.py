@@ -71,7 +71,7 @@ def require_form(moved: Array, seen: Array) -> None:
 
 def _misfit(moved: Array, seen: Array) -> float:
     """How far off the best places of camera and board are, as a share of the hand's motion plus rad (medians)."""
-    b = np.linalg.inv(seen)
+    b = np.asarray(np.linalg.inv(seen), dtype=float)
     solved = hand_eye(moved, b)
     if solved is None:
         return np.inf
@@ -102,7 +102,8 @@ def _forms(moved: Array, seen: Array) -> Iterator[tuple[Array, Array, str]]:
         "rx, ry, rz turn about moving axes, x first (XYZ)": Rotation.from_euler("XYZ", angles).as_matrix(),
     }
     forms = [(_posed(turned, moved[:, :3, 3]), words) for words, turned in turns.items()]
-    for poses, words in [*forms, (np.linalg.inv(moved), "poses are those of the base in the flange's frame")]:
+    inverse = np.asarray(np.linalg.inv(moved), dtype=float)
+    for poses, words in [*forms, (inverse, "poses are those of the base in the flange's frame")]:
         if words:
             yield poses, seen, words
         for gain in _GAINS:

@@ -34,8 +34,9 @@ def dark_rectangles(board: Board) -> Array:
 
 def outline(board: Board) -> Array:
     """Smallest x and y, largest x and y of what is printed (4; m)."""
-    is_checked = isinstance(board, Chessboard | Charuco)
-    low = np.array([-board.square, -board.square]) if is_checked else board.points[:, :2].min(axis=0)
+    low = board.points[:, :2].min(axis=0)
+    if isinstance(board, Chessboard | Charuco):
+        low = np.array([-board.square, -board.square])
     return np.array([*low, *(low + board.extent)])
 
 

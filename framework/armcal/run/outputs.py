@@ -173,6 +173,7 @@ def _errors(result: RunResult) -> dict[str, Any]:
 def calibration_content(result: RunResult, experiment: Experiment, accepted: bool = False) -> dict[str, Any]:
     """The content of calibration.yaml; nothing loads one whose verdict is bad, unless it was ``accepted``."""
     estimate, provenance, unit = result.estimate, result.provenance, result.errors.unit
+    quality: dict[str, Any] = {f"quality_{unit}": result.table.as_dict()}
     information = InformationRecord(
         increments=estimate.parameters.coordinate_names,
         square_root=tuple(tuple(float(x) for x in row) for row in estimate.square_root_information),
@@ -186,7 +187,7 @@ def calibration_content(result: RunResult, experiment: Experiment, accepted: boo
         identity={"arm": provenance["arm_sha256"], "data": provenance["data_sha256"], "source": provenance["data"]},
         environment_columns=tuple(filter(result.dataset.has, surroundings(result.system.arms))),
         noise=in_unit(_noise(result), unit),
-        **{f"quality_{unit}": result.table.as_dict()},
+        **quality,
         verdict={
             "headline": result.verdict.headline,
             "usable": not result.verdict.bad,
