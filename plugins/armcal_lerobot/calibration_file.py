@@ -72,7 +72,12 @@ def read_motors(path: Path) -> MotorFile:
     if not isinstance(content, dict) or not content:
         _refuse(path, "", f"found {_kind(content)}, expected {_EXPECTED}.", "Give LeRobot's calibration file.")
     motors = {name: _motor(path, name, entry) for name, entry in content.items()}
-    _require_own_ids(path, motors)
+    owners: dict[int, str] = {}
+    for name, motor in motors.items():
+        if (other := owners.setdefault(motor.id, name)) != name:
+            found = f"found {motor.id}, which {other} has too; expected an id of its own."
+            mend = "Give each servo its own id (lerobot-setup-motors), and correct the file."
+            _refuse(path, f"{name}.id", found, mend)
     return MotorFile(path, text, motors)
 
 
@@ -83,8 +88,16 @@ def read_json(path: Path, most: int, expected: str, hint: str) -> tuple[str, Any
         DataError: it cannot be read, is not JSON, or has a key twice.
     """
     text = text_of(input_bytes(path, most, expected), path, "Save it as UTF-8 text.")
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        names = [name for name, _ in pairs]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            _refuse(path, twice, "found this key twice, expected it once.", "Remove one of them.")
+        return dict(pairs)
+
     try:
-        return text, json.loads(text, object_pairs_hook=lambda pairs: _unique(path, pairs))
+        return text, json.loads(text, object_pairs_hook=unique)
     except (ValueError, RecursionError) as fault:
         where = Location(str(path), line=getattr(fault, "lineno", None))
         raise DataError(f"it is not JSON ({getattr(fault, 'msg', fault)}).", where=where, hint=hint) from fault
@@ -130,17 +143,6 @@ def _require_possible(path: Path, motor: Motor) -> None:
         _refuse(path, f"{name}.range_max", text, f"{_CALIBRATE}, and move the joint from end to end.")
 
 
-def _require_own_ids(path: Path, motors: Mapping[str, Motor]) -> None:
-    owners: dict[int, str] = {}
-    for name, motor in motors.items():
-        other = owners.setdefault(motor.id, name)
-        if other != name:
-            text = f"found {motor.id}, which {other} has too; expected an id of its own."
-            _refuse(
-                path, f"{name}.id", text, "Give each servo its own id (lerobot-setup-motors), and correct the file."
-            )
-
-
 def _notes(motor: Motor) -> list[str]:
     notes, name = [], motor.name
     if motor.drive_mode:
@@ -167,14 +169,6 @@ def _replaced(text: str, motor: str, field: str, value: int) -> str:
     entry = re.compile(re.escape(json.dumps(motor)) + r"\s*:\s*\{[^{}]*\}")
     number = re.compile(rf'("{field}"\s*:\s*)-?\d+')
     return entry.sub(lambda part: number.sub(rf"\g<1>{value}", part[0], count=1), text, count=1)
-
-
-def _unique(path: Path, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    names = [name for name, _ in pairs]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        _refuse(path, twice, "found this key twice, expected it once.", "Remove one of them.")
-    return dict(pairs)
 
 
 def _kind(value: Any) -> str:

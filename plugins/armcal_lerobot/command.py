@@ -218,7 +218,6 @@ def _gripper(console: Console, motors: list[str], **given: Any) -> Any:
 
 def _agreed(path: Path) -> bool:
     if not sys.stdin.isatty():
-        raise InputError(
-            f"there is no terminal to ask whether {path} may be written; nothing was written.", hint="Give --yes."
-        )
+        text = f"there is no terminal to ask whether {path} may be written; nothing was written."
+        raise InputError(text, hint="Give --yes.")
     return click.confirm(f"Write {path}?", err=True)

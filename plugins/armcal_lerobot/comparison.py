@@ -115,7 +115,17 @@ def findings_of(trackings: Sequence[Tracking]) -> list[str]:
             "follower's."
         )
     for t in trackings:
-        texts += _of_motor(t)
+        if t.gain and t.gain.high < 0:
+            texts.append(f"{t.motor} is inverted: its state moves {t.gain.value:+.2f} times as far as its command.")
+            continue
+        if t.gain and (t.gain.low > 1 + _SAME_GAIN or t.gain.high < 1 - _SAME_GAIN):
+            texts.append(
+                f"{t.motor} moves {t.gain.value:.3f} times as far as commanded: ranges that differ between leader and "
+                "follower, or something that stops it."
+            )
+        if t.offset and t.unit == "deg" and (teeth := teeth_of(t.offset.value)):
+            off = f"{t.offset.value:+.1f} deg from its command"
+            texts.append(f"{t.motor} stands {off}: {teeth_text(teeth)} would explain that.")
     return texts
 
 
@@ -143,24 +153,6 @@ def costs_at(gripper: Gripper, angles: Array, figures: Mapping[str, float]) -> d
     """Median mm at the gripper of angles (deg) by motor, over poses (n x N; rad)."""
     each_degree = {gripper.motor_of(joint)[0]: cost for joint, cost in gripper.per_degree(angles).items()}
     return {name: abs(value) * each_degree[name].typical_mm for name, value in figures.items() if name in each_degree}
-
-
-def _of_motor(t: Tracking) -> list[str]:
-    texts = []
-    if t.gain and t.gain.high < 0:
-        texts.append(f"{t.motor} is inverted: its state moves {t.gain.value:+.2f} times as far as its command.")
-        return texts
-    if t.gain and (t.gain.low > 1 + _SAME_GAIN or t.gain.high < 1 - _SAME_GAIN):
-        texts.append(
-            f"{t.motor} moves {t.gain.value:.3f} times as far as commanded: ranges that differ between leader and "
-            "follower, or something that stops it."
-        )
-    teeth = teeth_of(t.offset.value) if t.offset and t.unit == "deg" else 0
-    if teeth and t.offset:
-        texts.append(
-            f"{t.motor} stands {t.offset.value:+.1f} deg from its command: {teeth_text(teeth)} would explain that."
-        )
-    return texts
 
 
 def _poses(gripper: Gripper, motion: Motion, values: Array) -> Array:

@@ -62,8 +62,11 @@ class Gripper:
             # Where the gripper is needs no measurement: a file of the arm alone will do.
             system = build_system(replace(source, data={"measurements": {}, **source.data}), registry)
             parameters = system.parameters()
-        self.name = _chosen(path, tuple(system.arms), arm)
-        self._where = Location(str(path))
+        self._where, arms = Location(str(path)), tuple(system.arms)
+        self.name = arms[0] if arm is None and len(arms) == 1 else arm or ""
+        if self.name not in arms:
+            text = f"no arm is called {arm!r}." if arm else "found several arms."
+            raise ConfigError(text, where=self._where, hint=f"Choose one of {', '.join(arms)} with --arm-name.")
         expression = arm_expression(system.arms[self.name], parameters, system.environment)
         self.joints = expression.joints
         self.limits = joint_limits(system.arms[self.name].nominal_chain)
@@ -141,17 +144,6 @@ class Gripper:
             own[index] = by[index]
             alone[joint] = Cost.of(self.moved_m(angles, own))
         return alone, Cost.of(self.moved_m(angles, by))
-
-
-def _chosen(path: Path, arms: Sequence[str], arm: str | None) -> str:
-    if arm is None and len(arms) == 1:
-        return arms[0]
-    if arm not in arms:
-        text = f"no arm is called {arm!r}" if arm else "found several arms"
-        raise ConfigError(
-            f"{text}.", where=Location(str(path)), hint=f"Choose one of {', '.join(arms)} with --arm-name."
-        )
-    return str(arm)
 
 
 def require_single(names: Sequence[str]) -> None:

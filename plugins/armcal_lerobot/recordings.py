@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -129,16 +128,21 @@ class Recording:
         """
         counted: dict[int, int] = {}
         for file in self.files:
-            for frames in _read(file, features, {name: len(self.names[name]) for name in features}):
-                episodes, counts = np.unique(frames.episode, return_counts=True)
-                for episode, count in zip(episodes.tolist(), counts.tolist(), strict=True):
-                    counted[episode] = counted.get(episode, 0) + count
-                yield frames
-        for episode, length in self.lengths.items():
-            if counted.get(episode, 0) != length:
-                text = (
-                    f"found {counted.get(episode, 0)} frames of episode {episode}, expected {length} (its meta data)."
-                )
+            done = 0
+            for batch in _batches(file, (*_NUMBERS, *features)):
+                numbers = {name: _numbers(batch.column(name), file, name, done) for name in _NUMBERS}
+                sizes = {name: len(self.names[name]) for name in features}
+                vectors = {name: _vectors(batch.column(name), file, name, sizes[name], done) for name in features}
+                done += batch.num_rows
+                if not batch.num_rows:
+                    continue
+                episode, frame = (numbers[name].astype(np.int64) for name in _NUMBERS[1:])
+                for one, count in zip(*(part.tolist() for part in np.unique(episode, return_counts=True)), strict=True):
+                    counted[one] = counted.get(one, 0) + count
+                yield Frames(file, episode, frame, numbers["timestamp"], vectors)
+        for one, length in self.lengths.items():
+            if counted.get(one, 0) != length:
+                text = f"found {counted.get(one, 0)} frames of episode {one}, expected {length} (its meta data)."
                 raise DataError(text, where=Location(str(self.folder / "data")), hint=_RECORD_AGAIN)
 
 
@@ -169,10 +173,7 @@ def open_recording(folder: Path) -> Recording:
     if not files:
         text = "found no file data/chunk-*/*.parquet."
         raise DataError(text, where=Location(str(folder)), hint="Give the folder that holds meta and data.")
-    is_early = version.startswith("v2")
-    lengths = _lengths_of_lines(folder) if is_early else _lengths_of_tables(folder)
-    if is_early:
-        _require_files(folder, files, lengths)
+    lengths = _lengths_of_lines(folder, files) if version.startswith("v2") else _lengths_of_tables(folder)
     return Recording(folder, version, float(fps), frames, names, files, lengths)
 
 
@@ -207,7 +208,8 @@ def _vector_names(info: Mapping[str, Any], where: Location) -> dict[str, tuple[s
     return names
 
 
-def _lengths_of_lines(folder: Path) -> dict[int, int]:
+def _lengths_of_lines(folder: Path, files: Sequence[Path]) -> dict[int, int]:
+    """Of v2: frames by episode; each must have its file."""
     path = folder / "meta" / "episodes.jsonl"
     lengths: dict[int, int] = {}
     lines = text_of(input_bytes(path, _MAX_META, "a list of episodes"), path, "Save it as UTF-8.").splitlines()
@@ -219,6 +221,13 @@ def _lengths_of_lines(folder: Path) -> dict[int, int]:
         except (ValueError, KeyError, TypeError, OverflowError) as fault:
             text = "found a line without episode_index and length."
             raise DataError(text, where=Location(str(path), line=number), hint=_RECORD_AGAIN) from fault
+    there = {int(match[1]) for file in files if (match := _EPISODE_FILE.fullmatch(file.name))}
+    missing = [episode for episode in lengths if episode not in there]
+    if missing:
+        shown = ", ".join(f"episode_{episode:06d}.parquet" for episode in missing[:3])
+        more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+        text = f"found no file {shown}{more}, expected one for each line of meta/episodes.jsonl."
+        raise DataError(text, where=Location(str(folder / "data")), hint=_RECORD_AGAIN)
     return lengths
 
 
@@ -231,43 +240,17 @@ def _lengths_of_tables(folder: Path) -> dict[int, int]:
     return lengths
 
 
-def _require_files(folder: Path, files: Sequence[Path], lengths: Mapping[int, int]) -> None:
-    there = {int(match[1]) for file in files if (match := _EPISODE_FILE.fullmatch(file.name))}
-    missing = [episode for episode in lengths if episode not in there]
-    if missing:
-        shown = ", ".join(f"episode_{episode:06d}.parquet" for episode in missing[:3])
-        more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
-        text = f"found no file {shown}{more}, expected one for each line of meta/episodes.jsonl."
-        raise DataError(text, where=Location(str(folder / "data")), hint=_RECORD_AGAIN)
-
-
-def _read(file: Path, features: Sequence[str], sizes: Mapping[str, int]) -> Iterator[Frames]:
-    done = 0
-    for batch in _batches(file, (*_NUMBERS, *features)):
-        numbers = {name: _numbers(batch.column(name), file, name, done) for name in _NUMBERS}
-        vectors = {name: _vectors(batch.column(name), file, name, sizes[name], done) for name in features}
-        done += batch.num_rows
-        if batch.num_rows:
-            episode, frame = (numbers[name].astype(np.int64) for name in _NUMBERS[1:])
-            yield Frames(file, episode, frame, numbers["timestamp"], vectors)
-
-
 def _batches(file: Path, columns: Sequence[str]) -> Iterator[Any]:
+    """Rows of a parquet file, some at a time; what the library raises of a damaged one is a DataError with the file."""
     parquet = library("pyarrow.parquet", "reading LeRobot's data sets")
-    with _damage_named(file), parquet.ParquetFile(file, memory_map=True) as table:
-        there = table.schema_arrow.names
-        for column in columns:
-            if column not in there:
-                hint = "Record the data set again, or take out this file."
-                _refuse(file, column, f"found no column {column}; found {', '.join(there)[:200]}.", hint)
-        yield from table.iter_batches(batch_size=_ROWS_AT_ONCE, columns=list(columns), use_threads=False)
-
-
-@contextmanager
-def _damage_named(file: Path) -> Iterator[None]:
-    """What the library raises of a damaged file, as a DataError with the file."""
     try:
-        yield
+        with parquet.ParquetFile(file, memory_map=True) as table:
+            there = table.schema_arrow.names
+            for column in columns:
+                if column not in there:
+                    hint = "Record the data set again, or take out this file."
+                    _refuse(file, column, f"found no column {column}; found {', '.join(there)[:200]}.", hint)
+            yield from table.iter_batches(batch_size=_ROWS_AT_ONCE, columns=list(columns), use_threads=False)
     except (OSError, ValueError, KeyError) as fault:  # pyarrow's own errors derive from these
         text = f"it is damaged or cut off ({str(fault).splitlines()[0][:120] if str(fault) else type(fault).__name__})."
         raise DataError(text, where=Location(str(file)), hint=_RECORD_AGAIN) from fault

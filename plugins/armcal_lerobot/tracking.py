@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.stats import t as student
 
-from armcal_lerobot.motion import Motion, Stretch
+from armcal_lerobot.motion import Motion
 
 Torque = Callable[[Array], Array]
 """Gravity about the joints of the motors (N x motors; N m) for commands (N x motors); NaN for a motor without joint."""
@@ -146,7 +146,13 @@ def _tracking(motion: Motion, index: int, torque: Torque | None) -> Tracking:
     else:
         delay, doubt = _delay(motion, index)
         known = replace(known, delay_s=delay, doubts=(doubt,) if doubt else ())
-    return _at_rest(motion, index, known, torque)
+    width = 0.0
+    for _ in range(_STEPS):  # of Gauss and Newton: the backlash
+        estimate = _at_rest(motion, index, known, torque, width)
+        if estimate.backlash is None:
+            break
+        width = max(estimate.backlash.value, 0.0)
+    return estimate
 
 
 def _delay(motion: Motion, index: int) -> tuple[Figure | None, str]:
@@ -166,7 +172,7 @@ def _delay(motion: Motion, index: int) -> tuple[Figure | None, str]:
         keep = mask & np.isfinite(late) & (way > SETTLED)  # backlash looks like a delay where motion has one speed
         rows.append(np.column_stack([np.ones(keep.sum()), late[keep], -rate[keep], -side[keep]]))
         y.append(state[keep])
-        cluster.append(_clusters(number, np.flatnonzero(keep), _CLUSTER_S * fps))
+        cluster.append(number * 1_000_000 + np.flatnonzero(keep) // max(1, round(_CLUSTER_S * fps)))
     fit = _fit(np.concatenate(rows), np.concatenate(y), np.concatenate(cluster))
     if fit is None:
         return None, "too few motions: its delay cannot be known"
@@ -194,19 +200,8 @@ def _left(pairs: Sequence[tuple[Array, Array]], moving: Sequence[NDArray[np.bool
     return float(np.mean((y - slope * x - level) ** 2))
 
 
-def _at_rest(motion: Motion, index: int, known: Tracking, torque: Torque | None) -> Tracking:
-    """Gain, offset, backlash and load from slow frames; the backlash by steps of Gauss and Newton."""
-    width = 0.0
-    for _ in range(_STEPS):
-        estimate = _one_step(motion, index, known, torque, width)
-        if estimate.backlash is None:
-            break
-        width = max(estimate.backlash.value, 0.0)
-    return estimate
-
-
-def _one_step(motion: Motion, index: int, known: Tracking, torque: Torque | None, width: float) -> Tracking:
-    """The linear fit about one width of the play."""
+def _at_rest(motion: Motion, index: int, known: Tracking, torque: Torque | None, width: float) -> Tracking:
+    """Gain, offset, backlash and load from slow frames: the linear fit about one width of the play."""
     delay = (known.delay_s.value if known.delay_s else 0.0) * motion.fps
     rows = _slow_rows(motion, index, delay, width, torque)
     if rows is None:
@@ -248,40 +243,30 @@ def _slow_rows(
     motion: Motion, index: int, delay: float, width: float, torque: Torque | None
 ) -> tuple[Array, Array, Array, Array, Array, NDArray[np.int64]] | None:
     """Command through the play, state, speed, side, torque and cluster of slow frames whose play is taken up."""
-    parts: list[tuple[Array, ...]] = []
+    parts: list[tuple[Array, Array, Array, Array, Array, NDArray[np.int64]]] = []
     for number, stretch in enumerate(motion.stretches):
-        parts.append(_slow_part(motion, stretch, number, index, delay, width, torque))
-    command, state, speed, side, load, cluster = (np.concatenate(column) for column in zip(*parts, strict=True))
-    if len(np.unique(cluster)) < 2:
+        late = np.column_stack([delayed(column, delay) for column in stretch.commanded.T])
+        known = np.flatnonzero(np.isfinite(late).all(axis=1))
+        if len(known) < 3:
+            continue
+        late = late[known]
+        command, state = late[:, index], stretch.reached[known, index]
+        speed = np.gradient(command) * motion.fps
+        quick = np.abs(speed) > SLOW_A_SECOND
+        for frames in range(1, round(_SETTLES_S * motion.fps) + 1):
+            quick[frames:] |= np.abs(speed[:-frames]) > SLOW_A_SECOND
+        side, way = sides(command)
+        # A motor that never left its place has no side, and its offset counts all the same.
+        keep = ~quick & ((way > SETTLED) if np.ptp(command) > REVERSAL else np.ones(len(command), dtype=bool))
+        load = torque(late[keep])[:, index] if torque else np.full(int(keep.sum()), np.nan)
+        turns = np.cumsum(np.abs(np.diff(side, prepend=side[0])) > 0)
+        blocks = np.arange(len(command)) // max(1, round(_CLUSTER_S * motion.fps))
+        cluster = (number * 10**10 + turns * 10**5 + blocks)[keep]
+        parts.append((played(command, width)[keep], state[keep], speed[keep], side[keep], load, cluster))
+    if len({int(cluster) for part in parts for cluster in part[5]}) < 2:
         return None
-    return command, state, speed, side, load, cluster.astype(np.int64)
-
-
-def _slow_part(
-    motion: Motion, stretch: Stretch, number: int, index: int, delay: float, width: float, torque: Torque | None
-) -> tuple[Array, ...]:
-    late = np.column_stack([delayed(column, delay) for column in stretch.commanded.T])
-    known = np.flatnonzero(np.isfinite(late).all(axis=1))
-    if len(known) < 3:
-        return tuple(np.zeros(0) for _ in range(6))
-    late = late[known]
-    command, state = late[:, index], stretch.reached[known, index]
-    speed = np.gradient(command) * motion.fps
-    quick = np.abs(speed) > SLOW_A_SECOND
-    for frames in range(1, round(_SETTLES_S * motion.fps) + 1):
-        quick[frames:] |= np.abs(speed[:-frames]) > SLOW_A_SECOND
-    side, way = sides(command)
-    # A motor that never left its place has no side, and its offset counts all the same.
-    keep = ~quick & ((way > SETTLED) if np.ptp(command) > REVERSAL else np.ones(len(command), dtype=bool))
-    load = torque(late[keep])[:, index] if torque else np.full(int(keep.sum()), np.nan)
-    turns = np.cumsum(np.abs(np.diff(side, prepend=side[0])) > 0)
-    blocks = np.arange(len(command)) // max(1, round(_CLUSTER_S * motion.fps))
-    cluster = (number * 10**10 + turns * 10**5 + blocks)[keep]
-    return played(command, width)[keep], state[keep], speed[keep], side[keep], load, cluster.astype(float)
-
-
-def _clusters(number: int, frames: NDArray[np.intp], length: float) -> NDArray[np.int64]:
-    return (number * 1_000_000 + frames // max(1, round(length))).astype(np.int64)
+    command, state, speed, side, load, cluster = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return command, state, speed, side, load, cluster
 
 
 def _unobstructed(rows: Array, y: Array) -> NDArray[np.bool_]:

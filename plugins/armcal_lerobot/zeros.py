@@ -24,7 +24,21 @@ def rezeroed(file: MotorFile, zeros: Mapping[str, tuple[Zero, int]]) -> dict[str
     Raises:
         InputError: an offset is larger than a servo stores, or nothing is left of a range.
     """
-    return {name: _moved(file, file.motors[name], zero, sense) for name, (zero, sense) in zeros.items()}
+    changed = {}
+    for name, (zero, sense) in zeros.items():
+        motor, counts = file.motors[name], -round(sense * zero.degrees / DEGREES_A_COUNT)
+        offset, trim = motor.homing_offset + counts, 0 if motor.turns_freely else abs(counts)
+        where = Location(str(file.path), field=f"{name}.homing_offset")
+        if abs(offset) > LARGEST_OFFSET:
+            limits = f"-{LARGEST_OFFSET} to {LARGEST_OFFSET} (a sign and 11 bits)"
+            raise InputError(f"the new offset would be {offset}, expected {limits}.", where=where, hint=remount(offset))
+        if motor.range_max - motor.range_min <= 2 * trim:
+            text = f"the zero would move by {zero.degrees:+.1f} deg, more than half of the range."
+            hint = "Run lerobot-calibrate again, with the joint moved from end to end, then calibrate the arm again."
+            raise InputError(text, where=where, hint=hint)
+        low, high = motor.range_min + trim, motor.range_max - trim
+        changed[name] = replace(motor, homing_offset=offset, range_min=low, range_max=high)
+    return changed
 
 
 def require_not_written(file: MotorFile, zeros: Mapping[str, tuple[Zero, int]]) -> None:
@@ -35,17 +49,3 @@ def require_not_written(file: MotorFile, zeros: Mapping[str, tuple[Zero, int]]) 
             hint = "Record anew with this file, and calibrate from those records; or take the old file back first."
             text = f"it has these zeros already: they were written over {path.name}."
             raise InputError(text, where=Location(str(file.path)), hint=hint)
-
-
-def _moved(file: MotorFile, motor: Motor, zero: Zero, sense: int) -> Motor:
-    counts = -round(sense * zero.degrees / DEGREES_A_COUNT)
-    offset, trim = motor.homing_offset + counts, 0 if motor.turns_freely else abs(counts)
-    where = Location(str(file.path), field=f"{motor.name}.homing_offset")
-    if abs(offset) > LARGEST_OFFSET:
-        text = f"the new offset would be {offset}, expected -{LARGEST_OFFSET} to {LARGEST_OFFSET} (a sign and 11 bits)."
-        raise InputError(text, where=where, hint=remount(offset))
-    if motor.range_max - motor.range_min <= 2 * trim:
-        text = f"the zero would move by {zero.degrees:+.1f} deg, more than half of the range."
-        hint = "Run lerobot-calibrate again, with the joint moved from end to end, then calibrate the arm again."
-        raise InputError(text, where=where, hint=hint)
-    return replace(motor, homing_offset=offset, range_min=motor.range_min + trim, range_max=motor.range_max - trim)

@@ -12,7 +12,6 @@ from armcal.base.domains import Array
 from armcal.base.settings import Settings
 from armcal.calibration.exporter import Exported, ExportRequest, changed_numbers, random_commands
 from armcal.calibration.rigid_chain import (
-    RigidJoint,
     largest_difference,
     numeric_chain,
     require_plain_axes,
@@ -21,7 +20,7 @@ from armcal.calibration.rigid_chain import (
 from armcal.errors import ConfigError, ProblemError
 
 from armcal_makers.formats import HASH, MARK, read_text
-from armcal_makers.frames import KEYS, at_zero, between, differences, placed, six_of, tips
+from armcal_makers.frames import KEYS, about_z, at_zero, between, differences, placed, six_of, tips
 from armcal_makers.nominal import FARTHEST_M, FARTHEST_RAD, UR, XARM, Family, Nominal, nearest, nominal_arms
 
 TOLERANCE = 1e-9
@@ -61,7 +60,9 @@ class XarmExporter:
             ConfigError: it is no arm of this maker, or its hash is not known.
             ProblemError: a joint has a pitch, or what was written is not the calibrated arm.
         """
-        chain = _chain(request)
+        scope = f"{request.name}.{request.arm.model_name}."
+        values = {n.removeprefix(scope): v for n, v in request.values.items() if n.startswith(scope)}
+        chain = numeric_chain(request.arm.model, values)
         axes, flange = _at_zero(chain, self.family)
         nominal = self._nominal(axes)
         drawn = at_zero(nominal.frames)
@@ -108,12 +109,6 @@ class UrExporter(XarmExporter):
         return {"hash": own}
 
 
-def _chain(request: ExportRequest) -> Chain:
-    scope = f"{request.name}.{request.arm.model_name}."
-    values = {n.removeprefix(scope): v for n, v in request.values.items() if n.startswith(scope)}
-    return numeric_chain(request.arm.model, values)
-
-
 def _flange_poses(chain: Chain, family: Family, commands: Array) -> tuple[Array, Array]:
     """The maker's base (4x4), and its flange at commands (N x n; rad) in it (N x 4 x 4).
 
@@ -139,18 +134,11 @@ def _at_zero(chain: Chain, family: Family) -> tuple[Array, Array]:
     if wrong:
         raise ConfigError(f"{', '.join(wrong)} slides or follows another joint.", hint="Export it as a URDF.")
     base, flange = _flange_poses(chain, family, np.zeros((1, len(chain.joints))))
-    return np.array([np.linalg.solve(base, _along_z(joint)) for joint in arm.joints]), flange[0]
-
-
-def _along_z(joint: RigidJoint) -> Array:
-    """The joint's frame with z along its axis (4x4)."""
-    frame, z = np.array(joint.base_T_joint), joint.direction
-    if np.abs(joint.axis - (0, 0, 1)).max() > 1e-12:
-        x = frame[:3, int(np.argmin(np.abs(joint.axis)))]
-        x = x - z * (z @ x)
-        x = x / np.linalg.norm(x)
-        frame[:3, :3] = np.column_stack([x, np.cross(z, x), z])
-    return frame
+    frames = [np.array(joint.base_T_joint) for joint in arm.joints]
+    for joint, frame in zip(arm.joints, frames, strict=True):
+        if np.abs(joint.axis - (0, 0, 1)).max() > 1e-12:
+            frame[:3, :3] = about_z(joint.direction, frame[:3, int(np.argmin(np.abs(joint.axis)))])
+    return np.linalg.solve(base, np.array(frames)), flange[0]
 
 
 def _compare(request: ExportRequest, chain: Chain, family: Family, frames: Array, left: Array) -> None:

@@ -76,20 +76,20 @@ def placed(axes: Array, flange: Array, nominal: Array) -> Array:
         apart = np.linalg.norm(own[:3, 3] - drawn[:3, 3])
         turned = Rotation.from_matrix(drawn[:3, :3].T @ own[:3, :3]).magnitude()
         near = apart < _NEAR_M and turned < _NEAR_RAD and drawn is not flange
-        moved.append(own if near else _on_axis(own, drawn))
+        frame = own.copy()
+        if not near:
+            z, point = own[:3, 2], own[:3, 3]
+            frame[:3, :3] = about_z(z, drawn[:3, 0] if abs(z @ drawn[:3, 0]) < _ALONG else own[:3, 0])
+            frame[:3, 3] = point + z * (z @ (drawn[:3, 3] - point))
+        moved.append(frame)
     return np.array(moved)
 
 
-def _on_axis(own: Array, drawn: Array) -> Array:
-    """The frame with the z axis of one, nearest to another (4x4 each)."""
-    z, point = own[:3, 2], own[:3, 3]
-    towards = drawn[:3, 0] if abs(z @ drawn[:3, 0]) < _ALONG else own[:3, 0]
+def about_z(z: Array, towards: Array) -> Array:
+    """The rotation (3x3) with this z axis (unit), and x as near as that lets it to a direction."""
     x = towards - z * (z @ towards)
     x = x / np.linalg.norm(x)
-    frame = np.eye(4)
-    frame[:3, :3] = np.column_stack([x, np.cross(z, x), z])
-    frame[:3, 3] = point + z * (z @ (drawn[:3, 3] - point))
-    return frame
+    return np.column_stack([x, np.cross(z, x), z])
 
 
 def differences(frames: Array, others: Array) -> tuple[Array, Array]:

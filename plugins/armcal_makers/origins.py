@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 from armcal.arm.assembly import Arm
-from armcal.arm.model import Joint
 from armcal.base.domains import Array
 from armcal.calibration.convert_check import nominal_values
 from armcal.calibration.exporter import Exporter, ExportRequest, random_commands, rigid_tools
@@ -93,17 +92,22 @@ class OwnUrdf:
         Raises:
             DataError: an offset is no number or too large, or none belongs to the arm.
         """
-        offsets = {name: _offset(entry) for name, entry in root.entries.items()}
+        offsets = {name: entry.number for name, entry in root.entries.items()}
+        for name, entry in root.entries.items():
+            if abs(offsets[name]) > _MOST:
+                hint = "Check its unit: it looks like mm or degrees."
+                entry.refuse(f"found {offsets[name]:g}, expected m or rad.", hint)
         moving = {joint.name: joint for joint in self.arm.nominal_chain.joints}
         frames, used = {}, set()
         for joint, origin in self.origins.items():
             keys = [f"{joint}_{part}" for part in _FRAME]
             own = {joint, *keys} & set(offsets)
             if own:
-                change = _motion([offsets.get(key, 0.0) for key in keys])
-                frames[joint] = origin @ change
-                if joint in moving:
-                    frames[joint] = frames[joint] @ _along(moving[joint], offsets.get(joint, 0.0))
+                frames[joint] = origin @ _motion([offsets.get(key, 0.0) for key in keys])
+                if joint in moving:  # its own motion, rad or m
+                    still, moved = [0.0] * 3, [offsets.get(joint, 0.0) * part for part in moving[joint].axis]
+                    along = [*still, *moved] if moving[joint].is_revolute else [*moved, *still]
+                    frames[joint] = frames[joint] @ _motion(along)
             used |= own
         if not used:
             names = ", ".join(list(offsets)[:6])
@@ -125,20 +129,8 @@ class OwnUrdf:
         return Placed(content, joints, unused, tools)
 
 
-def _offset(entry: Entry) -> float:
-    if abs(entry.number) > _MOST:
-        entry.refuse(f"found {entry.number:g}, expected m or rad.", "Check its unit: it looks like mm or degrees.")
-    return entry.number
-
-
 def _motion(offsets: list[float]) -> Array:
     """x, y, z (m) and a rotation vector (rad) as a 4x4 matrix."""
     matrix = np.eye(4)
     matrix[:3, 3], matrix[:3, :3] = offsets[:3], Rotation.from_rotvec(offsets[3:]).as_matrix()
     return matrix
-
-
-def _along(joint: Joint, offset: float) -> Array:
-    """A joint's own motion by its offset (rad or m)."""
-    still, moved = [0.0, 0.0, 0.0], [offset * part for part in joint.axis]
-    return _motion([*still, *moved] if joint.is_revolute else [*moved, *still])
