@@ -65,11 +65,8 @@ class Bench:
             ConfigError: none is configured, or it is refused.
         """
         if experiment.settings.bench is None:
-            raise ConfigError(
-                "found no bench.",
-                where=experiment.source.where((SECTION,)),
-                hint="Say what moves and measures the arm: bench: {link: ..., device: ..., tracker: ...}.",
-            )
+            hint = "Say what moves and measures the arm: bench: {link: ..., device: ..., tracker: ...}."
+            raise ConfigError("found no bench.", where=experiment.source.where((SECTION,)), hint=hint)
         return cls(experiment, validate(BenchSettings, experiment.source, (SECTION,)))
 
     @property
@@ -81,11 +78,9 @@ class Bench:
         """
         arms = list(self.experiment.system.arms.values())
         if len(arms) != 1:
-            raise ConfigError(
-                f"found {len(arms)} arms, expected one: a bench moves a single arm.",
-                where=self.experiment.source.where(("arms",)),
-                hint="Configure each arm's bench on its own.",
-            )
+            text = f"found {len(arms)} arms, expected one: a bench moves a single arm."
+            hint = "Configure each arm's bench on its own."
+            raise ConfigError(text, where=self.experiment.source.where(("arms",)), hint=hint)
         return arms[0]
 
     @contextmanager
@@ -136,9 +131,7 @@ class Bench:
     def _built(self, part: str, *context: Any, kind: str = "") -> Any:
         at = (SECTION, part)
         if getattr(self.settings, part) is None:
-            raise ConfigError(
-                f"found no {part} of the bench.",
-                where=self.experiment.source.where((SECTION,)),
-                hint=f"Give bench: {{{part}: {{type: NAME, ...}}}}; see armcal plugins list.",
-            )
+            text = f"found no {part} of the bench."
+            hint = f"Give bench: {{{part}: {{type: NAME, ...}}}}; see armcal plugins list."
+            raise ConfigError(text, where=self.experiment.source.where((SECTION,)), hint=hint)
         return build_component(self.experiment.source, self.experiment.registry, kind or part, at, *context)[0]

@@ -82,15 +82,14 @@ class Zero:
         if self.is_sure and not self.teeth[0][0] and not self.is_far:
             return ""
         amount = f"{math.degrees(self.value):+.1f} +- {math.degrees(self.sd):.1f} deg"
-        shares = [(self._as_teeth(k), "" if self.is_sure else f" ({100 * share:.0f} %)") for k, share in self.teeth]
+        causes = []
+        for number, share in self.teeth:
+            count, zero = abs(number), math.degrees(self.value) - number * _TOOTH_DEG
+            teeth = f"{count} {'tooth' if count == 1 else 'teeth'} of its horn ({_TOOTH_DEG:.1f} deg each)"
+            cause = f"{teeth} and a zero of {zero:+.1f} deg" if number else "a zero set by hand"
+            causes.append(cause if self.is_sure else f"{cause} ({100 * share:.0f} %)")
         mend = " Remount the horn, or move its zero_count." if self.is_far else ""
-        return f"{joint} stands {amount} from where its servo says: {', or '.join(map(''.join, shares))}.{mend}"
-
-    def _as_teeth(self, number: int) -> str:
-        if not number:
-            return "a zero set by hand"
-        teeth = f"{abs(number)} {'tooth' if abs(number) == 1 else 'teeth'} of its horn ({_TOOTH_DEG:.1f} deg each)"
-        return f"{teeth} and a zero of {math.degrees(self.value) - number * _TOOTH_DEG:+.1f} deg"
+        return f"{joint} stands {amount} from where its servo says: {', or '.join(causes)}.{mend}"
 
 
 @dataclass(frozen=True)
@@ -161,11 +160,9 @@ def _measured(experiment: Experiment) -> tuple[dict[str, float], dict[str, Any]]
     bench = Bench.of(experiment)
     device = bench.device()
     if not isinstance(device, MeasuringDevice):
-        raise ConfigError(
-            "found a device whose servos do not know where they stand, and no servo file.",
-            where=experiment.source.where((SECTION, "device")),
-            hint="Name the servo file in bench.device.servos.",
-        )
+        text = "found a device whose servos do not know where they stand, and no servo file."
+        hint = "Name the servo file in bench.device.servos."
+        raise ConfigError(text, where=experiment.source.where((SECTION, "device")), hint=hint)
     with bench.clock() as clock:
         try:
             adapter = device.open(clock).adapter
@@ -194,8 +191,11 @@ def _judged(
     zeros: dict[str, Zero] = {}
     if len(seen) == len(joints) and {verdict.kind for verdict in verdicts} <= {"right", "unclear"}:
         names = [_BASE, *joints]
-        poses = np.array([commanded[name] for name in names])
-        zeros = _zeros(nominal, joints, (poses, np.array([measured[name] for name in names])), _target(experiment))
+        poses = np.array([commanded[name] for name in names]), np.array([measured[name] for name in names])
+        scope, stated = measured_by(experiment)[0], experiment.parameters
+        axes = [f"{scope}.target_{axis}" for axis in "xyz"]
+        target = np.array([stated[name].nominal[0] if name in stated.names else 0.0 for name in axes])
+        zeros = _zeros(nominal, joints, poses, target)
         # a zero that is far off turns the axes of the joints after it away from the model's
         verdicts = _verdicts(moves, {joint: base[joint] + zeros[joint].value for joint in joints}, nominal)
     for joint in joints:
@@ -208,13 +208,6 @@ def _judged(
 def _verdicts(moves: Sequence[Move], base: Mapping[str, float], nominal: NominalArm) -> list[Verdict]:
     verdicts = judged(moves, base, nominal) if moves else []
     return [replace(verdict, mend=_MENDS.get(verdict.kind, verdict.mend)) for verdict in verdicts]
-
-
-def _target(experiment: Experiment) -> Array:
-    """Where the measured target is stated to sit (3, m, tool frame)."""
-    scope, stated = measured_by(experiment)[0], experiment.parameters
-    names = [f"{scope}.target_{axis}" for axis in "xyz"]
-    return np.array([stated[name].nominal[0] if name in stated.names else 0.0 for name in names])
 
 
 def _zeros(nominal: NominalArm, joints: list[str], poses: tuple[Array, Array], target: Array) -> dict[str, Zero]:

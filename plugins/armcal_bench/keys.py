@@ -139,21 +139,17 @@ class TerminalKeys(Typed, Keys):
         return [command for command in pressed if command is not None]
 
     def _pressed(self, key: str) -> str | None:
-        """The command that a key completes."""
-        if self._name is not None:
-            return self._letter(key, self._name)
-        if key in "\r\n":
-            return "c"
-        if key == _END_OF_INPUT:
-            return END
-        if key == "g":
-            self._name = ""
-            self._echo("name: ")
+        """The command that a key completes, or a letter of a name."""
+        name = self._name
+        if name is None:
+            if key == "g":
+                self._name = ""
+                self._echo("name: ")
+            elif key in "\r\n" or key == _END_OF_INPUT:
+                return "c" if key in "\r\n" else END
+            elif key.isprintable() and not key.isspace():
+                return key
             return None
-        return key if key.isprintable() and not key.isspace() else None
-
-    def _letter(self, key: str, name: str) -> str | None:
-        """The command that a letter of a name completes."""
         if key in "\r\n" or key in (_ESCAPE, _END_OF_INPUT):
             self._name = None
             self._echo("\n")

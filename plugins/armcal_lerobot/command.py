@@ -150,10 +150,8 @@ def compare(console: Console, dataset: Path, second: Path | None, out: Path | No
     read = partial(read_motion, units=units, file=file)
     motions = [read(open_recording(folder)) for folder in (dataset, second) if folder]
     if len(motions) == 2 and set(motions[0].motors) != set(motions[1].motors):
-        raise InputError(
-            f"found the motors {', '.join(motions[1].motors)} in {second}, expected {', '.join(motions[0].motors)}.",
-            hint="Compare data sets of arms with the same motors.",
-        )
+        text = f"found the motors {', '.join(motions[1].motors)} in {second}, expected {', '.join(motions[0].motors)}."
+        raise InputError(text, hint="Compare data sets of arms with the same motors.")
     gripper = _gripper(console, list(motions[0].motors), **given)
     if gripper and units == "percent" and file is None:
         raise InputError("found numbers in percent, expected degrees for mm.", hint="Give --calibration FILE as well.")

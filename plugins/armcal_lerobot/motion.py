@@ -132,11 +132,9 @@ def require_motors(file: MotorFile, motors: Sequence[str]) -> None:
     """Raise InputError if a calibration file lacks one of the motors."""
     missing = [name for name in motors if name not in file.motors]
     if missing:
-        raise InputError(
-            f"found no motor {missing[0]}; it has {', '.join(file.motors)}.",
-            where=Location(str(file.path)),
-            hint="Give the calibration file of the arm that the data set was recorded with.",
-        )
+        text = f"found no motor {missing[0]}; it has {', '.join(file.motors)}."
+        hint = "Give the calibration file of the arm that the data set was recorded with."
+        raise InputError(text, where=Location(str(file.path)), hint=hint)
 
 
 def unit_of(name: str, units: Units, file: MotorFile | None) -> tuple[float, str]:

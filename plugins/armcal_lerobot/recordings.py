@@ -200,11 +200,8 @@ def _vector_names(info: Mapping[str, Any], where: Location) -> dict[str, tuple[s
     for feature in (STATE, ACTION):
         if feature not in names:
             shown = ", ".join(features) or "none"
-            raise DataError(
-                f"found no feature {feature}, expected it as a vector of numbers; found {shown[:200]}.",
-                where=where,
-                hint="Only data sets of arms whose joints were recorded can be used.",
-            )
+            text = f"found no feature {feature}, expected it as a vector of numbers; found {shown[:200]}."
+            raise DataError(text, where=where, hint="Only data sets of arms whose joints were recorded can be used.")
     return names
 
 

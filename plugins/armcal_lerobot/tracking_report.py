@@ -35,13 +35,27 @@ Table = tuple[str, tuple[str, ...], list[list[str]]]
 
 
 def compare_content(motions: Sequence[Motion], gripper: Gripper | None) -> dict[str, Any]:
-    """Everything that one data set says, or two."""
+    """Everything that one data set says, or two, and what differs from the first to the second."""
     followed = [trackings(m, gravity_of(gripper, m.motors) if gripper else None) for m in motions]
     sets = [_content(motion, of_set, gripper) for motion, of_set in zip(motions, followed, strict=True)]
     content: dict[str, Any] = {"sets": sets, "cannot_show": LIMITS_OF_DATA}
-    if len(motions) == 2:
-        content["between"] = _between(motions, [{t.motor: t for t in of_set} for of_set in followed], gripper)
-    return content
+    if len(motions) < 2:
+        return content
+    moved = shifts(*motions)
+    motors: dict[str, Any] = {}
+    for shift in moved:
+        one, two = (next(t for t in of_set if t.motor == shift.motor) for of_set in followed)
+        entry: dict[str, Any] = {"unit": shift.unit, "doubt": shift.doubt}
+        entry["start"] = asdict(shift.start) if shift.start else None
+        for key in _FIGURES:
+            first, second = getattr(one, key), getattr(two, key)
+            entry[key] = asdict(second.minus(first)) if first and second else None
+        motors[shift.motor] = entry
+    if gripper is not None:
+        figures = {s.motor: s.start.value for s in moved if s.start and s.unit == "deg"}
+        for name, cost in costs_at(gripper, poses_of(motions[0], gripper), figures).items():
+            motors[name]["start_mm"] = cost
+    return {**content, "between": {"motors": motors, "findings": shift_findings(moved, *motions)}}
 
 
 def show_compare(console: Console, content: Mapping[str, Any]) -> None:
@@ -78,27 +92,6 @@ def _content(motion: Motion, followed: Sequence[Tracking], gripper: Gripper | No
         figures = {t.motor: figure.value for t in followed if t.unit == "deg" and (figure := getattr(t, key))}
         for name, cost in costs_at(gripper, angles, figures).items():
             content["motors"][name][f"{key}_mm"] = cost
-    return content
-
-
-def _between(
-    motions: Sequence[Motion], followed: Sequence[Mapping[str, Tracking]], gripper: Gripper | None
-) -> dict[str, Any]:
-    """What differs from the first data set to the second."""
-    moved = shifts(*motions)
-    content: dict[str, Any] = {"motors": {}, "findings": shift_findings(moved, *motions)}
-    for shift in moved:
-        one, two = (of_motor[shift.motor] for of_motor in followed)
-        entry: dict[str, Any] = {"unit": shift.unit, "doubt": shift.doubt}
-        entry["start"] = asdict(shift.start) if shift.start else None
-        for key in _FIGURES:
-            first, second = getattr(one, key), getattr(two, key)
-            entry[key] = asdict(second.minus(first)) if first and second else None
-        content["motors"][shift.motor] = entry
-    if gripper is not None:
-        figures = {s.motor: s.start.value for s in moved if s.start and s.unit == "deg"}
-        for name, cost in costs_at(gripper, poses_of(motions[0], gripper), figures).items():
-            content["motors"][name]["start_mm"] = cost
     return content
 
 

@@ -111,8 +111,12 @@ def _of_yaml(root: Entry, path: Path, robot: str | None, arms: dict[str, Nominal
     nominal = nearest({arm.name: frames for arm in known}, robot, Location(str(path)))
     if nominal.family is not UR:
         return MakersArm(nominal, frames, nominal.family.format)
-    moving = np.array([pose(row, "XYZ") for row in rows])
-    return MakersArm(nominal, frames, UR.format, _hash(kinematics), moving)
+    entry = kinematics.entries.get("hash")
+    text = (entry.text if entry else None) or ""
+    if not HASH.fullmatch(text):
+        hint = "Without it the driver cannot tell whose calibration it is. Extract the file from the robot again."
+        kinematics.refuse(f"found {repr(text[:40]) if text else 'no hash'}, expected hash: calib_ and a number.", hint)
+    return MakersArm(nominal, frames, UR.format, text, np.array([pose(row, "XYZ") for row in rows]))
 
 
 def _six(section: Entry) -> list[float]:
@@ -125,15 +129,6 @@ def _six(section: Entry) -> list[float]:
     return numbers
 
 
-def _hash(kinematics: Entry) -> str:
-    entry = kinematics.entries.get("hash")
-    text = entry.text if entry else None
-    if text is None or not HASH.fullmatch(text):
-        hint = "Without it the driver cannot tell whose calibration it is. Extract the file from the robot again."
-        kinematics.refuse(f"found {repr(text[:40]) if text else 'no hash'}, expected hash: calib_ and a number.", hint)
-    return text
-
-
 def _of_conf(text: str, path: Path, robot: str | None, arms: dict[str, Nominal]) -> MakersArm:
     """Deltas of standard Denavit-Hartenberg rows, added to the nominal ones, and moved back to the links."""
     deltas = _deltas(text, path)
@@ -141,14 +136,12 @@ def _of_conf(text: str, path: Path, robot: str | None, arms: dict[str, Nominal])
     if robot is None or robot not in choices:
         reason = "it holds only differences from a nominal arm" if robot is None else f"found {robot}"
         refuse(path, f"{reason}, expected a UR.", f"Give --robot, one of {', '.join(choices)}.")
-    fitted = {name: _with(deltas, arm) for name, arm in choices.items()}
+    fitted = {}
+    for name, arm in choices.items():
+        rows = (row + deltas[key] for row, key in zip(ur_rows(name), _CONF, strict=True))
+        zero = at_zero(dh_frames(*rows))
+        fitted[name] = between(placed(zero, zero[-1], at_zero(arm.frames)))
     return MakersArm(nearest(fitted, robot, Location(str(path))), fitted[robot], "ur_controller")
-
-
-def _with(deltas: dict[str, Array], nominal: Nominal) -> Array:
-    theta, a, d, alpha = (row + deltas[name] for row, name in zip(ur_rows(nominal.name), _CONF, strict=True))
-    zero = at_zero(dh_frames(theta, a, d, alpha))
-    return between(placed(zero, zero[-1], at_zero(nominal.frames)))
 
 
 def _deltas(text: str, path: Path) -> dict[str, Array]:

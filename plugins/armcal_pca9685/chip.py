@@ -103,8 +103,15 @@ class Chip:
         is_running = not mode1 & (SLEEP | RESTART)
         prescale, mode2 = self._read(PRE_SCALE, 1)[0], self._read(MODE2, 1)[0]
         if not is_running or (prescale, mode2) != (self._prescale, OUTDRV):
-            if is_running and foreign_pulses == "refuse":
-                self._refuse_pulses(prescale, mode2)
+            if is_running and foreign_pulses == "refuse" and (pulsed := self._pulsed()):
+                found = f"found prescale {prescale} and MODE2 0x{mode2:02x} with pulses on channels"
+                raise DeviceRefusedError(
+                    f"{found} {', '.join(map(str, pulsed))}, expected prescale {self._prescale} and MODE2 "
+                    f"0x{OUTDRV:02x}.",
+                    where=self.where,
+                    hint="Hold the arm, and switch the servos' power and the board off and on; or set foreign_pulses: "
+                    "end, which lets go of the arm.",
+                )
             self._set_up()
         elif mode1 & (SUB_ADDRESSES | ALL_CALL):
             self._write(MODE1, AUTO_INCREMENT)
@@ -120,11 +127,8 @@ class Chip:
             mode1 = self._read(MODE1, 1)[0]
             if mode1 == AUTO_INCREMENT:
                 return
-        raise DeviceResetError(
-            f"found MODE1 = 0x{mode1:02x}, expected 0x{AUTO_INCREMENT:02x}: it has forgotten its set-up.",
-            where=self.where,
-            hint="Look at its supply: did the servos pull it down?",
-        )
+        text = f"found MODE1 = 0x{mode1:02x}, expected 0x{AUTO_INCREMENT:02x}: it has forgotten its set-up."
+        raise DeviceResetError(text, where=self.where, hint="Look at its supply: did the servos pull it down?")
 
     def channels(self, channels: Iterable[int]) -> dict[int, Channel]:
         """What stands in these channels' registers; read until two readings agree, for links without a checksum."""
@@ -151,11 +155,9 @@ class Chip:
             read_back = self._link.read(self._address, register, CHANNEL_BYTES)
             if read_back == data:
                 return
-        raise DeviceError(
-            f"found {read_back.hex(' ')} in channel {channel}, expected {data.hex(' ')}, which was written twice.",
-            where=self.where,
-            hint="Look at the bus: wires, pull-ups, and whether another program uses it.",
-        )
+        text = f"found {read_back.hex(' ')} in channel {channel}, expected {data.hex(' ')}, which was written twice."
+        hint = "Look at the bus: wires, pull-ups, and whether another program uses it."
+        raise DeviceError(text, where=self.where, hint=hint)
 
     def _channels(self, chosen: list[int]) -> dict[int, Channel]:
         channels: dict[int, Channel] = {}
@@ -166,24 +168,14 @@ class Chip:
                 channels[channel] = Channel.unpack(data[CHANNEL_BYTES * (channel - first) :])
         return {channel: channels[channel] for channel in chosen}
 
-    def _refuse_pulses(self, prescale: int, mode2: int) -> None:
-        """Refuse if there are pulses: to set it up anew would let go of what they hold."""
-        pulsed = [channel for channel, set_to in self.channels(range(CHANNELS)).items() if set_to.counts is not None]
-        if not pulsed:
-            return
-        listed = ", ".join(map(str, pulsed))
-        text = f"found prescale {prescale} and MODE2 0x{mode2:02x} with pulses on channels {listed}"
-        raise DeviceRefusedError(
-            f"{text}, expected prescale {self._prescale} and MODE2 0x{OUTDRV:02x}.",
-            where=self.where,
-            hint="Hold the arm, and switch the servos' power and the board off and on; or set foreign_pulses: end, "
-            "which lets go of the arm.",
-        )
+    def _pulsed(self) -> list[int]:
+        """Channels that have pulses: to set it up anew would let go of what they hold."""
+        return [channel for channel, set_to in self.channels(range(CHANNELS)).items() if set_to.counts is not None]
 
     def _set_up(self) -> None:
         """Prescale and modes, while no channel has pulses."""
         self._link.write(self._address, bytes((ALL_LED,)) + Channel(0, FULL).pack())
-        if any(set_to.counts is not None for set_to in self.channels(range(CHANNELS)).values()):
+        if self._pulsed():
             raise DeviceError("its pulses did not end as they should have.", where=self.where, hint="Try again.")
         self._write(MODE1, AUTO_INCREMENT | SLEEP)
         self._write(PRE_SCALE, self._prescale)
@@ -198,11 +190,9 @@ class Chip:
         expected = {MODE1: AUTO_INCREMENT, MODE2: OUTDRV, PRE_SCALE: self._prescale}
         read_back = {register: self._read(register, 1)[0] for register in expected}
         if read_back != expected:
-            raise DeviceError(
-                f"found {_listed(read_back)}, expected {_listed(expected)}: its set-up does not read back.",
-                where=self.where,
-                hint="Is it a PCA9685, and alone at this address? Look at the bus: wires, pull-ups.",
-            )
+            text = f"found {_listed(read_back)}, expected {_listed(expected)}: its set-up does not read back."
+            hint = "Is it a PCA9685, and alone at this address? Look at the bus: wires, pull-ups."
+            raise DeviceError(text, where=self.where, hint=hint)
 
     def _read(self, register: int, count: int) -> bytes:
         return self._link.read(self._address, register, count)

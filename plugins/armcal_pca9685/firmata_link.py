@@ -77,11 +77,8 @@ class FirmataLink(Link):
             if data is not None and not complaint:
                 return data[:count]
         if complaint:
-            raise DeviceError(
-                f"the device at 0x{address:02x} does not answer; the board says {complaint!r}.",
-                where=self._where,
-                hint="Check its address, power and wires.",
-            )
+            text = f"the device at 0x{address:02x} does not answer; the board says {complaint!r}."
+            raise DeviceError(text, where=self._where, hint="Check its address, power and wires.")
         self._port.close()
         raise DeviceLostError("the board does not answer.", where=self._where, hint="Look at its cable and power.")
 

@@ -179,19 +179,15 @@ class FramedLink(GuardedLink, Link):
             raise DeviceError(
                 f"the board's answer cannot be read ({fault}).", where=self._where, hint="Load its firmware anew."
             ) from fault
-        if self._boots is not None and head.boots != self._boots:
+        if self._boots not in (None, head.boots) or (refusal and refusal.code == Code.WRONG_BOOTS):
             self._port.close()
             raise DeviceResetError("the board has started anew.", where=self._where, hint="Look at its power.")
-        self._boots = head.boots
-        self._flags = head.flags
+        self._boots, self._flags = head.boots, head.flags
         self._took_over |= Flag.TOOK_OVER in head.flags
         if refusal is None:
             return rest
         if refusal.code == Code.TOOK_OVER:
             self._lose_to_board()
-        if refusal.code == Code.WRONG_BOOTS:
-            self._port.close()
-            raise DeviceResetError("the board has started anew.", where=self._where, hint="Look at its power.")
         unknown = (f"it gives code {refusal.code}", "Load newer firmware.")
         meaning, hint = _REFUSALS.get(refusal.code, unknown)
         address, what = payload[0] if payload else 0, f"byte {refusal.detail}"

@@ -93,8 +93,6 @@ class LinuxI2cLink(Link):
                     raise DeviceLostError(
                         f"the I2C bus is gone ({fault}).", where=Location(self._path), hint="Look at its adapter."
                     ) from fault
-        raise DeviceError(
-            f"the device at 0x{address:02x} does not answer ({fault}).",
-            where=Location(self._path),
-            hint=f"Check its address, power and wires; i2cdetect -y {self._path.rpartition('-')[2]} lists who answers.",
-        ) from fault
+        text = f"the device at 0x{address:02x} does not answer ({fault})."
+        hint = f"Check its address, power and wires; i2cdetect -y {self._path.rpartition('-')[2]} lists who answers."
+        raise DeviceError(text, where=Location(self._path), hint=hint) from fault

@@ -86,7 +86,12 @@ class Bag:
                 hint = "Convert it with rosbags-convert." if self.path.suffix == ".bag" else _EXPECTED
                 refuse(self.path, f"found the ending {self.path.suffix or 'none'}, expected .mcap or .db3.", hint)
             return [self.path]
-        there = sorted((file for file in self.path.iterdir() if file.suffix in _KINDS), key=_natural)
+
+        def natural(path: Path) -> list[tuple[int, str]]:
+            parts = re.split(r"(\d+)", path.name)
+            return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+
+        there = sorted((file for file in self.path.iterdir() if file.suffix in _KINDS), key=natural)
         listed = self._listed()
         missing = [name for name in listed if not (self.path / name).exists()]
         if missing:
@@ -110,7 +115,3 @@ class Bag:
         except (yaml.YAMLError, KeyError, TypeError, ValueError):
             self.remarks.append(f"{_METADATA} is damaged: files are taken in the order of their names.")
             return []
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]

@@ -81,19 +81,15 @@ def extract(bag: Bag, out: Path, topic: str | None, joints: str | None, offset: 
         refuse(bag.path, f"found no image of {images} in {len(rests)} rests.", " ".join(remarks) or "Record again.")
     if len(written) < len(rests):
         remarks.append(f"{len(rests) - len(written)} of {len(rests)} rests have no image.")
-    files = {table: _table(log.names, written, rests).encode()}
+    lines = [",".join(["image", "time_s", *(f"{name}_rad" for name in log.names)])]
+    for place, name in written.items():
+        middle = (rests[place].begin + rests[place].end) / 2
+        lines.append(",".join([name, *map(repr, [middle, *rests[place].means.tolist()])]))
+    files = {table: ("\n".join(lines) + "\n").encode()}
     if infos:
         files[information] = _camera_info(infos[0]).encode()
     write_new(files)
     return Extracted(tuple(written.values()), log.names, tuple(files), tuple(remarks))
-
-
-def _table(joints: Sequence[str], images: Mapping[int, str], rests: Sequence[JointRest]) -> str:
-    lines = [",".join(["image", "time_s", *(f"{name}_rad" for name in joints)])]
-    for place, name in images.items():
-        rest = rests[place]
-        lines.append(",".join([name, repr((rest.begin + rest.end) / 2), *map(repr, rest.means.tolist())]))
-    return "\n".join(lines) + "\n"
 
 
 def _only(bag: Bag, names: Sequence[str], stated: str | None, what: str, option: str) -> str:

@@ -3,7 +3,6 @@
 import contextlib
 import importlib
 import io
-from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
@@ -27,19 +26,14 @@ def decompressed(content: bytes, compression: str) -> io.BytesIO:
     """What was compressed by ``zstd`` or ``lz4``; of content that was cut off or damaged, what comes before."""
     unpacked = io.BytesIO()
     with contextlib.suppress(Exception):  # each library has errors of its own
-        for part in _parts(content, compression):
-            unpacked.write(part)
+        if compression == "lz4":
+            stream = importlib.import_module("lz4.frame").LZ4FrameDecompressor()
+        else:
+            try:
+                stream = importlib.import_module("compression.zstd").ZstdDecompressor()
+            except ImportError:  # before Python 3.14
+                stream = importlib.import_module("backports.zstd").ZstdDecompressor()
+        for start in range(0, len(content), _PIECE_BYTES):
+            unpacked.write(stream.decompress(content[start : start + _PIECE_BYTES]))
     unpacked.seek(0)
     return unpacked
-
-
-def _parts(content: bytes, compression: str) -> Iterator[bytes]:
-    if compression == "lz4":
-        stream = importlib.import_module("lz4.frame").LZ4FrameDecompressor()
-    else:
-        try:
-            stream = importlib.import_module("compression.zstd").ZstdDecompressor()
-        except ImportError:  # before Python 3.14
-            stream = importlib.import_module("backports.zstd").ZstdDecompressor()
-    for start in range(0, len(content), _PIECE_BYTES):
-        yield stream.decompress(content[start : start + _PIECE_BYTES])

@@ -13,6 +13,7 @@ from pydantic import Field
 
 _TEMPLATE = Path(__file__).with_name("templates") / "node.py.in"
 _CHANNELS = {"tip_position": False, "tip_pose": True}
+"""Measurements that a node feeds, and whether they read orientations."""
 Port = Annotated[int, Field(ge=1, le=65535)]
 
 
@@ -42,7 +43,15 @@ class Ros2NodeExporter:
             ProblemError: it does not read back.
         """
         s = self._settings
-        name, is_pose = self._measurement(request)
+        own = {name: str(i.settings.get("type")) for name, i in request.instruments.items()}
+        usable = {name: _CHANNELS[kind] for name, kind in own.items() if kind in _CHANNELS}
+        name = s.measurement or (next(iter(usable)) if len(usable) == 1 else "")
+        if name not in usable:
+            listed = ", ".join(f"{name} ({kind})" for name, kind in own.items()) or "none"
+            text = f"found the measurements {listed}, expected {s.measurement or 'one'} "
+            hint = f"Give --option measurement=NAME: {', '.join(usable)}." if usable else "A node feeds tip positions."
+            raise ConfigError(f"{text}of type tip_position or tip_pose.", hint=hint)
+        is_pose = usable[name]
         constants = {
             "ARM": request.name,
             "CALIBRATION": request.digest,
@@ -70,18 +79,6 @@ class Ros2NodeExporter:
             raise ProblemError("the names do not read back as they were written.", hint="Rename the joints.")
         remarks = (f"run armcal recalibrate with --from udp:{s.recalibrate_port} beside it",)
         return Exported(text.encode(), 0, remarks=remarks)
-
-    def _measurement(self, request: ExportRequest) -> tuple[str, bool]:
-        """The measurement's name, and whether it reads orientations."""
-        own = {name: str(i.settings.get("type")) for name, i in request.instruments.items()}
-        usable = {name: _CHANNELS[kind] for name, kind in own.items() if kind in _CHANNELS}
-        chosen = self._settings.measurement or (next(iter(usable)) if len(usable) == 1 else None)
-        if chosen is None or chosen not in usable:
-            listed = ", ".join(f"{name} ({kind})" for name, kind in own.items()) or "none"
-            text = f"found the measurements {listed}, expected {self._settings.measurement or 'one'} "
-            hint = f"Give --option measurement=NAME: {', '.join(usable)}." if usable else "A node feeds tip positions."
-            raise ConfigError(f"{text}of type tip_position or tip_pose.", hint=hint)
-        return chosen, usable[chosen]
 
 
 def _comment(text: str) -> str:

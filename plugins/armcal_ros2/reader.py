@@ -99,10 +99,8 @@ class Rosbag2Reader:
         dataset = self._dataset(request, joints, logs, (*bag.remarks, *remarks))
         for name in s.measurements:
             if _follows_nominal(request, name, dataset):
-                text = (
-                    f"{name} follows the nominal arm to {1e6 * _NO_NOISE_M:g} um: it seems to be computed from joints"
-                )
-                dataset = warned(dataset, f"{text}, as robot_state_publisher does, and not measured.")
+                text = f"{name} follows the nominal arm to {1e6 * _NO_NOISE_M:g} um: it seems to be computed from "
+                dataset = warned(dataset, f"{text}joints, as robot_state_publisher does, and not measured.")
         dataset = with_absent(dataset, request.channels)
         return check_dataset(dataset, layout_of(request.channels, dataset, {}, {}, by_line=False))
 
@@ -165,9 +163,15 @@ class Rosbag2Reader:
             assert not isinstance(offset, str)
             return offset, []
         seen.close(str(self._settings.path))
-        tool = _target_of(request, name)
+        blocks, tool = request.measurements[name].parameters(), _tool_of(request, name)
+        stated = {block.name: block.nominal[0] for block in blocks if len(block.nominal) == 1}
+        target = np.array([stated.get(f"target_{axis}", 0.0) for axis in "xyz"] + [1.0])
+
+        def place(moved: Array) -> Array:
+            return np.asarray((tool(moved) @ target)[:, :3])
+
         guess = joints.stamps.delay - seen.stamps.delay
-        estimate = estimated_offset(joints.rests, joints.path(), seen.path(), tool, guess)
+        estimate = estimated_offset(joints.rests, joints.path(), seen.path(), place, guess)
         if isinstance(estimate, str):
             hint = f"State it, measurements: {{{name}: {{clock_offset_ms: 0}}}}, and let rests be longer than it."
             self._refuse(f"the clock offset of {name} cannot be estimated: {estimate}.", hint)
@@ -289,14 +293,6 @@ def _tool_of(request: ReadRequest, name: str) -> Callable[[Array], Array]:
     arm, channels = request.arms[own], _joint_channels(request)
     columns = [channels.index(f"{own}.{joint}") for joint in arm.commanded]
     return lambda joints: tool_poses(arm.nominal_chain, np.stack(arm.joint_commands([*joints[:, columns].T]), axis=1))
-
-
-def _target_of(request: ReadRequest, name: str) -> Callable[[Array], Array]:
-    """The place of a measurement's target on the nominal arm (N x 3, m) at the joints of all arms (N x joints)."""
-    blocks, tool = request.measurements[name].parameters(), _tool_of(request, name)
-    stated = {block.name: block.nominal[0] for block in blocks if len(block.nominal) == 1}
-    target = np.array([stated.get(f"target_{axis}", 0.0) for axis in "xyz"] + [1.0])
-    return lambda joints: np.asarray((tool(joints) @ target)[:, :3])
 
 
 def _follows_nominal(request: ReadRequest, name: str, dataset: Dataset) -> bool:

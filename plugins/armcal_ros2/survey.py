@@ -78,7 +78,8 @@ def survey(bag: Bag) -> Survey:
             continue
         if topic.type == JOINT_STATE:
             if topic.name not in joints:
-                joints[topic.name] = _joint_log(topic.name, tuple(message.name))
+                own_settings, still = JointsSettings(topic=topic.name), [False] * len(message.name)
+                joints[topic.name] = JointLog(message.name, still, own_settings, RestSettings())
             joints[topic.name].add(topic.name, message, received)
             continue
         for part in message.transforms if topic.type == TRANSFORMS else [message]:
@@ -97,7 +98,3 @@ def survey(bag: Bag) -> Survey:
         except DataError as fault:
             remarks.append(f"{fault.message} {fault.hint}")
     return Survey(topics, joints, [*bag.remarks, *remarks])
-
-
-def _joint_log(topic: str, names: tuple[str, ...]) -> JointLog:
-    return JointLog(names, [False] * len(names), JointsSettings(topic=topic), RestSettings())

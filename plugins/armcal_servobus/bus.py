@@ -3,7 +3,7 @@
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 from armcal.base.settings import Duration
 from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError
@@ -20,6 +20,7 @@ _ECHO_ID = 0xFD
 _NOBODY = frozenset((-1,))
 _NOISE = 4
 """So many bytes that mean nothing are more than an adapter makes that turns its direction."""
+SILENT_MEND = "Look at its plug and its power; armcal bus find shows who answers, and at which baud rate."
 
 
 class BusSettings(SerialPortSettings):
@@ -195,22 +196,12 @@ class Bus:
                     hint="Check that its model is the configured one; some registers are locked while torque is on.",
                 )
             return answer
-        self._give_up(servo, was_damaged)
-
-    def _give_up(self, servo: int, damaged: int) -> NoReturn:
-        tries = self.settings.tries
-        if damaged:
-            raise DeviceError(
-                f"the answers of {self.name(servo)} arrive damaged ({damaged} of {tries} tries).",
-                where=self.where,
-                hint="If others answer well, two servos have this id: unplug one and change it. Otherwise look at the "
-                "cable, its ground, and the servos' supply.",
-            )
-        raise DeviceLostError(
-            f"{self.name(servo)} does not answer ({tries} tries).",
-            where=self.where,
-            hint="Look at its plug and its power; armcal bus find shows who answers, and at which baud rate.",
-        )
+        name, tries = self.name(servo), self.settings.tries
+        if was_damaged:
+            text = f"the answers of {name} arrive damaged ({was_damaged} of {tries} tries)."
+            hint = "If others answer well, two servos have this id: unplug one and change it. Otherwise look at the "
+            raise DeviceError(text, where=self.where, hint=f"{hint}cable, its ground, and the servos' supply.")
+        raise DeviceLostError(f"{name} does not answer ({tries} tries).", where=self.where, hint=SILENT_MEND)
 
     def _wait(self, size: int, attempt: int) -> float:
         """How long an exchange of so many bytes may take (s)."""

@@ -7,13 +7,12 @@ from typing import Any
 
 from armcal.devices.device import DeviceLostError, DeviceRefusedError
 
-from armcal_servobus.bus import Bus
+from armcal_servobus.bus import SILENT_MEND, Bus
 from armcal_servobus.finding import looked_at, present, read_number
 from armcal_servobus.joints import ServoJoint
 from armcal_servobus.models import ANY
 
 _READINGS = 2
-_SILENT_MEND = "Look at its plug and its power; armcal bus find shows who answers, and at which baud rate."
 SEVERAL_TURNS = 0x10
 """Of a Feetech servo's phase: it reports angles of several turns."""
 _ROUNDED = 2
@@ -101,7 +100,7 @@ def checked(bus: Bus, joints: Mapping[str, ServoJoint], *, moves: bool = True) -
     """
     examination = examined(bus, joints)
     if len(examination.silent) == len(joints) and not examination.strangers:
-        raise DeviceLostError(f"no servo answers at {bus.settings.baud} baud.", where=bus.where, hint=_SILENT_MEND)
+        raise DeviceLostError(f"no servo answers at {bus.settings.baud} baud.", where=bus.where, hint=SILENT_MEND)
     mistakes = [mistake for mistake in examination.mistakes if moves or not mistake.of_motion]
     if not mistakes:
         return examination.eeproms
@@ -122,7 +121,7 @@ def examined(bus: Bus, joints: Mapping[str, ServoJoint]) -> Examination:
         if name in silent:
             listed = ", ".join(map(str, strangers))
             mend = f"Found the id {listed}, which no joint has: is that the servo? Then give it the id {joint.id}."
-            mistakes.append(Mistake(label, "does not answer", mend if strangers else _SILENT_MEND))
+            mistakes.append(Mistake(label, "does not answer", mend if strangers else SILENT_MEND))
         elif (mistake := _wrong_servo(bus, label, joint)) is not None:
             mistakes.append(mistake)
         else:
@@ -169,11 +168,8 @@ def _mistakes(label: str, joint: ServoJoint, eeprom: Eeprom) -> list[Mistake]:
 
 def calibrated_parts(joints: Mapping[str, ServoJoint], eeproms: Mapping[str, Eeprom]) -> dict[str, Any]:
     """All of the servos that a calibration hangs on, by joint."""
-    return {
-        name: {"id": joint.id, "model": joint.model.name, "offset": eeproms[name].offset, **_mapping(joint)}
-        for name, joint in joints.items()
-    }
-
-
-def _mapping(joint: ServoJoint) -> dict[str, int]:
-    return {"zero_count": joint.settings.zero_count, "direction": joint.settings.direction}
+    parts: dict[str, Any] = {}
+    for name, joint in joints.items():
+        parts[name] = {"id": joint.id, "model": joint.model.name, "offset": eeproms[name].offset}
+        parts[name] |= {"zero_count": joint.settings.zero_count, "direction": joint.settings.direction}
+    return parts

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import click
 from armcal.cli.common import FILE, overrides, speaking
@@ -27,25 +27,16 @@ def on_config(command: Any) -> Any:
     return click.argument("config", type=FILE)(overrides(speaking(command)))
 
 
-class OpenBus(NamedTuple):
-    """A bus, all joints that are on it, what was checked of them, and the serial number of the adapter."""
-
-    wires: Bus
-    joints: dict[str, ServoJoint]
-    checks: WiringRecord
-    adapter: str
-
-
 @contextmanager
-def opened(config: Path, overrides: tuple[str, ...]) -> Iterator[OpenBus]:
-    """The bus of a configuration, open."""
+def opened(config: Path, overrides: tuple[str, ...]) -> Iterator[tuple[Bus, dict[str, ServoJoint], WiringRecord, str]]:
+    """The bus of a configuration, open; its joints, what was checked of them, and the adapter's serial number."""
     source = load_config(config, overrides)
     settings = _settings(source)
     joints = settings.chosen(settings.joints)
     wires = Bus(settings, named(joints))
     adapter = wires.open()
     try:
-        yield OpenBus(wires, joints, WiringRecord.of_config(source, joints), adapter)
+        yield wires, joints, WiringRecord.of_config(source, joints), adapter
     finally:
         wires.close()
 
@@ -65,8 +56,5 @@ def _settings(source: ConfigSource) -> ServoJointsSettings:
             stripped = {key: value for key, value in section.items() if key != "type"}
             data = {**source.data, _SECTION: {**parts, part: stripped}}
             return validate(kind, replace(source, data=data), (_SECTION, part))
-    raise ConfigError(
-        "found no servo bus.",
-        where=source.where((_SECTION,)),
-        hint="Give bench: {device: {type: servobus, port: ..., joints: ...}}; docs/servo_bus.md has an example.",
-    )
+    hint = "Give bench: {device: {type: servobus, port: ..., joints: ...}}; docs/servo_bus.md has an example."
+    raise ConfigError("found no servo bus.", where=source.where((_SECTION,)), hint=hint)

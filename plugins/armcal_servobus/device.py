@@ -21,7 +21,7 @@ from typing_extensions import override
 
 from armcal_servobus.bus import Bus
 from armcal_servobus.checks import calibrated_parts, checked
-from armcal_servobus.health import Health, HealthLimits
+from armcal_servobus.health import Health
 from armcal_servobus.joints import ServoJoint, ServoJointsSettings, drivable, named
 from armcal_servobus.servos import Servos
 
@@ -60,7 +60,7 @@ class ServoBusDevice(JointDevice, MeasuringDevice):
         drivable(self._joints.values())
         self._bus = Bus(settings, named(self._joints))
         self._servos = Servos(self._bus, self._joints)
-        self._health = Health(self._joints, HealthLimits(settings.temperature, settings.load_percent / 100))
+        self._health = Health(self._joints, settings.temperature, settings.load_percent / 100)
         self._clock: Clock = RealClock()
         self._is_open = False
         self._powered: set[str] = set()
@@ -82,7 +82,7 @@ class ServoBusDevice(JointDevice, MeasuringDevice):
             self._health.check(readings, clock.now())
             self._powered = {joint for joint, reading in readings.items() if reading.has_torque}
             for joint in self._ordered_powered:  # one that has started anew may hold, and knows no limit
-                self._servos.set_motion(self._joints[joint], self._speed, self._acceleration)
+                self._limit_motion(self._joints[joint])
             self._is_open = True
         except BaseException:
             self.close()
@@ -117,7 +117,7 @@ class ServoBusDevice(JointDevice, MeasuringDevice):
         servo = self._known(joint)
         goal = servo.count(angle)
         if joint not in self._powered:
-            self._servos.set_motion(servo, self._speed, self._acceleration)
+            self._limit_motion(servo)
             here = servo.unwrapped(self._servos.reading(joint).position)
             low, high = servo.count_range
             if not low <= here <= high:
@@ -172,13 +172,9 @@ class ServoBusDevice(JointDevice, MeasuringDevice):
     def _ordered_powered(self) -> list[str]:
         return [joint for joint in self._joints if joint in self._powered]
 
-    @property
-    def _speed(self) -> float:
-        return math.radians(self._settings.speed_deg_per_s)
-
-    @property
-    def _acceleration(self) -> float:
-        return math.radians(self._settings.acceleration_deg_per_s2)
+    def _limit_motion(self, servo: ServoJoint) -> None:
+        limits = self._settings.speed_deg_per_s, self._settings.acceleration_deg_per_s2
+        self._servos.set_motion(servo, *map(math.radians, limits))
 
     def _known(self, joint: str) -> ServoJoint:
         if joint not in self._joints:

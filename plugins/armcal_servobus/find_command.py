@@ -1,7 +1,7 @@
 """``armcal bus find``."""
 
 from collections.abc import Sequence
-from typing import Any, get_args
+from typing import get_args
 
 import click
 from armcal.cli.common import Console, speaking
@@ -29,22 +29,14 @@ def find_command(
     """
     place = port or _only_port()
     spoken, servos = _searched(console, place, (protocol,) if protocol else get_args(ProtocolName), baud, last_id)
-    console.result({"port": place, "protocol": spoken, "servos": [_as_json(servo) for servo in servos]})
-    table = columned(
-        f"{place}, {spoken}", ("baud", "id", "model", "firmware", "count", "V", "deg C", "state"), ("state",)
-    )
+    console.result({"port": place, "protocol": spoken, "servos": [servo.content for servo in servos]})
+    headings = ("baud", "id", "model", "firmware", "count", "V", "deg C", "state")
+    table = columned(f"{place}, {spoken}", headings, ("state",))
     for servo in servos:
         state = "two servos with this id?" if servo.is_doubled else ", ".join(servo.alarms) or "well"
-        cells = (
-            servo.baud,
-            servo.id,
-            servo.model_name,
-            servo.firmware,
-            servo.position,
-            servo.voltage,
-            servo.temperature,
-        )
-        table.add_row(*("" if cell is None else str(cell) for cell in cells), state)
+        cells = (servo.baud, servo.id, servo.model_name, servo.firmware, servo.position)
+        measured = ("" if cell is None else str(cell) for cell in (*cells, servo.voltage, servo.temperature))
+        table.add_row(*measured, state)
     console.out.print(table)
     for number in sorted({servo.id for servo in servos if servo.is_doubled}):
         console.warn(f"two servos may have the id {number}: unplug all but one, and give it another id.")
@@ -78,26 +70,9 @@ def _searched(
                 return protocol, servos
     if there:
         return next(iter(there.items()))
-    raise InputError(
-        f"no servo answers at {'these baud rates' if bauds else 'any baud rate'}, ids 0 to {last_id}.",
-        where=Location(place),
-        hint="Switch the servos' power on and look at the plug of the first one; ids beyond that: --last-id.",
-    )
-
-
-def _as_json(servo: FoundServo) -> dict[str, Any]:
-    return {
-        "baud": servo.baud,
-        "id": servo.id,
-        "model": servo.model.name if servo.model else None,
-        "model_number": servo.number,
-        "firmware": servo.firmware,
-        "position": servo.position,
-        "voltage_V": servo.voltage,
-        "temperature_C": servo.temperature,
-        "alarms": list(servo.alarms),
-        "doubled": servo.is_doubled,
-    }
+    text = f"no servo answers at {'these baud rates' if bauds else 'any baud rate'}, ids 0 to {last_id}."
+    hint = "Switch the servos' power on and look at the plug of the first one; ids beyond that: --last-id."
+    raise InputError(text, where=Location(place), hint=hint)
 
 
 def _only_port() -> str:

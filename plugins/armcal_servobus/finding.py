@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 from armcal.devices.device import DeviceError, DeviceRefusedError
 
@@ -51,6 +52,14 @@ class FoundServo:
     def model_name(self) -> str:
         """For people."""
         return self.model.name if self.model else f"model {self.number}"
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """For programs."""
+        own = {"baud": self.baud, "id": self.id, "model": self.model.name if self.model else None}
+        own |= {"model_number": self.number, "firmware": self.firmware, "position": self.position}
+        own |= {"voltage_V": self.voltage, "temperature_C": self.temperature}
+        return {**own, "alarms": list(self.alarms), "doubled": self.is_doubled}
 
 
 def find(
@@ -104,18 +113,22 @@ def looked_at(bus: Bus, servo: int, times: int = _AGAIN) -> FoundServo:
     for _ in range(times):
         try:
             number, model = read_model(bus, servo)
-            numbers = _numbers(bus, servo, model or base, ("firmware", "position", "voltage", "temperature"))
+            names = ("firmware", "position", "voltage", "temperature")
+            numbers = {name: read_number(bus, servo, model or base, name) for name in names}
         except DeviceError:
             continue
     damaged = bus.counts["damaged"] + bus.counts["extra"] - before
     if not numbers:
         return FoundServo(bus.settings.baud, servo, number, model, damaged=max(damaged, 1))
+    firmware = str(numbers["firmware"])
+    if bus.settings.protocol == "feetech":
+        firmware = ".".join(map(str, bus.read(servo, 0, 2)))
     return FoundServo(
         baud=bus.settings.baud,
         id=servo,
         number=number,
         model=model,
-        firmware=str(numbers["firmware"]) if bus.settings.protocol != "feetech" else _version(bus, servo),
+        firmware=firmware,
         position=numbers["position"],
         voltage=round(numbers["voltage"] * base.registers["voltage"].unit, 3),
         temperature=numbers["temperature"],
@@ -152,15 +165,6 @@ def alarms_of(bus: Bus, servo: int, model: ServoModel) -> tuple[str, ...]:
         register = model.registers["status"]
         alarm = model.unpack("status", bus.read(servo, register.address, register.size))
     return model.words(alarm)
-
-
-def _version(bus: Bus, servo: int) -> str:
-    major, minor = bus.read(servo, 0, 2)
-    return f"{major}.{minor}"
-
-
-def _numbers(bus: Bus, servo: int, model: ServoModel, names: Iterable[str]) -> dict[str, int]:
-    return {name: read_number(bus, servo, model, name) for name in names}
 
 
 def read_number(bus: Bus, servo: int, model: ServoModel, name: str) -> int:

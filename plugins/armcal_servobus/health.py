@@ -1,7 +1,6 @@
 """Whether servos are well: alarms, temperature, voltage, load, torque. Named with the joint, and what to do."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from typing import NoReturn
 
 from armcal.devices.device import DeviceError, DeviceResetError, DeviceUnwellError
@@ -24,19 +23,17 @@ _MENDS: Mapping[str, str] = {
 }
 
 
-@dataclass(frozen=True)
-class HealthLimits:
-    """What is borne: a temperature (deg C), and a share of full torque for a while."""
-
-    temperature: float
-    load: float
-
-
 class Health:
-    """Judges readings, one after the other."""
+    """Judges readings, one after the other.
 
-    def __init__(self, joints: Mapping[str, ServoJoint], limits: HealthLimits) -> None:
-        self._joints, self._limits = joints, limits
+    Args:
+        joints: whose servos they are of.
+        temperature: that is borne (deg C).
+        load: share of full torque that is borne for a while.
+    """
+
+    def __init__(self, joints: Mapping[str, ServoJoint], temperature: float, load: float) -> None:
+        self._joints, self._temperature, self._load = joints, temperature, load
         self._eeprom: Mapping[str, Eeprom] = {}
         self._loaded_since: dict[str, float] = {}
         self._reported: set[tuple[str, str]] = set()
@@ -57,7 +54,7 @@ class Health:
                 mends = " ".join(dict.fromkeys(_MENDS.get(word, "") for word in reading.alarms)).strip()
                 self._fail(name, f"reports {' and '.join(reading.alarms)}", mends or "See the servo's manual.")
             eeprom = self._eeprom.get(name, Eeprom())
-            limit = min(self._limits.temperature, eeprom.max_temperature)
+            limit = min(self._temperature, eeprom.max_temperature)
             if reading.temperature >= limit:
                 text = f"is at {reading.temperature:.0f} deg C, expected below {limit:.0f}"
                 self._report(name, text, _MENDS["overheating"], "heat")
@@ -65,7 +62,12 @@ class Health:
             if not low - _VOLTAGE_SLACK <= reading.voltage <= high + _VOLTAGE_SLACK:
                 text = f"has {reading.voltage:.1f} V, expected {low:.1f} to {high:.1f}"
                 self._fail(name, text, _MENDS["voltage"])
-            self._check_load(name, reading, now)
+            is_loaded = self._joints[name].model.load == "share" and abs(reading.load) >= self._load
+            if not (is_loaded and reading.has_torque):
+                self._loaded_since.pop(name, None)
+            elif now - self._loaded_since.setdefault(name, now) >= _BLOCKED_S:
+                text = f"works with {100 * abs(reading.load):.0f} % of its torque for {_BLOCKED_S:g} s"
+                self._report(name, text, "It is blocked or carries too much: free it, or take the load away.", "load")
 
     def check_powered(self, readings: Mapping[str, ServoReading], powered: Collection[str]) -> None:
         """That those hold which were made to.
@@ -75,18 +77,8 @@ class Health:
         """
         limp = [name for name in readings if name in powered and not readings[name].has_torque]
         if limp:
-            raise DeviceResetError(
-                f"{', '.join(map(self._label, limp))} lost torque by itself: started anew, or gave up under load.",
-                hint="Look at the supply and the plugs, and whether the joint is blocked.",
-            )
-
-    def _check_load(self, name: str, reading: ServoReading, now: float) -> None:
-        is_loaded = self._joints[name].model.load == "share" and abs(reading.load) >= self._limits.load
-        if not (is_loaded and reading.has_torque):
-            self._loaded_since.pop(name, None)
-        elif now - self._loaded_since.setdefault(name, now) >= _BLOCKED_S:
-            text = f"works with {100 * abs(reading.load):.0f} % of its torque for {_BLOCKED_S:g} s"
-            self._report(name, text, "It is blocked or carries too much: free it, or take the load away.", "load")
+            text = f"{', '.join(map(self._label, limp))} lost torque by itself: started anew, or gave up under load."
+            raise DeviceResetError(text, hint="Look at the supply and the plugs, and whether the joint is blocked.")
 
     def _label(self, name: str) -> str:
         return f"{name} (id {self._joints[name].id})"

@@ -56,8 +56,10 @@ def home_command(
         plans = planned(wires, joints, targets)
         _show_plans(console, config, plans)
         path = kept or config.with_name(f"{config.stem}.servos-{datetime.now():%Y%m%d-%H%M%S}.json")
-        if not yes:
-            _ask(path)
+        if not yes and not sys.stdin.isatty():
+            raise InputError("nothing was written: there is no terminal to ask at.", hint="Give --yes.")
+        if not yes and not click.confirm(f"Write these offsets to the servos? The old ones go to {path}.", err=True):
+            raise InputError("nothing was written.", hint="Say yes, or give --yes.")
         keep(path, wires, joints)
         console.line(f"what the servos hold is kept in {path}; --restore writes it back.")
         checks.forget(joints)
@@ -67,14 +69,6 @@ def home_command(
     console.line("the offsets are written and read back.")
     if calibration is not None:
         console.line("Now the zeros of the configuration are those of before: set them to 0, and measure anew.")
-
-
-def _ask(path: Path) -> None:
-    """Raise InputError unless somebody at the terminal agrees."""
-    if not sys.stdin.isatty():
-        raise InputError("nothing was written: there is no terminal to ask at.", hint="Give --yes.")
-    if not click.confirm(f"Write these offsets to the servos? The old ones go to {path}.", err=True):
-        raise InputError("nothing was written.", hint="Say yes, or give --yes.")
 
 
 def _zeros(console: Console, calibration: Path, joints: dict[str, ServoJoint]) -> dict[str, float]:

@@ -155,11 +155,9 @@ class ServoJoint:
         low, high = self.settings.range
         if not low - self.model.step <= angle <= high + self.model.step:  # no range has what is not finite
             ends = " to ".join(f"{math.degrees(end):g}" for end in (low, high))
-            raise DeviceRefusedError(
-                f"found {math.degrees(angle):.3f} deg for {self.name}, expected {ends} deg, its range.",
-                where=Location(field=f"joints.{self.name}.range"),
-                hint="Keep the plan within the range; or move the arm by hand, with torque off, if it hangs beyond it.",
-            )
+            text = f"found {math.degrees(angle):.3f} deg for {self.name}, expected {ends} deg, its range."
+            hint = "Keep the plan within the range; or move the arm by hand, with torque off, if it hangs beyond it."
+            raise DeviceRefusedError(text, where=Location(field=f"joints.{self.name}.range"), hint=hint)
         count = round(self.exact_count(angle))
         return min(max(count, self.count_range[0]), self.count_range[1])
 
@@ -169,20 +167,18 @@ def check_offset(model: ServoModel, offset: int) -> None:
     if not model.offset_limit:
         raise ValueError(f"found an offset of {offset}, but a {model.name} has none: leave it out, set zero_count")
     beyond = abs(offset) - model.offset_limit
-    if beyond > 0:
-        raise ValueError(
-            f"found an offset of {offset} counts, expected -{model.offset_limit} to {model.offset_limit}, which is all "
-            f"that a {model.name} holds: {_remount(model, beyond)}"
-        )
-
-
-def _remount(model: ServoModel, beyond: int) -> str:
-    if not model.teeth:
-        return f"remount its horn by {math.degrees(beyond * model.step):.0f} deg or more"
-    tooth = model.counts / model.teeth
-    number = math.ceil(beyond / tooth)
-    unit = "tooth" if number == 1 else "teeth"
-    return f"remount its horn by {number} {unit} of {math.degrees(tooth * model.step):.1f} deg ({tooth:.0f} counts)"
+    if beyond <= 0:
+        return
+    amount = f"{math.degrees(beyond * model.step):.0f} deg or more"
+    if model.teeth:
+        tooth = model.counts / model.teeth
+        number = math.ceil(beyond / tooth)
+        unit = "tooth" if number == 1 else "teeth"
+        amount = f"{number} {unit} of {math.degrees(tooth * model.step):.1f} deg ({tooth:.0f} counts)"
+    raise ValueError(
+        f"found an offset of {offset} counts, expected -{model.offset_limit} to {model.offset_limit}, which is all "
+        f"that a {model.name} holds: remount its horn by {amount}"
+    )
 
 
 def drivable(joints: Collection[ServoJoint]) -> None:

@@ -183,21 +183,18 @@ def checksum(body: bytes) -> int:
 
 def crc16(data: bytes) -> int:
     """CRC-16 of polynomial 0x8005, from zero, not reflected. [Dynamixel2]"""
-    table, crc = _crc_table(), 0
+    crc = 0
     for value in data:
-        crc = ((crc << 8) & 0xFFFF) ^ table[(crc >> 8) ^ value]
+        crc = ((crc << 8) & 0xFFFF) ^ _crc_of((crc >> 8) ^ value)
     return crc
 
 
 @cache
-def _crc_table() -> tuple[int, ...]:
-    table = []
-    for value in range(256):
-        crc = value << 8
-        for _ in range(8):
-            crc = (crc << 1) ^ (0x8005 if crc & 0x8000 else 0)
-        table.append(crc & 0xFFFF)
-    return tuple(table)
+def _crc_of(byte: int) -> int:
+    crc = byte << 8
+    for _ in range(8):
+        crc = (crc << 1) ^ (0x8005 if crc & 0x8000 else 0)
+    return crc & 0xFFFF
 
 
 _REFUSALS2 = MappingProxyType(

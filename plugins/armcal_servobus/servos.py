@@ -55,7 +55,10 @@ class Servos:
         """
         joints = [self._joints[name] for name in (self._joints if names is None else names)]
         values: dict[str, dict[str, int]] = {joint.name: {} for joint in joints}
-        for polled, alike in _by_polled(joints).items():
+        by_polled: dict[tuple[tuple[int, int], ...], list[ServoJoint]] = {}
+        for joint in joints:
+            by_polled.setdefault(joint.model.polled, []).append(joint)
+        for polled, alike in by_polled.items():
             for stretch in polled:
                 together = all(joint.model.reads_together for joint in alike)
                 data = self._bus.read_all([joint.id for joint in alike], *stretch, together=together)
@@ -63,7 +66,19 @@ class Servos:
                     model = joint.model
                     names_there = [name for name in model.registers if model.holds(name, stretch)]
                     values[joint.name] |= {name: model.unpack(name, data[joint.id], stretch[0]) for name in names_there}
-        return {joint.name: self._reading(joint, values[joint.name]) for joint in joints}
+        readings = {}
+        for joint in joints:
+            own, registers = values[joint.name], joint.model.registers
+            readings[joint.name] = ServoReading(
+                position=own["position"],
+                goal=own["goal"],
+                has_torque=bool(own["torque"]),
+                load=own["load"] * registers["load"].unit,
+                voltage=own["voltage"] * registers["voltage"].unit,
+                temperature=float(own["temperature"]),
+                alarms=alarms_of(self._bus, joint.id, joint.model),
+            )
+        return readings
 
     def positions(self) -> dict[str, int]:
         """Counts of all joints, in one exchange; quicker than ``readings``."""
@@ -105,11 +120,8 @@ class Servos:
         self._goals.pop(joint.name, None)
         self._write(joint, "torque", 0)
         if read_number(self._bus, joint.id, joint.model, "torque"):
-            raise DeviceError(
-                f"the torque of {joint.name} (id {joint.id}) did not go off.",
-                where=self._bus.where,
-                hint="Hold the arm and switch the servos' power off.",
-            )
+            text = f"the torque of {joint.name} (id {joint.id}) did not go off."
+            raise DeviceError(text, where=self._bus.where, hint="Hold the arm and switch the servos' power off.")
 
     def command(self, goals: Mapping[str, int]) -> None:
         """Goals (counts) of several joints, at once for all that have them in the same place."""
@@ -147,23 +159,3 @@ class Servos:
 
     def _write(self, joint: ServoJoint, name: str, value: int) -> None:
         self._bus.write(joint.id, joint.model.registers[name].address, joint.model.pack(name, value))
-
-    def _reading(self, joint: ServoJoint, values: Mapping[str, int]) -> ServoReading:
-        registers = joint.model.registers
-        return ServoReading(
-            position=values["position"],
-            goal=values["goal"],
-            has_torque=bool(values["torque"]),
-            load=values["load"] * registers["load"].unit,
-            voltage=values["voltage"] * registers["voltage"].unit,
-            temperature=float(values["temperature"]),
-            alarms=alarms_of(self._bus, joint.id, joint.model),
-        )
-
-
-def _by_polled(joints: Iterable[ServoJoint]) -> dict[tuple[tuple[int, int], ...], list[ServoJoint]]:
-    """Joints whose servos are polled alike."""
-    alike: dict[tuple[tuple[int, int], ...], list[ServoJoint]] = {}
-    for joint in joints:
-        alike.setdefault(joint.model.polled, []).append(joint)
-    return alike

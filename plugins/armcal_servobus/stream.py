@@ -78,7 +78,10 @@ class ServoBusStream(JointStream):
         except DeviceError as fault:
             self._refused[fault.message] += 1
             self._next = now + _AGAIN_S
-            self._open_again(self._bus)
+            try:
+                self._bus.open()
+            except (DeviceError, DeviceRefusedError) as again:
+                self._refused[again.message] += 1
             return []
         return [JointSample(now, None, {name: self._angle(name, count) for name, count in positions.items()})]
 
@@ -110,16 +113,8 @@ class ServoBusStream(JointStream):
         servos = Servos(bus, self._joints)
         holding = [name for name, reading in servos.readings().items() if reading.has_torque]
         if holding and self._settings.torque == "refuse":
-            raise DeviceRefusedError(
-                f"{', '.join(holding)} hold, expected servos without torque, which can be guided by hand.",
-                where=bus.where,
-                hint="Hold the arm, and give bench.joints: {torque: release}, which lets them go.",
-            )
+            text = f"{', '.join(holding)} hold, expected servos without torque, which can be guided by hand."
+            hint = "Hold the arm, and give bench.joints: {torque: release}, which lets them go."
+            raise DeviceRefusedError(text, where=bus.where, hint=hint)
         for name in reversed(holding):
             servos.release(self._joints[name])
-
-    def _open_again(self, bus: Bus) -> None:
-        try:
-            bus.open()
-        except (DeviceError, DeviceRefusedError) as fault:
-            self._refused[fault.message] += 1

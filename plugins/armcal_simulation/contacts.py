@@ -98,10 +98,8 @@ class ContactsSimulator:
         for instance, keys in self._settings.groups.items():
             measurement = measurements.get(instance)
             if not isinstance(measurement, GroupedMeasurement):
-                raise ConfigError(
-                    f"simulation.groups: {instance!r} is no measurement with groups.",
-                    hint=f"The measurements are {', '.join(measurements)}.",
-                )
+                text = f"simulation.groups: {instance!r} is no measurement with groups."
+                raise ConfigError(text, hint=f"The measurements are {', '.join(measurements)}.")
             labels = measurement.group_labels
             for key in keys:
                 if len(key.split("/")) != len(labels) if labels else key != ONLY:
@@ -148,10 +146,8 @@ class ContactsSimulator:
                 postures[name].append(angles[name][good])
             if sum(len(part) for part in postures[names[0]]) >= settings.count:
                 return {n: np.concatenate(parts)[: settings.count] for n, parts in postures.items()}
-        raise ConfigError(
-            f"simulation: hardly any posture reaches {instance}, {key}.",
-            hint="Check its place in the truth, widen within, or give other angles around.",
-        )
+        hint = "Check its place in the truth, widen within, or give other angles around."
+        raise ConfigError(f"simulation: hardly any posture reaches {instance}, {key}.", hint=hint)
 
     def _middle(self, request: SimulationRequest, names: list[str]) -> dict[str, float]:
         around = self._settings.around

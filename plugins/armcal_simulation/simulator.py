@@ -55,10 +55,8 @@ class PoseSettings(Settings):
         for given, joints, key in ((self.levels, turning, "levels"), (self.travel, sliding, "travel")):
             missing, unknown = sorted(joints - set(given)), sorted(set(given) - joints)
             if missing or unknown:
-                raise ConfigError(
-                    f"simulation.poses.{key}: missing {missing or 'none'}, unknown {unknown or 'none'}.",
-                    hint=f"Give one list for each of {', '.join(sorted(joints)) or 'no joint'}.",
-                )
+                text = f"simulation.poses.{key}: missing {missing or 'none'}, unknown {unknown or 'none'}."
+                raise ConfigError(text, hint=f"Give one list for each of {', '.join(sorted(joints)) or 'no joint'}.")
         levels = [np.array(self.levels.get(j) or self.travel[j]) for j in arm.commanded]
         if self.kind == "random":
             return np.array([random.uniform(level.min(), level.max(), self.count) for level in levels])

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from pathlib import Path
 
 import pytest
+import yaml
 
 from tests.own_arms import POST, TOWER, OwnArm, said_by
 
@@ -60,6 +62,35 @@ class TestAFrameThatIsNotTheArms:
             done = arm.armcal("servo", "--check", "--yes", sets=("bench.acquisition.settle.longest_s=3",))
         assert done.exit_code == 2 and named in said_by(done)
         assert not (tmp_path / "servos.yaml.checked").exists()
+
+    @pytest.mark.parametrize(
+        ("gain", "named"), [(1000, "as if mm came where m are"), (0.001, "as if m came where mm are")]
+    )
+    def test_sweeps_of_servos_are_refused_in_other_units_and_leave_no_table(
+        self, tmp_path: Path, gain: float, named: str
+    ) -> None:
+        arm = OwnArm(tmp_path, POST, **{"bench.simulator.tracker.length_gain": gain})
+        with arm.run.simulated() as clock:
+            sets = ("bench.acquisition.settle.longest_s=3",)
+            done = arm.armcal("servo", "--out", arm.out, "--yes", sets=sets)
+            assert done.exit_code == 2 and f"{named} expected (by 3 poses)" in said_by(done)
+            targets = {joint: state["target_rad"] for joint, state in clock.ask({"state": True})["joints"].items()}
+        assert targets == pytest.approx({"a": 0.0, "b": math.radians(30), "c": math.radians(20)}, abs=0.01)
+        assert arm.servos.read_text() == arm.kind["servos"]
+        assert {file.name for file in arm.out.iterdir()} == {"observations.jsonl.before-1"}
+
+    @pytest.mark.parametrize("joint", ["turn", "lift"])
+    def test_sweeps_of_a_servo_that_turns_the_other_way_are_in_the_right_units(
+        self, tmp_path: Path, joint: str
+    ) -> None:
+        arm = OwnArm(tmp_path, TOWER)
+        truth = yaml.safe_load(arm.kind["servos"])
+        truth["servos"][joint]["pulses_us"].reverse()
+        (tmp_path / "true.yaml").write_text(yaml.safe_dump(truth), encoding="utf-8")
+        with arm.run.simulated():
+            said = said_by(arm.armcal("servo", "--out", arm.out, "--yes"))
+        assert f"{joint}: the servo turns the other way than its table said" in said
+        assert "times those of the model" not in said
 
 
 class TestAJointThatGivesWay:

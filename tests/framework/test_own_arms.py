@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from armcal.devices.clock import SimulatedClock
-from armcal_bench.waiting import Waits
+from armcal_bench.acquisition.tracker_monitor import Waits
 
 from tests.own_arms import POST, POST_SERVOS, TOWER, TOWER_SERVOS, OwnArm, said_by
 

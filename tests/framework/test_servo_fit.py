@@ -52,7 +52,8 @@ def angle_pulse(table, angle):
 
 
 def task(observations, zero="measured", servos=ONE, measured=(), clock=CLOCK):
-    return FitTask(tuple(servos), {"front": KnownBoard(clock, tuple(measured))}, KNOTS, tuple(observations), zero)
+    servos = tuple(replace(servo, knots=KNOTS) for servo in servos)
+    return FitTask(servos, {"front": KnownBoard(clock, tuple(measured))}, tuple(observations), zero)
 
 
 def test_a_planted_table_and_lag_come_back() -> None:

@@ -187,6 +187,11 @@ class AcquisitionRun:
             StopRequested: it stood elsewhere several times in a row, or in other units or another frame than expected.
         """
         drive = self._drive
+        commanded, readings = drive.standing(), [drive.measured() for _ in range(_READINGS)]
+        measured = {joint: sum(reading[joint] for reading in readings) / _READINGS for joint in readings[0]}
+        angles = {"standing": commanded, **({"measured": measured} if measured else {})}
+        if self._settings.angles == "measured":  # those that the dataset has
+            angles = {"standing": measured, "commanded": commanded}
         record = {
             "pose": self._ids[pose],
             **self._here(),
@@ -195,7 +200,7 @@ class AcquisitionRun:
             "frames": settled.frames,
             "rejected": settled.rejected,
             "temperature": self._settings.temperature,
-            **self._standing(),
+            **angles,
             "approach": dict(zip(drive.angles, drive.approach.tolist(), strict=True)),
         }
         doubt = self._arrival.doubt(pose, settled.base_T_target, self.known) if self._arrival else ""
@@ -211,14 +216,6 @@ class AcquisitionRun:
         self._astray = 0
         self.evidence.succeeded(pose)
         self._keep(pose, record)
-
-    def _standing(self) -> dict[str, dict[str, float]]:
-        """``standing``: the joint angles (rad) that the dataset has; the others, where there are any, by their name."""
-        commanded, readings = self._drive.standing(), [self._drive.measured() for _ in range(_READINGS)]
-        measured = {joint: sum(reading[joint] for reading in readings) / _READINGS for joint in readings[0]}
-        if self._settings.angles == "measured":
-            return {"standing": measured, "commanded": commanded}
-        return {"standing": commanded, **({"measured": measured} if measured else {})}
 
     def _check_frame(self) -> None:
         """Refuse other units or another frame than expected; poses that seemed astray in it are kept as measured.

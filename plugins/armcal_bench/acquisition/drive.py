@@ -160,10 +160,8 @@ class Drive(Motion):
         for joint, angle in commanded.items():
             if joint not in angles or abs(angles[joint] - angle) > _SAME_RAD:
                 stands = f"{math.degrees(angles[joint]):.2f} deg" if joint in angles else "no pulses"
-                raise DeviceError(
-                    f"found {stands} for {joint}, expected {math.degrees(angle):.2f} deg, as commanded.",
-                    hint="Look at the board's power and bus, and whether another program uses it.",
-                )
+                text = f"found {stands} for {joint}, expected {math.degrees(angle):.2f} deg, as commanded."
+                raise DeviceError(text, hint="Look at the board's power and bus, and whether another program uses it.")
         return commanded
 
     def measured(self) -> dict[str, float]:
@@ -182,7 +180,12 @@ class Drive(Motion):
             difference, gone, before = goal - start, 0.0, self.clock.now()
             length = float(np.max(np.abs(difference)))
             commanded = self.device.standing(self.angles)
-            self._note_turns(difference)
+            # On which side of their play joints come to lie.
+            turned, signs = np.abs(difference) > _SAME_RAD, np.sign(difference)
+            further = difference + np.where(self._one_way * signs > 0, self._one_way, 0.0)
+            self._one_way = np.where(turned, further, self._one_way)
+            lies = (np.abs(self._one_way) >= _TAKEN_UP_RAD) | (self.approach == signs)
+            self.approach = np.where(turned, np.where(lies, signs, 0.0), self.approach)
             while gone < length:
                 moves = self.tick(may_move)
                 now = self.clock.now()
@@ -198,13 +201,6 @@ class Drive(Motion):
                     self.device.command(standing)
                     commanded = standing
         self._guard(path[-1])
-
-    def _note_turns(self, turns: Array) -> None:
-        """On which side of their play joints come to lie by turns (joints, rad)."""
-        turned, signs = np.abs(turns) > _SAME_RAD, np.sign(turns)
-        self._one_way = np.where(turned, turns + np.where(self._one_way * signs > 0, self._one_way, 0.0), self._one_way)
-        lies = (np.abs(self._one_way) >= _TAKEN_UP_RAD) | (self.approach == signs)
-        self.approach = np.where(turned, np.where(lies, signs, 0.0), self.approach)
 
     def preload_backlash(self, sides: Array, may_move: MayMove) -> None:
         """Come to the pose from the stated sides: a little away, and back. See ``go`` for what it raises.

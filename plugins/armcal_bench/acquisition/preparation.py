@@ -104,21 +104,17 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
 
 def _check_measures(experiment: Experiment, settings: AcquisitionSettings, device: JointDevice) -> None:
     if settings.angles == "measured" and not isinstance(device, MeasuringDevice):
-        raise ConfigError(
-            "found measured, but this device does not know where its servos stand.",
-            where=experiment.source.where((*_AT, "angles")),
-            hint="Leave angles out: the commanded angles are written.",
-        )
+        text = "found measured, but this device does not know where its servos stand."
+        hint = "Leave angles out: the commanded angles are written."
+        raise ConfigError(text, where=experiment.source.where((*_AT, "angles")), hint=hint)
 
 
 def _check_clear(planner: PathPlanner, poses: Array, plan: Path, commands: Dataset) -> None:
     for row, pose in enumerate(poses):
         if not planner.allowed(pose):
-            raise DataError(
-                f"pose {commands.ids[row]} is too near to something.",
-                where=_row(plan, commands, row),
-                hint="Nothing was moved. Plan anew with this clearance, or take the pose out.",
-            )
+            text = f"pose {commands.ids[row]} is too near to something."
+            hint = "Nothing was moved. Plan anew with this clearance, or take the pose out."
+            raise DataError(text, where=_row(plan, commands, row), hint=hint)
 
 
 def _approaches(commands: Dataset, space: JointSpace) -> Array:
@@ -140,22 +136,17 @@ def run_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) 
     """
     source, plan = experiment.source, experiment.settings.plan
     if sliding := [joint for joint, dimension in arm.commanded.items() if dimension != "angle"]:
-        raise ConfigError(
-            f"the joint {sliding[0]} slides, expected joints that turn: servos move angles.",
-            where=source.where(("arms",)),
-            hint="Measure this arm with its own controller, and read its data.",
-        )
+        text = f"the joint {sliding[0]} slides, expected joints that turn: servos move angles."
+        hint = "Measure this arm with its own controller, and read its data."
+        raise ConfigError(text, where=source.where(("arms",)), hint=hint)
     where = source.where((*_AT, "limits"))
     try:
         limits = joint_limits(arm.nominal_chain, settings.limits, plan.limits if plan else {})
     except ValueError as fault:
         raise ConfigError(f"{fault}.", where=where) from fault
     if missing := [joint for joint, ends in limits.items() if ends is None]:
-        raise ConfigError(
-            f"found no limits of the joint {missing[0]}.",
-            where=where,
-            hint=f"Give them: limits: {{{missing[0]}: [-100 deg, 100 deg]}}.",
-        )
+        text = f"found no limits of the joint {missing[0]}."
+        raise ConfigError(text, where=where, hint=f"Give them: limits: {{{missing[0]}: [-100 deg, 100 deg]}}.")
     return np.array([ends for ends in limits.values() if ends is not None])
 
 
@@ -258,11 +249,9 @@ def heat_of(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> 
         ConfigError: the settings name no such joint, or nothing weighs anything.
     """
     if settings.heat and not arm.masses and not experiment.system.environment.payload_mass:
-        raise ConfigError(
-            "heat is to be reckoned with, and no part of the arm has a mass: no joint would hold anything.",
-            where=experiment.source.where((*_AT, "heat")),
-            hint="Give the masses of the links (arms.NAME.links), or leave heat out.",
-        )
+        text = "heat is to be reckoned with, and no part of the arm has a mass: no joint would hold anything."
+        hint = "Give the masses of the links (arms.NAME.links), or leave heat out."
+        raise ConfigError(text, where=experiment.source.where((*_AT, "heat")), hint=hint)
     try:
         model = HeatModel.of(tuple(arm.commanded), settings.heat)
     except ValueError as fault:

@@ -76,10 +76,8 @@ class Recovery:
             try:
                 opened, begun = self._device.open(clock), self._identity
                 if (opened.digest, opened.name) != (begun.digest, begun.name):
-                    raise DeviceRefusedError(
-                        f"found {opened.name}, expected {begun.name}, with which the run began.",
-                        hint="Connect the board that the run began with.",
-                    )
+                    text = f"found {opened.name}, expected {begun.name}, with which the run began."
+                    raise DeviceRefusedError(text, hint="Connect the board that the run began with.")
                 restore()
                 waits.over("device", clock.now())
                 return

@@ -116,11 +116,8 @@ def make_bench_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as fault:
-        raise InputError(
-            f"the folder cannot be made ({fault.strerror or fault}).",
-            where=Location(str(folder)),
-            hint="Give a folder that can be written.",
-        ) from fault
+        text = f"the folder cannot be made ({fault.strerror or fault})."
+        raise InputError(text, where=Location(str(folder)), hint="Give a folder that can be written.") from fault
 
 
 def _wait_for(process: subprocess.Popen[bytes], folder: Path) -> None:

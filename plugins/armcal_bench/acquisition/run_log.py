@@ -137,11 +137,9 @@ def measured_by(experiment: Experiment) -> tuple[str, tuple[str, ...]]:
             candidates.append((name, channels))
     if len(candidates) != 1:
         names = ", ".join(name for name, _ in candidates) or "none"
-        raise ConfigError(
-            f"found {names} among the measurements, expected one tip_position or tip_pose.",
-            where=experiment.source.where(("measurements",)),
-            hint="Configure the one that the bench's tracker measures.",
-        )
+        text = f"found {names} among the measurements, expected one tip_position or tip_pose."
+        hint = "Configure the one that the bench's tracker measures."
+        raise ConfigError(text, where=experiment.source.where(("measurements",)), hint=hint)
     return candidates[0]
 
 

@@ -22,11 +22,10 @@ from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.preparation import Prepared
 from armcal_bench.acquisition.run_log import OURS, Progress, RunLog, in_order, measured_by, write_outputs
 from armcal_bench.acquisition.sag import Sag
-from armcal_bench.acquisition.tracker_monitor import MotionGate, TrackerMonitor
+from armcal_bench.acquisition.tracker_monitor import MotionGate, TrackerMonitor, Waits
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.journal_folder import Start, opened_journal
 from armcal_bench.settling import pose_of
-from armcal_bench.waiting import Waits
 
 _SAME = {"plan": "plan", "config": "configuration"}
 """What a run that is resumed must have been begun with: entries of the journal's header, and their names."""
@@ -115,11 +114,8 @@ def _check_frame(prepared: Prepared, progress: Progress, folder: Path) -> None:
         i: pose_of(progress.measured[name]) for i, name in enumerate(prepared.plan.ids) if name in progress.measured
     }
     if (mistake := prepared.arrival.mistake(seen)) is not None:
-        raise InputError(
-            f"{mistake.sentence}; nothing was moved.",
-            where=Location(str(folder)),
-            hint=f"{mistake.mend} Then begin anew with another --out.",
-        )
+        text = f"{mistake.sentence}; nothing was moved."
+        raise InputError(text, where=Location(str(folder)), hint=f"{mistake.mend} Then begin anew with another --out.")
 
 
 def _header(prepared: Prepared, plan: Path) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from armcal_bench.acquisition.preparation import Prepared, prepare
 from armcal_bench.acquisition.run_log import DATASET, Progress
 from armcal_bench.acquisition.schedule import LeaveOut, Rest, ScheduleForecast, forecast_schedule
 from armcal_bench.acquisition.session import Outcome, RunOptions, acquire
+from armcal_bench.acquisition.tracker_monitor import duration
 from armcal_bench.commands.common import (
     FILE,
     Question,
@@ -27,7 +28,6 @@ from armcal_bench.commands.common import (
     warned,
 )
 from armcal_bench.journal_folder import Start
-from armcal_bench.waiting import duration
 
 
 @click.command("acquire")

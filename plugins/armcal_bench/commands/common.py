@@ -10,8 +10,8 @@ from armcal.cli.common import Console, overrides, speaking
 from armcal.errors import InputError
 from armcal.run.experiment import Experiment
 
+from armcal_bench.acquisition.tracker_monitor import Waits
 from armcal_bench.hazards import FirstMotion, Hazard
-from armcal_bench.waiting import Waits
 
 F = TypeVar("F", bound=Callable[..., Any])
 FILE = click.Path(path_type=Path)
@@ -50,10 +50,8 @@ def ask(motion: FirstMotion) -> bool:
     named = ", ".join(motion.free or motion.measured or motion.powered)
     pulses = "get no pulses yet" if motion.free else "hang free" if motion.measured else "have pulses"
     if not sys.stdin.isatty():
-        raise InputError(
-            f"{named} {pulses}, and there is no terminal to ask whether the arm may be moved; nothing was moved.",
-            hint="Stand clear of the arm and give --yes.",
-        )
+        text = f"{named} {pulses}, and there is no terminal to ask whether the arm may be moved; nothing was moved."
+        raise InputError(text, hint="Stand clear of the arm and give --yes.")
     jumps = (
         "A servo does not report where it stands, so each may jump when its first pulse comes, one after the other."
         if motion.free

@@ -26,7 +26,7 @@ from armcal_bench.journal_folder import Start
 from armcal_bench.keys import Keys, LineKeys, NoKeys, TerminalKeys, single_keys
 from armcal_bench.recording.recorder import KEYS, LOOK, Message
 from armcal_bench.recording.recording_log import DATASET, IMAGES
-from armcal_bench.recording.session import RecordingOptions, record
+from armcal_bench.recording.session import record
 
 _TERMINAL = Path("/dev/tty")
 _AS_CSV = "--set 'data={type: csv}' "
@@ -84,8 +84,7 @@ def record_command(
         if is_terminal and not console.quiet:
             click.echo(f"{KEYS}.{f' {LOOK}.' if bench.settings.camera else ''}", err=True)
         start: Start = "resume" if resume else "anew"
-        options = RecordingOptions(out, start, capture, keys, lambda: signals.finish or signals.rotate, show)
-        ending = record(bench, options)
+        ending = record(bench, (out, start), capture, keys, lambda: signals.finish or signals.rotate, show)
     show(ending)
     if ending.content["postures"] and not (console.json or console.quiet):
         data = experiment.settings.data or {}

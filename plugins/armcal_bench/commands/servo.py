@@ -71,7 +71,9 @@ def servo(
             waits=waits(console),
         )
         if check:
-            _check(console, setup, talk, "somebody" if guided else "tracker")
+            with _stoppable(console):
+                verdicts = tried(setup, talk, "somebody" if guided else "tracker")
+            _show_verdicts(console, verdicts, swapped(verdicts))
         elif not parks and not (release and out is None):
             if out is None:
                 raise InputError("found no --out.", hint="Say where what is measured is to be kept, or give --check.")
@@ -106,12 +108,6 @@ def _evaluate(console: Console, setup: Setup, out: Path, keep: bool) -> None:
             "is said above: mend that, and give the same command again."
         )
         sys.exit(EXIT_INCOMPLETE)
-
-
-def _check(console: Console, setup: Setup, talk: Conversation, seen: str) -> None:
-    with _stoppable(console):
-        verdicts = tried(setup, talk, seen)
-    _show_verdicts(console, verdicts, swapped(verdicts))
 
 
 def _show_verdicts(

@@ -17,8 +17,7 @@ from armcal.measure.measurement import Measurement
 from armcal.run.experiment import Experiment
 from scipy.special import fdtri
 
-from armcal_bench.recording.advice import Advice, advice
-from armcal_bench.recording.knowledge import Knowledge, explained, knowledge
+from armcal_bench.recording.knowledge import Advice, Knowledge, advice, explained, knowledge
 from armcal_bench.recording.quick_fit import Fitted, PredictedResidual, QuickFitter
 from armcal_bench.recording.recording_log import Posture, dataset_of
 from armcal_bench.recording.window import JointKinds

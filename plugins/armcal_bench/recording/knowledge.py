@@ -1,21 +1,28 @@
-"""What the postures so far determine of the free parameters, and which joints to vary for more."""
+"""What the postures so far determine, how well an instrument's own parameters are known, and what to record next."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Array
+from armcal.diagnose.clustered import widened
 from armcal.errors import ArmcalError
+from armcal.estimate.estimator import Solution, SolverVerdict, estimate
 from armcal.estimate.identifiability import numerical_rank
 from armcal.estimate.nuisance import restricted
 from armcal.estimate.structure import GIVE_A_LENGTH, UNSEEN_SCALE, explain, identify_from, scale_is_unseen
 from armcal.estimate.validation import hold_out
+from armcal.planning.suggestion import suggest
 from armcal.problem.many_points import as_seen
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.projection import factor_at_zero, projected
 from armcal.run.experiment import Experiment
+from armcal.run.judging import known_accuracies, own_deviations
 from armcal.run.prepare import labels_of
+
+from armcal_bench.recording.quick_fit import Fitted, QuickFitter
 
 FEW = 6
 """So many undetermined combinations are named at most."""
@@ -27,6 +34,7 @@ _RIDGE = 1e-6
 _WORTH = 0.7
 """Joints that add nearly as much as the best one are named too."""
 _MOST_NAMED = 3
+_QUICK = SolverVerdict("quick fit", "ended", True, 0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -133,3 +141,46 @@ def _joints_to_vary(problem: Problem, dataset: Dataset, scaled: Array, rank: int
     ranked = sorted((c for c, gain in gains.items() if gain > _WORTH * best > 0), key=lambda c: -gains[c])
     alone = len(problem.blueprint.arms) == 1
     return tuple(c.partition(".")[2] if alone else c for c in ranked[:_MOST_NAMED])
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What is known, and what would help.
+
+    Attributes:
+        accuracy: how well what a user wants to know is known, a sentence a measurement.
+        deviations: standard deviations of the instruments' own coordinates (SI); finite ones alone.
+        next: the posture that would help most, for people; empty where none is better than others.
+        commands: it, by channel (rad or m).
+        shrink: what it would multiply standard deviations by, on average.
+    """
+
+    accuracy: tuple[str, ...] = ()
+    deviations: Mapping[str, float] = field(default_factory=dict)
+    next: str = ""
+    commands: Mapping[str, float] = field(default_factory=dict)
+    shrink: float = 1.0
+
+    def fell_by(self, before: Self) -> float | None:
+        """The share by which the instruments' standard deviations fell; None while nothing can be compared."""
+        ratios = [sd / before.deviations[name] for name, sd in self.deviations.items() if name in before.deviations]
+        return 1 - float(np.median(ratios)) if ratios else None
+
+
+def advice(fitter: QuickFitter, fitted: Fitted, dataset: Dataset, joints: Mapping[str, str]) -> Advice:
+    """What a fit says of postures that an instrument read; nothing of contacts, which only few postures can make.
+
+    Raises:
+        ArmcalError: it cannot be judged.
+    """
+    problem = fitter.problem
+    if not all(kernel.factor.output_channels for kernel in problem.kernels) or not problem.parameters.free:
+        return Advice()
+    acting = problem.weighted(fitter.records, [fitted.used.astype(float)] * len(fitter.records))
+    made = estimate(problem, acting, Solution(fitted.values, _QUICK))
+    made = widened(problem, acting, made, np.arange(len(dataset)))
+    best = suggest(problem, dataset.subset(np.flatnonzero(fitted.used)), made, joints, 1)
+    own = {f"{n}.{local}": sd for n in problem.blueprint.measurements for local, sd in own_deviations(made, n).items()}
+    finite = {name: sd for name, sd in own.items() if np.isfinite(sd) and sd > 0}
+    known = Advice(tuple(known_accuracies(problem, made)), finite)
+    return replace(known, next=best[0].text, commands=best[0].commands, shrink=best[0].shrink) if best else known

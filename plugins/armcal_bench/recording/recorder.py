@@ -15,8 +15,8 @@ from armcal.io.file_set import write_over
 from armcal.measure.environment import warn_beyond_limits
 
 from armcal_bench.bench import Bench
-from armcal_bench.recording.advice import Advice
 from armcal_bench.recording.agreement import Assessment, Assessor
+from armcal_bench.recording.knowledge import Advice
 from armcal_bench.recording.labels import Labels
 from armcal_bench.recording.recording_log import IMAGES, Posture, RecordingLog, dataset_of, write_dataset
 from armcal_bench.recording.window import JointKinds, Mean, SampleWindow
@@ -297,10 +297,8 @@ class Recorder:
         self._looked_from = mean.angles
         self._unseen += 1
         if self._unseen >= _MOST_UNSEEN and self._log.last is None:
-            raise InputError(
-                f"found no board in {self._unseen} images; of the last: {shot.fault}",
-                hint="Check the board's settings (armcal board writes them), the light and the focus.",
-            )
+            hint = "Check the board's settings (armcal board writes them), the light and the focus."
+            raise InputError(f"found no board in {self._unseen} images; of the last: {shot.fault}", hint=hint)
         return _refused(shot.fault)
 
     def _status(self) -> list[Message]:

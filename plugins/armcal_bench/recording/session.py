@@ -1,12 +1,11 @@
 """A recording from opening the stream to its end."""
 
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from armcal.devices.clock import Clock
-from armcal.devices.live import JointStream, LiveCamera, RestStream
+from armcal.devices.live import JointStream, RestStream
 from armcal.errors import ConfigError
 
 from armcal_bench.bench import SECTION, Bench
@@ -23,29 +22,23 @@ _SAME = {"joints": "set of joints", "labels": "set of labels"}
 """What a recording that is resumed must have been begun with: entries of the journal's header, and their names."""
 
 
-@dataclass(frozen=True)
-class RecordingOptions:
-    """How a recording is done, and who hears of it.
+def record(
+    bench: Bench,
+    to: tuple[Path, Start],
+    capture: Capture,
+    keys: Keys,
+    asked_to_end: Callable[[], bool],
+    show: Callable[[Message], None],
+) -> Message:
+    """Record until somebody ends it, or the stream ends; how it ended.
 
-    Attributes:
-        folder: where everything of it is kept.
-        start: ``anew``, or ``resume`` what is there.
-        capture: what makes a posture be captured.
+    Args:
+        bench: what is recorded.
+        to: where everything of it is kept, and ``anew``, or ``resume`` what is there.
+        capture: what makes a posture be captured; a camera that gives images by itself goes before it.
         keys: what a person types.
         asked_to_end: whether somebody wants it to end.
         show: called with every message.
-    """
-
-    folder: Path
-    start: Start
-    capture: Capture
-    keys: Keys
-    asked_to_end: Callable[[], bool]
-    show: Callable[[Message], None]
-
-
-def record(bench: Bench, options: RecordingOptions) -> Message:
-    """Record until somebody ends it, or the stream ends; how it ended.
 
     Raises:
         InputError: the configuration, the folder or the stream is refused.
@@ -55,7 +48,9 @@ def record(bench: Bench, options: RecordingOptions) -> Message:
     channels = JointKinds.of(bench.experiment.system.arms).channels
     columns = Labels(bench.experiment.system.measurements, ()).columns
     header = {"joints": list(channels), "labels": list(columns)}
-    stream, capture = bench.joints(), _capture(options.capture, camera)
+    stream = bench.joints()
+    if camera is not None and camera.gives_shots:
+        capture = "images"
     if isinstance(stream, RestStream) and stream.gives_rests:
         if capture in ("keys", "images") or camera is not None:
             raise ConfigError(
@@ -70,42 +65,37 @@ def record(bench: Bench, options: RecordingOptions) -> Message:
                 camera.open(clock, bench.experiment.system.measurements)
             contacts_of(bench.experiment, camera)
             stream.open(clock, channels)
-            with opened_journal(options.folder, options.start, OURS, header, "recording", _SAME) as journal:
+            with opened_journal(*to, OURS, header, "recording", _SAME) as journal:
                 if camera is not None:
-                    (options.folder / IMAGES).mkdir(exist_ok=True)
-                recorder = Recorder(bench, stream, capture, options.folder, RecordingLog(journal), clock, camera)
-                return _recorded(recorder, stream, options, clock)
+                    (to[0] / IMAGES).mkdir(exist_ok=True)
+                recorder = Recorder(bench, stream, capture, to[0], RecordingLog(journal), clock, camera)
+                for message in _messages(recorder, stream, keys, asked_to_end, clock):
+                    show(message)
+                return recorder.finished()
         finally:
             stream.close()
             if camera is not None:
                 camera.close()
 
 
-def _capture(chosen: Capture, camera: LiveCamera | None) -> Capture:
-    """A camera that gives images by itself says when."""
-    return "images" if camera is not None and camera.gives_shots else chosen
-
-
-def _recorded(recorder: Recorder, stream: JointStream, options: RecordingOptions, clock: Clock) -> Message:
-    def show(messages: list[Message]) -> None:
-        for message in messages:
-            options.show(message)
-
-    show(recorder.begin())
+def _messages(
+    recorder: Recorder, stream: JointStream, keys: Keys, asked_to_end: Callable[[], bool], clock: Clock
+) -> Iterator[Message]:
+    """All that happens, as it does, until somebody ends it or the stream ends."""
+    yield from recorder.begin()
     typed: deque[str] = deque()
     while True:
         has_ended = stream.ended  # before its last samples are taken
-        show(recorder.take(stream.samples()))
-        typed.extend(options.keys.commands())
+        yield from recorder.take(stream.samples())
+        typed.extend(keys.commands())
         if typed:  # one a round, so that each finds fresh readings
             command = typed.popleft()
             if command.strip() == END:
                 break
-            show(recorder.command(command))
-        is_over = has_ended or (options.keys.ended and recorder.capture == "keys")
-        if options.asked_to_end() or (is_over and not typed):
+            yield from recorder.command(command)
+        is_over = has_ended or (keys.ended and recorder.capture == "keys")
+        if asked_to_end() or (is_over and not typed):
             break
         clock.sleep(_PERIOD_S)
     if isinstance(stream, RestStream) and stream.gives_rests:
-        show(recorder.take(stream.lasting()))
-    return recorder.finished()
+        yield from recorder.take(stream.lasting())

@@ -2,11 +2,14 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import numpy as np
+from armcal.base.domains import Array
+from armcal.diagnose.measured_frame import FrameMistake, frame_mistake
+from armcal.errors import InputError, Location
 
 from armcal_bench.acquisition.heat import ThermalLimit
 from armcal_bench.acquisition.tracker_monitor import StopRequested, TrackerLost
@@ -16,6 +19,8 @@ from armcal_bench.settling import Settled
 
 _MOST_RESTLESS = 3
 _LOOKED_AT_EVERY_S = 1.0
+_FAR_GAIN = 8.0
+"""Of lengths: in sweeps of one joint after the other a reversed servo resembles a frame with a smaller one."""
 
 ReportProgress = Callable[[str, int, int], None]
 """Takes the joint, and how many of its points are done and planned."""
@@ -53,6 +58,31 @@ def left(points: Iterable[Point], entries: Iterable[Mapping[str, Any]]) -> list[
     return [point for point in points if point not in done]
 
 
+@dataclass
+class FrameWatch:
+    """Where the target was seen in poses that were commanded, whether the arm stood or not.
+
+    Attributes:
+        expected: ``base_T_tool`` of the rigid arm in each pose (4 x 4, m).
+        seen: ``base_T_target`` there, in whatever units and frame the tracker gives it.
+    """
+
+    mover: Mover
+    expected: list[Array] = field(default_factory=list)
+    seen: list[Array] = field(default_factory=list)
+
+    def look(self, pose: Mapping[str, float]) -> None:
+        """The arm was commanded to this pose (rad by joint); nothing where the target was not seen since."""
+        monitor = self.mover.gate.monitor
+        if monitor is not None and (stand := monitor.stand()) is not None:
+            self.expected.append(self.mover.setup.nominal.tool(pose))
+            self.seen.append(stand.base_T_target)
+
+    def mistake(self) -> FrameMistake | None:
+        """What is wrong with the tracker's units or handedness; None where nothing is, or too few poses tell."""
+        return frame_mistake(np.array(self.expected), np.array(self.seen))
+
+
 class Restless(StopRequested):
     """Time after time the arm does not come to stand: a servo stalls, or has let go."""
 
@@ -67,10 +97,14 @@ class Automatic:
     restless: int = 0
     first: int = 0
 
+    def __post_init__(self) -> None:
+        self._frame = FrameWatch(self.mover)
+
     def run(self) -> None:
         """Measure all that is left; the arm ends in its base pose.
 
         Raises:
+            InputError: the tracker's units are not those expected; the arm is in its base pose.
             StopRequested: it was asked for, and the arm holds; or the tracker stays away, or the arm does not come to
                 stand: then it is in its base pose.
             DeviceLost: the device is gone and does not come back.
@@ -88,10 +122,11 @@ class Automatic:
                     self.report(joint, len(points) - len(left(points, self._done)), len(points))
                 mover.persist(mover.to_base)
             mover.guard({})
-        except (TrackerLost, Restless) as stop:
+        except (TrackerLost, Restless, InputError) as stop:
             # Nobody may be there for hours, and it could hold a heavy pose.
             mover.persist(mover.to_base)
-            stop.arm = "the arm is commanded to hold its base pose"
+            if isinstance(stop, StopRequested):
+                stop.arm = "the arm is commanded to hold its base pose"
             raise
 
     @property
@@ -125,6 +160,7 @@ class Automatic:
         line: dict[str, Any] = {"joint": point.joint, "counts": point.counts, "came": point.came}
         line["at"], line["warmth"] = mover.clock.wall(), mover.thermal_state.by_joint
         line["told"] = mover.angles
+        self._check_frame()
         if isinstance(settled, str):
             self.record.append(LEFT_OUT, {**line, "why": settled})
             self.restless += 1
@@ -135,3 +171,19 @@ class Automatic:
         deviations = [float(d) if np.isfinite(d) else None for d in settled.deviations]
         self.record.append(POSE, {**line, **settled.record, "deviations": deviations, "frames": settled.frames})
         self.restless = 0
+
+    def _check_frame(self) -> None:
+        """Refuse other units than expected. A left-handed frame cannot be told from a reversed servo, one by one.
+
+        Raises:
+            InputError: they are others. What was measured so far by this run is set aside.
+        """
+        self._frame.look(self.mover.angles)
+        mistake = self._frame.mistake()
+        if mistake is None or 1 / _FAR_GAIN < mistake.frame.gain < _FAR_GAIN:
+            return
+        hint = f"{mistake.mend} Then give another --out."
+        if self.first <= 1:
+            hint = f"{mistake.mend} Then give the same command: what was measured is kept as "
+            hint += f"{self.record.set_aside().name}, and not used."
+        raise InputError(f"{mistake.sentence}.", where=Location(str(self.record.path)), hint=hint)

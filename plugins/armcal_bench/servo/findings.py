@@ -58,7 +58,10 @@ def _of_servo(servo: FittedServo, outcome: Outcome) -> Iterator[str]:
         return
     before, after = (np.sign(pulses[-1] - pulses[0]) for pulses in (servo.known.table.pulses, servo.pulses))
     if before != after:
-        yield f"{joint}: the servo turns the other way than its table said."
+        yield (
+            f"{joint}: the servo turns the other way than its table said, or the tracker's frame is left-handed: "
+            "look which way it turns."
+        )
     for angle, is_determined in zip(servo.angles, servo.determined, strict=True):
         beyond = max(servo.reach[0] - angle, angle - servo.reach[1])
         if not is_determined:

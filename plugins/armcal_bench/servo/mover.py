@@ -149,10 +149,8 @@ class Mover(Motion):
                 for joint in order:
                     self.go(joint, goals[joint])
                 return
-        raise DeviceRefusedError(
-            "no way to the base pose is clear from where the arm stands.",
-            hint="Bring it nearer by armcal servo --guided, or release it and put it there by hand.",
-        )
+        hint = "Bring it nearer by armcal servo --guided, or release it and put it there by hand."
+        raise DeviceRefusedError("no way to the base pose is clear from where the arm stands.", hint=hint)
 
     def guard(self, base: Mapping[str, float]) -> bool:
         """What the board is to do when the host falls silent: back to a pose (rad by joint), slowly."""

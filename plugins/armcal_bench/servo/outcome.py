@@ -77,7 +77,7 @@ def _fitted(
     sweeps, silent = _swept(entries, servos, nominal, settings, {})
     seen = tuple(servo for servo in servos if servo.joint in sweeps)
     zero: Zero = "kept" if settings.zero == "kept" and all(s.by is not None for s in sweeps.values()) else "measured"
-    task = FitTask(seen, dict(boards), settings.knots, (), zero, settings.sag_sd)
+    task = FitTask(seen, dict(boards), (), zero, settings.sag_sd)
     now = _Round(sweeps, task, fit_servos(task), Alignment.of(nominal), {})
     has_springs = settings.sag != "none" and bool(nominal.compliances)
     for _ in range(_ROUNDS if has_springs else 1):

@@ -102,11 +102,8 @@ def write_servo_file(path: Path, file: ServoFile) -> Path | None:
         write_whole(REAL_FILES, kept, before)
         write_whole(REAL_FILES, path, text)
     except OSError as fault:
-        raise InputError(
-            f"it cannot be written ({fault.strerror}).",
-            where=Location(str(path)),
-            hint="Make it writable and give the command again: nothing measured is lost.",
-        ) from fault
+        hint = "Make it writable and give the command again: nothing measured is lost."
+        raise InputError(f"it cannot be written ({fault.strerror}).", where=Location(str(path)), hint=hint) from fault
     return kept
 
 

@@ -102,7 +102,6 @@ class FitTask:
 
     Attributes:
         servos, boards: as known before; boards by name.
-        knots: angles of the tables to be fitted (rad, rising); empty: each servo's own.
         observations: of any of the servos.
         zero: ``measured`` angles are absolute; ``kept``: each servo's pulse at zero stays the stated one.
         compliance_sd: how far the arm's compliances may well be from the model's (rad/(N m)).
@@ -111,7 +110,6 @@ class FitTask:
 
     servos: tuple[KnownServo, ...]
     boards: dict[str, KnownBoard]
-    knots: tuple[float, ...]
     observations: tuple[Observation, ...]
     zero: Zero
     compliance_sd: float = 0.2
@@ -123,8 +121,7 @@ class FitTask:
 
     def knots_of(self, servo: KnownServo) -> Array:
         """A trusted table keeps its own."""
-        own = servo.table.angles if servo.trusted_sd is not None else self.knots or servo.knots
-        return np.array(own or servo.table.angles)
+        return np.array((servo.trusted_sd is None and servo.knots) or servo.table.angles)
 
 
 class Unknowns:

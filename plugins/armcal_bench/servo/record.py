@@ -136,11 +136,8 @@ class Record:
                 elif number > 1 and is_beginning:
                     damage = "a second beginning"
             if damage:
-                raise DataError(
-                    f"found {damage}.",
-                    where=Location(str(self.path), line=number),
-                    hint="Give another --out." if number == 1 else "Give another --out, or remove this line.",
-                )
+                hint = "Give another --out." if number == 1 else "Give another --out, or remove this line."
+                raise DataError(f"found {damage}.", where=Location(str(self.path), line=number), hint=hint)
             self._entries.append(json.loads(line))
 
     @property
@@ -237,11 +234,8 @@ def check_same(setup: Setup, record: Record, device: DeviceIdentity) -> None:
     where = Location(str(record.path))
     adapter = str(begun.get("adapter", ""))
     if adapter and device.adapter and adapter != device.adapter:
-        raise InputError(
-            f"it was begun with the adapter {adapter!r}, found {device.adapter!r}.",
-            where=where,
-            hint="Connect the one that it was begun with, or give a new --out.",
-        )
+        text = f"it was begun with the adapter {adapter!r}, found {device.adapter!r}."
+        raise InputError(text, where=where, hint="Connect the one that it was begun with, or give a new --out.")
     moved = [joint for joint, angle in setup.base.items() if abs(begun["base"].get(joint, angle) - angle) > _SAME]
     if moved:
         raise InputError(
@@ -253,11 +247,8 @@ def check_same(setup: Setup, record: Record, device: DeviceIdentity) -> None:
     for joint in setup.base:
         stated, before = _as_stated(setup, joint), begun["servos"].get(joint, {})
         if any(stated[key] != before.get(key) for key in ("board", "channel", "oscillator_hz", "prescale")):
-            raise InputError(
-                f"it was begun with another board, channel or oscillator of {joint}.",
-                where=where,
-                hint="Give a new --out.",
-            )
+            text = f"it was begun with another board, channel or oscillator of {joint}."
+            raise InputError(text, where=where, hint="Give a new --out.")
 
 
 def _deg(angle: float) -> str:

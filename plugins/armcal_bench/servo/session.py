@@ -1,33 +1,29 @@
 """A servo calibration from opening the devices to what it leaves behind."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import cast
 
-import numpy as np
-from armcal.base.domains import Array
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceIdentity
 from armcal.devices.wiring import WiringRecord
-from armcal.diagnose.measured_frame import FEWEST, frame_mistake
+from armcal.diagnose.measured_frame import FEWEST
 from armcal.errors import InputError, Location
 
 from armcal_bench.acquisition.recovery import DeviceLost
-from armcal_bench.acquisition.tracker_monitor import MotionGate, StopRequested, TrackerMonitor
+from armcal_bench.acquisition.tracker_monitor import MotionGate, StopRequested, TrackerMonitor, Waits
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.keys import Wishes
-from armcal_bench.servo.automatic import Automatic, ReportProgress
+from armcal_bench.servo.automatic import Automatic, FrameWatch, ReportProgress
 from armcal_bench.servo.guided import Guided, next_wish
 from armcal_bench.servo.mover import Mover, ServoDevice
 from armcal_bench.servo.outcome import Outcome, outcome_of
 from armcal_bench.servo.record import BEGUN, Record, begin, check_same, stated_by
 from armcal_bench.servo.setup import Setup
 from armcal_bench.servo.trial import Move, Verdict, answered, judged, noted, wrapped
-from armcal_bench.waiting import Waits
 
-_Glimpse = tuple[Mapping[str, float], Array]
 _AS_IT_IS = "its pulses go on as they are, unless the board brings the arm to its base pose"
 
 
@@ -185,56 +181,44 @@ def _go_on_warm(mover: Mover, record: Record) -> None:
         InputError: one would not cool where it is to rest.
     """
     if joint := mover.thermal_state.too_heavy_at_rest:
-        raise InputError(
-            f"the servo of {joint} would not cool in the base pose, by bench.acquisition.heat; nothing was moved.",
-            hint="Give bench.servo.base a pose in which it carries less.",
-        )
+        text = f"the servo of {joint} would not cool in the base pose, by bench.acquisition.heat; nothing was moved."
+        raise InputError(text, hint="Give bench.servo.base a pose in which it carries less.")
     last = next((entry for entry in reversed(record.entries) if "warmth" in entry), None)
     if last is not None:
         mover.thermal_state.go_on(last["warmth"], mover.angles, mover.clock.wall() - float(last["at"]))
 
 
 def _tracked(mover: Mover) -> list[Verdict]:
-    setup, base, moves, unseen = mover.setup, mover.angles, [], []
-    glimpses: list[_Glimpse] = []
+    setup, base, moves, unseen, frame = mover.setup, mover.angles, [], [], FrameWatch(mover)
     longest = setup.bench.settings.acquisition.settle.longest
     for joint in setup.joints:
         turn, at = _small_turn(setup, joint), mover.counts[joint]
         before = mover.gate.settled(mover.tick, longest)
-        glimpses += _glimpse(mover, base)
+        frame.look(base)
         mover.go(joint, mover.counts_at(joint, setup.base[joint] + turn))
         after = mover.gate.settled(mover.tick, longest)
-        glimpses += _glimpse(mover, {**base, joint: base[joint] + turn})
+        frame.look({**base, joint: base[joint] + turn})
         mover.go(joint, at)
         if isinstance(before, str) or isinstance(after, str):
             why = before if isinstance(before, str) else after
             unseen.append(Verdict(joint, "unclear", f"{joint}: it was not seen to stand ({why})."))
         else:
             moves.append(Move(joint, turn, before.base_T_target, after.base_T_target))
-        _check_frame(setup, glimpses, ())
-    verdicts = judged(moves, base, setup.nominal)
-    _check_frame(setup, glimpses, [*verdicts, *unseen])
-    return [*verdicts, *unseen]
+        _check_frame(frame, ())
+    verdicts = [*judged(moves, base, setup.nominal), *unseen]
+    _check_frame(frame, verdicts)
+    return verdicts
 
 
-def _glimpse(mover: Mover, pose: Mapping[str, float]) -> list[_Glimpse]:
-    """A commanded pose (rad) and where the target was seen, whether it stood or not; nothing where it was not seen."""
-    stand = None if mover.gate.monitor is None else mover.gate.monitor.stand()
-    return [] if stand is None else [(pose, stand.base_T_target)]
-
-
-def _check_frame(
-    setup: Setup, glimpses: Sequence[tuple[Mapping[str, float], Array]], verdicts: Sequence[Verdict]
-) -> None:
+def _check_frame(frame: FrameWatch, verdicts: Sequence[Verdict]) -> None:
     """Refuse other units than expected, or a left-handed frame, which reversed servos resemble.
 
     Raises:
         InputError: it is one, and not every joint turned as commanded.
     """
-    if len(glimpses) < 2 * FEWEST or (verdicts and all(verdict.kind == "right" for verdict in verdicts)):
+    if len(frame.seen) < 2 * FEWEST or (verdicts and all(verdict.kind == "right" for verdict in verdicts)):
         return
-    expected = np.array([setup.nominal.tool(pose) for pose, _ in glimpses])
-    mistake = frame_mistake(expected, np.array([seen for _, seen in glimpses]))
+    mistake = frame.mistake()
     if mistake is None or (mistake.frame.is_mirrored and not verdicts):
         return
     other = "Or servos of several joints are reversed: look which way each turns." if mistake.frame.is_mirrored else ""

@@ -189,15 +189,11 @@ def _check_names(
             where = experiment.source.where((*AT, key))
             raise ConfigError(f"{fault}.", where=where, hint="Name joints that have a servo in the servo file.")
     if not moved:
-        raise ConfigError(
-            "the servo file has no servo of a joint of this arm.",
-            where=experiment.source.where((SECTION, "device")),
-            hint=f"Name them as the joints: {', '.join(file.servos)} are not in the model.",
-        )
+        text = "the servo file has no servo of a joint of this arm."
+        hint = f"Name them as the joints: {', '.join(file.servos)} are not in the model."
+        raise ConfigError(text, where=experiment.source.where((SECTION, "device")), hint=hint)
     for index, measured in enumerate(settings.measured_pulses):
         if measured.board not in file.boards:
-            raise ConfigError(
-                f"no board is called {str(measured.board)!r}.",
-                where=experiment.source.where((*AT, "measured_pulses", index)),
-                hint=f"Boards are {', '.join(file.boards)}.",
-            )
+            text = f"no board is called {str(measured.board)!r}."
+            hint = f"Boards are {', '.join(file.boards)}."
+            raise ConfigError(text, where=experiment.source.where((*AT, "measured_pulses", index)), hint=hint)

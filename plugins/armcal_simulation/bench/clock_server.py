@@ -57,11 +57,9 @@ class ClockServer:
         try:
             self._listener.bind(str(self._path))
         except OSError as fault:
-            raise InputError(
-                f"the clock's socket cannot be made ({fault}).",
-                where=Location(str(self._path)),
-                hint="Give a folder with a short path (a socket's has at most 107 characters) that can be written.",
-            ) from fault
+            text = f"the clock's socket cannot be made ({fault})."
+            hint = "Give a folder with a short path (a socket's has at most 107 characters) that can be written."
+            raise InputError(text, where=Location(str(self._path)), hint=hint) from fault
         self._bound = True
         self._listener.listen()
         self._listener.setblocking(False)

@@ -40,10 +40,8 @@ class ElasticPose:
     def __init__(self, tracked: TrackedArm) -> None:
         arm = tracked.arm
         if arm.conditions:
-            raise ConfigError(
-                f"effects of {arm.name} ask for {', '.join(arm.conditions)}, which a bench does not simulate.",
-                hint="Name them under bench.simulator.without_effects.",
-            )
+            text = f"effects of {arm.name} ask for {', '.join(arm.conditions)}, which a bench does not simulate."
+            raise ConfigError(text, hint="Name them under bench.simulator.without_effects.")
         # From commands and approaches to the body's pose (3x4, column by column).
         values = {block.name: ca.SX(list(block.nominal)) for block in tracked.parameters.blocks}
         count = len(arm.commanded)
@@ -85,10 +83,8 @@ def without_effects(arm: Arm, names: tuple[str, ...]) -> Arm:
         ConfigError: it has none of this name.
     """
     if unknown := sorted(set(names) - set(arm.effects)):
-        raise ConfigError(
-            f"bench.simulator.without_effects: no effect of {arm.name} is called {unknown[0]!r}.",
-            hint=f"Its effects are {', '.join(arm.effects) or 'none'}.",
-        )
+        text = f"bench.simulator.without_effects: no effect of {arm.name} is called {unknown[0]!r}."
+        raise ConfigError(text, hint=f"Its effects are {', '.join(arm.effects) or 'none'}.")
     return replace(arm, effects={name: effect for name, effect in arm.effects.items() if name not in names})
 
 
@@ -98,10 +94,8 @@ def _body(
     """Position and rotation of the body; that of the tool where the measurement knows of no rotation."""
     read = tracked.measurement.outputs({tracked.arm.name: state}, scoped(values, f"{tracked.name}."))
     if not set(_POSITION) <= set(read):
-        raise ConfigError(
-            f"the measurement {tracked.name} is no position, which a tracker would see.",
-            hint="Give a measurement of type tip_position or tip_pose.",
-        )
+        text = f"the measurement {tracked.name} is no position, which a tracker would see."
+        raise ConfigError(text, hint="Give a measurement of type tip_position or tip_pose.")
     position = ca.vertcat(*[read[axis] for axis in _POSITION])
     if set(_QUATERNION) <= set(read):
         return position, rotation_of(ca.vertcat(*[read[name] for name in _QUATERNION]))

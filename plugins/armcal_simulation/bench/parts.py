@@ -96,11 +96,8 @@ def true_servos(settings: ServoBenchSettings, arm: Arm) -> ServoFile:
     """
     file = load_servo_file(settings.servos)
     if missing := sorted(set(arm.commanded) - set(file.servos)):
-        raise ConfigError(
-            f"found no servo for {', '.join(missing)}.",
-            where=Location(str(settings.servos)),
-            hint="The bench needs the true pulse table of every joint.",
-        )
+        hint = "The bench needs the true pulse table of every joint."
+        raise ConfigError(f"found no servo for {', '.join(missing)}.", where=Location(str(settings.servos)), hint=hint)
     if fault := unknown_joint(file.servos, arm.commanded):
         raise ConfigError(f"{fault}.", where=Location(str(settings.servos)))
     if fault := unknown_joint([name for name in (*settings.joints, *settings.start) if name != ALL], arm.commanded):
@@ -122,10 +119,8 @@ def tracked_arm(settings: BenchTruthSettings, experiment: Experiment) -> Tracked
         raise ConfigError(f"the joint {sliding[0]} slides, expected joints that turn: servos do.")
     name = settings.measurement or next(iter(measurements))
     if name not in measurements or (settings.measurement is None and len(measurements) > 1):
-        raise ConfigError(
-            f"bench.simulator.measurement: found {settings.measurement or 'none'} of {', '.join(measurements)}.",
-            hint="Name the measurement whose body the tracker sees.",
-        )
+        text = f"bench.simulator.measurement: found {settings.measurement or 'none'} of {', '.join(measurements)}."
+        raise ConfigError(text, hint="Name the measurement whose body the tracker sees.")
     parameters = experiment.parameters
     if settings.truth is not None:
         source = load_config(settings.truth)

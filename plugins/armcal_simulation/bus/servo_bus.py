@@ -113,7 +113,12 @@ class ServoBus:
                 error = BAD_CRC if self._sizes == 2 else CHECKSUM
                 self._answer([(s, (s.status(error), b"")) for s in servos if s.id == instruction.servo])
         elif instruction.code == SYNC_WRITE:
-            self._sync_write(servos, instruction.params)
+            size, params = self._sizes, instruction.params
+            address, count = (int.from_bytes(params[at : at + size], "little") for at in (0, size))
+            blocks = params[2 * size :]
+            for begin in range(0, len(blocks) - count, count + 1):
+                for servo in (servo for servo in servos if servo.id == blocks[begin]):
+                    servo.write(address, blocks[begin + 1 : begin + 1 + count])
         elif instruction.code == SYNC_READ or (instruction.code == BULK_READ and self._sizes == 2):
             for number, span in self._spans(instruction):
                 self._answer([(s, s.execute(READ, span)) for s in servos if s.id == number])
@@ -128,15 +133,6 @@ class ServoBus:
             meant = [servo for servo in servos if servo.id == instruction.servo]
             answers = [(s, s.execute(instruction.code, instruction.params)) for s in meant]
             self._answer([pair for pair in answers if pair[0].answers(instruction.code)], instruction.servo)
-
-    def _sync_write(self, servos: list[BusServo], params: bytes) -> None:
-        size = self._sizes
-        address, count = (int.from_bytes(params[at : at + size], "little") for at in (0, size))
-        blocks = params[2 * size :]
-        for begin in range(0, len(blocks) - count, count + 1):
-            for servo in servos:
-                if servo.id == blocks[begin]:
-                    servo.write(address, blocks[begin + 1 : begin + 1 + count])
 
     def _spans(self, instruction: Instruction) -> list[tuple[int, bytes]]:
         """Who is to be read, and the parameters of each reading."""

@@ -172,10 +172,8 @@ def _of_events(parameters: Parameters, settings: MissionSettings) -> Iterator[Pa
         if isinstance(event, CreepSettings | PlaySettings):
             amount, over, _ = _creep(parameters, event.parameter, event.change)
             if isinstance(event, PlaySettings) and not amount > 0:
-                raise ConfigError(
-                    f"simulation.events: found play that changes by {event.change}, expected one that grows.",
-                    hint="Write an amount above zero, such as 0.3 deg in 10 d.",
-                )
+                text = f"simulation.events: found play that changes by {event.change}, expected one that grows."
+                raise ConfigError(text, hint="Write an amount above zero, such as 0.3 deg in 10 d.")
             end = (settings.days if event.until is None else event.until) * DAY_S
             times, changes = np.array([begin, end]), np.array([0.0, amount * (end - begin) / over])
             yield Path(_entry(parameters, event.parameter), times, changes)

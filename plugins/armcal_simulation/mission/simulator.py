@@ -176,10 +176,8 @@ class MissionOfDays:
         positions: list[Array] = []
         for joint, span in joint_limits(arm.nominal_chain, stated).items():
             if span is None:
-                raise ConfigError(
-                    f"simulation.records: found no range of {joint}, and the arm states no limits of it.",
-                    hint=f"Write for example ranges_deg: {{{joint}: [-90, 90]}}.",
-                )
+                text = f"simulation.records: found no range of {joint}, and the arm states no limits of it."
+                raise ConfigError(text, hint=f"Write for example ranges_deg: {{{joint}: [-90, 90]}}.")
             positions.append(random.uniform(*span, len(times)))
         angles = np.array(positions)
         approach = approach_of(angles) if len(times) else angles
@@ -198,7 +196,8 @@ class MissionOfDays:
         random: Mapping[str, np.random.Generator],
     ) -> tuple[dict[str, Array], NDArray[np.bool_], NDArray[np.bool_]]:
         """Readings of the cameras, where they stand at each time; which records are wrong, and which exchanged."""
-        loaded = with_channels(standing, _payload(truth.payload_at(times)))
+        hung = zip(("payload", "payload_x", "payload_y", "payload_z"), truth.payload_at(times).T, strict=True)
+        loaded = with_channels(standing, dict(hung))
         exact = measured_while_moving(request, loaded, truth.values_at(times))
         camera_T_base = truth.camera_T_base_at(times)
         for name in request.measurements:
@@ -216,10 +215,8 @@ def _check(request: SimulationRequest, settings: MissionSettings) -> None:
     for name, measurement in request.measurements.items():
         channels = tuple(channel.name for channel in measurement.channels())
         if channels != ("x", "y", "z"):
-            raise ConfigError(
-                f"simulation: {name} reads {', '.join(channels) or 'nothing'}, expected a position x, y, z.",
-                hint="A mission is measured by instruments such as tip_position.",
-            )
+            text = f"simulation: {name} reads {', '.join(channels) or 'nothing'}, expected a position x, y, z."
+            raise ConfigError(text, hint="A mission is measured by instruments such as tip_position.")
     joints, effects = _joints(request), {f"{arm.name}.{name}" for arm in request.arms.values() for name in arm.effects}
     for event in settings.events:
         joint = getattr(event, "joint", joints[0])
@@ -231,10 +228,8 @@ def _check(request: SimulationRequest, settings: MissionSettings) -> None:
                 hint="Give the arm an effect such as approach_backlash, and its half-width here (arm.lag.lag3).",
             )
         if isinstance(event, PayloadSettings) and not _bends(request):
-            raise ConfigError(
-                "simulation.events: a payload bends nothing here.",
-                hint="Give the arm a spring effect, such as torsional_spring, and gravity in the section statics.",
-            )
+            hint = "Give the arm a spring effect, such as torsional_spring, and gravity in the section statics."
+            raise ConfigError("simulation.events: a payload bends nothing here.", hint=hint)
 
 
 def _bends(request: SimulationRequest) -> bool:
@@ -248,7 +243,3 @@ def _joints(request: SimulationRequest) -> list[str]:
 
 def _gravity(vectors: Array) -> dict[str, Array]:
     return {f"gravity_{axis}": vectors[i] for i, axis in enumerate("xyz")}
-
-
-def _payload(hung: Array) -> dict[str, Array]:
-    return dict(zip(("payload", "payload_x", "payload_y", "payload_z"), hung.T, strict=True))
