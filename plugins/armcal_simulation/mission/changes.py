@@ -27,6 +27,7 @@ from armcal_simulation.mission.events import (
     SlipSettings,
     SwapSettings,
     TiltedSettings,
+    label_of,
     parsed_creep,
 )
 from armcal_simulation.mission.settings import MissionSettings, TemperatureSettings
@@ -144,7 +145,7 @@ def scheduled(settings: MissionSettings, joints: Sequence[str]) -> tuple[Mission
             until = settings.days if event.until is None else min(event.until, settings.days)
         if isinstance(event, BendSettings):
             beside = dict(pairwise(joints)).get(joint, "")
-        events.append(MissionEvent(event.kind, event.day * DAY_S, joint, event.label, until * DAY_S, beside))
+        events.append(MissionEvent(event.kind, event.day * DAY_S, joint, label_of(event), until * DAY_S, beside))
         if isinstance(event, PayloadSettings) and event.until is not None and event.until < settings.days:
             down = event.until * DAY_S
             events.append(MissionEvent(event.kind, down, "", "payload set down", down))

@@ -4,7 +4,6 @@ import math
 import re
 from typing import Annotated, Literal, Self
 
-import numpy as np
 from armcal.base.settings import Angle, Angle3, Length3, Mass, Settings, Temperature
 from pydantic import Field, field_validator, model_validator
 
@@ -31,11 +30,6 @@ class EventSettings(Settings):
     """What all events have: the ``day`` on which they begin, counted from the mission's midnight."""
 
     day: Day
-
-    @property
-    def label(self) -> str:
-        """A few words for figures and tables."""
-        raise NotImplementedError
 
 
 class LastingSettings(EventSettings):
@@ -71,11 +65,6 @@ class SlipSettings(EventSettings):
         """By how much it slips (rad)."""
         return self.angle if self.angle is not None else 2 * math.pi * (self.teeth or 0) / self.of_teeth
 
-    @property
-    def label(self) -> str:
-        """By how many degrees."""
-        return f"{self.joint} slips by {math.degrees(self.turned):.1f} deg"
-
 
 class SwapSettings(EventSettings):
     """A servo is replaced: what changes by how much, with units (``{arm.mdh.theta3: 2 deg}``)."""
@@ -83,11 +72,6 @@ class SwapSettings(EventSettings):
     kind: Literal["swap"]
     joint: str
     changes: Annotated[dict[str, str | float], Field(min_length=1)]
-
-    @property
-    def label(self) -> str:
-        """Of which joint."""
-        return f"servo of {self.joint} replaced"
 
 
 class BendSettings(EventSettings):
@@ -99,11 +83,6 @@ class BendSettings(EventSettings):
     kind: Literal["bend"]
     joint: str
     changes: Annotated[dict[str, str | float], Field(min_length=1)]
-
-    @property
-    def label(self) -> str:
-        """By how much."""
-        return f"link behind {self.joint} bent ({', '.join(str(change) for change in self.changes.values())})"
 
 
 class JointCreepSettings(LastingSettings):
@@ -126,21 +105,11 @@ class CreepSettings(JointCreepSettings):
 
     kind: Literal["creep"]
 
-    @property
-    def label(self) -> str:
-        """How fast."""
-        return f"{self.joint} creeps by {self.change}"
-
 
 class PlaySettings(JointCreepSettings):
     """The play of a joint grows: ``parameter`` is its half-width in an effect of backlash (``arm.lag.lag3``)."""
 
     kind: Literal["play"]
-
-    @property
-    def label(self) -> str:
-        """How fast."""
-        return f"play of {self.joint} grows by {self.change}"
 
 
 class PayloadSettings(LastingSettings):
@@ -153,22 +122,12 @@ class PayloadSettings(LastingSettings):
     mass: Annotated[Mass, Field(gt=0)]
     lever: Length3 = (0.0, 0.0, 0.0)
 
-    @property
-    def label(self) -> str:
-        """How heavy, and how far out."""
-        return f"unreported payload of {1000 * self.mass:.0f} g at {1000 * float(np.linalg.norm(self.lever)):.0f} mm"
-
 
 class TiltedSettings(EventSettings):
     """The rover reads its tilt wrong from now on: gravity is turned against it about the base's x and y axes."""
 
     kind: Literal["tilt"]
     turn: Angle2
-
-    @property
-    def label(self) -> str:
-        """How far."""
-        return f"unreported tilt of {math.degrees(math.hypot(*self.turn)):.1f} deg"
 
 
 class BumpSettings(EventSettings):
@@ -177,12 +136,6 @@ class BumpSettings(EventSettings):
     kind: Literal["bump"]
     shift: Length3 = (0.0, 0.0, 0.0)
     turn: Angle3 = (0.0, 0.0, 0.0)
-
-    @property
-    def label(self) -> str:
-        """How far."""
-        shift, turn = (float(np.linalg.norm(vector)) for vector in (self.shift, self.turn))
-        return f"camera bumped by {1000 * shift:.1f} mm, {math.degrees(turn):.1f} deg"
 
 
 class BiasSettings(LastingSettings):
@@ -198,11 +151,6 @@ class BiasSettings(LastingSettings):
             raise ValueError("found a bias that does not grow: write for example per_day_mm: [0.3, 0, 0]")
         return value
 
-    @property
-    def label(self) -> str:
-        """How fast."""
-        return f"camera's bias grows by {1000 * float(np.linalg.norm(self.per_day)):.2f} mm a day"
-
 
 class ClimateSettings(EventSettings):
     """Days and nights change: from now on the temperature swings by ``swing`` about ``mean``."""
@@ -210,11 +158,6 @@ class ClimateSettings(EventSettings):
     kind: Literal["climate"]
     mean: Temperature
     swing: Temperature
-
-    @property
-    def label(self) -> str:
-        """To what."""
-        return f"temperature now {self.mean - self.swing:.0f} to {self.mean + self.swing:.0f} C"
 
 
 Event = Annotated[
@@ -230,3 +173,29 @@ Event = Annotated[
     | ClimateSettings,
     Field(discriminator="kind"),
 ]
+
+
+def label_of(event: Event) -> str:
+    """A few words for figures and tables."""
+    match event:
+        case SlipSettings():
+            return f"{event.joint} slips by {math.degrees(event.turned):.1f} deg"
+        case SwapSettings():
+            return f"servo of {event.joint} replaced"
+        case BendSettings():
+            return f"link behind {event.joint} bent ({', '.join(str(change) for change in event.changes.values())})"
+        case CreepSettings():
+            return f"{event.joint} creeps by {event.change}"
+        case PlaySettings():
+            return f"play of {event.joint} grows by {event.change}"
+        case PayloadSettings():
+            return f"unreported payload of {1000 * event.mass:.0f} g at {1000 * math.hypot(*event.lever):.0f} mm"
+        case TiltedSettings():
+            return f"unreported tilt of {math.degrees(math.hypot(*event.turn)):.1f} deg"
+        case BumpSettings():
+            shift, turn = math.hypot(*event.shift), math.hypot(*event.turn)
+            return f"camera bumped by {1000 * shift:.1f} mm, {math.degrees(turn):.1f} deg"
+        case BiasSettings():
+            return f"camera's bias grows by {1000 * math.hypot(*event.per_day):.2f} mm a day"
+        case ClimateSettings():
+            return f"temperature now {event.mean - event.swing:.0f} to {event.mean + event.swing:.0f} C"
