@@ -98,8 +98,7 @@ def zeros(console: Console, calibrated: Path, calibration: Path, arm_name: str |
     """
     from armcal.calibration.joint_zeros import zeros_of
 
-    from armcal_lerobot.check import show_zeros, wired_zeros
-    from armcal_lerobot.zeros import require_not_written, rezeroed
+    from armcal_lerobot.check import require_not_written, rezeroed, show_zeros, wired_zeros
 
     file = read_motors(calibration)
     known, left = zeros_of(calibrated, arm_name, console.registry())

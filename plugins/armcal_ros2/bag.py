@@ -10,9 +10,8 @@ from typing import Any
 import yaml
 from armcal.io.plain_files import input_bytes, refuse
 
-from armcal_ros2.library import decompressed, message_types
 from armcal_ros2.mcap import McapFile
-from armcal_ros2.message import RawMessage, Topic
+from armcal_ros2.message import RawMessage, Topic, decompressed, message_types
 from armcal_ros2.sqlite import SqliteFile
 
 _METADATA = "metadata.yaml"

@@ -11,8 +11,7 @@ from typing import BinaryIO
 
 from armcal.io.plain_files import input_file, refuse
 
-from armcal_ros2.library import decompressed
-from armcal_ros2.message import MAX_BYTES, RawMessage, Topic
+from armcal_ros2.message import MAX_BYTES, RawMessage, Topic, decompressed
 
 MAGIC = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F

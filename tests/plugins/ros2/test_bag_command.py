@@ -14,7 +14,7 @@ import yaml
 from armcal.errors import DataError, InputError, PluginError
 from armcal.run.experiment import Experiment
 from armcal_ros2.bag_command import bag as command
-from armcal_ros2.library import message_types
+from armcal_ros2.message import message_types
 from click.testing import CliRunner
 
 
