@@ -138,7 +138,7 @@ def _at_zero(chain: Chain, family: Family) -> tuple[Array, Array]:
     for joint, frame in zip(arm.joints, frames, strict=True):
         if np.abs(joint.axis - (0, 0, 1)).max() > 1e-12:
             frame[:3, :3] = about_z(joint.direction, frame[:3, int(np.argmin(np.abs(joint.axis)))])
-    return np.linalg.solve(base, np.array(frames)), flange[0]
+    return np.asarray(np.linalg.solve(base, np.array(frames))), flange[0]
 
 
 def _compare(request: ExportRequest, chain: Chain, family: Family, frames: Array, left: Array) -> None:

@@ -56,7 +56,7 @@ class FoundServo:
     @property
     def content(self) -> dict[str, Any]:
         """For programs."""
-        own = {"baud": self.baud, "id": self.id, "model": self.model.name if self.model else None}
+        own: dict[str, Any] = {"baud": self.baud, "id": self.id, "model": self.model.name if self.model else None}
         own |= {"model_number": self.number, "firmware": self.firmware, "position": self.position}
         own |= {"voltage_V": self.voltage, "temperature_C": self.temperature}
         return {**own, "alarms": list(self.alarms), "doubled": self.is_doubled}
