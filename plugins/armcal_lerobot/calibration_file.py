@@ -75,9 +75,9 @@ def read_motors(path: Path) -> MotorFile:
     owners: dict[int, str] = {}
     for name, motor in motors.items():
         if (other := owners.setdefault(motor.id, name)) != name:
-            found = f"found {motor.id}, which {other} has too; expected an id of its own."
+            message = f"found {motor.id}, which {other} has too; expected an id of its own."
             mend = "Give each servo its own id (lerobot-setup-motors), and correct the file."
-            _refuse(path, f"{name}.id", found, mend)
+            _refuse(path, f"{name}.id", message, mend)
     return MotorFile(path, text, motors)
 
 

@@ -104,9 +104,9 @@ class Chip:
         prescale, mode2 = self._read(PRE_SCALE, 1)[0], self._read(MODE2, 1)[0]
         if not is_running or (prescale, mode2) != (self._prescale, OUTDRV):
             if is_running and foreign_pulses == "refuse" and (pulsed := self._pulsed()):
-                found = f"found prescale {prescale} and MODE2 0x{mode2:02x} with pulses on channels"
+                text = f"found prescale {prescale} and MODE2 0x{mode2:02x} with pulses on channels"
                 raise DeviceRefusedError(
-                    f"{found} {', '.join(map(str, pulsed))}, expected prescale {self._prescale} and MODE2 "
+                    f"{text} {', '.join(map(str, pulsed))}, expected prescale {self._prescale} and MODE2 "
                     f"0x{OUTDRV:02x}.",
                     where=self.where,
                     hint="Hold the arm, and switch the servos' power and the board off and on; or set foreign_pulses: "
