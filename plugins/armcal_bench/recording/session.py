@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from armcal.devices.clock import Clock
-from armcal.devices.live import JointStream, RestStream
+from armcal.devices.live import JointStream, LiveCamera, RestStream
 from armcal.errors import ConfigError
 
 from armcal_bench.bench import SECTION, Bench
@@ -49,16 +49,7 @@ def record(
     columns = Labels(bench.experiment.system.measurements, ()).columns
     header = {"joints": list(channels), "labels": list(columns)}
     stream = bench.joints()
-    if camera is not None and camera.gives_shots:
-        capture = "images"
-    if isinstance(stream, RestStream) and stream.gives_rests:
-        if capture in ("keys", "images") or camera is not None:
-            raise ConfigError(
-                "the stream gives a sample only when a rest is over, so no key can capture one, and no image is of it.",
-                where=bench.experiment.source.where((SECTION, "joints", "still")),
-                hint="Give --capture still, or leave still out.",
-            )
-        capture = "rests"
+    capture = _capture(bench, capture, stream, camera)
     with bench.clock() as clock:
         try:
             if camera is not None:
@@ -76,6 +67,21 @@ def record(
             stream.close()
             if camera is not None:
                 camera.close()
+
+
+def _capture(bench: Bench, chosen: Capture, stream: JointStream, camera: LiveCamera | None) -> Capture:
+    """A camera that gives images by itself says when, and so does a stream of rests."""
+    if camera is not None and camera.gives_shots:
+        chosen = "images"
+    if not (isinstance(stream, RestStream) and stream.gives_rests):
+        return chosen
+    if chosen in ("keys", "images") or camera is not None:
+        raise ConfigError(
+            "the stream gives a sample only when a rest is over, so no key can capture one, and no image is of it.",
+            where=bench.experiment.source.where((SECTION, "joints", "still")),
+            hint="Give --capture still, or leave still out.",
+        )
+    return "rests"
 
 
 def _messages(
