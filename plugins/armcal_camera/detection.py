@@ -93,19 +93,13 @@ def _chessboard(image: Grey, reduced: Grey, board: Board, nothing: Detection) ->
     if whole != size:
         text = f"expected {size[0]} x {size[1]} inner corners, found {whole[0]} x {whole[1]}"
         return replace(nothing, fault=text, found_size=whole)
-    if cv2.findChessboardCornersSB(_without(reduced, rough.reshape(-1, 2)), size)[0]:
+    hull, middle = cv2.convexHull(rough.astype(np.float32)).reshape(-1, 2), rough.reshape(-1, 2).mean(axis=0)
+    outline = np.rint(middle + 1.1 * (hull - middle)).astype(np.int32)
+    painted_over = cv2.fillConvexPoly(reduced.copy(), outline, int(np.percentile(reduced, 90)))
+    if cv2.findChessboardCornersSB(painted_over, size)[0]:
         return replace(nothing, fault="the chessboard was found twice")
     corners, _ = upright(fit.corners.reshape(grid.shape), fit.crossing.reshape(grid.shape[:2]))
     return replace(nothing, corners=corners.reshape(-1, 2), fault="", blur=float(np.nanmedian(fit.blur)))
-
-
-def _without(image: Grey, corners: Array) -> Grey:
-    """The image with the board's squares painted over."""
-    cv2 = opencv()
-    hull, middle = cv2.convexHull(corners.astype(np.float32)).reshape(-1, 2), corners.mean(axis=0)
-    outline = np.rint(middle + 1.1 * (hull - middle)).astype(np.int32)
-    painted: Grey = cv2.fillConvexPoly(image.copy(), outline, int(np.percentile(image, 90)))
-    return painted
 
 
 def _other_board(image: Grey, nothing: Detection) -> Detection:

@@ -1,7 +1,5 @@
 """Where a fit of a camera starts: intrinsics from homographies, poses of boards, hand-eye in closed form."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

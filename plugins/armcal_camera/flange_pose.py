@@ -7,8 +7,6 @@ A controller computes the pose that it shows from the joints by its own nominal 
 back. Of several postures for a pose the sequence decides: the one that moves the joints least from pose to pose.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, ClassVar

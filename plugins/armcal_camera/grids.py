@@ -1,7 +1,5 @@
 """Chessboards in an image: which way round a grid of corners lies, and how far the pattern goes on."""
 
-from __future__ import annotations
-
 import numpy as np
 from armcal.base.domains import Array
 

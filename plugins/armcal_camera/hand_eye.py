@@ -4,8 +4,6 @@ For a camera on the hand A is base_T_tool, X tool_T_camera, Y base_T_board and B
 beside the arm X is tool_T_board, Y base_T_camera and B camera_T_board.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

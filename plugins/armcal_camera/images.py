@@ -1,7 +1,5 @@
 """Images as grey values, and the library OpenCV, which only what reads images needs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -5,8 +5,6 @@ pixels, as the core holds places in an image; pixel (0, 0) is the centre of the 
 are ROS ``camera_info``, OpenCV's and Kalibr's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias

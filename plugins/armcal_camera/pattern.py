@@ -1,7 +1,5 @@
 """What is printed of a board: dark rectangles on white paper."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

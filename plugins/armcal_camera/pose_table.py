@@ -1,7 +1,5 @@
 """Where the arm stood for each image: joint angles, or poses of the flange, from a file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

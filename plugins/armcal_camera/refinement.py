@@ -6,8 +6,6 @@ function f. That holds for the crossing of a chessboard as for the corner of a t
 it is more accurate than a point's gradient, and its width says how sharp the image is.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

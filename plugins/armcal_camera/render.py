@@ -1,7 +1,5 @@
 """Images of boards from a stated truth: a printed pattern through a lens, with blur, light and noise."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

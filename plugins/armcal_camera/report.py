@@ -179,22 +179,18 @@ def _figure(residuals: CameraResiduals, index: int, word: str, most_bytes: int) 
     seen = residuals.seen[:, :, index]
     predicted = seen - residuals.off[:, :, index]
     there = np.isfinite(predicted).all(axis=0)
-    marks = _marks(scale * (seen[:, there] + 0.5), scale * (predicted[:, there] + 0.5), _enlarged(residuals))
-    error = significant(float(residuals.by_image[index]))
-    words = f"{name} ({word}): {error} px rms, {int(there.sum())} corners"
-    drawn = svg.document(f"camera-{residuals.name}-{index}", shape, words, words, [back, *marks])
-    return f"<figure>{drawn}<figcaption>{escape(words)}</figcaption></figure>"
-
-
-def _marks(seen: Array, predicted: Array, enlarged: float) -> list[str]:
-    """Corners seen, predicted, and the arrows between them (2 x n each, px of the figure)."""
-    tips = predicted + enlarged * (seen - predicted)
+    seen, predicted = (scale * (corners[:, there] + 0.5) for corners in (seen, predicted))
+    tips = predicted + _enlarged(residuals) * (seen - predicted)
     style = '<g style="stroke:{};stroke-width:{};stroke-linecap:round">{}</g>'
-    return [
+    marks = [
         style.format(_COLOURS["arrow"], 1.4, svg.segments(predicted[0], predicted[1], tips[0], tips[1], "")),
         style.format(_COLOURS["predicted"], 1.2, svg.marks(predicted[0], predicted[1], _CROSS, "")),
         style.format(_COLOURS["seen"], 3, svg.dots(seen[0], seen[1], "")),
     ]
+    error = significant(float(residuals.by_image[index]))
+    words = f"{name} ({word}): {error} px rms, {int(there.sum())} corners"
+    drawn = svg.document(f"camera-{residuals.name}-{index}", shape, words, words, [back, *marks])
+    return f"<figure>{drawn}<figcaption>{escape(words)}</figcaption></figure>"
 
 
 def _photo(path: str, most_bytes: int) -> _Photo | None:

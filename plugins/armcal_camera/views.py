@@ -4,8 +4,6 @@ A flat board's image is a homography of it [Hartley2004]; homographies of severa
 principal point [Zhang2000].
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
