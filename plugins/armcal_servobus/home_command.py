@@ -21,6 +21,7 @@ from armcal_servobus.servos import Servos
 @click.option("--joint", "chosen", multiple=True, metavar="NAME", help="Only this joint; may be repeated.")
 @click.option("--keep", "kept", type=FILE, help="The new file for the old values [default: beside CONFIG].")
 @click.option("--calibration", type=FILE, help="Write the zeros that this calibration.yaml found: nothing is held.")
+@click.option("--arm-name", metavar="NAME", help="Which arm of that calibration, where there are several.")
 @click.option("--restore", type=FILE, help="Write the offsets of such a file back, in place of new ones.")
 @click.option("--release", is_flag=True, help="Let servos go that hold; hold the arm.")
 @click.option("--yes", is_flag=True, help="Write without asking.")
@@ -32,6 +33,7 @@ def home_command(
     chosen: tuple[str, ...],
     kept: Path | None,
     calibration: Path | None,
+    arm_name: str | None,
     restore: Path | None,
     release: bool,
     yes: bool,
@@ -46,7 +48,7 @@ def home_command(
         joints = _chosen(all_joints, chosen)
         targets = held_at(_angles(joints, stated))
         if calibration is not None:
-            zeros = _zeros(console, calibration, joints)
+            zeros = _zeros(console, calibration, arm_name, joints)
             joints, targets = {name: joints[name] for name in zeros}, corrected(zeros)
         elif restore is not None:
             targets = restored(kept_offsets(restore, joints))
@@ -71,11 +73,13 @@ def home_command(
         console.line("Now the zeros of the configuration are those of before: set them to 0, and measure anew.")
 
 
-def _zeros(console: Console, calibration: Path, joints: dict[str, ServoJoint]) -> dict[str, float]:
+def _zeros(
+    console: Console, calibration: Path, arm: str | None, joints: dict[str, ServoJoint]
+) -> dict[str, float]:
     """The zeros (rad) that a calibration found, by joint; the joints without one are named."""
     from armcal.calibration.joint_zeros import zeros_of
 
-    known, reasons = zeros_of(calibration, None, console.registry())
+    known, reasons = zeros_of(calibration, arm, console.registry())
     for name, reason in reasons.items():
         console.warn(f"{name} keeps its zero: {reason}.")
     by_local = {name: name.rpartition(".")[2] for name in joints}
