@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.config.yaml_source import load_config
 from armcal_capability.loading import load_task
 from armcal_capability.mechanics import MechanicsFunction

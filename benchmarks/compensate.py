@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.parameters import Parameters
 from armcal.calibration.compensation.compensator import Compensator
 from armcal.calibration.compensation.request import Commands, Options, Targets

@@ -12,7 +12,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 from armcal.arm.assembly import Arm
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.calibration.exporter import ExportRequest, rigid_tools
 from armcal.calibration.rigid_chain import numeric_chain
 from armcal.config.selection import with_values

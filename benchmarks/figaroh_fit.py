@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import yaml
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from figaroh.calibration import BaseCalibration  # type: ignore[import-not-found]
 from figaroh.calibration.calibration_tools import calc_updated_fkm  # type: ignore[import-not-found]
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.problem.problem import Problem
 from scipy.optimize import least_squares

@@ -9,8 +9,8 @@ from functools import partial
 
 import casadi as ca
 import numpy as np
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.estimate.online import Gaussian
 from armcal.functions.batch_function import EvaluatorChoice

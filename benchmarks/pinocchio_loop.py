@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.functions.compiler import cache_directory
 
 SOURCE, ARM = (Path(__file__).with_name(name) for name in ("pinocchio_loop.cpp", "pinocchio_arm.hpp"))

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.planning.bound import bounded
-from armcal.planning.candidates import Candidates, Indices, whitened_rows
+from armcal.planning.candidates import Candidates, whitened_rows
 from armcal.planning.criterion import criterion
 from armcal.planning.planning import Plan, choose, detmax, value_of
 from armcal.planning.relaxation import Task

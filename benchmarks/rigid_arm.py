@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import yaml
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.run.experiment import Experiment
 
 ROWS = [  # alpha (deg), a (m), d (m): Rot_x(alpha) Trans_x(a) Rot_z(theta) Trans_z(d)

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import yaml
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
 from rosbags.rosbag2 import StoragePlugin, Writer

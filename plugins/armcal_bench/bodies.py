@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.poses import PoseSettings
 from armcal.base.settings import Settings
 from armcal.devices.live import TrackerFrame

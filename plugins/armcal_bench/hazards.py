@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 
 _GEARS_HOLD = 0.05
 """N m: under less than this the gears of a small servo stand without pulses; more turns them."""

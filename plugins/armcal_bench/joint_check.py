@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.devices.device import MeasuringDevice
 from armcal.devices.wiring import WiringRecord
 from armcal.errors import ConfigError

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.devices.live import TrackerFrame
 from armcal.measure.stillness import deviations_of_mean, judged, mean_pose, turns_from
 from scipy.spatial.transform import Rotation

@@ -13,8 +13,8 @@ from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
+from armcal.base.arrays import Array
 from armcal.base.config_text import resolve_path
-from armcal.base.domains import Array
 from armcal.base.settings import Length, Settings
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config

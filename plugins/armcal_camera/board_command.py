@@ -10,7 +10,7 @@ from xml.sax.saxutils import escape
 import click
 import numpy as np
 import yaml
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.cli.common import Console, speaking
 from armcal.errors import InputError
 from armcal.io.file_set import write_new, write_over

@@ -10,14 +10,14 @@ import casadi as ca
 import numpy as np
 from armcal.arm.assembly import ArmState
 from armcal.arm.statics import BASE_FRAME, TOOL_FRAME
-from armcal.base.domains import Array, Interval
+from armcal.base.arrays import Array, Indices, Mask
+from armcal.base.domains import Interval
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.poses import PoseSettings, pose_transform
 from armcal.base.se3 import identity
 from armcal.measure.instrument import InstrumentSettings
 from armcal.measure.measurement import Channel, Mistake
 from armcal.measure.points import PointInstrument, Proposal, Reading, spread_points
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from armcal_camera.board import Board, BoardOrFile, Chessboard, require_distinct
@@ -184,7 +184,7 @@ class Camera(PointInstrument):
         return ("board",) if len(self.boards) == 1 else tuple(f"board{i}" for i in range(1, len(self.boards) + 1))
 
     @cached_property
-    def used(self) -> tuple[NDArray[np.intp], ...]:
+    def used(self) -> tuple[Indices, ...]:
         """Which points of each board are used, in order."""
         return tuple(spread_points(board.points, self.settings.most_points) for board in self.boards)
 
@@ -271,7 +271,7 @@ class Camera(PointInstrument):
         s = self.settings
         return s.image or (s.intrinsics.image if s.intrinsics else None)
 
-    def visible(self, margins: Array) -> NDArray[np.bool_]:
+    def visible(self, margins: Array) -> Mask:
         """Which points can be read (P x N): of a chessboard all or none, of others those in view, if there are four."""
         visible, start = margins > 0, 0
         for board, used in zip(self.boards, self.used, strict=True):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from warnings import catch_warnings, simplefilter
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.errors import PluginError
 from armcal.extras import library
 from scipy.optimize import least_squares

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.io.cells import CellFault, read_cell
 from armcal.io.plain_files import input_bytes, refuse, text_of
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 
 from armcal_camera.board import FAMILIES, Board, Charuco, Chessboard
 from armcal_camera.grids import grown, is_chessboard, refined_grid, upright

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import numpy as np
 import yaml
 from armcal.arm.statics import BASE_FRAME, TOOL_FRAME
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.settings import Settings
 from armcal.calibration.exporter import Exported, ExportRequest, Instrument
 from armcal.errors import ConfigError

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.quaternions import quaternion_of, rotation_matrix
 from armcal.measure.points import Proposal, Reading
 

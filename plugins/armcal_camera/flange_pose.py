@@ -15,7 +15,7 @@ import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.arm.model import Attachment, Chain, Joint
 from armcal.base import se3
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.parameters import ParameterBlock
 from armcal.base.settings import Settings
 from armcal.calibration.exporter import rigid_tools

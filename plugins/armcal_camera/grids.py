@@ -1,7 +1,7 @@
 """Chessboards in an image: which way round a grid of corners lies, and how far the pattern goes on."""
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 
 from armcal_camera.images import Grey
 from armcal_camera.refinement import Refined, refine

@@ -7,8 +7,7 @@ beside the arm X is tool_T_board, Y base_T_camera and B camera_T_board.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from armcal.base.domains import Array
-from numpy.typing import NDArray
+from armcal.base.arrays import Array, Mask
 from scipy.spatial.transform import Rotation
 
 FEWEST = 3
@@ -32,7 +31,7 @@ class HandEye:
     y: Array
     method: str
     left_m: float
-    kept: NDArray[np.bool_]
+    kept: Mask
 
 
 def hand_eye(a: Array, b: Array) -> HandEye | None:
@@ -55,7 +54,7 @@ def hand_eye(a: Array, b: Array) -> HandEye | None:
     return best
 
 
-def _better(a: Array, b: Array, kept: NDArray[np.bool_]) -> HandEye:
+def _better(a: Array, b: Array, kept: Mask) -> HandEye:
     """The better of the closed forms of the poses that decide."""
     a, b = a[kept], b[kept]
     answers = {"Park": _park(a, b), "Shah": _shah(a, b), "Daniilidis": _daniilidis(a, b)}

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import casadi as ca
 import numpy as np
 import yaml
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.settings import Settings, UnitOf
 from armcal.errors import DataError, Location
 from armcal.io.plain_files import input_bytes

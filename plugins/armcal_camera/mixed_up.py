@@ -7,9 +7,8 @@ the camera sits: pairs of images show what does not belong together before anyth
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices, Mask
 from armcal.errors import ProblemError
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from armcal_camera.hand_eye import hand_eye
@@ -157,7 +156,7 @@ def require_one_board(moved: Array, seen: Array, ids: Sequence[str]) -> None:
         )
 
 
-def _contradicting(agree: NDArray[np.bool_]) -> NDArray[np.intp]:
+def _contradicting(agree: Mask) -> Indices:
     """Images that agree with few of the others, where those agree among themselves; none if they are many."""
     share = (agree.sum(axis=1) - agree.diagonal()) / (len(agree) - 1)
     alone, rest = np.flatnonzero(share < _ALONE), np.flatnonzero(share >= _ALONE)
@@ -167,7 +166,7 @@ def _contradicting(agree: NDArray[np.bool_]) -> NDArray[np.intp]:
     return alone
 
 
-def _times_further(off: Array, first: NDArray[np.intp], second: NDArray[np.intp]) -> float:
+def _times_further(off: Array, first: Indices, second: Indices) -> float:
     """How many times further pairs across two groups are off than those within."""
     apart = np.where(np.eye(len(off), dtype=bool), np.nan, off)
     within = max(float(np.nanmedian(apart[np.ix_(group, group)])) for group in (first, second))

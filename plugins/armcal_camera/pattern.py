@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 
 from armcal_camera.board import FAMILIES, Board, Charuco, Chessboard, tag_modules
 from armcal_camera.images import opencv

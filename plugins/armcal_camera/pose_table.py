@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 from armcal.arm.assembly import Arm
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.quaternions import nearest_rotation
 from armcal.base.units import DIMENSIONLESS
 from armcal.errors import DataError

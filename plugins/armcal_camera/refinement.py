@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from scipy.special import erf
 
 from armcal_camera.images import Grey

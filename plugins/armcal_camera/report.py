@@ -8,7 +8,7 @@ from html import escape
 from pathlib import Path
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.errors import ArmcalError
 from armcal.io.plain_files import input_bytes
 from armcal.report import svg

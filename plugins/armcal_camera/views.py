@@ -7,7 +7,7 @@ principal point [Zhang2000].
 from collections.abc import Sequence
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from armcal.arm.servo import PulseClock, PulseTable, SteppedEffect
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.tool_expression import Equilibrium, ToolExpression
 from armcal.functions.batch_function import EvaluatorChoice

@@ -6,7 +6,7 @@ from itertools import cycle
 from typing import Any
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 
 from armcal_capability.cells import Voxels
 from armcal_capability.drawing import INK, LABEL_POINTS, empty_figure, png_of, style

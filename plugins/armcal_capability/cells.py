@@ -4,8 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from armcal.arm.clearance import Mask
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices, Mask
 from numpy.typing import NDArray
 
 from armcal_capability.inverse import Pointing, reach_for
@@ -48,7 +47,7 @@ def voxels_of(postures: Postures, size: float) -> Voxels:
     return Voxels(size, cells.reshape(-1, 3), counts, values)
 
 
-def grouped(values: Mapping[str, Array], group: NDArray[np.intp], count: int) -> dict[str, Array]:
+def grouped(values: Mapping[str, Array], group: Indices, count: int) -> dict[str, Array]:
     """Best, mean and worst (3 x count) of quantities by group; not a number where a group has none."""
     members = np.bincount(group, minlength=count)
     order = np.argsort(group, kind="stable")

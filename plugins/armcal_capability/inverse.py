@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from armcal.arm.clearance import Mask
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Mask
 
 from armcal_capability.mechanics import MechanicsFunction
 from armcal_capability.settings import ToolDirectionSettings

@@ -4,9 +4,8 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
-from armcal.arm.clearance import Mask
 from armcal.arm.loading import LOAD_CHANNELS
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Mask
 from armcal.calibration.compensation.step import force_compliance, slopes, twists
 from armcal.calibration.tool_expression import Equilibrium, ToolExpression
 from armcal.functions.batch_function import BatchFunction, EvaluatorChoice

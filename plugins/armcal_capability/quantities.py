@@ -11,9 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from armcal.arm.clearance import Mask
-from armcal.base.domains import Array
-from numpy.typing import NDArray
+from armcal.base.arrays import Array, Indices, Mask
 
 from armcal_capability.mechanics import MechanicsFunction
 
@@ -85,7 +83,7 @@ class Postures:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def subset(self, chosen: Mask | NDArray[np.intp]) -> Postures:
+    def subset(self, chosen: Mask | Indices) -> Postures:
         """Some of them, by place or by mask."""
         return Postures(
             self.commands[:, chosen],

@@ -6,9 +6,9 @@ from typing import Self
 
 import numpy as np
 from armcal.arm.assembly import Arm
-from armcal.arm.clearance import ClearanceCheck, Mask
+from armcal.arm.clearance import ClearanceCheck
 from armcal.arm.joints import by_dimension, joint_limits, unknown_joint
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Mask
 from armcal.base.parameters import Parameters
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.tool_expression import ToolExpression, arm_expression

@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from armcal.arm.clearance import Mask
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Mask
 
 from armcal_capability.cells import AreaMap
 from armcal_capability.quantities import BY_NAME, CATALOGUE

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 from armcal.arm.model import forward
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.errors import ProblemError
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.functions.batch_function import EvaluatorChoice

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.settings import InputPath, Settings
 from armcal.errors import DataError, Location
 from armcal.io.cells import is_missing, is_number

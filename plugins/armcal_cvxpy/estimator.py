@@ -11,7 +11,8 @@ from typing import Annotated, ClassVar
 
 import cvxpy as cp
 import numpy as np
-from armcal.base.domains import Array, Semidefinite, symmetric
+from armcal.base.arrays import Array
+from armcal.base.domains import Semidefinite, symmetric
 from armcal.base.settings import Settings
 from armcal.estimate.estimator import Progress, Solution, SolverVerdict, no_progress
 from armcal.estimate.polish import polish

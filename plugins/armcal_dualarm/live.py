@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.units import from_unit
 from armcal.devices.clock import Clock
 from armcal.devices.line_source import Begin, FileLines, LineJointStream, SourceName, open_lines

@@ -4,7 +4,7 @@ from collections import Counter
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.settings import Settings
 from armcal.measure.rests import StillSettings
 from pydantic import Field, model_validator

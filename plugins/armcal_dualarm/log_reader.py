@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from typing import ClassVar, NoReturn
 
 import numpy as np
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.settings import InputPath
 from armcal.base.units import from_unit
 from armcal.errors import DataError, Location

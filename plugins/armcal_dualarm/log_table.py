@@ -9,7 +9,7 @@ from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.io.cells import is_missing, is_number, plain_numbers
 from armcal.io.plain_files import input_bytes, refuse
 

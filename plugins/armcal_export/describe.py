@@ -9,7 +9,7 @@ from armcal.arm.effects import MOUNT, JointCommand, Spring
 from armcal.arm.environment import STATICS, tilted
 from armcal.arm.model import Chain, forward
 from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME, Load, frame_names
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.calibration.exporter import ExportRequest, random_commands, rigid_tools
 from armcal.calibration.rigid_chain import RigidJoint, rigid_chain
 from armcal.errors import ProblemError

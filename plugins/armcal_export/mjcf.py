@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from xml.etree import ElementTree
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.quaternions import quaternion_of
 from armcal.calibration.rigid_chain import RigidChain
 

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from armcal.arm.assembly import scoped
 from armcal.arm.effects import JointCommand, reshapes
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.settings import Settings
 from armcal.calibration.exporter import (
     POSES,

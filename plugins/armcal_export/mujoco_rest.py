@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.calibration.rigid_chain import RigidChain
 from armcal.errors import NotConvergedError
 

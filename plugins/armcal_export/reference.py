@@ -5,11 +5,10 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 from armcal.arm.evaluator import Evaluator
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Mask
 from armcal.calibration.exporter import random_commands
 from armcal.calibration.tool_expression import ToolExpression
 from armcal.errors import NotConvergedError
-from numpy.typing import NDArray
 
 _PAYLOAD_KG, _FORCE_N = 0.05, 0.5
 
@@ -29,7 +28,7 @@ class Reference:
     efforts: Array
 
 
-def in_equilibrium(expression: ToolExpression, records: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+def in_equilibrium(expression: ToolExpression, records: Array) -> tuple[Array, Array, Mask]:
     """Tools (N x 3 x 4), efforts (N x joints) and which records (N x channels) have an equilibrium (N)."""
     tool = ca.vec(expression.base_T_tool.matrix()[:3, :].T)
     shown, settled = Evaluator(expression, ca.vertcat(tool, expression.efforts)).settle(

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from armcal.arm.servo import SteppedEffect
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.quaternions import rpy_of
 from armcal.base.settings import Settings
 from armcal.calibration.exporter import Exported, ExportRequest, changed_numbers

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from armcal.base.domains import Array, Semidefinite, symmetric
+from armcal.base.arrays import Array
+from armcal.base.domains import Semidefinite, symmetric
 from armcal.base.parameters import Parameters
 from armcal.errors import NotConvergedError
 from armcal.problem.posed import PosedProblem

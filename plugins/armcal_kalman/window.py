@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.online import Gaussian, Observation, OnlineEstimator, Update, checked

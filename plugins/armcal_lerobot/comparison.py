@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from scipy.stats import t as student
 
 from armcal_lerobot.gripper import Cost, Gripper

@@ -9,7 +9,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 from armcal.arm.joints import joint_limits
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.tool_expression import arm_expression
 from armcal.config.system import build_system

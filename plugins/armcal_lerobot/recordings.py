@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.errors import DataError, Location
 from armcal.extras import library
 from armcal.io.plain_files import input_bytes, text_of

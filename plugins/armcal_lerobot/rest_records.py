@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.errors import DataError, InputError, Location
 from armcal.extras import library
 from armcal.io.cells import csv_text

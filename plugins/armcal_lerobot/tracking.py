@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Mask
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.stats import t as student
@@ -185,7 +185,7 @@ def _delay(motion: Motion, index: int) -> tuple[Figure | None, str]:
     return late_s.plus(best / fps).no_finer(_FINEST / fps / 2), ""
 
 
-def _left(pairs: Sequence[tuple[Array, Array]], moving: Sequence[NDArray[np.bool_]], frames: float) -> float:
+def _left(pairs: Sequence[tuple[Array, Array]], moving: Sequence[Mask], frames: float) -> float:
     """What a line leaves of the states at a delay, over all stretches."""
     late, state = [], []
     for (command, reached), mask in zip(pairs, moving, strict=True):
@@ -269,7 +269,7 @@ def _slow_rows(
     return command, state, speed, side, load, cluster
 
 
-def _unobstructed(rows: Array, y: Array) -> NDArray[np.bool_]:
+def _unobstructed(rows: Array, y: Array) -> Mask:
     """Frames that agree with the least sum of absolute residuals: the rest was stopped on its way, or pushed."""
     weight = np.ones(len(y))
     for _ in range(_L1_STEPS):

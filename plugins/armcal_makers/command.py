@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.calibration.convert_poe_urdf import urdf_text
 from armcal.calibration.exporter import POSES
 from armcal.calibration.rigid_chain import turn_between

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import yaml
 from armcal.arm.model import Chain, forward
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.settings import Settings
 from armcal.calibration.exporter import Exported, ExportRequest, changed_numbers, random_commands
 from armcal.calibration.rigid_chain import (

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.errors import Location
 from armcal.io.plain_files import input_bytes, refuse, text_of
 

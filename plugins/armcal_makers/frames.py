@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.quaternions import rpy_of
 from armcal.calibration.rigid_chain import RigidChain, RigidJoint
 from scipy.spatial.transform import Rotation

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from armcal.arm.assembly import Arm
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.calibration.convert_check import nominal_values
 from armcal.calibration.exporter import Exporter, ExportRequest, random_commands, rigid_tools
 from armcal.errors import DataError, Location

@@ -12,7 +12,8 @@ import casadi as ca
 import numpy as np
 from armcal.arm.model import Attachment, Chain, Joint, Vector3
 from armcal.base import se3
-from armcal.base.domains import Array, Direction, ScrewAxis
+from armcal.base.arrays import Array
+from armcal.base.domains import Direction, ScrewAxis
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.poses import pose_transform
 from armcal.base.quaternions import rotation_matrix

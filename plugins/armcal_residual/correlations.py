@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import casadi as ca
 import numpy as np
 from armcal.arm.pose_residual import SURROUNDINGS
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.settings import Settings
 from pydantic import Field
 from scipy.linalg import solve_triangular

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from armcal.arm.effects import JointChoice, chosen
 from armcal.arm.pose_residual import OF_TOOL, ModelErrors
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.settings import Settings
 from pydantic import Field
 from typing_extensions import override

@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar
 import casadi as ca
 import numpy as np
 from armcal.arm.pose_residual import OF_TOOL, SURROUNDINGS, ModelErrors, Postures
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.settings import Settings
 from pydantic import Field
 from typing_extensions import override

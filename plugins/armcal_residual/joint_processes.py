@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from armcal.arm.pose_residual import OF_TOOL, ModelErrors
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from scipy.linalg import block_diag
 
 from armcal_residual.correlations import Correlations, Input, ProcessSettings, TermSettings, roots_of, share_between

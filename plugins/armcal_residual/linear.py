@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import casadi as ca
 import numpy as np
 from armcal.arm.pose_residual import OF_TOOL, ModelErrors, PoseResidual, Postures
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.se3 import Expression
 from armcal.base.settings import Settings
 from numpy.linalg import LinAlgError

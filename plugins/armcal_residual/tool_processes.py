@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from armcal.arm.pose_residual import SURROUNDINGS, ModelErrors
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from scipy.optimize import minimize
 
 from armcal_residual.correlations import (

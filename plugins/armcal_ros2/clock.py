@@ -10,7 +10,7 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from scipy.interpolate import CubicSpline
 from scipy.special import stdtrit
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.settings import Angle, Duration, Length, Settings
 from armcal.io.plain_files import refuse
 from armcal.measure.rests import LiveRests, Rows, StillSettings

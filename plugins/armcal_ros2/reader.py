@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.settings import InputPath, Settings
 from armcal.calibration.rigid_chain import tool_poses
 from armcal.io.plain_files import refuse

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.settings import Duration
 from armcal.io.plain_files import refuse
 from pydantic import model_validator

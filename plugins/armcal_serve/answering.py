@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.poses import PoseSettings
 from armcal.base.quaternions import quaternion_of, rotation_matrix
 from armcal.base.units import to_unit

@@ -7,7 +7,7 @@ from typing import NoReturn
 
 import numpy as np
 from armcal.arm.loading import LOAD_CHANNELS
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.units import from_unit, split_suffix, to_unit
 from armcal.calibration.compensation.compensator import Compensator
 from armcal.calibration.measured_point import Point

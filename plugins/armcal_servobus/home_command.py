@@ -73,9 +73,7 @@ def home_command(
         console.line("Now the zeros of the configuration are those of before: set them to 0, and measure anew.")
 
 
-def _zeros(
-    console: Console, calibration: Path, arm: str | None, joints: dict[str, ServoJoint]
-) -> dict[str, float]:
+def _zeros(console: Console, calibration: Path, arm: str | None, joints: dict[str, ServoJoint]) -> dict[str, float]:
     """The zeros (rad) that a calibration found, by joint; the joints without one are named."""
     from armcal.calibration.joint_zeros import zeros_of
 

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.base.settings import Angle, InputPath, Length, Settings
 from armcal.config.selection import with_values

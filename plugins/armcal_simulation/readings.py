@@ -9,8 +9,8 @@ import casadi as ca
 import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.arm.evaluator import Evaluator
+from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.settings import Length, Settings
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
@@ -18,7 +18,6 @@ from armcal.estimate.simulation import SimulationRequest, measured_with_noise
 from armcal.measure.points import LimitedView
 from armcal.problem.many_points import as_seen
 from armcal.problem.problem import Problem
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
@@ -83,7 +82,7 @@ def is_orientation(channel: str) -> bool:
 
 def with_outliers(
     measured: Mapping[str, Array], outliers: OutlierSettings, random: np.random.Generator
-) -> tuple[dict[str, Array], NDArray[np.bool_]]:
+) -> tuple[dict[str, Array], Mask]:
     """Channels (N each, m) with some records pushed away by a size as stated, and which those are (N)."""
     count = len(next(iter(measured.values())))
     wrong = random.random(count) < outliers.fraction
@@ -99,7 +98,7 @@ def with_outliers(
 
 def with_exchanged(
     measured: Mapping[str, Array], fraction: float, random: np.random.Generator
-) -> tuple[dict[str, Array], NDArray[np.bool_]]:
+) -> tuple[dict[str, Array], Mask]:
     """Channels (N each) of which some neighbours have each other's measurement, and which those are (N)."""
     count = len(next(iter(measured.values())))
     order, exchanged = np.arange(count), np.zeros(count, dtype=bool)
@@ -160,7 +159,7 @@ def out_of_view(request: SimulationRequest, dataset: Dataset) -> dict[str, Array
     return {channel: values for channel, values in seen.channels.items() if values is not dataset.channels[channel]}
 
 
-def seen_poses(request: SimulationRequest, arm: Arm, commands: Array) -> NDArray[np.bool_]:
+def seen_poses(request: SimulationRequest, arm: Arm, commands: Array) -> Mask:
     """In which of these commands of an arm (joints x N) an instrument sees anything (N)."""
     if not any(isinstance(measurement, LimitedView) for measurement in request.measurements.values()):
         return np.ones(commands.shape[1], dtype=bool)

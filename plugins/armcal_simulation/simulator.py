@@ -9,8 +9,8 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from armcal.arm.assembly import Arm
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.settings import Angle, InputPath, Length, Settings
 from armcal.errors import ConfigError
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, BinaryIO, ClassVar, Literal, Self
 
 import numpy as np
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.settings import InputPath, Settings
 from armcal.base.units import from_unit
 from armcal.errors import DataError, Location

@@ -13,7 +13,7 @@ import math
 import re
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 
 from armcal_tracker.frames import FARTHEST_M, TOO_FAR, Frame, UnreadableError
 

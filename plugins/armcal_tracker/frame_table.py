@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.units import from_unit, split_suffix
 from armcal.io.cells import DELIMITERS, read_cell, split
 from armcal.io.plain_files import refuse

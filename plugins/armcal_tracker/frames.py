@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.quaternions import rotation_matrix
 from armcal.devices.clock import Clock
 from armcal.devices.live import REPEATED, Tracker

@@ -10,7 +10,7 @@ import json
 import math
 from typing import Any, NoReturn
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.units import from_unit
 
 from armcal_tracker.frames import Frame, UnreadableError, body_pose

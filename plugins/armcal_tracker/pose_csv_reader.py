@@ -8,8 +8,8 @@ import casadi as ca
 import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.arm.model import forward
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.units import DIMENSIONLESS
 from armcal.errors import DataError, Location
 from armcal.measure.checks import Layout, require_records

@@ -8,7 +8,7 @@ import numpy as np
 from armcal.arm.assembly import MassSpec
 from armcal.arm.model import Mimic
 from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from scipy.spatial.transform import Rotation
 
 from armcal_urdf.robot import FREE, MOVING, Robot, UrdfJoint

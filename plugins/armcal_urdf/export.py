@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 from armcal.arm.assembly import PLACEMENT, Arm
 from armcal.arm.model import forward
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.quaternions import rotation_matrix, rpy_of
 from armcal.base.settings import Settings
 from armcal.calibration.exporter import Exported, ExportRequest, random_commands

@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 import yaml
 from armcal.calibration.calibration import Calibration
-from armcal.calibration.calibration_file import read_record, sealed
+from armcal.calibration.calibration_file import dump, read_record, sealed
 from armcal.cli.main import cli
+from armcal.config.yaml_source import load_config
 from armcal.errors import ArmcalError, CalibrationWarning, ConfigError
 from armcal.plugins import PluginRegistry, discover
 from armcal_joints.springs import TorsionalSprings
@@ -314,3 +315,17 @@ def test_a_calibration_of_many_free_parameters_is_read(tmp_path: Path) -> None:
     assert path.stat().st_size > 1 << 20
     source, whole = read_record(path)
     assert whole and source.data["information"] == information
+
+
+@pytest.mark.parametrize("text", ["78850542e9104225", "1e5", "-.inf", "1_000", "017", "0o17", "12:30", "off", "7", ""])
+def test_texts_that_look_like_something_else_are_written_so_that_they_are_read_as_text(
+    text: str, tmp_path: Path
+) -> None:
+    """A digest of sixteen hexadecimal digits may have digits around one e; a pose may be called so too."""
+    first, second = tmp_path / "first.yaml", tmp_path / "second.yaml"
+    content = {"digest": text, "ids": [text, "a"], "of": {text or "an empty key is refused": "b"}}
+    first.write_text(dump(content))
+    read = load_config(first).data
+    assert read == content
+    second.write_text(yaml.safe_dump({"ids": read["ids"]}))
+    assert load_config(second).data == {"ids": [text, "a"]}

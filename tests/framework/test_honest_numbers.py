@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 import pytest
 import yaml
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.cli.main import cli
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Estimate, estimate

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.units import length_mistake
 from armcal.calibration.rigid_chain import tool_poses
 from armcal.diagnose.measured_frame import frame_mistake, frame_of

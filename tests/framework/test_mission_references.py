@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.estimate.estimator import Solution, SolverVerdict
 from armcal.estimate.robust import reweighted
 from armcal.estimate.simulation import DAY_S, Mission

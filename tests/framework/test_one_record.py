@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.errors import NotConvergedError
 from armcal.estimate.online import inverse_times
 from armcal.estimate.online import normalised_innovation_squared as nis

@@ -8,7 +8,7 @@ from pathlib import Path
 import armcal
 import numpy as np
 import pytest
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.parameters import Parameters
 from armcal.calibration.tool_expression import Equilibrium, arm_expression
 from armcal.config.selection import with_values

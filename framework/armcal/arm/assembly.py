@@ -15,8 +15,8 @@ from armcal.arm.environment import Environment
 from armcal.arm.model import ArmModel, Chain, forward
 from armcal.arm.pose_residual import OF_TOOL, SURROUNDINGS, PoseResidual, Postures, corrected, correction_names
 from armcal.arm.statics import Load, Mass, joint_efforts, wrenches
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.poses import pose_transform
 from armcal.base.se3 import Expression, Transform

@@ -11,14 +11,12 @@ from fnmatch import fnmatchcase
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from armcal.arm.assembly import Arm
 from armcal.arm.model import Vector3, forward
 from armcal.arm.statics import BASE_FRAME, MOUNT_FRAME, TOOL_FRAME, frame_names
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Mask
 
-Mask = NDArray[np.bool_]
 EVERYTHING = "everything"
 _AT_ONCE = 4096
 _NO_LENGTH = 1e-18

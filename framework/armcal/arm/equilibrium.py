@@ -10,9 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices, Mask
 from armcal.errors import NotConvergedError
 
 REST_RAD = 1e-13
@@ -27,7 +26,7 @@ MOST_PASSES = 100
 _SHIFTED_TO = 0.1
 """Where the potential is not convex, its lowest eigenvalue is taken for this: the step goes down."""
 
-Evaluate = Callable[[NDArray[np.intp]], tuple[Array, Array]]
+Evaluate = Callable[[Indices], tuple[Array, Array]]
 """F (n_d x k) and S (k x n_d x n_d) of some records at their states."""
 
 
@@ -40,16 +39,16 @@ class Settled:
         held: whether the springs hold the arm there (N).
     """
 
-    at_rest: NDArray[np.bool_]
-    held: NDArray[np.bool_]
+    at_rest: Mask
+    held: Mask
 
     @property
-    def sound(self) -> NDArray[np.bool_]:
+    def sound(self) -> Mask:
         """Both (N)."""
         return self.at_rest & self.held
 
 
-def by_passes(following: Callable[[], Array], state: Array, rest: float = REST_RAD) -> NDArray[np.bool_]:
+def by_passes(following: Callable[[], Array], state: Array, rest: float = REST_RAD) -> Mask:
     """Replace states (n_d x N), in place, by what ``following`` gives of them until none moves more than ``rest``.
 
     Returns:

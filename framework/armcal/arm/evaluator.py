@@ -12,7 +12,6 @@ from itertools import pairwise
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from armcal.arm.equilibrium import (
     MOST_DEFLECTION,
@@ -25,11 +24,10 @@ from armcal.arm.equilibrium import (
     settle,
 )
 from armcal.base import se3
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.se3 import Expression
 from armcal.functions.interpreted import InterpretedFunction
 
-Mask = NDArray[np.bool_]
 ManyRecords = Callable[..., list[Array]]
 """A CasADi function over columns: ``InterpretedFunction`` or ``BatchFunction``."""
 _TOGETHER = 4096
@@ -181,7 +179,7 @@ class Evaluator:
         """What Newton's method asks for, of these records at their states."""
         size = len(state)
 
-        def evaluate(places: NDArray[np.intp]) -> tuple[Array, Array]:
+        def evaluate(places: Indices) -> tuple[Array, Array]:
             following, slopes = self._slope(*self._inputs(values, record[:, places], state[:, places]))
             return following, slopes.reshape(size, size, -1).transpose(2, 1, 0)
 

@@ -10,7 +10,7 @@ from armcal.arm.assembly import Arm
 from armcal.arm.environment import Environment
 from armcal.arm.model import Chain, Frames, Vector3, forward
 from armcal.arm.statics import Load, Mass, SiteWrench, joint_efforts, wrenches
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.se3 import Expression
 
 LOAD_CHANNELS = (

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.se3 import Expression, Transform, small_rotation
 from armcal.base.settings import Settings
 

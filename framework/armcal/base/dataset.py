@@ -5,9 +5,8 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.errors import DataError, Location
 
 
@@ -86,7 +85,7 @@ class Dataset:
         """Whether a channel is there."""
         return channel in self.channels
 
-    def subset(self, chosen: NDArray[np.intp] | Sequence[int]) -> Self:
+    def subset(self, chosen: Indices | Sequence[int]) -> Self:
         """Some records, in the order of ``chosen``."""
         index = np.asarray(chosen, dtype=np.intp)
         return replace(

@@ -16,16 +16,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from armcal.base.quaternions import (
-    Array,
-    left_jacobian,
-    quaternion_exp,
-    quaternion_log,
-    quaternion_matrix,
-    rotation_matrix,
-)
+from armcal.base.arrays import Array
+from armcal.base.quaternions import left_jacobian, quaternion_exp, quaternion_log, quaternion_matrix, rotation_matrix
 
-__all__ = ["Array", "Direction", "Domain", "Interval", "Pose", "Rotation", "ScrewAxis", "Semidefinite", "symmetric"]
+__all__ = ["Direction", "Domain", "Interval", "Pose", "Rotation", "ScrewAxis", "Semidefinite", "symmetric"]
 
 _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 

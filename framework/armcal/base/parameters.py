@@ -11,9 +11,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from armcal.base.domains import Array, Domain, Interval, Rotation
+from armcal.base.arrays import Array, Indices
+from armcal.base.domains import Domain, Interval, Rotation
 from armcal.errors import ConfigError
 
 FIT_NAME = re.compile(r"""[^\s.*?\[\]<>"'\\@]+""")
@@ -91,9 +91,9 @@ class _Layout:
         shape: how many free entries and increments there are.
     """
 
-    places: NDArray[np.intp]
-    entries: NDArray[np.intp]
-    increments: NDArray[np.intp]
+    places: Indices
+    entries: Indices
+    increments: Indices
     others: tuple[tuple[ParameterBlock, slice, slice, slice], ...]
     shape: tuple[int, int]
 

@@ -7,7 +7,8 @@ import casadi as ca
 import numpy as np
 from pydantic import model_validator
 
-from armcal.base.domains import Array, Rotation
+from armcal.base.arrays import Array
+from armcal.base.domains import Rotation
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.quaternions import PRINTED, nearest_rotation, quaternion_of, rotation_matrix, rpy_matrices
 from armcal.base.se3 import Expression, Transform

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from armcal.base.arrays import Array
+
 PRINTED = 2e-3
 """A printed matrix may be so far from a rotation, entry by entry; it is taken for the nearest one."""
 

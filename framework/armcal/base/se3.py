@@ -11,7 +11,8 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+
+from armcal.base.arrays import Array
 
 Expression = Any
 """A CasADi ``SX`` (or a number where a constant is meant)."""
@@ -55,7 +56,7 @@ class Transform:
         return ca.vertcat(ca.horzcat(self.rotation, self.translation), bottom)
 
 
-def evaluated(expression: Expression) -> NDArray[np.float64]:
+def evaluated(expression: Expression) -> Array:
     """The numbers of an expression without symbols, in its shape."""
     return np.asarray(ca.evalf(ca.densify(ca.SX(expression))).full())
 

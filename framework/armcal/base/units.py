@@ -10,8 +10,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, overload
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+    from armcal.base.arrays import Array
 
 DIMENSIONLESS = "dimensionless"
 
@@ -211,7 +210,7 @@ def _expected(text: str, dimension: str) -> str:
 @overload
 def from_unit(value: float, unit_name: str) -> float: ...
 @overload
-def from_unit(value: NDArray[np.float64], unit_name: str) -> NDArray[np.float64]: ...
+def from_unit(value: Array, unit_name: str) -> Array: ...
 def from_unit(value: Any, unit_name: str) -> Any:
     """The SI value of a number or array in the named unit; ValueError for an unknown unit."""
     known = unit(unit_name)
@@ -221,7 +220,7 @@ def from_unit(value: Any, unit_name: str) -> Any:
 @overload
 def to_unit(si_value: float, unit_name: str) -> float: ...
 @overload
-def to_unit(si_value: NDArray[np.float64], unit_name: str) -> NDArray[np.float64]: ...
+def to_unit(si_value: Array, unit_name: str) -> Array: ...
 def to_unit(si_value: Any, unit_name: str) -> Any:
     """The value in the named unit of an SI number or array; ValueError for an unknown unit."""
     known = unit(unit_name)

@@ -8,9 +8,9 @@ from typing import Any, Self
 
 import numpy as np
 
+from armcal.base.arrays import Array
 from armcal.base.config_text import plain
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.calibration.calibration_file import CalibrationFile, identity_of, lost_calibration, read_record
 from armcal.calibration.compensation.compensator import Compensator

@@ -14,6 +14,7 @@ from armcal.base.config_text import finite, plain
 from armcal.base.settings import Settings
 from armcal.calibration.intervals import PredictionRecord
 from armcal.calibration.physics import CheckRecord, ComponentRecord
+from armcal.config.yaml_scalars import needs_quotes
 from armcal.config.yaml_source import ConfigSource, load_config
 from armcal.errors import ConfigError, Location
 from armcal.estimate.estimator import Estimate
@@ -183,11 +184,12 @@ def _hash(text: str) -> str:
 
 
 class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
-    """Puts text of several lines in double quotes, the only style that keeps every kind of line end."""
+    """Puts text of several lines in double quotes, the only style that keeps every kind of line end, and numbers that
+    are text."""
 
 
 def _quoted(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
-    style = '"' if _LINE_END.search(text) else None
+    style = '"' if _LINE_END.search(text) or needs_quotes(text) else None
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from armcal.arm.assembly import MassiveModel
 from armcal.arm.model import ArmModel, Chain
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.rigid_chain import largest_difference, numeric_chain, random_commands, rigid_chain, tool_poses
 from armcal.config.system import build_component

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.quaternions import rpy_of
 from armcal.calibration.rigid_chain import RigidChain, require_independent, require_plain_axes
 

@@ -6,8 +6,8 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from armcal.base.arrays import Array
 from armcal.base.config_text import shown
-from armcal.base.domains import Array
 from armcal.base.quaternions import quaternion_of, rpy_of
 from armcal.calibration.rigid_chain import RigidChain, RigidJoint, require_independent, require_plain_axes
 

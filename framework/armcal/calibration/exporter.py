@@ -12,8 +12,8 @@ import numpy as np
 
 from armcal.arm.assembly import Arm
 from armcal.arm.environment import STATICS, Environment
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.calibration.calibration import Calibration, arm_named
 from armcal.calibration.calibration_file import ParameterRecord

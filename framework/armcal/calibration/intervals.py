@@ -13,15 +13,14 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import Drift, Parameters
 from armcal.base.settings import Settings
 from armcal.config.system import System
 from armcal.diagnose.coverage import Recording, Stretch, level_name
 from armcal.errors import DataError
 from armcal.estimate.prediction import LEVELS, POSITION, STATED, TURN, KnownDrift, Predictor, Spread, is_position
-from armcal.estimate.validation import Indices
 from armcal.estimate.variance import Axes, Component, VarianceComponents, apply_components
 from armcal.problem.drift import Chain, chain, with_drift
 from armcal.problem.problem import FactorRecords, Problem

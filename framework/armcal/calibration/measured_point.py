@@ -9,7 +9,7 @@ import numpy as np
 
 from armcal.arm.assembly import Arm, ArmState, scoped
 from armcal.arm.model import forward
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.parameters import Parameters
 from armcal.base.quaternions import rotation_matrix
 from armcal.base.se3 import Transform, evaluated

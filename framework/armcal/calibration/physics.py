@@ -15,15 +15,14 @@ import numpy as np
 from armcal import plugin_files
 from armcal.arm import assembly
 from armcal.arm.environment import Environment
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.base.settings import Settings
 from armcal.calibration.intervals import PlusMinus
 from armcal.calibration.tool_expression import poses_of
 from armcal.config.system import System
 from armcal.errors import Location, PluginError
-from armcal.estimate.validation import Indices
 from armcal.measure.contact import ArmsAlone
 from armcal.measure.measurement import Measurement
 from armcal.measure.partners import PairedMeasurement

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from armcal.arm.model import ArmModel, Chain, Joint, Mimic, forward
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.se3 import Transform, evaluated
 from armcal.errors import ProblemError
 

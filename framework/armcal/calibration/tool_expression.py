@@ -14,14 +14,13 @@ import numpy as np
 from typing_extensions import override
 
 from armcal.arm.assembly import Arm, ArmInputs, scoped
-from armcal.arm.clearance import Mask
 from armcal.arm.environment import STATICS, Environment, tilted
 from armcal.arm.evaluator import ElasticPass, Evaluator
 from armcal.arm.loading import LOAD_CHANNELS
 from armcal.arm.servo import PulseClock, PulseTable, SteppedEffect
 from armcal.arm.statics import Load
 from armcal.base import se3
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Mask
 from armcal.base.parameters import Parameters
 from armcal.base.se3 import Expression, Transform
 from armcal.functions.batch_function import BatchFunction, EvaluatorChoice

@@ -8,8 +8,8 @@ from typing import Any
 import click
 import numpy as np
 
+from armcal.base.arrays import Array
 from armcal.base.config_text import finite
-from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.cli.common import FILE, Console, data, overrides, speaking
 from armcal.diagnose.minimal import Dropped, minimal_set

@@ -56,6 +56,15 @@ def read_plain(text: str) -> Scalar:
     return text
 
 
+def needs_quotes(text: str) -> bool:
+    """Whether a text is refused where it stands bare, as ``1e5`` is, which YAML itself takes for text and writes so."""
+    try:
+        read_plain(text)
+    except ScalarError:
+        return True
+    return False
+
+
 def _refuse_surprises(text: str) -> None:
     quoted = f'or "{text}" if it is text'
     if _NOT_FINITE.fullmatch(text):

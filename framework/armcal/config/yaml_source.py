@@ -13,6 +13,7 @@ import yaml
 from armcal.base.config_text import ConfigText, resolve_path
 from armcal.base.units import split_suffix
 from armcal.config.yaml_nodes import Node, Origin, Step, dotted, read_nodes
+from armcal.config.yaml_scalars import needs_quotes
 from armcal.config.yaml_tree import entries_of, merge, override
 from armcal.errors import ConfigError, Location
 from armcal.io.plain_files import input_bytes
@@ -25,7 +26,8 @@ MAX_FILES = 32
 
 
 def _as_plain_text(dumper: Any, text: ConfigText) -> Any:
-    return dumper.represent_str(str(text))
+    style = '"' if needs_quotes(text) else None
+    return dumper.represent_scalar("tag:yaml.org,2002:str", str(text), style=style)
 
 
 # PyYAML looks a class up exactly, so a subclass of str must be made known to both families of dumpers.

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.devices.clock import Clock
 from armcal.measure.measurement import Measurement
 

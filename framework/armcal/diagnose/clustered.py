@@ -10,10 +10,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.score_tests import family_test, linear_fit
 from armcal.estimate.estimator import Estimate
@@ -30,9 +29,7 @@ _SHARES = (0.1, 0.25, 0.5, 0.75, 0.9, 0.98)
 _DISTANCES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 
 
-def widened(
-    problem: Problem, records: Sequence[FactorRecords], estimate: Estimate, position: NDArray[np.intp]
-) -> Estimate:
+def widened(problem: Problem, records: Sequence[FactorRecords], estimate: Estimate, position: Indices) -> Estimate:
     """The estimate with the wider covariance where neighbouring residuals correlate (5 %), and it is wider by a tenth.
 
     Args:
@@ -99,13 +96,13 @@ def _wider(estimate: Estimate, by_coordinate: Array, by_entry: Array) -> Estimat
     )
 
 
-def _correlation(place: NDArray[np.intp], share: float, distance: float) -> Array:
+def _correlation(place: Indices, share: float, distance: float) -> Array:
     """Of the errors of records (N x N)."""
     apart = np.abs(place[:, None] - place[None, :])
     return np.asarray((1 - share) * (apart == 0) + share * np.exp(-apart / distance))
 
 
-def _shared(rows: FitRows, place: NDArray[np.intp], noise_scale: float, parameters: int) -> Array:
+def _shared(rows: FitRows, place: Indices, noise_scale: float, parameters: int) -> Array:
     """The likeliest covariance of the errors of records (N x N), in squares of the noise scale, of a grid of shares.
 
     Of the columns the first ones are the parameters', the others a drift's.

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import ndtri
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.diagnose.noise_findings import Finding
 from armcal.errors import NotConvergedError
 from armcal.estimate.bootstrap import automatic_block_length, standard_error_of_mean
@@ -33,7 +33,7 @@ from armcal.estimate.prediction import (
     is_position,
     quantile,
 )
-from armcal.estimate.validation import FitTask, Indices, JudgedFit, Split, failed_fit, fit_and_judge, judged_fit
+from armcal.estimate.validation import FitTask, JudgedFit, Split, failed_fit, fit_and_judge, judged_fit
 from armcal.estimate.variance import apply_components
 from armcal.estimate.weighing import WeighedFit, Weighing, fit
 from armcal.problem.problem import FactorRecords, Problem

@@ -12,8 +12,8 @@ from numpy.polynomial import legendre
 
 from armcal.arm.assembly import Arm
 from armcal.arm.loading import SiteLoads
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.units import display_unit, to_unit
 from armcal.problem.motion import Motion, recorded_order
 from armcal.problem.problem import Problem

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.diagnose.large_errors import LargeErrors
 from armcal.diagnose.residual_structure import ResidualStructure
 from armcal.diagnose.unseen import HiddenPayload

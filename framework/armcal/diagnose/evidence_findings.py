@@ -5,7 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import stdtrit
 
-from armcal.base.domains import Array, Semidefinite, symmetric
+from armcal.base.arrays import Array
+from armcal.base.domains import Semidefinite, symmetric
 from armcal.base.parameters import ParameterBlock
 from armcal.diagnose.evidence import PriorsAlone
 from armcal.diagnose.large_errors import MEDIANS, LargeErrors

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.prediction import POSITION, is_position
 from armcal.problem.problem import FactorRecords, Problem
@@ -27,8 +26,8 @@ class FitRows:
 
     slopes: Array
     residual: Array
-    record_of: NDArray[np.intp]
-    by_record: NDArray[np.intp]
+    record_of: Indices
+    by_record: Indices
     whitening: tuple[Array, ...]
     points: tuple[Array, ...]
     positions: tuple[bool, ...]

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.errors import NotConvergedError
 from armcal.estimate.combination import Measure
 from armcal.estimate.estimator import Estimate
@@ -62,7 +61,7 @@ class Figure:
     displaced: tuple[Displaced, ...]
 
 
-def thinned(chosen: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+def thinned(chosen: Indices, most: int) -> Indices:
     """At most so many of some records, evenly."""
     return chosen[:: max(1, -(-len(chosen) // most))]
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.diagnose.gross import BEYOND, FAR_BEYOND, Displaced, Figure
 from armcal.diagnose.majority import Minority
 from armcal.diagnose.noise_findings import Finding, first_few

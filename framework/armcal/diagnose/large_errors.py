@@ -4,11 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import betainc
 
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.units import display_unit, to_unit
 from armcal.estimate.estimator import Estimate
 from armcal.problem.motion import Motion
@@ -73,7 +72,7 @@ class Judged:
 
     errors_mm: Array
     residuals: tuple[Array, ...]
-    position: NDArray[np.intp]
+    position: Indices
 
 
 def large_errors(

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.noise_findings import Finding
 from armcal.measure.groups import group_key
@@ -48,13 +47,13 @@ class Minority:
         since: the first of them in the recording, if it is all those from there on (or up to there); else None.
     """
 
-    far: NDArray[np.intp]
+    far: Indices
     typical_mm: float
     far_mm: float
     since: int | None
 
 
-def minority(rows: FitRows, noise_scale: float, position: NDArray[np.intp]) -> Minority | None:
+def minority(rows: FitRows, noise_scale: float, position: Indices) -> Minority | None:
     """The records that a fit to the majority leaves far off, if they are many; None if there is no such split.
 
     The fit minimises the sum of residual lengths, to first order from the estimate, by weights that are their inverse
@@ -87,7 +86,7 @@ def _lengths(rows: FitRows, residual: Array) -> Array:
     return np.asarray(np.linalg.norm(residual[rows.by_record], axis=1))
 
 
-def _since(far: NDArray[np.intp], near: NDArray[np.intp], position: NDArray[np.intp]) -> int | None:
+def _since(far: Indices, near: Indices, position: Indices) -> int | None:
     """The far record from which on (in recorded order) nearly all are far, and before which nearly none is."""
     order = np.sort(np.concatenate([position[far], position[near]]))
     is_far = np.isin(order, position[far])

@@ -12,7 +12,7 @@ from itertools import combinations
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.units import length_mistake
 from armcal.diagnose.permuted_axes import FITS, MISSES, MUCH_BETTER
 from armcal.problem.tool_motion import rigid_fit, spread_of

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.parameters import Parameters
 from armcal.estimate.combination import Combination, named
 from armcal.estimate.identifiability import RANK_TOLERANCE, measures_of

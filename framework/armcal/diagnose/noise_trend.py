@@ -8,10 +8,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.diagnose.dependences import Records
 from armcal.diagnose.smooth import CLEAR
 from armcal.problem.motion import recorded_order
@@ -37,9 +36,7 @@ class NoiseTrend:
     alternatives: tuple[str, ...]
 
 
-def noise_trend(
-    residual: Array, basis: Array, by_record: NDArray[np.intp], here: Records, place: Array
-) -> NoiseTrend | None:
+def noise_trend(residual: Array, basis: Array, by_record: Indices, here: Records, place: Array) -> NoiseTrend | None:
     """What the scatter of a residual (rows, whitened) depends on; None where nothing shows.
 
     ``basis`` is what the fit takes up (rows x n), ``place`` what instruments read (3 x N; m), or nothing (0 x N).

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.diagnose.dependences import Dependence
 from armcal.diagnose.score_tests import own_basis
 from armcal.diagnose.smooth import CLEAR, IMITATED, Kernels, smooth
@@ -56,8 +55,8 @@ class Contest:
     columns: Sequence[Array]
     residual: Array
     basis: Array
-    by_record: NDArray[np.intp]
-    fold: NDArray[np.intp]
+    by_record: Indices
+    fold: Indices
     pose: Kernels
     time: Kernels
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock
 from armcal.diagnose.dependences import Dependence, Records
 from armcal.measure.measurement import NamesMistakes

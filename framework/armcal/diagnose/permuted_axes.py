@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from armcal.arm.assembly import Arm
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.diagnose.readings import LEFT_HANDED, Wires, scaled_positions, several_joints, single_joints, turned_axes
 from armcal.errors import NotConvergedError
 from armcal.estimate.placing import Placing, placings
@@ -181,7 +180,7 @@ def _seen(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, 
 
 def _neighbours(
     dataset: Dataset, record: FactorRecords, channels: Sequence[str], sighting: Sighting
-) -> tuple[NDArray[np.intp], tuple[tuple[str, Array], ...]]:
+) -> tuple[Indices, tuple[tuple[str, Array], ...]]:
     """Which of the records to look at, and what was measured one row before and after each of these (3 x n each)."""
     lines = np.array(dataset.rows or range(len(dataset)))
     whole = np.flatnonzero(record.measured)

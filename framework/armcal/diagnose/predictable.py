@@ -16,12 +16,11 @@ from itertools import combinations
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import LinAlgError
 from scipy.linalg.lapack import dposv
 
+from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.diagnose.fit_rows import FitRows
 from armcal.problem.motion import Motion, recorded_order
 from armcal.problem.problem import Problem
@@ -213,7 +212,7 @@ def _harmonics(angle: Array, highest: int) -> tuple[Array, Array]:
     return np.hstack([np.cos(turned), np.sin(turned)]), np.tile(order, 2).astype(float)
 
 
-def _entries(rows: FitRows, inputs: frozenset[int], features: Array, order: Array, acting: NDArray[np.bool_]) -> _Block:
+def _entries(rows: FitRows, inputs: frozenset[int], features: Array, order: Array, acting: Mask) -> _Block:
     """Functions of each entry of a record's residual for itself; none of an entry that did not take part."""
     entries, size = rows.by_record.shape[1], features.shape[1]
     columns = np.zeros((len(rows.record_of), entries * size))
@@ -235,7 +234,7 @@ class _Regression:
     """
 
     blocks: Sequence[_Block]
-    members: Sequence[NDArray[np.intp]]
+    members: Sequence[Indices]
     values: Array
 
     def of_first(self) -> Self:

@@ -6,7 +6,7 @@ from itertools import combinations, permutations, product
 import numpy as np
 
 from armcal.arm.assembly import Arm
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 
 Wires = Mapping[str, tuple[str, float]]
 """Channels, each read as another one times a factor."""

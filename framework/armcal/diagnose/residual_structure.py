@@ -11,10 +11,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.diagnose.dependences import Dependence, Records, dependences
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.noise_trend import NoiseTrend, noise_trend
@@ -122,7 +121,7 @@ def structure(
     estimate: Estimate,
     dataset: Dataset,
     motion: Motion,
-    position: NDArray[np.intp],
+    position: Indices,
     modelled: frozenset[str] = frozenset(),
 ) -> ResidualStructure | None:
     """Test the residuals of a fit to records, with the weights they had; None where there are too few to judge.
@@ -177,7 +176,7 @@ def _alike(residual: Array, basis: Array, rows: FitRows, contest: Contest) -> Ti
     )
 
 
-def _looked_at(candidates: NDArray[np.intp], position: NDArray[np.intp]) -> NDArray[np.intp]:
+def _looked_at(candidates: Indices, position: Indices) -> Indices:
     """In recorded order; of very many, runs of neighbours spread over the recording."""
     order = candidates[np.argsort(position[candidates], kind="stable")]
     if len(order) <= MOST_RECORDS:
@@ -187,7 +186,7 @@ def _looked_at(candidates: NDArray[np.intp], position: NDArray[np.intp]) -> NDAr
     return np.concatenate([run[:most] for run in runs])
 
 
-def _fit_of(rows: FitRows, count: int, consecutive: NDArray[np.bool_]) -> tuple[Fit, Array, int]:
+def _fit_of(rows: FitRows, count: int, consecutive: Mask) -> tuple[Fit, Array, int]:
     """The linear fit, an orthonormal basis of its slopes, and how many records a block has.
 
     Blocks are as long as errors resemble their neighbours', and neither too many nor too few. The rows of priors and

@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fdtrc, ndtr
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices, Mask
 
 DRAWS = 999
 """Of noise, in the test that decides whether anything is found: the level of one design then scatters by 0.7 %."""
@@ -45,9 +44,9 @@ class Fit:
 
     residual: Array
     draws: Array
-    block: NDArray[np.intp]
-    records: NDArray[np.intp]
-    neighbours: NDArray[np.bool_]
+    block: Indices
+    records: Indices
+    neighbours: Mask
 
     @property
     def blocks(self) -> int:
@@ -64,9 +63,7 @@ class Fit:
         return replace(self, draws=self.draws[:, :FEWER_DRAWS])
 
 
-def linear_fit(
-    slopes: Array, residual: Array, block: NDArray[np.intp], records: NDArray[np.intp], neighbours: NDArray[np.bool_]
-) -> tuple[Fit, Array]:
+def linear_fit(slopes: Array, residual: Array, block: Indices, records: Indices, neighbours: Mask) -> tuple[Fit, Array]:
     """A fit from its slopes (rows x n) and residual at the solution; and an orthonormal basis of the slopes."""
     lengths = np.linalg.norm(slopes, axis=0)
     basis = np.linalg.qr(slopes / np.where(lengths > 0, lengths, 1.0))[0]

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.problem.problem import Problem
 
 CLEAR = 3.0
@@ -95,7 +94,7 @@ def pose_kernels(problem: Problem, dataset: Dataset) -> Kernels:
     return Kernels((*(np.exp(-whole / (2 * length**2)) for length in _POSE_LENGTHS), *own))
 
 
-def smooth(residual: Array, basis: Array, by_record: NDArray[np.intp], kernels: Kernels) -> Smooth:
+def smooth(residual: Array, basis: Array, by_record: Indices, kernels: Kernels) -> Smooth:
     """The best process in a residual (rows) that is freed of an orthonormal basis (rows x n)."""
     rows, entries = len(residual), by_record.shape[1]
     best = Smooth(-np.inf, np.zeros_like(residual), np.zeros((rows, 0)))
@@ -121,7 +120,7 @@ def smooth(residual: Array, basis: Array, by_record: NDArray[np.intp], kernels: 
     return best
 
 
-def left_out(of: Smooth, residual: Array, basis: Array, by_record: NDArray[np.intp]) -> Array:
+def left_out(of: Smooth, residual: Array, basis: Array, by_record: Indices) -> Array:
     """Residuals of each record, predicted by the others (rows): those of a linear smoother, without its own hat."""
     held = residual - of.function
     for own in by_record:

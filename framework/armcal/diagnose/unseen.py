@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.gross import Figure
 from armcal.diagnose.noise_findings import Finding, first_few

@@ -5,10 +5,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import bdtr, chdtri, ndtri
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.base.units import ERROR_NAMES
 from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.evidence_findings import (
@@ -61,7 +60,7 @@ def judge(
     estimate: Estimate,
     whitened: Array,
     errors_mm: Array,
-    train: NDArray[np.intp],
+    train: Indices,
     judged_mm: Array,
     judged_on: str,
     ids: Sequence[str],
@@ -255,7 +254,7 @@ def _size(estimate: Estimate, seen: Evidence) -> Finding:
     return Finding("good", text, test)
 
 
-def _neighbours(whitened: Array, train: NDArray[np.intp], estimate: Estimate) -> list[Finding]:
+def _neighbours(whitened: Array, train: Indices, estimate: Estimate) -> list[Finding]:
     """Do training records that follow one another correlate? Against independence, two-sided, at 5 %."""
     first = train[:-1][np.diff(train) == 1]
     spread = float(np.mean(whitened[:, train] ** 2))

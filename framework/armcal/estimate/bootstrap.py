@@ -14,10 +14,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 from pydantic import Field
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.estimator import CONFIDENCE, Estimate, Estimator, Progress, no_progress
@@ -89,7 +88,7 @@ def draw_weights(count: int, block: int, random: np.random.Generator) -> Array:
     """How often each record is drawn (N, summing to N): circular blocks, the last one cut to fit."""
     length = min(block, count)
     starts = random.integers(0, count, -(-count // length))
-    drawn: NDArray[np.intp] = (starts[:, None] + np.arange(length)[None, :]).ravel()[:count] % count
+    drawn: Indices = (starts[:, None] + np.arange(length)[None, :]).ravel()[:count] % count
     return np.bincount(drawn, minlength=count).astype(float)
 
 
@@ -150,7 +149,7 @@ def bootstrap(
     settings: BootstrapSettings,
     executor: Executor | None = None,
     progress: Progress = no_progress,
-    poses: NDArray[np.intp] | None = None,
+    poses: Indices | None = None,
 ) -> Bootstrap:
     """Refit to resamples of the records (in recorded order) of an estimate; the same seed gives the same refits.
 
@@ -194,7 +193,7 @@ def _refit(
     estimator: Estimator,
     start: Array,
     noise_scale: float,
-    resample: tuple[NDArray[np.intp], Array, int | None],
+    resample: tuple[Indices, Array, int | None],
 ) -> Array | None:
     """The values of one refit; None if it did not converge.
 

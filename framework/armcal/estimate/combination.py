@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.units import DIMENSIONLESS, UNITS, display_unit
 
 MOST_NAMES = 6

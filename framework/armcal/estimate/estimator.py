@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from scipy.special import stdtrit
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.parameters import Parameters
 from armcal.errors import NotConvergedError
 from armcal.estimate.identifiability import Identifiability, InverseInformation

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import fdtrc
 
-from armcal.base.domains import Array, Semidefinite
+from armcal.base.arrays import Array
+from armcal.base.domains import Semidefinite
 from armcal.base.parameters import Parameters
 from armcal.problem.normal_equations import NormalEquations
 from armcal.problem.problem import FactorRecords, Problem

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import qr
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.parameters import Parameters
 from armcal.estimate.combination import Combination, Measure, named
 from armcal.estimate.null_space import sparse_basis

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.estimate.polish import bounded_step
 from armcal.problem.problem import NormalEquations
 

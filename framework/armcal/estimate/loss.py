@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import chdtri, gammaln
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 
 LossName = Literal["huber", "cauchy"]
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.estimate.polish import descended
 from armcal.measure.groups import group_name, owner_of
 from armcal.measure.measurement import GroupedMeasurement

@@ -5,13 +5,9 @@ from itertools import combinations
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from armcal.base.domains import Array
-
-Mask = NDArray[np.bool_]
-Indices = NDArray[np.intp]
+from armcal.base.arrays import Array, Indices, Mask
 
 EXACT = 1e-6
 """Sine of the angle within which a vector belongs to a space."""

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from scipy.linalg.lapack import dposv
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.errors import ProblemError
 
 

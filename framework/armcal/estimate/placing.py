@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from armcal.base import domains
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.parameters import Parameters
 from armcal.errors import NotConvergedError
 from armcal.estimate.polish import descended

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Solution, SolverVerdict
 from armcal.measure.partners import OTHER

@@ -15,10 +15,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fdtri, stdtrit
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.estimate.validation import error_dimension
 from armcal.problem.corrected import unexplained
 from armcal.problem.factor_records import noise_roots
@@ -193,7 +192,7 @@ class Predictor:
             for factor_records, (noise, values, drift) in parts
         )
 
-    def new_recording(self, records: Sequence[FactorRecords], judged: NDArray[np.intp]) -> NewRecording | None:
+    def new_recording(self, records: Sequence[FactorRecords], judged: Indices) -> NewRecording | None:
         """What the errors of judged records, held out of this recording, say of a new one.
 
         None where nothing drifts, or no record is judged.

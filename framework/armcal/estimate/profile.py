@@ -15,7 +15,8 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import fdtri
 
-from armcal.base.domains import Array, Interval
+from armcal.base.arrays import Array
+from armcal.base.domains import Interval
 from armcal.errors import ConfigError, NotConvergedError
 from armcal.estimate.estimator import CONFIDENCE, Estimate, Estimator, Progress, no_progress
 from armcal.estimate.weighing import WeighedFit, Weighing

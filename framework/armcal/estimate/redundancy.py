@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import fdtri
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.estimate.identifiability import InverseInformation
 from armcal.estimate.loss import median_norm
 from armcal.problem.problem import FactorRecords, Problem

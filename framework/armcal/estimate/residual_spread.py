@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import multigammaln
 
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.estimate.estimator import SMALLEST_SPREAD, Estimate
 from armcal.problem.factor_records import correlation_of
 from armcal.problem.problem import FactorRecords, Problem

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Estimator, Influence, Progress, Solution, degrees_of_freedom, no_progress
 from armcal.estimate.loss import Loss, LossName, median_norm, tuned

@@ -5,12 +5,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armcal.arm.assembly import Arm
 from armcal.arm.environment import Environment
+from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.measure.measurement import Measurement
 from armcal.problem.problem import Problem
@@ -169,8 +168,8 @@ class Mission:
 
     records: Dataset
     times: Array
-    outliers: NDArray[np.bool_]
-    exchanged: NDArray[np.bool_]
+    outliers: Mask
+    exchanged: Mask
     truth: MissionTruth
     events: tuple[MissionEvent, ...]
     power_cuts: tuple[float, ...]

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from armcal.arm.effects import JointCommand
 from armcal.arm.model import forward
 from armcal.arm.statics import BASE_FRAME, TOOL_FRAME
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.placing import Placing, placings

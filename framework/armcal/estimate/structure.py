@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.parameters import Parameters
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.combination import Combination, named

@@ -9,9 +9,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.base.units import ERROR_UNITS
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.estimator import Estimator, Progress, Solution, no_progress
@@ -20,7 +19,6 @@ from armcal.io.parallel import Executor, Sequential
 from armcal.problem.drift import residuals
 from armcal.problem.problem import FactorRecords, Problem
 
-Indices = NDArray[np.intp]
 FEWEST_FOR_P95 = 20
 
 

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.functions import c_source, compiler
 from armcal.functions.interpreted import InterpretedFunction
 

@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 
 _BLOCKS = (64, 8, 1)
 """Records that are evaluated together; what does not fill a block goes to smaller ones."""

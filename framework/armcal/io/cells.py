@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.units import UNITS
 
 MISSING = frozenset({"", "na", "n/a", "nan", "null", "none"})

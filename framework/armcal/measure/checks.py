@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.units import split_suffix, to_unit
 from armcal.errors import DataError, Location
@@ -286,13 +286,13 @@ def warn_repeated_poses(dataset: Dataset, layout: Layout) -> Dataset:
     )
 
 
-def _known(dataset: Dataset, channel: str) -> NDArray[np.float64]:
+def _known(dataset: Dataset, channel: str) -> Array:
     """A channel with zeros for what was not recorded."""
     values = dataset.column(channel)
     return np.where(np.isnan(values), 0.0, values)
 
 
-def _runs(values: NDArray[np.float64]) -> list[tuple[int, int]]:
+def _runs(values: Array) -> list[tuple[int, int]]:
     """Runs of identical columns (start, stop) that are long enough to mean a frozen instrument."""
     changes = np.flatnonzero((values[:, 1:] != values[:, :-1]).any(axis=0)) + 1
     edges = np.concatenate([[0], changes, [values.shape[1]]])
@@ -300,7 +300,7 @@ def _runs(values: NDArray[np.float64]) -> list[tuple[int, int]]:
     return [(int(edges[i]), int(edges[i + 1])) for i in long]
 
 
-def _first_alike(dataset: Dataset, channels: Sequence[str]) -> NDArray[np.intp]:
+def _first_alike(dataset: Dataset, channels: Sequence[str]) -> Indices:
     """For each record the first that agrees with it, to the last bit, in these channels."""
     table = np.ascontiguousarray(dataset.stacked(channels).T) + 0.0  # -0.0 and 0.0 are one value
     table[np.isnan(table)] = np.nan  # and so are all that are missing

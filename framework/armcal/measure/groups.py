@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from armcal.base.arrays import Indices, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock
 from armcal.errors import ConfigError, DataError
@@ -102,7 +102,7 @@ def record_keys(dataset: Dataset, measurement: GroupedMeasurement) -> tuple[str,
     return tuple("/".join(cells) if all(cells) else "" for cells in zip(*columns, strict=True))
 
 
-def group_numbers(dataset: Dataset, instance: str, measurement: Measurement, groups: Groups) -> NDArray[np.intp] | None:
+def group_numbers(dataset: Dataset, instance: str, measurement: Measurement, groups: Groups) -> Indices | None:
     """Of each record the place of its group (N); -1 where it has none.
 
     None if the measurement has no groups, or none that the records could belong to: no group is known, or no label.
@@ -116,7 +116,7 @@ def group_numbers(dataset: Dataset, instance: str, measurement: Measurement, gro
     return np.array([place.get(key, NO_GROUP) for key in record_keys(dataset, measurement)], dtype=np.intp)
 
 
-def refuse_lost(dataset: Dataset, measurements: Mapping[str, Measurement], lost: NDArray[np.bool_]) -> None:
+def refuse_lost(dataset: Dataset, measurements: Mapping[str, Measurement], lost: Mask) -> None:
     """Refuse records that belong to no measurement, for want of a group.
 
     Raises:
@@ -201,7 +201,7 @@ differ by less, poses chosen apart by more."""
 _LOADS = ("gravity_", "payload", "force_", "torque_")
 
 
-def first_of_pose(dataset: Dataset, joints: Sequence[str]) -> NDArray[np.intp]:
+def first_of_pose(dataset: Dataset, joints: Sequence[str]) -> Indices:
     """For each record the first one of its pose (N): near in all joint channels, and under the same load.
 
     Nearness is to that first record, so that a slow sweep falls into many poses.
@@ -226,6 +226,6 @@ def first_of_pose(dataset: Dataset, joints: Sequence[str]) -> NDArray[np.intp]:
     return first
 
 
-def pose_numbers(dataset: Dataset, joints: Sequence[str]) -> NDArray[np.intp]:
+def pose_numbers(dataset: Dataset, joints: Sequence[str]) -> Indices:
     """Numbers of the poses (N), from 0 in the order in which they first appear."""
     return np.asarray(np.unique(first_of_pose(dataset, joints), return_inverse=True)[1], dtype=np.intp)

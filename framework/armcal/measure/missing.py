@@ -4,15 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.measure.layout import Layout, set_aside, warned
 from armcal.measure.reader import RequestedChannel
 
 _MOST_NAMED = 12
-Mask = NDArray[np.bool_]
 
 
 def set_aside_not_finite(dataset: Dataset, layout: Layout) -> Dataset:

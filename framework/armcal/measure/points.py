@@ -7,11 +7,10 @@ from typing import Protocol, runtime_checkable
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import override
 
 from armcal.arm.assembly import ArmState
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.se3 import Expression
 from armcal.measure.instrument import Instrument
 from armcal.measure.measurement import Channel
@@ -100,7 +99,7 @@ class LimitedView(Protocol):
     ) -> Expression:
         """A number above zero where a point is in view."""
 
-    def visible(self, margins: Array) -> NDArray[np.bool_]:
+    def visible(self, margins: Array) -> Mask:
         """Which points can be read (P x N) with these margins (P x N): of some boards all or none."""
 
 
@@ -161,7 +160,7 @@ class PointInstrument(Instrument):
         return tuple(self.point_noise()) * len(self.points)
 
 
-def spread_points(points: Array, most: int) -> NDArray[np.intp]:
+def spread_points(points: Array, most: int) -> Indices:
     """At most so many of the points (N x k), in order: each next one as far as can be from those before it."""
     if len(points) <= most:
         return np.arange(len(points))

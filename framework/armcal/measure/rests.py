@@ -9,15 +9,12 @@ from itertools import pairwise
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.settings import Angle, Duration, Settings
 
 _SPREAD_RAD = math.radians(0.01)
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 
 class StillSettings(Settings):

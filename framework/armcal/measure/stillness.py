@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Mask
 from armcal.base.quaternions import nearest_turn
 
 LEVER_M = 0.1
@@ -37,7 +36,7 @@ class Stillness:
     """
 
     why_not: str
-    kept: NDArray[np.bool_]
+    kept: Mask
 
 
 def judged(poses: Array, spread: float) -> Stillness:
@@ -65,7 +64,7 @@ def judged(poses: Array, spread: float) -> Stillness:
     return Stillness(why, kept)
 
 
-def far_off(points: Array, least: float) -> NDArray[np.bool_]:
+def far_off(points: Array, least: float) -> Mask:
     """Which frames (points: N x P x 3, m) have a point far from its median: by ``_FAR``, and by ``least`` at any rate.
 
     Distances do not hang on the directions of the axes, nor does the spatial median. [Huber1981]

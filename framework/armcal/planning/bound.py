@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.planning.relaxation import (
     AT_ONCE,
     INTERIOR_POINT,

@@ -6,16 +6,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.problem.many_points import as_seen
 from armcal.problem.problem import Problem, triangular
 from armcal.problem.projection import as_predicted
 
-Indices = NDArray[np.intp]
 RIDGE = 1e-9
 """Information in typical scales that stands in for what nothing determines yet, relative to the candidates' mean:
 below what any real measurement gives, far above rounding."""

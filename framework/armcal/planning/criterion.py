@@ -11,7 +11,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 
 Goal = Literal["D", "A", "E", "O1", "O2", "O3", "O4", "O5"]
 GOALS: tuple[Goal, ...] = get_args(Goal)

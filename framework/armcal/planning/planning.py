@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from armcal.base.domains import Array
-from armcal.planning.candidates import Candidates, Indices
+from armcal.base.arrays import Array, Indices
+from armcal.planning.candidates import Candidates
 from armcal.planning.criterion import Criterion, Goal, criterion
 from armcal.planning.relaxation import AT_ONCE, INTERIOR_POINT, Relaxation, Task, interior_point, relax
 from armcal.planning.tally import Tally, tally

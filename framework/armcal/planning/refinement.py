@@ -3,14 +3,13 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Mask
 from armcal.planning.criterion import Criterion
 
 Rows = Callable[[Array], Array]
 """Poses (joints x N) to whitened Jacobians (draws x n_r x N x n)."""
-Allowed = Callable[[Array], NDArray[np.bool_]]
+Allowed = Callable[[Array], Mask]
 """Poses (joints x N) to whether each may be visited (N, bool)."""
 
 _FIRST_STEP = 0.125

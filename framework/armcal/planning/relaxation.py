@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from armcal.base.domains import Array
-from armcal.planning.candidates import Candidates, Indices
+from armcal.base.arrays import Array, Indices
+from armcal.planning.candidates import Candidates
 from armcal.planning.criterion import Criterion, spread
 
 AT_ONCE = 2000

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.units import display_unit, to_unit
 from armcal.estimate.estimator import Estimate
 from armcal.planning.candidates import Candidates, deviations, whitened_rows

@@ -14,8 +14,8 @@ from typing import Protocol
 import numpy as np
 from typing_extensions import override
 
-from armcal.base.domains import Array
-from armcal.planning.candidates import Candidates, Indices
+from armcal.base.arrays import Array, Indices
+from armcal.planning.candidates import Candidates
 from armcal.planning.criterion import SMALLEST_DETERMINANT, Criterion, packed_log_det, packed_trace
 
 _REFRESH = 64

@@ -4,8 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from armcal.base.domains import Array
-from armcal.planning.candidates import Indices
+from armcal.base.arrays import Array, Indices
 
 WINDOW = 5
 """Poses over which squared torque is averaged: a servo warms and cools over about so many."""

@@ -13,7 +13,7 @@ import numpy as np
 from typing_extensions import override
 
 from armcal.arm.equilibrium import MOST_PASSES, NEAR_REST_RAD, REST_RAD, by_passes
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.functions import c_source, compiler
 from armcal.functions.interpreted import InterpretedFunction
 from armcal.problem.factor import Factor

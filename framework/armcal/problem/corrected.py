@@ -7,8 +7,8 @@ import numpy as np
 
 from armcal.arm.assembly import Arm
 from armcal.arm.pose_residual import OF_TOOL, PoseResidual, Postures
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.problem.problem import FactorRecords, Problem
 
 

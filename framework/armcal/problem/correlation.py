@@ -14,10 +14,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dpstrf
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 
 _LEAST_SHARED = 1e-3
 """Of the noise's variance: a part of the covariance that is smaller is left out of its root."""
@@ -37,7 +36,7 @@ class _Node:
     """
 
     left: Array
-    records: NDArray[np.intp]
+    records: Indices
     slopes: Array
     covariance: Array
     whitening: Array
@@ -57,7 +56,7 @@ class Correlation:
 
     slopes: tuple[Array, ...]
     raw: tuple[Array, ...]
-    node: NDArray[np.intp]
+    node: Indices
     apart: Array
 
     def independent(self, rows: Sequence[Array]) -> tuple[Array, ...]:
@@ -122,12 +121,12 @@ class Correlation:
         made[order - 1] = np.tril(root)[:, :rank]
         return self._apart(made.reshape(count, size, rank), self.slopes)
 
-    def kernels(self, records: NDArray[np.intp]) -> list[Array]:
+    def kernels(self, records: Indices) -> list[Array]:
         """Correlation of each state between records (n x n each)."""
         place = np.vstack([np.zeros_like(self._start), np.cumsum(self.apart, axis=0)])[self.node[records]]
         return [kept(np.abs(at[:, None] - at)) for at in place.T]
 
-    def subset(self, chosen: NDArray[np.intp]) -> Correlation:
+    def subset(self, chosen: Indices) -> Correlation:
         """Some records of all; the same states."""
         slopes, raw = (tuple(s[:, chosen] for s in rows) for rows in (self.slopes, self.raw))
         return Correlation(slopes, raw, self.node[chosen], self.apart)

@@ -11,10 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import Drift, ParameterBlock
 from armcal.errors import DataError
 from armcal.problem.correlation import Correlation
@@ -34,7 +33,7 @@ class Chain:
     channels: tuple[str, ...]
     places: Array
 
-    def nodes(self, dataset: Dataset) -> NDArray[np.intp]:
+    def nodes(self, dataset: Dataset) -> Indices:
         """Which node each record is at (N); all their places must be on the chain."""
         own = np.stack([dataset.column(channel) for channel in self.channels], axis=1)
         nodes = np.unique(np.vstack([self.places, own]), axis=0, return_inverse=True)[1].ravel()

@@ -26,7 +26,7 @@ from armcal.arm.evaluator import ElasticPass
 from armcal.arm.model import Vector3
 from armcal.arm.pose_residual import SURROUNDINGS, correction_names
 from armcal.arm.statics import Load
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.se3 import Expression
 from armcal.base.units import ERROR_UNITS

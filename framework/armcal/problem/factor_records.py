@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.functions.c_source import LANES
 from armcal.measure.groups import NO_GROUP
 from armcal.problem.correlation import Correlation
@@ -18,8 +17,6 @@ from armcal.problem.factor import Factor
 
 _FEW_ROWS = 8
 """Up to so many rows records are faster side by side than matrix by matrix."""
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -49,7 +46,7 @@ class FactorRecords:
         counted = self.weight != 0
         return int(self.present[:, counted].sum()) if self.present is not None else rows * int(counted.sum())
 
-    def points_of(self, factor: Factor) -> NDArray[np.intp]:
+    def points_of(self, factor: Factor) -> Indices:
         """How many points each record has (N); one of a measurement without points."""
         if factor.points is None:
             return np.ones(self.count, dtype=np.intp)

@@ -11,14 +11,12 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.functions.c_source import LANES
 from armcal.problem.factor_records import FactorRecords, declared, mean_shares, transformed
 from armcal.problem.kernel import Kernel
 
-Indices = NDArray[np.intp]
 HELD = -1
 BLOCK_RECORDS = 1024
 _THREADS = 2

@@ -13,7 +13,7 @@ import numpy as np
 
 from armcal.arm.equilibrium import MOST_DEFLECTION, NEAR_REST_RAD, REST_RAD
 from armcal.arm.evaluator import Evaluator
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.functions import c_source, compiler
 from armcal.functions.batch_function import EvaluatorChoice, quietly
 from armcal.functions.interpreted import InterpretedFunction

@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armcal.arm.evaluator import Evaluator
+from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.measure.points import LimitedView, spread_points
 from armcal.problem.factor import Factor
 from armcal.problem.factor_records import FactorRecords, by_covariance
@@ -56,7 +55,7 @@ def _thinned(factor: Factor, record: FactorRecords) -> tuple[Factor, FactorRecor
     return small, replace(record, record=record.record[kept], whitening=whitening, present=present)
 
 
-def as_seen(problem: Problem, values: Array, dataset: Dataset) -> tuple[Dataset, NDArray[np.bool_]]:
+def as_seen(problem: Problem, values: Array, dataset: Dataset) -> tuple[Dataset, Mask]:
     """The dataset with readings of points out of view missing (NaN), and which records have any reading left (N).
 
     Raises:

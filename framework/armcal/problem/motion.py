@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armcal.arm.loading import LOAD_CHANNELS, SiteLoads, site_loads
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -51,7 +50,7 @@ class Motion:
         elastic = any(len(record.state) for record in records)
         return cls(channels, slopes, loads, _by_load(problem, values, records, dataset) if elastic else ())
 
-    def subset(self, chosen: NDArray[np.intp]) -> Motion:
+    def subset(self, chosen: Indices) -> Motion:
         """Some records of all."""
         loads = {
             name: SiteLoads(load.moments[..., chosen], load.efforts[..., chosen], load.levers[..., chosen])
@@ -74,7 +73,7 @@ def recorded_order(dataset: Dataset) -> Array:
     return np.arange(len(dataset), dtype=float)
 
 
-def recorded_position(dataset: Dataset) -> NDArray[np.intp]:
+def recorded_position(dataset: Dataset) -> Indices:
     """How many records were recorded before each (N)."""
     position = np.empty(len(dataset), dtype=np.intp)
     position[np.argsort(recorded_order(dataset), kind="stable")] = np.arange(len(dataset))

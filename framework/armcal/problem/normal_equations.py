@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.base.parameters import Parameters
 from armcal.base.se3 import Expression
 from armcal.measure.groups import OwnedTie
@@ -70,7 +69,7 @@ class TieFunction:
     """
 
     groups: tuple[str, str]
-    entries: NDArray[np.intp]
+    entries: Indices
     noise: Array
     function: ca.Function
     bend: ca.Function
@@ -95,7 +94,7 @@ class TieFunction:
         return cls(owned.tie.groups, np.array(entries, dtype=np.intp), np.array(owned.tie.noise), function, bend)
 
     @property
-    def sides(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def sides(self) -> tuple[Indices, Indices]:
         """The positions that belong to each group; every group has the same parameters."""
         half = len(self.entries) // 2
         return self.entries[:half], self.entries[half:]

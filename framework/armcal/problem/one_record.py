@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from armcal.arm.equilibrium import MOST_DEFLECTION
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.functions.c_source import LANES
 from armcal.problem.backend import Compiled
 from armcal.problem.kernel import Kernel

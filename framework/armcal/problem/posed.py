@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.errors import NotConvergedError
 from armcal.problem.problem import FactorRecords, NormalEquations, Problem
 

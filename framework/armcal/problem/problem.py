@@ -7,12 +7,11 @@ from functools import cached_property, lru_cache
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armcal.arm.assembly import Arm
 from armcal.arm.environment import Environment
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.measure.groups import NO_GROUP, Groups, group_numbers, groups_of, refuse_lost
@@ -293,7 +292,7 @@ class Problem:
             raise ValueError("a fixed parameter differs from the value the problem was compiled with")
 
     @cached_property
-    def _compiled_in(self) -> NDArray[np.intp]:
+    def _compiled_in(self) -> Indices:
         """Positions of the entries that the kernels hold as numbers."""
         plan = self.blueprint.parameters
         held = [block.name for block in plan.blocks if not block.free and not block.nuisance]

@@ -9,10 +9,9 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from armcal.arm.pose_residual import CORRECTION
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Mask
 from armcal.problem.factor import Factor
 from armcal.problem.grouped_kernel import GroupedKernel
 from armcal.problem.problem import FactorRecords, Problem
@@ -80,7 +79,7 @@ def factor_at_zero(problem: Problem, values: Array, records: Sequence[FactorReco
     return problem.triangular_factor(values, projected(problem, values, records))
 
 
-def fits(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[NDArray[np.bool_], ...]:
+def fits(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[Mask, ...]:
     """Which records a contact can be in at these values, one mask a factor; all of any other measurement."""
     residuals = problem.residuals(values, records)
     return tuple(

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.errors import ProblemError
 from armcal.measure.partners import OTHER
 from armcal.problem.factor import Factor

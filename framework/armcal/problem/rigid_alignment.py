@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.base.quaternions import nearest_turn
 from armcal.problem.tool_motion import rigid_fit, spread_of
 
@@ -41,7 +40,7 @@ class Tools:
     places: Array
     rotations: Array
 
-    def subset(self, chosen: NDArray[np.intp]) -> Tools:
+    def subset(self, chosen: Indices) -> Tools:
         """Some of them."""
         return Tools(self.places[:, chosen], self.rotations[chosen])
 

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.measure.partners import OTHER
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.rigid_alignment import Tools
@@ -33,7 +32,7 @@ class Sighting:
     """
 
     kernel: int
-    chosen: NDArray[np.intp]
+    chosen: Indices
     measured: Array
     turned: Array | None = None
 
@@ -42,7 +41,7 @@ class Sighting:
         """How far the positions are spread (m)."""
         return spread_of(self.measured)
 
-    def subset(self, places: NDArray[np.intp]) -> Sighting:
+    def subset(self, places: Indices) -> Sighting:
         """Some of its records."""
         turned = None if self.turned is None else self.turned[places]
         return Sighting(self.kernel, self.chosen[places], self.measured[:, places], turned)

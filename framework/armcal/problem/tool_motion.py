@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.quaternions import nearest_turn
 from armcal.problem.problem import FactorRecords, Problem
 

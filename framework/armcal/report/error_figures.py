@@ -1,9 +1,8 @@
 """Figures of errors: their distribution before and after, and in the order of recording."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices, Mask
 from armcal.estimate.validation import FEWEST_FOR_P95
 from armcal.report import svg
 from armcal.report.numbers import count, plural, significant
@@ -16,8 +15,6 @@ _CURVE_POINTS = 240
 _LOG_FROM = 6.0
 _OUTLIER = 4.0
 _TRIANGLE = "m-4 5l4-7l4 7z"
-
-Mask = NDArray[np.bool_]
 
 
 def roles(result: RunResult) -> tuple[Mask, Mask]:
@@ -77,7 +74,7 @@ def _ecdf(errors: Array, x: Axis, y: Axis, css: str) -> str:
     return svg.polyline(x.at(np.repeat(ordered, 2)), y.at(steps), css)
 
 
-def in_order(result: RunResult, worst: NDArray[np.intp]) -> Figure | None:
+def in_order(result: RunResult, worst: Indices) -> Figure | None:
     """Calibrated error of each record in recorded order; None without records."""
     errors = result.errors.calibrated_mm
     finite = errors[np.isfinite(errors)]

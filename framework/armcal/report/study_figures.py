@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.report import svg
 from armcal.report.numbers import significant
 from armcal.report.svg import MONO, Axis, Box, Figure

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup, escape
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.report.numbers import MINUS, count, decimals_for, fixed, significant
 
 WIDE, HALF, NARROW = 1040, 504, 344

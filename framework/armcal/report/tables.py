@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armcal.base.arrays import Indices
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.validation import ErrorSummary
 from armcal.estimate.variance import VarianceComponents
@@ -175,7 +175,7 @@ def fixed_rows(estimate: Estimate) -> list[tuple[str, str, str]]:
     return rows
 
 
-def worst_records(result: RunResult) -> NDArray[np.intp]:
+def worst_records(result: RunResult) -> Indices:
     """The indices with the largest calibrated errors, the largest first; errors that are no number lead."""
     errors = result.errors.calibrated_mm
     ranked = np.where(np.isnan(errors), np.inf, errors)
@@ -194,7 +194,7 @@ def moved_rows(result: RunResult) -> list[tuple[str, str, str]]:
     return list(zip(parts, shown[::2], shown[1::2], strict=True))
 
 
-def worst_rows(result: RunResult, worst: NDArray[np.intp]) -> list[tuple[Any, ...]]:
+def worst_rows(result: RunResult, worst: Indices) -> list[tuple[Any, ...]]:
     """Id, source row, role, and errors of these records: nominal, calibrated, cross-validated.
 
     Then a list of the same of orientations (deg), empty where none are measured.

@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.report import svg
 from armcal.report.numbers import count, decimals_for, fixed, plural, significant
 from armcal.report.svg import Axis, Box, Figure
@@ -81,7 +80,7 @@ def _vectors(result: RunResult) -> Array | None:
     return residual if residual.shape[0] == 3 and len(positions) == 1 else None
 
 
-def _view(position: Array, what: Coloured, chosen: NDArray[np.intp], total: int, axes: tuple[int, int]) -> Figure:
+def _view(position: Array, what: Coloured, chosen: Indices, total: int, axes: tuple[int, int]) -> Figure:
     shown = position[list(axes)][:, chosen]
     across, up = (_NAMES[i] for i in axes)
     numbers, unit = what.numbers[chosen], what.unit

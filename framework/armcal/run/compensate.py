@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armcal.arm.loading import LOAD_CHANNELS
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.quaternions import quaternion_of
 from armcal.base.units import UNITS
 from armcal.calibration.calibration import Calibration, arm_named

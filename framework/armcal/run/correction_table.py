@@ -11,16 +11,15 @@ from pathlib import Path
 from typing import Annotated, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
+from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.settings import Angle3, Length3, Mass, Settings
 from armcal.calibration.compensation.compensator import Compensator
-from armcal.calibration.compensation.request import FARTHEST_M, Commands, Mask, Targets
+from armcal.calibration.compensation.request import FARTHEST_M, Commands, Targets
 from armcal.calibration.rigid_chain import turn_between
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
@@ -203,7 +202,7 @@ def _outward(compensator: Compensator, targets: Targets, shape: tuple[int, ...],
         commands[rows[onward.reached]] = onward.joint_angles[onward.reached]
 
 
-def _edge(had: Mask, tried: set[tuple[int, int]]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _edge(had: Mask, tried: set[tuple[int, int]]) -> tuple[Indices, Indices]:
     """Nodes beside such as are reached, each with one neighbour that it was not yet tried from."""
     index = np.arange(had.size).reshape(had.shape)
     pairs: dict[int, int] = {}

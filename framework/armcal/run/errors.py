@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.units import ERROR_UNITS
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import gave_up

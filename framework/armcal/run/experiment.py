@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from armcal.base.arrays import Array, Indices
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.calibration.calibration_file import identity_of
 from armcal.config.selection import select, without_groups
@@ -148,7 +147,7 @@ class Experiment:
         texts = unmatched(self.system.measurements, groups)
         return replace(self, parameters=chosen, warnings=(*self.warnings, *texts))
 
-    def poses(self, dataset: Dataset) -> NDArray[np.intp]:
+    def poses(self, dataset: Dataset) -> Indices:
         """Which records are of one pose, by number (N): all arms near the same joint positions, under the same load."""
         arms = self.system.arms.items()
         return pose_numbers(dataset, [f"{name}.{joint}" for name, arm in arms for joint in arm.commanded])

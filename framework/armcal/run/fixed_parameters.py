@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.freeing import Candidate, candidates, freeing
 from armcal.estimate.validation import cross_validate, folds

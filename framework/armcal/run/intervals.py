@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.diagnose.coverage import (
     Coverage,
     PredictedFit,
@@ -28,7 +28,7 @@ from armcal.diagnose.dependences import MOST_LEVELS
 from armcal.diagnose.noise_findings import Finding
 from armcal.estimate.estimator import Estimator
 from armcal.estimate.prediction import LEVELS, POSITION, STATED, Predictor, Spread, is_position
-from armcal.estimate.validation import CrossValidation, Indices, Split
+from armcal.estimate.validation import CrossValidation, Split
 from armcal.estimate.weighing import WeighedFit
 from armcal.problem.problem import FactorRecords, Problem
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.config.system import System
 from armcal.diagnose.coverage import predictor
 from armcal.diagnose.evidence import Evidence, priors_alone, unseen_poses

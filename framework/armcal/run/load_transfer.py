@@ -6,14 +6,14 @@ from functools import partial
 
 import numpy as np
 
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.errors import ConfigError, DataError, Location
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.simulation import SimulationRequest, with_channels
 from armcal.estimate.start import aligned_start, with_proposals
 from armcal.estimate.structure import require_solvable
-from armcal.estimate.validation import Indices, Split, error_unit, errors_and_turns, folds, summarise
+from armcal.estimate.validation import Split, error_unit, errors_and_turns, folds, summarise
 from armcal.io.parallel import Executor
 from armcal.problem.drift import with_drift
 from armcal.problem.problem import Problem

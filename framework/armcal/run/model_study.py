@@ -7,20 +7,11 @@ from itertools import chain
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.bootstrap import BlockLength, automatic_block_length, standard_error_of_mean
 from armcal.estimate.estimator import Progress, no_progress
-from armcal.estimate.validation import (
-    ErrorSummary,
-    Indices,
-    JudgedFit,
-    Split,
-    error_unit,
-    errors_and_turns,
-    folds,
-    summarise,
-)
+from armcal.estimate.validation import ErrorSummary, JudgedFit, Split, error_unit, errors_and_turns, folds, summarise
 from armcal.io.parallel import Executor
 from armcal.run.prepare import Prepared, Stopwatch, prepare
 from armcal.run.study import PREVIOUS, ModelStudySettings, Study, interpreted_first, judged_fits, naming

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.errors import ProblemError
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.identifiability import Identifiability, analyse, measures_of
 from armcal.planning.bound import bounded
-from armcal.planning.candidates import Candidates, Indices, deviations, over_draws
+from armcal.planning.candidates import Candidates, deviations, over_draws
 from armcal.planning.criterion import Observability, criterion, observability
 from armcal.planning.planning import Plan, choose, value_of
 from armcal.planning.refinement import Allowed, refine

@@ -11,9 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
-from armcal.planning.candidates import Indices
 from armcal.problem.problem import Problem
 from armcal.run.plan_poses import JointSpace, Pool
 

@@ -22,7 +22,7 @@ from armcal.arm.clearance import (
     Shape,
     joints_of_frames,
 )
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.settings import InputPath, Length, Length3, Settings
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ConfigError, DataError, Location, PluginError

@@ -8,8 +8,8 @@ from typing import Self
 import numpy as np
 
 from armcal.arm.loading import holding_efforts
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.calibration.calibration import Calibration
 from armcal.errors import ConfigError, ProblemError

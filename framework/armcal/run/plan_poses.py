@@ -9,10 +9,10 @@ from typing import Self
 
 import numpy as np
 
-from armcal.arm.clearance import ClearanceCheck, Mask
+from armcal.arm.clearance import ClearanceCheck
 from armcal.arm.joints import by_dimension
+from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.calibration.compensation.finder import Allowed
 from armcal.config.system import build_component
 from armcal.errors import ConfigError, DataError, Location, ProblemError

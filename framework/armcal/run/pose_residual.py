@@ -9,8 +9,8 @@ import numpy as np
 
 from armcal.arm.assembly import Arm
 from armcal.arm.pose_residual import OF_TOOL, ModelErrors, PoseResidual, Postures
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.config.system import System
 from armcal.diagnose.coverage import PredictedFit, missed, predictor, whitened_like
 from armcal.diagnose.noise_findings import Finding
@@ -19,7 +19,6 @@ from armcal.estimate.estimator import Progress
 from armcal.estimate.validation import (
     CrossValidation,
     FitTask,
-    Indices,
     JudgedFit,
     Split,
     cross_validate,

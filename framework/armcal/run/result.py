@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from armcal.base.arrays import Array
 from armcal.base.config_text import finite
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.calibration.intervals import PredictionRecord
 from armcal.config.system import System
 from armcal.diagnose.evidence import Evidence

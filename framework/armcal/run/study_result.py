@@ -3,9 +3,9 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from armcal.base.arrays import Array
 from armcal.base.config_text import as_json
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.calibration.calibration_file import dump
 from armcal.config.variants import SECTION
 from armcal.estimate.validation import ErrorSummary, in_unit

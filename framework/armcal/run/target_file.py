@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from armcal.arm.loading import LOAD_CHANNELS
+from armcal.base.arrays import Array
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.quaternions import rotation_matrix, rpy_matrices
 from armcal.base.units import DIMENSIONLESS, split_suffix
 from armcal.calibration.compensation.reach import Reach

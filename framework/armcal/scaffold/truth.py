@@ -6,7 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from armcal.base.domains import Array, Rotation
+from armcal.base.arrays import Array
+from armcal.base.domains import Rotation
 from armcal.base.parameters import Parameters
 from armcal.base.units import to_unit
 from armcal.scaffold.rendering import number

@@ -10,7 +10,7 @@ from armcal.arm.assembly import Arm
 from armcal.arm.effects import MOUNT, JointCommand, JointEffect, Spring, reshapes
 from armcal.arm.model import Attachment, Chain, Joint
 from armcal.base import se3
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression
 from armcal.measure.reader import surroundings

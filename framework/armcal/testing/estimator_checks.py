@@ -4,7 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armcal.base.domains import Array, Interval
+from armcal.base.arrays import Array
+from armcal.base.domains import Interval
 from armcal.base.parameters import Parameters
 from armcal.estimate.estimator import Estimator, Solution
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise

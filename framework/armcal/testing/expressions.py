@@ -9,7 +9,8 @@ from typing import TypeVar
 import casadi as ca
 import numpy as np
 
-from armcal.base.domains import Array, Interval
+from armcal.base.arrays import Array
+from armcal.base.domains import Interval
 from armcal.base.parameters import FIT_NAME, ParameterBlock, Parameters
 from armcal.base.se3 import Expression
 from armcal.base.units import UNITS, si_unit

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from armcal.arm.assembly import Arm, prefixed
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.se3 import Expression
 from armcal.base.units import ERROR_UNITS, display_unit, si_unit, units_of

@@ -10,7 +10,7 @@ from armcal.arm.assembly import Arm, MassiveModel, MassSpec
 from armcal.arm.environment import Environment
 from armcal.arm.model import ArmModel, Chain, forward
 from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME, frame_names
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression, Transform
 from armcal.problem.problem import Problem

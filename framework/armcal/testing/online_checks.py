@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from typing_extensions import override
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.errors import ProblemError
 from armcal.estimate.online import Gaussian, Linearised, Observation, OnlineEstimator, Update
 from armcal.testing.results import ContractError, Recorder, expect

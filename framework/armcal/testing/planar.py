@@ -11,8 +11,8 @@ from armcal.arm.effects import JointCommand, JointEffect, Spring
 from armcal.arm.environment import Environment
 from armcal.arm.model import Attachment, Chain, Joint
 from armcal.base import se3
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
 from armcal.base.poses import quaternion_expression
 from armcal.base.se3 import Expression

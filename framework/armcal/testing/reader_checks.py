@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.errors import InputError
 from armcal.measure.measurement import Measurement
 from armcal.measure.reader import Reader, ReadRequest, requested_channels

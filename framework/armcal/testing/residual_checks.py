@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 
 from armcal.arm.pose_residual import OF_TOOL, SURROUNDINGS, ModelErrors, PoseResidual, Postures
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.testing.expressions import expect_only, expect_repeated
 from armcal.testing.results import Recorder, expect
 from armcal.testing.settings_checks import Subject

@@ -5,7 +5,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.devices.device import DeviceIdentity, DeviceUnwellError
 
 from armcal_bench.acquisition import run_log as entry

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.diagnose.measured_frame import FrameMistake, frame_mistake
 
 from armcal_bench.acquisition.settings import ArrivalSettings

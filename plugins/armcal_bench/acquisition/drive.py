@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceError, DeviceRefusedError, JointDevice, MeasuringDevice
 

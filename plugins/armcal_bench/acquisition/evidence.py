@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 
 from armcal_bench.acquisition.arrival import Arrival
 from armcal_bench.acquisition.sag import Sag, SagJudge

@@ -9,7 +9,7 @@ from armcal.arm.assembly import Arm
 from armcal.arm.environment import Environment
 from armcal.arm.joints import unknown_joint
 from armcal.arm.loading import holding_function
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.devices.clock import Clock
 
 from armcal_bench.acquisition.settings import ServoHeatSettings

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 from armcal.arm.clearance import ClearanceCheck
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 
 _SPREAD = 256
 _TRIED_AT_ONCE = 24

@@ -8,8 +8,8 @@ import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.arm.clearance import ClearanceCheck
 from armcal.arm.joints import joint_limits, unknown_joint
+from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.calibration.rigid_chain import tool_poses
 from armcal.devices.device import DeviceRefusedError, JointDevice, MeasuringDevice
 from armcal.errors import ConfigError, DataError, Location
@@ -17,7 +17,6 @@ from armcal.run.experiment import Experiment
 from armcal.run.plan_approaches import approach_channels
 from armcal.run.plan_clearance import clearance_check
 from armcal.run.plan_poses import JointSpace, commands_of, read_poses
-from numpy.typing import NDArray
 
 from armcal_bench.acquisition.arrival import Arrival
 from armcal_bench.acquisition.heat import HeatModel, Torques, holding_torques
@@ -203,7 +202,7 @@ def _last_settable(device: JointDevice, joint: str, inside: float, beyond: float
     return inside
 
 
-def _outside(pose: Array, limits: Array) -> NDArray[np.bool_]:
+def _outside(pose: Array, limits: Array) -> Mask:
     return np.asarray((pose < limits[:, 0] - _SLACK) | (pose > limits[:, 1] + _SLACK))
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.devices.device import DeviceIdentity
 from armcal.errors import ConfigError
 from armcal.io.journal.files import REAL_FILES, write_whole

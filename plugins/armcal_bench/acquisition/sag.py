@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.diagnose.measured_frame import MeasuredFrame, frame_of
 
 from armcal_bench.settling import Stand

@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import TypeGuard
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 
 from armcal_bench.acquisition.heat import NEVER, HeatModel, Torques
 from armcal_bench.acquisition.path_planner import JointPath, PathPlanner, travel

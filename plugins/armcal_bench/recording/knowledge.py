@@ -5,8 +5,8 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.diagnose.clustered import widened
 from armcal.errors import ArmcalError
 from armcal.estimate.estimator import Solution, SolverVerdict, estimate

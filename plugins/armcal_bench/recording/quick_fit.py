@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
+from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.errors import ProblemError
 from armcal.estimate.identifiability import InverseInformation
 from armcal.estimate.nuisance import started
@@ -72,7 +72,7 @@ class Fitted:
     half: Array
     scale: float
     freedom: float
-    used: NDArray[np.bool_]
+    used: Mask
 
 
 class QuickFitter:
@@ -121,7 +121,7 @@ class QuickFitter:
         parameters = self._weak.parameters
         return {b.name: tuple(fitted.values[parameters.entries_of(b.name)].tolist()) for b in parameters.free}
 
-    def fit(self, used: NDArray[np.bool_]) -> Fitted:
+    def fit(self, used: Mask) -> Fitted:
         """Fit some of the postures (N), from where the last fit ended."""
         parameters = self._weak.parameters
         records = self._weak.weighted(self.records, [used.astype(float)] * len(self.records))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from scipy.linalg import block_diag
 from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 
 from armcal_bench.servo.nominal import By, NominalArm
 from armcal_bench.servo.problem import Observation

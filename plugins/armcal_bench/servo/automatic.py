@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.diagnose.measured_frame import FrameMistake, frame_mistake
 from armcal.errors import InputError, Location
 

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 from armcal.arm.servo import PulseClock
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from scipy.optimize import OptimizeResult, least_squares
 
 from armcal_bench.servo.problem import WEAK_PULSE_SD, FitTask, KnownServo, Observation, Residuals, Unknowns

@@ -12,7 +12,7 @@ import numpy as np
 from armcal.arm.assembly import Arm, ArmState, scoped
 from armcal.arm.environment import Environment
 from armcal.arm.model import forward
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.se3 import Expression
 from armcal.measure.measurement import Channel, Measurement

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 from armcal.arm.servo import PulseClock, PulseTable, piecewise_linear
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from scipy.interpolate import BSpline, make_interp_spline
 
 Zero = Literal["kept", "measured"]

@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 from armcal.arm.joints import unknown_joint
 from armcal.arm.servo import PulseClock, PulseTable
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.config.servo_file import ServoFile, load_servo_file
 from armcal.config.validate import validate
 from armcal.devices.wiring import servo_file_of

@@ -8,7 +8,7 @@ from itertools import combinations, permutations
 from typing import Any
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.devices.wiring import WiringRecord
 from armcal.errors import InputError
 from scipy.spatial.transform import Rotation

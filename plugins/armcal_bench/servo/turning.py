@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.measure.stillness import mean_rotation
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation

@@ -5,11 +5,12 @@ from dataclasses import dataclass, field
 from itertools import combinations, pairwise
 
 import numpy as np
+from armcal.base.arrays import Indices
 
 from armcal_capability.acceptance import characteristics as of
 from armcal_capability.acceptance.characteristics import Figure
 from armcal_capability.acceptance.comparison import Comparison
-from armcal_capability.acceptance.records import FEWEST, Group, Indices, Visits
+from armcal_capability.acceptance.records import FEWEST, Group, Visits
 
 MM, DEG = 1000.0, 180.0 / np.pi
 _MOST_PAIRED = 10

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.estimate.prediction import RADIUS_LEVEL, Spread, quantile
 from scipy.stats import chi2
 

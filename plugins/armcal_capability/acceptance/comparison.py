@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.quaternions import nearest_turn, rotation_matrix
 from armcal.errors import DataError, Location, NotConvergedError
 from armcal.estimate.placing import placings

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from armcal.base.arrays import Indices
 from armcal.base.dataset import Dataset
 from armcal.base.units import DIMENSIONLESS
 from armcal.config.system import build_component
@@ -15,11 +16,9 @@ from armcal.measure.environment import noticed
 from armcal.measure.groups import pose_numbers
 from armcal.measure.reader import CYCLE, Reader, ReadRequest, RequestedChannel, requested_channels
 from armcal.plugins import PluginRegistry
-from numpy.typing import NDArray
 
 from armcal_capability.acceptance.subject import ArmToJudge
 
-Indices = NDArray[np.intp]
 POSE, DIRECTION = "pose", "direction"
 COMMANDED = tuple(f"commanded_{axis}" for axis in "xyz")
 COMMANDED_TURN = tuple(f"commanded_{part}" for part in ("qw", "qx", "qy", "qz"))

@@ -1,7 +1,7 @@
 """Visits that cannot be of their pose: another unit, another pose's measurement, a jump of the instrument."""
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.errors import DataError, Location
 
 from armcal_capability.acceptance.records import Group, Visits

@@ -9,8 +9,8 @@ import casadi as ca
 import numpy as np
 from armcal.arm.assembly import ArmState
 from armcal.arm.environment import unstated_payload
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.base.se3 import Expression
 from armcal.config.system import System

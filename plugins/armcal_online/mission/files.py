@@ -10,8 +10,8 @@ from typing import Any, get_args
 
 import numpy as np
 import yaml
+from armcal.base.arrays import Array
 from armcal.base.config_text import as_json
-from armcal.base.domains import Array
 from armcal.base.parameters import Parameters
 from armcal.base.units import to_unit
 from armcal.errors import InputError, Location

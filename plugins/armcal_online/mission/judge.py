@@ -4,14 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Mask
 from armcal.estimate.simulation import DAY_S, Mission
-from numpy.typing import NDArray
 
 from armcal_online.mission.decisions import Finding, Occurrence, Verdict, findings, occurrences
 from armcal_online.mission.log import Decision, MissionLog
 
-Flags = NDArray[np.bool_]
+Flags = Mask
 USABLE = ("nominal", "watch")
 FILTER, RECENT = "recalibrated", "refit_recent"
 _IN_A_ROW = 3

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import sealed
 from armcal.errors import ConfigError, InputError, NotConvergedError

@@ -12,8 +12,8 @@ import casadi as ca
 import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.arm.environment import gravity_tilt, unstated_payload
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.quaternions import quaternion_matrix
 from armcal.calibration.calibration import Calibration
 from armcal.errors import ArmcalError

@@ -14,7 +14,7 @@ from itertools import combinations
 from typing import Literal, get_args
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.directions import CAUSES, Cause, CauseKind, Steps

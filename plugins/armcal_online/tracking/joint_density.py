@@ -5,9 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Mask
 from armcal.estimate.online import log_density, log_likelihood
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
 
@@ -27,7 +26,7 @@ class JointDensity:
     covariance: Array
     rows: Sequence[slice]
 
-    def log_densities(self, chosen: NDArray[np.bool_], freedom: float) -> tuple[Density, Array]:
+    def log_densities(self, chosen: Mask, freedom: float) -> tuple[Density, Array]:
         """The density of chosen records, and what it becomes with each record taken out of them, or put to them (n).
 
         Both come from one factorisation: a record less divides by its density given the others, which the blocks of

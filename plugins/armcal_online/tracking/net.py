@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.errors import ArmcalError
 from armcal.estimate.loss import median_norm, tuned
 from armcal.estimate.online import Gaussian

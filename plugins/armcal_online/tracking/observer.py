@@ -6,8 +6,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.errors import DataError
 from armcal.estimate.online import Linearised, Observation
 from armcal.functions.c_source import LANES
@@ -17,7 +17,6 @@ from armcal.problem.grouped_kernel import HELD
 from armcal.problem.kernel import Kernel
 from armcal.problem.one_record import OneRecord
 from armcal.problem.problem import Problem
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from typing_extensions import override
 
@@ -202,7 +201,7 @@ class Observer:
             for group in np.unique(groups).tolist():
                 at = np.flatnonzero(groups == group)
                 residual[at], own = evaluator.linearise_several(grouped.values(values, group), records[at])
-                moving: NDArray[np.intp] = np.flatnonzero(grouped.free[group] != HELD)
+                moving: Indices = np.flatnonzero(grouped.free[group] != HELD)
                 jacobian[np.ix_(at, np.arange(rows), grouped.free[group][moving])] = own[:, :, moving]
         slope = -self.space.by_coordinates(values, jacobian.reshape(-1, jacobian.shape[2]))
         return residual, slope.reshape(*jacobian.shape[:2], -1)

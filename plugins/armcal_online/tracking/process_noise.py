@@ -14,14 +14,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.base.parameters import Parameters
 from armcal.base.units import parse_quantity
 from armcal.config.selection import quantity
 from armcal.errors import ConfigError, Location
 from armcal.estimate.online import Gaussian, checked
 from armcal.problem.correlation import kept, passed_on
-from numpy.typing import NDArray
 
 from armcal_online.tracking.belief import Belief
 
@@ -63,7 +62,7 @@ class GaussMarkovStates:
         return len(self.states)
 
     @property
-    def drifts(self) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+    def drifts(self) -> tuple[Indices, Indices, Array]:
         """Of those that move a parameter: their places, the parameters' coordinates, and by how much."""
         drifts = [(i, s.coordinate, s.size) for i, s in enumerate(self.states) if s.coordinate is not None]
         which, coordinate, size = zip(*drifts, strict=True) if drifts else ((), (), ())

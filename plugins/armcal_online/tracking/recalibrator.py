@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.calibration.calibration import Calibration
 from armcal.errors import ArmcalError, ConfigError, DataError, Location
 from armcal.estimate.online import Linearised, OnlineEstimator, normalised_innovation_squared

@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.errors import NotConvergedError
 from armcal.estimate.loss import Loss, median_norm, tuned
 from armcal.estimate.online import Gaussian, normalised_innovation_squared
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from armcal_online.tracking.belief import Belief
@@ -68,7 +67,7 @@ class Innovations:
 
     numbers: Array
     slopes: Array
-    owner: NDArray[np.intp]
+    owner: Indices
     norms: Array
     relative: Array
     losses: tuple[tuple[Loss, slice], ...]

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 from armcal.arm.environment import gravity_tilt, unstated_payload
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array, Interval
+from armcal.base.domains import Interval
 from armcal.base.parameters import Parameters
 from armcal.calibration.calibration import Calibration
 from armcal.config.selection import quantity

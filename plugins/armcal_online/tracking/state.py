@@ -11,7 +11,7 @@ from types import UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.errors import DataError
 from armcal.estimate.online import Gaussian, OnlineEstimator, kalman_update
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from armcal.base.domains import Array, Interval, Semidefinite, symmetric
+from armcal.base.arrays import Array, Indices
+from armcal.base.domains import Interval, Semidefinite, symmetric
 from armcal.base.parameters import ParameterBlock, Parameters
-from numpy.typing import NDArray
 
 _ENTRIES = np.triu_indices(3)
 
@@ -34,7 +34,7 @@ class StateSpace:
         return self.parameters.coordinate_names
 
     @cached_property
-    def entries(self) -> NDArray[np.intp]:
+    def entries(self) -> Indices:
         """Positions of the free entries in a value vector."""
         return np.array(self.parameters.free_entries, dtype=np.intp)
 
@@ -54,7 +54,7 @@ class StateSpace:
         return tuple(b for b in self._blocks if not isinstance(b[0].domain, (Interval, Semidefinite)))
 
     @cached_property
-    def _adding(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def _adding(self) -> tuple[Indices, Indices]:
         """Positions in a value vector, and among the coordinates, of numbers that add."""
         adding = [b for b in self._blocks if isinstance(b[0].domain, (Interval, Semidefinite))]
         return _positions(entries for _, entries, _ in adding), _positions(coordinates for _, _, coordinates in adding)
@@ -125,7 +125,7 @@ class StateSpace:
         return tuple((e, c) for block, e, c in self._blocks if isinstance(block.domain, Semidefinite))
 
     @cached_property
-    def bounds(self) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
+    def bounds(self) -> tuple[Indices, Indices, Array, Array]:
         """Of numbers with bounds: places in a value vector and among the coordinates, lower and upper bounds."""
         bounded = [
             (entries.start, coordinates.start, block.domain.lower, block.domain.upper)
@@ -146,12 +146,12 @@ class StateSpace:
         return near
 
     @cached_property
-    def _matrices(self) -> NDArray[np.intp]:
+    def _matrices(self) -> Indices:
         """Of semidefinite blocks, the places of their entries in a value vector (blocks x 6)."""
         return _positions(entries for entries, _ in self.cones).reshape(-1, 6)
 
 
-def _positions(slices: Iterable[slice]) -> NDArray[np.intp]:
+def _positions(slices: Iterable[slice]) -> Indices:
     return np.array([i for places in slices for i in range(places.start, places.stop)], dtype=np.intp)
 
 

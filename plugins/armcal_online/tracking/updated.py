@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 from armcal.arm.environment import unstated_payload
-from armcal.base.domains import Array, Interval
+from armcal.base.arrays import Array
+from armcal.base.domains import Interval
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import UNMOVED_SD, InformationRecord, ParameterRecord, identity_of, sealed
 from armcal.calibration.intervals import covariance_rows

@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 from itertools import accumulate, combinations, pairwise
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Mask
 from armcal.errors import ArmcalError
 from armcal.estimate.online import Gaussian, Linearised, OnlineEstimator, log_likelihood
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from armcal_online.tracking.belief import Belief
@@ -42,7 +41,7 @@ class Weighed:
 
     log_likelihood: float
     shift: Array
-    fits: NDArray[np.bool_]
+    fits: Mask
     nis: float
 
 
@@ -122,7 +121,7 @@ class RecordsSince:
         points = {id(mean): mean + moved for mean in self._means}
         return linearised(self._observations, [points[id(mean)] for mean in self._means])
 
-    def _likeliest_shift(self, directions: Array, shift: Array, fits: NDArray[np.bool_], factor: float) -> Array:
+    def _likeliest_shift(self, directions: Array, shift: Array, fits: Mask, factor: float) -> Array:
         """By the records that fit (k; in standard deviations), weighted as without the change."""
         key, chosen = (fits.tobytes(), factor), np.flatnonzero(fits).tolist()
         if key not in self._roots:  # most changes are weighed with the same records, as good as stated
@@ -140,9 +139,7 @@ class RecordsSince:
                 break
         return shift
 
-    def _with_likeliest_outliers(
-        self, directions: Array, shift: Array, fits: NDArray[np.bool_], factor: float
-    ) -> Weighed:
+    def _with_likeliest_outliers(self, directions: Array, shift: Array, fits: Mask, factor: float) -> Weighed:
         """The likeliest choice of outliers, one record changed at a time, and the evidence with it."""
         every = np.ones(len(self._observations), dtype=bool)
         innovation, slope, covariance, rows = self._stacked(self._records(directions, shift), every, factor)
@@ -161,7 +158,7 @@ class RecordsSince:
             chosen[i] = not chosen[i]
 
     def _stacked(
-        self, records: Sequence[Linearised], chosen: NDArray[np.bool_], factor: float
+        self, records: Sequence[Linearised], chosen: Mask, factor: float
     ) -> tuple[Array, Array, Array, list[slice]]:
         """Innovations of chosen records, their slopes by a shift at the first, covariance without it, rows of each."""
         places = np.flatnonzero(chosen).tolist()

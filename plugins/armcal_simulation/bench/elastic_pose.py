@@ -9,7 +9,7 @@ from armcal.arm.assembly import Arm, ArmInputs, ArmState, scoped
 from armcal.arm.environment import STATICS, Environment, tilted
 from armcal.arm.evaluator import ElasticPass, Evaluator
 from armcal.base import se3
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.parameters import Parameters
 from armcal.base.poses import rotation_of
 from armcal.errors import ConfigError, NotConvergedError

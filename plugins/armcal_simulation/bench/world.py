@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.devices.simulated import BOARD, CLOCK, LOG
 from armcal.io.signals import Signals
 

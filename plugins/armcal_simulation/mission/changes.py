@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 from armcal.arm.environment import gravity_tilt
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.parameters import Parameters
 from armcal.config.selection import quantity
 from armcal.errors import ConfigError

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 from armcal.arm.assembly import Arm
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.estimate.simulation import SimulationRequest, with_channels
 from armcal.problem.problem import Problem
 

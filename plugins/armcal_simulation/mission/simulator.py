@@ -7,12 +7,11 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.arm.joints import by_dimension, joint_limits, unknown_joint
+from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.errors import ConfigError
 from armcal.estimate.simulation import DAY_S, Mission, SimulationRequest, with_channels
 from armcal.testing import EXAMPLE_TRUTH
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from armcal_simulation.mission.changes import MovingTruth, moving_truth, scheduled
@@ -45,7 +44,7 @@ def record_times(days: float, records: RecordSettings, random: np.random.Generat
     return np.array(times)
 
 
-def arriving(times: Array, losses: LossSettings, random: np.random.Generator) -> NDArray[np.bool_]:
+def arriving(times: Array, losses: LossSettings, random: np.random.Generator) -> Mask:
     """Which records arrive (N): not in a gap or an hour without contact, nor if they are lost alone."""
     hours = np.floor(times / _HOUR_S).astype(int)
     silent = (random.random(int(hours.max(initial=0)) + 1) < losses.hours)[hours]
@@ -194,7 +193,7 @@ class MissionOfDays:
         times: Array,
         truth: MovingTruth,
         random: Mapping[str, np.random.Generator],
-    ) -> tuple[dict[str, Array], NDArray[np.bool_], NDArray[np.bool_]]:
+    ) -> tuple[dict[str, Array], Mask, Mask]:
         """Readings of the cameras, where they stand at each time; which records are wrong, and which exchanged."""
         hung = zip(("payload", "payload_x", "payload_y", "payload_z"), truth.payload_at(times).T, strict=True)
         loaded = with_channels(standing, dict(hung))

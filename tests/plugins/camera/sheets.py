@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal_camera.board import AnyBoard, Aprilgrid, Board, Charuco, Chessboard, Tag
 from armcal_camera.pattern import outline
 from pydantic import TypeAdapter

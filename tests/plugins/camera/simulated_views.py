@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 import yaml
 from armcal.arm.model import forward
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.quaternions import quaternion_of
 from armcal.estimate.estimator import Estimate
 from armcal.measure.csv_writer import write_csv

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from click.testing import CliRunner
 
 pytest.importorskip("cv2")

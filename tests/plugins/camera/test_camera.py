@@ -9,8 +9,8 @@ import armcal
 import casadi as ca
 import numpy as np
 import pytest
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.calibration.calibration import Calibration
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, ProblemError

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import yaml
 from armcal.api import Run
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.calibration.exporter import request_of
 from armcal.errors import ConfigError
 from armcal_camera.export import FramesSettings, HandEyeExporter

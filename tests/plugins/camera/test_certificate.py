@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal_camera import certificate as of
 from armcal_camera.certificate import certificate, sentence
 from armcal_camera.hand_eye import HandEye, hand_eye

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.errors import DataError, PluginError
 
 pytest.importorskip("cv2")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.measure.points import Reading
 from armcal_camera.first_guess import Setup, first_guess
 from armcal_camera.hand_eye import hand_eye, open_motion

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.arm.assembly import Arm
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.calibration.exporter import rigid_tools
 from armcal.errors import DataError
 from armcal.run.experiment import Experiment

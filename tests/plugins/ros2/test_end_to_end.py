@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import recorded_bags as bags
 import yaml
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.calibration.calibration import Calibration
 from armcal.cli.run import run
 from armcal.run.experiment import Experiment

@@ -9,14 +9,14 @@ from functools import cached_property
 import numpy as np
 
 from armcal.arm.loading import LOAD_CHANNELS
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Mask
 from armcal.base.parameters import Parameters
 from armcal.calibration.compensation.counts import Rounding, ServoCounts
 from armcal.calibration.compensation.finder import Allowed, Finder, Seeds
 from armcal.calibration.compensation.path import PathFinder, with_sides
 from armcal.calibration.compensation.reach import Reach, check_held, command_limits, held_joints, reach_of, why_not
 from armcal.calibration.compensation.redundancy import Descent
-from armcal.calibration.compensation.request import Commands, Mask, Options, Targets
+from armcal.calibration.compensation.request import Commands, Options, Targets
 from armcal.calibration.compensation.search import Rows, Solutions, Solver
 from armcal.calibration.rigid_chain import turn_between
 from armcal.calibration.tool_expression import APPROACH, Equilibrium, Standing, ToolExpression

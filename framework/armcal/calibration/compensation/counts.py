@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armcal.arm.servo import PulseClock, PulseTable
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices
 from armcal.calibration.compensation.finder import Allowed
 from armcal.calibration.compensation.request import Targets
 from armcal.calibration.compensation.search import Solutions, Solver
@@ -106,7 +106,7 @@ class ServoCounts:
         return counts[joint, place, target], angles[joint, place, target]
 
 
-def _sums(slopes: Array, moved: Array, joints: Sequence[int]) -> tuple[Array, NDArray[np.intp]]:
+def _sums(slopes: Array, moved: Array, joints: Sequence[int]) -> tuple[Array, Indices]:
     """What all combinations of some joints' offsets do (N x combinations x m), and the combinations."""
     wide = moved.shape[2]
     places = np.indices((wide,) * len(joints)).reshape(len(joints), wide ** len(joints)).T

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from armcal.base.domains import Array
-from armcal.calibration.compensation.request import FARTHEST_M, Mask
+from armcal.base.arrays import Array, Indices, Mask
+from armcal.calibration.compensation.request import FARTHEST_M
 from armcal.calibration.compensation.search import (
     NEAREST,
     PREFERRED,
@@ -148,7 +147,7 @@ class Finder:
         solutions.replace(good, attempt.subset(good))
         return solutions
 
-    def _picked(self, target: Array, used: int, wide: int) -> NDArray[np.intp]:
+    def _picked(self, target: Array, used: int, wide: int) -> Indices:
         """The next seeds of each target (N x wide)."""
         apart = self._seeds.apart(target, self._solver.length)
         if used == 0 and wide == 1:
@@ -163,7 +162,7 @@ class Finder:
         record: Array,
         target: Array,
         todo: Rows,
-        picks: NDArray[np.intp],
+        picks: Indices,
         solutions: Solutions,
         score: Score | None,
         start: Array | None,

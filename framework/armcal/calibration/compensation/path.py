@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.calibration.compensation.finder import Finder
 from armcal.calibration.compensation.search import Solutions
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from armcal.arm.assembly import Arm
 from armcal.arm.joints import Limits, joint_limits, unknown_joint
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Mask
 from armcal.base.parameters import Parameters
 from armcal.base.se3 import Transform, evaluated, identity
-from armcal.calibration.compensation.request import Mask, Targets
+from armcal.calibration.compensation.request import Targets
 from armcal.calibration.compensation.search import Rows, Solutions
 from armcal.calibration.tool_expression import ToolExpression
 

@@ -7,7 +7,7 @@ step counts only if what is to be small became smaller. [Nocedal2006]
 import casadi as ca
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.base.se3 import Expression
 from armcal.calibration.compensation.finder import Allowed
 from armcal.calibration.compensation.request import Redundancy

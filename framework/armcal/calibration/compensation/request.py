@@ -9,10 +9,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array, Indices, Mask
 
 Redundancy = Literal["nearest", "stiffest", "least_sag", "coolest"]
-Mask = NDArray[np.bool_]
 FARTHEST_M = 1e6
 """A target beyond this is a slip of a unit, and its square may be no number."""
 _ORTHOGONAL = 1e-6
@@ -58,7 +57,7 @@ class Targets:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def subset(self, rows: NDArray[np.intp]) -> Targets:
+    def subset(self, rows: Indices) -> Targets:
         """Some of them."""
         turned = None if self.rotations is None else self.rotations[rows]
         conditions = {name: values[rows] for name, values in self.conditions.items()}

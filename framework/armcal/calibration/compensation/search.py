@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from armcal.base.domains import Array
-from armcal.calibration.compensation.request import Mask
+from armcal.base.arrays import Array, Indices, Mask
 from armcal.calibration.compensation.step import (
     FIRST_DAMPING,
     REACHED,
@@ -20,7 +18,7 @@ from armcal.calibration.compensation.step import (
 from armcal.calibration.tool_expression import ToolExpression, sample_inputs
 from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
-Rows = NDArray[np.intp]
+Rows = Indices
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from armcal.arm.joints import joint_limits
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Array
 from armcal.base.units import display_unit, to_unit
 from armcal.calibration.compensation.compensator import Compensator
 from armcal.calibration.compensation.request import Options

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armcal.base.domains import Array
+from armcal.base.arrays import Array
 from armcal.calibration.compensation.compensator import Compensator
 from armcal.errors import ProblemError
 
