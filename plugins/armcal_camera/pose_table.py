@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from armcal.arm.assembly import Arm
+from armcal.arm.effects import JOINT_RATE
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.quaternions import nearest_rotation
@@ -100,7 +101,7 @@ def read_poses(
         PluginError: the reader is not known.
     """
     channels = tuple(w for w in request.channels if w.channel.partition(".")[0] not in cameras)
-    rates = [w for w in channels if w.dimension == "joint rate" and w.required]
+    rates = [w for w in channels if w.dimension == JOINT_RATE and (w.required or w.is_evidence)]
     channels = tuple(replace(w, required=w.required and w not in rates) for w in channels)
     rest = {name: m for name, m in request.measurements.items() if name not in cameras}
     request = ReadRequest(request.arms, rest, channels)
@@ -125,7 +126,8 @@ def _with_rates(dataset: Dataset, rates: Sequence[RequestedChannel]) -> Dataset:
     """Rates of joints (rad/s or m/s) that the file has not, from the times of its rows.
 
     Raises:
-        DataError: there are no times, or rows are too far apart in time to say how fast a joint was.
+        DataError: there are no times, or rows are too far apart in time to say how fast a joint was; not where only
+            the verdict would read it.
     """
     missing = [w for w in rates if not dataset.has(w.channel)]
     if not missing:
@@ -136,6 +138,8 @@ def _with_rates(dataset: Dataset, rates: Sequence[RequestedChannel]) -> Dataset:
     )
     steps = np.diff(dataset.column("time")) if dataset.has("time") else np.zeros(0)
     if len(steps) < 2 or steps.min() <= 0 or steps.max() > _LONGEST_STEP_S:
+        if all(w.is_evidence for w in missing):
+            return dataset
         spacing = f"rows up to {steps.max():.3g} s apart" if len(steps) else "no times"
         message = f"found {spacing}, expected how fast joints were: {missing[0].what}."
         raise DataError(message, where=dataset.where(), hint=hint)

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
-from armcal.arm.effects import Condition, EffectSettings, JointEffect
+from armcal.arm.effects import EffectSettings, JointEffect, joint_rate
 from armcal.arm.model import Chain
 from armcal.base.parameters import ParameterBlock, scalar
 
@@ -22,8 +22,8 @@ class Delay(JointEffect):
 
     def __init__(self, settings: EffectSettings, joint_names: Sequence[str]) -> None:
         super().__init__(settings, joint_names)
-        self._rates = {joint: f"{joint_names[joint - 1]}_rate" for joint in self.joints}
-        self.conditions = tuple(Condition(name, "joint rate") for name in self._rates.values())
+        rates = {joint: joint_rate(joint_names[joint - 1]) for joint in self.joints}
+        self._rates, self.conditions = {joint: rate.name for joint, rate in rates.items()}, tuple(rates.values())
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """How old the recorded joints are at the time of the measurement (s)."""

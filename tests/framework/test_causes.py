@@ -213,6 +213,32 @@ def test_a_stretched_instrument_is_named_by_the_command(tmp_path):
     assert first["size"].startswith("share: 0.")
 
 
+@pytest.mark.slow
+def test_late_joints_are_named_by_the_command_from_columns_of_their_rates(tmp_path):
+    """Joints read 100 ms before the tip, at some 10 deg/s; a rate that is missing costs no record."""
+    lines = [line.split(",") for line in (DEMO / "demo.csv").read_text().splitlines()]
+    joints, rng = [lines[0].index(f"q{i}_deg") for i in range(1, 7)], np.random.default_rng(1)
+    rows = [[*lines[0], *(f"q{i}_rate_deg_s" for i in range(1, 7))]]
+    for line in lines[1:]:
+        rates, late = 10 * rng.normal(size=6), list(line)
+        for place, rate in zip(joints, rates, strict=True):
+            late[place] = str(float(line[place]) - 0.1 * rate)
+        rows.append([*late, *map(str, rates)])
+    rows[3][-1] = ""
+    (tmp_path / "data.csv").write_text("\n".join(map(",".join, rows)) + "\n")
+    arguments = ["run", str(DEMO / "demo.yaml"), "--data", str(tmp_path / "data.csv"), "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(cli, [*arguments, "--json", *QUICKLY])
+    assert result.exit_code == 0, result.output
+    findings = json.loads(result.stdout)["verdict"]["findings"]
+    named = next(f for f in findings if "how fast the joints moved" in f["text"])
+    assert "joints late by about 100 ms, to first order" in named["text"]
+    assert "synchronise the clocks" in named["action"]
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert "set aside" not in json.dumps(metrics) and len(lines) == 201
+    kept = (tmp_path / "out" / "residuals.csv").read_text().splitlines()
+    assert len(kept) == len(lines)
+
+
 @pytest.mark.parametrize(("name", "in_order", "cause"), [("drift", False, "time"), ("slow joints", True, "open")])
 @pytest.mark.slow
 def test_time_is_blamed_only_where_poses_do_not_follow_it(lrm, name, in_order, cause):

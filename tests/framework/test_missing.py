@@ -14,7 +14,7 @@ from armcal.measure import checks
 from armcal.measure.checks import Layout, check_dataset, layout_of
 from armcal.measure.environment import warn_beyond_limits
 from armcal.measure.missing import set_aside_not_finite, with_absent
-from armcal.measure.reader import ReadRequest, RequestedChannel, requested_channels
+from armcal.measure.reader import ReadRequest, RequestedChannel, evidence_channels, requested_channels
 from armcal.testing.planar import Tip, planar_arms
 from armcal_contact.ball import BallInSocket, BallInSocketSettings
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
@@ -95,6 +95,20 @@ def test_what_is_infinite_costs_the_record(channel: str) -> None:
 def test_what_belongs_to_no_measurement_costs_the_record(channel: str) -> None:
     dataset = records(**{channel: [0.0, NAN]})
     assert [aside.record_id for aside in set_aside_not_finite(dataset, layout(dataset)).set_aside] == ["p1"]
+
+
+def test_a_missing_rate_which_only_the_verdict_reads_costs_nothing(tmp_path: Path) -> None:
+    """Nor does a column that is called a rate and has no unit; of two arms' joints of one name nobody knows whose."""
+    arms, tip = planar_arms(["arm"]), {"t": Tip()}
+    evidence = evidence_channels(arms)
+    assert [(w.channel, w.required) for w in evidence] == [("q1_rate", False), ("q2_rate", False)]
+    assert evidence_channels(two_arms()[0]) == ()
+    path = tmp_path / "records.csv"
+    path.write_text("q1_rad,q2_rad,x_mm,y_mm,z_mm,q1_rate_deg_s,q2_rate\n0,1,2,3,4,180,6\n1,2,3,4,5,,7\n")
+    request = ReadRequest(arms, tip, (*requested_channels(arms, tip, measured=True), *evidence))  # type: ignore[arg-type]
+    dataset = CsvReader(CsvSettings(path=path)).read(request)  # type: ignore[arg-type]
+    assert len(dataset) == 2 and not dataset.warnings and dataset.extra == {"q2_rate": ("6", "7")}
+    assert dataset.column("q1_rate") == pytest.approx([np.pi, NAN], nan_ok=True)
 
 
 def test_with_one_measurement_any_missing_value_costs_the_record() -> None:

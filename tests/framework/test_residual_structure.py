@@ -132,6 +132,48 @@ def test_two_structures_are_told_apart(lrm):
     assert {(s.kind, s.subject) for s in found.worthwhile} == {("approach", "q4"), ("level", "q3")}
 
 
+def moving(lrm, late_s, seed, deg_s=5.0, **how):
+    """A recording of joints that moved, read so long before the tip was measured, and their rates (6 x N, rad/s)."""
+    rates = deg_s * DEG * np.random.default_rng(seed + 555).normal(size=(6, 100))
+    columns = {f"q{i + 1}_rate": rate for i, rate in enumerate(rates)}
+    return recording(lrm, 100, seed, lambda q, came: late_s * rates.T, **columns, **how)
+
+
+@pytest.mark.parametrize(("late_s", "size"), [(0.1, "late"), (-0.02, "early")])
+def test_late_joints_of_an_arm_that_moved_are_named_with_their_delay(lrm, late_s, size):
+    """Within a tenth; other rates, of an arm that stood where it was read, are no delay."""
+    first, *others = looked_at(*moving(lrm, late_s, 6)).worthwhile
+    assert (first.kind, first.odds > 0.9, others) == ("delay", True, [])
+    assert first.size.startswith(f"joints {size} by about ") and "to first order" in first.size
+    assert float(first.size.split()[4]) == pytest.approx(1000 * abs(late_s), rel=0.1)
+    assert first.effect.startswith("delay on all joints") and "synchronise the clocks" in first.effect
+
+
+def test_joints_that_moved_and_are_not_late_are_not_said_to_be(lrm):
+    kinds = [s.kind for seed in range(20, 26) for s in looked_at(*moving(lrm, 0.0, seed)).structures]
+    assert "delay" not in kinds
+
+
+def test_a_delay_is_not_tested_where_no_joint_moved_or_a_rate_is_missing(lrm):
+    """The family of tests is then what it is without rates."""
+    plain, at_rest = (looked_at(*made) for made in (recording(lrm, 100, 7), moving(lrm, 0.1, 7, deg_s=0.0)))
+    assert at_rest == plain
+    problem, records, start, dataset = moving(lrm, 0.0, 7)
+    some = replace(dataset, channels={k: v for k, v in dataset.channels.items() if k != "q4_rate"})
+    assert looked_at(problem, records, start, some) == plain
+    assert looked_at(problem, records, start, dataset).tested == plain.tested + 2, "a delay, and play of all joints"
+
+
+def test_play_of_joints_that_move_is_not_called_a_delay(lrm):
+    """Equal play of all joints, and of one, whose rates have the sign of their approach."""
+    came = poses(150, 2)[1]
+    speeds = np.random.default_rng(2).uniform(0.02, 0.2, came.shape)
+    rates = {f"q{i + 1}_rate": rate for i, rate in enumerate((speeds * came).T)}
+    for play, subject in ((np.full(6, 0.4 * DEG), "all joints"), (0.6 * DEG * np.eye(6)[3], "q4")):
+        found = looked_at(*recording(lrm, 150, 2, lambda q, came, play=play: -play * came, **rates))
+        assert [(s.kind, s.subject) for s in found.worthwhile] == [("approach", subject)]
+
+
 def false_findings(lrm, seeds, **how):
     wrong = 0
     for seed in seeds:

@@ -74,6 +74,15 @@ class Condition:
     dimension: str | None = None
 
 
+JOINT_RATE = "joint rate"
+"""The dimension of rates of joints, sliding ones too."""
+
+
+def joint_rate(joint: str) -> Condition:
+    """How fast a joint moved when its place was recorded (rad/s or m/s): ``q1_rate``."""
+    return Condition(f"{joint}_rate", JOINT_RATE)
+
+
 class EffectSettings(Settings):
     """Which joints an effect is on."""
 

@@ -4,13 +4,14 @@ Each dependence is a set of columns: how residuals would move with it, to first 
 along the residual's own entries (base axes for a position), or along the turning of one site.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
 
 from armcal.arm.assembly import Arm
+from armcal.arm.effects import joint_rate
 from armcal.arm.loading import SiteLoads
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
@@ -39,8 +40,9 @@ class Dependence:
     """One thing that residuals might depend on.
 
     Attributes:
-        kind: ``offset``, ``order``, ``level``, ``approach``, ``coupling``, ``torque``, ``moment``, ``payload``,
-            ``temperature``; of what is outside of the arm ``step``, ``slip``, ``gravity``, ``load``, ``scale``.
+        kind: ``offset``, ``order``, ``level``, ``approach``, ``coupling``, ``torque``, ``moment``, ``delay``,
+            ``payload``, ``temperature``; of what is outside of the arm ``step``, ``slip``, ``gravity``, ``load``,
+            ``scale``.
         subject: the joint or site, as a user names it; empty where it is none.
         arm: the arm's name; empty where it is none.
         words: what residuals depend on, as the end of a sentence.
@@ -112,6 +114,7 @@ def dependences(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[
             yield from _of_coupling(here, name, arm, joint, shown)
             yield from _of_torque(here, name, f"{name}.{joint}", shown, loads.efforts[index], angle)
         yield from _of_moments(problem, here, arm, loads, len(arms) == 1)
+        yield from _of_rates(here, arm, arms)
     for channel, words, effect in _SURROUNDINGS:
         if dataset.has(channel) and np.ptp(dataset.column(channel)) > 0:
             feature = dataset.column(channel)
@@ -251,6 +254,30 @@ def _of_moments(problem: Problem, here: Records, arm: Arm, loads: SiteLoads, alo
         shown = name if alone else (f"{arm.name}.{name}" if site else f"the mount of {arm.name}")
         words = f"the moment that {shown} carries, in all directions"
         yield Dependence("moment", shown, arm.name, words, f"compliance on {shown}", _SECOND_LOAD, columns)
+
+
+def _of_rates(here: Records, arm: Arm, arms: Mapping[str, Arm]) -> Iterator[Dependence]:
+    """Joints read before or after the measurement, which moved in between: to first order in that time.
+
+    Beside it the play of all joints at once, which a delay resembles where each moved about as fast, to and fro.
+    """
+    names = {joint: joint_rate(joint).name for joint in arm.commanded}
+    shared = any(not names.keys().isdisjoint(other.commanded) for other in arms.values() if other is not arm)
+    if shared or not all(map(here.dataset.has, names.values())):
+        return
+    rates = {f"{arm.name}.{joint}": np.nan_to_num(here.dataset.column(rate)) for joint, rate in names.items()}
+    moved = [here.along(channel, rate[:, None]) for channel, rate in rates.items()]
+    columns = tuple(np.sum(parts, axis=0) for parts in zip(*moved, strict=True))
+    which = "the joints" if len(arms) == 1 else f"the joints of {arm.name}"
+    words = f"how fast {which} moved: they were read at another time than the measurement was made"
+    effect = "delay on all joints, or synchronise the clocks of joints and instrument"
+    measure = "repeat some poses at rest, where a delay has no effect"
+    yield Dependence("delay", "", arm.name, words, effect, measure, columns, ("joints",), "s")
+    played = [here.along(channel, -np.sign(rate)[:, None]) for channel, rate in rates.items()]
+    columns = tuple(np.concatenate(parts, axis=2) for parts in zip(*played, strict=True))
+    words, effect = f"which way {which} moved, each along its own motion", "approach_backlash on all joints"
+    measure = "move through the same poses slowly and fast: play stays, what a delay does grows with the rates"
+    yield Dependence("approach", "all joints", arm.name, words, effect, measure, columns)
 
 
 def _stated(feature: Array) -> Array:

@@ -301,4 +301,7 @@ def _size(one: Dependence, coefficients: Array) -> str:
     if one.kind == "level":
         largest = int(np.argmax(np.abs(numbers)))
         return f"{shown(float(numbers[largest]))} off at {one.labels[largest]}, beside its other levels"
+    if one.kind == "delay":
+        late_ms = float(f"{1000 * numbers[0]:.2g}")
+        return f"joints {'late' if late_ms > 0 else 'early'} by about {abs(late_ms):g} ms, to first order"
     return ", ".join(f"{label}: {shown(float(n))}" for label, n in zip(one.labels, numbers, strict=True))

@@ -124,7 +124,7 @@ def match_columns(header: Header, requested_channels: Sequence[RequestedChannel]
     refuse_joint_count([*by_name], requested_channels, Location(header.source, line=header.line))
     unused = {name: column for name, column in by_name.items() if name not in claimed}
     for w in requested_channels:
-        if w.channel not in channels:
+        if w.channel not in channels and not w.is_evidence:
             _refuse_unit(header, w, unused)
     for w in requested_channels:
         if w.required and w.channel not in channels:

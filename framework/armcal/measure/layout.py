@@ -27,6 +27,7 @@ class Layout:
         by_id: whether a record's id says where it stood, better than its row does.
         parts: channel to the measurements that need it; one that is absent belongs to the record as a whole.
         of_points: channels of points, of which a record may lack some but not all.
+        evidence: channels that only the verdict reads, which a record may lack.
     """
 
     joints: tuple[str, ...] = ()
@@ -40,6 +41,7 @@ class Layout:
     by_id: bool = False
     parts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     of_points: frozenset[str] = frozenset()
+    evidence: frozenset[str] = frozenset()
 
     def column(self, channel: str) -> str:
         """What a channel is called in the source."""
@@ -96,6 +98,7 @@ def layout_of(
         deviations=tuple(name for name in deviations if dataset.has(name)),
         parts={w.channel: w.parts for w in requested_channels if w.parts and dataset.has(w.channel)},
         of_points=frozenset(w.channel for w in requested_channels if w.is_of_point and dataset.has(w.channel)),
+        evidence=frozenset(w.channel for w in requested_channels if w.is_evidence),
     )
 
 

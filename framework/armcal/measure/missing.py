@@ -18,7 +18,8 @@ def set_aside_not_finite(dataset: Dataset, layout: Layout) -> Dataset:
 
     A missing value (NaN) in a channel that no measurement owns costs the record. One in a channel of measurements
     (``Layout.parts``) costs it only if no measurement has all it needs; else those that lack something are left out
-    of this record, with a warning where they have a part of their own values. Of points a record may lack some.
+    of this record, with a warning where they have a part of their own values. Of points a record may lack some, of
+    what only the verdict reads all.
     """
     if all(np.isfinite(values).all() for values in dataset.channels.values()):
         return dataset
@@ -35,7 +36,8 @@ def set_aside_not_finite(dataset: Dataset, layout: Layout) -> Dataset:
     if complete:
         lost |= ~np.any(list(complete.values()), axis=0)
     for channel, values in dataset.channels.items():
-        lost |= np.isinf(values) if layout.parts.get(channel) else ~np.isfinite(values)
+        spared = layout.parts.get(channel) or channel in layout.evidence
+        lost |= np.isinf(values) if spared else ~np.isfinite(values)
     faulty = {int(index): _reason(dataset, layout, int(index)) for index in np.flatnonzero(lost)}
     kept = set_aside(dataset, layout, faulty, "a value is missing or not finite", "Measure these again.")
     return _without_incomplete(kept, layout, {part: mask[~lost] for part, mask in complete.items()})

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from armcal.arm.assembly import Arm
+from armcal.arm.effects import JOINT_RATE, joint_rate
 from armcal.base.dataset import Dataset
 from armcal.base.units import DIMENSIONLESS, units_of
 from armcal.io.parallel import Report, unreported
@@ -30,6 +31,7 @@ class RequestedChannel:
         parts: the measurements (instances) that need it; none if the record as a whole does, or nothing does.
         effects: the joint effects (``arm.thermal``) that read it.
         is_of_point: whether it belongs to one of many points, of which a record may lack some.
+        is_evidence: whether only the verdict reads it, so that a record that lacks it loses nothing.
     """
 
     channel: str
@@ -41,6 +43,7 @@ class RequestedChannel:
     parts: tuple[str, ...] = ()
     effects: tuple[str, ...] = ()
     is_of_point: bool = False
+    is_evidence: bool = False
 
     @property
     def what(self) -> str:
@@ -112,7 +115,7 @@ def surroundings(arms: Mapping[str, Arm]) -> dict[str, str]:
                 )
             if dimension != DIMENSIONLESS:
                 units_of(dimension)
-            if dimension == "joint rate" and sum(any(c.name == name for _, c in a.declared) for a in arms.values()) > 1:
+            if dimension == JOINT_RATE and sum(any(c.name == name for _, c in a.declared) for a in arms.values()) > 1:
                 raise ValueError(
                     f"{text}, and so does another arm's: a rate is of one joint, so name joints differently"
                 )
@@ -151,6 +154,14 @@ def requested_channels(
                 RequestedChannel(own, names, channel.dimension, measured, parts=parts, is_of_point=of_point)
             )
     return (*requested, *_deviations(measurements)) if measured else tuple(requested)
+
+
+def evidence_channels(arms: Mapping[str, Arm]) -> tuple[RequestedChannel, ...]:
+    """What no effect reads and the verdict does: the rates of joints, of a name that only one arm has."""
+    joints = Counter(joint for arm in arms.values() for joint in arm.commanded)
+    taken = {*surroundings(arms), *joints, *ID_NAMES}
+    rates = {rate.name for joint, count in joints.items() if count == 1 and (rate := joint_rate(joint))} - taken
+    return tuple(RequestedChannel(name, (name,), JOINT_RATE, False, is_evidence=True) for name in sorted(rates))
 
 
 def _deviations(measurements: Mapping[str, Measurement]) -> Iterator[RequestedChannel]:

@@ -25,7 +25,7 @@ from armcal.estimate.simulation import SimulationRequest, Simulator
 from armcal.estimate.weighing import weighed
 from armcal.measure.environment import noticed, require_conditions, warn_beyond_limits
 from armcal.measure.groups import grouped_instances, groups_of, pose_numbers, unmatched
-from armcal.measure.reader import Reader, ReadRequest, requested_channels
+from armcal.measure.reader import Reader, ReadRequest, evidence_channels, requested_channels
 from armcal.plugins import PluginRegistry, discover
 from armcal.run.settings import ExperimentSettings
 
@@ -156,7 +156,8 @@ class Experiment:
         """What a reader should look for; with ``measured`` the measured values are required."""
         system = self.system
         channels = requested_channels(system.arms, system.measurements, measured=measured)
-        return ReadRequest(system.arms, system.measurements, channels)
+        evidence = evidence_channels(system.arms) if measured else ()
+        return ReadRequest(system.arms, system.measurements, (*channels, *evidence))
 
     def provenance(self, dataset: Dataset) -> dict[str, Any]:
         """Where the numbers of a run on these records come from: files, hashes, versions."""

@@ -13,6 +13,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.units import to_unit
 from armcal.errors import DataError
 from armcal.run.experiment import Experiment
+from armcal.run.pipeline import calibrate
 from armcal_camera.corners_csv import corners_text
 
 from tests.plugins.camera.simulated_views import MIDDLE, base_T, configured, estimated, numbers, pose, simulated
@@ -64,6 +65,26 @@ def test_joints_that_are_late_are_late_by_so_much(recorded: Path) -> None:
     delay = float(estimate.values[estimate.parameters.entry_names.index("arm.clock.delay")])
     assert abs(delay - LATE_S) < 2 * own + 1e-3, "a rate is a mean over two steps of the table"
     assert own < 1e-3
+
+
+def test_late_joints_are_named_without_the_effect(recorded: Path) -> None:
+    """From the times of the joint table alone; of a table without times nothing is said of rates."""
+    content = yaml.safe_load((recorded / "late.yaml").read_text())
+    del content["arms"]["arm"]["effects"]
+    content["parameters"]["free"].remove("arm.clock.delay")
+    (recorded / "plain.yaml").write_text(yaml.safe_dump(content))
+    experiment = Experiment.load(recorded / "plain.yaml")
+    structure = calibrate(experiment, "test").evidence.structure
+    assert structure is not None
+    first = structure.structures[0]
+    assert first.kind == "delay" and first.odds > 0.9
+    late_ms = float(first.size.removeprefix("joints late by about ").split()[0])
+    assert abs(late_ms - 1000 * LATE_S) < 100 * LATE_S
+    lines = [line.split(",") for line in (recorded / "joints.csv").read_text().splitlines()]
+    (recorded / "no_times.csv").write_text("".join(",".join([row[0], *row[2:]]) + "\n" for row in lines))
+    plain = Experiment.load(recorded / "plain.yaml", (f"data.poses={recorded / 'no_times.csv'}",)).read()
+    assert len(plain) == IMAGES and not plain.has("q1_rate")
+    assert experiment.read().has("q1_rate")
 
 
 def test_rates_are_not_made_of_rows_that_are_far_apart(recorded: Path) -> None:
