@@ -111,8 +111,9 @@ def _read(path: Path, expression: ToolExpression, registry: PluginRegistry) -> D
     try:
         dataset = noticed(reader.read(ReadRequest({}, {}, tuple(channels))))
     except DataError as fault:
-        # Measured data have a section in a configuration that describes them; targets have none.
-        hint = _AS_DOCUMENTED if "data section" in fault.hint else fault.hint
+        # Measured data are described in a configuration; targets are not.
+        described = "data section" in fault.hint or "in the configuration" in fault.hint
+        hint = _AS_DOCUMENTED if described else fault.hint
         raise DataError(fault.message, where=fault.where, hint=hint) from fault
     units = {name: split_suffix(name) for name in dataset.extra if not any(name in w for w in dataset.warnings)}
     # Commands that stand in the file already give way to those that are found.
