@@ -8,6 +8,7 @@ from typing import Any
 import click
 import numpy as np
 
+from armcal.base.units import to_unit
 from armcal.cli.common import FILE, Console, data, overrides, speaking
 from armcal.cli.console import columned
 from armcal.cli.outlet import say
@@ -53,9 +54,12 @@ def check(console: Console, config: Path, data: Path | None, overrides: tuple[st
         f"{len(records['set_aside'])} set aside), {content['equations']} equations for "
         f"{len(parameters['free'])} free of {len(parameters['all'])} parameters."
     )
-    table = columned("Excitation of the joints", ("joint", "from", "to", "levels"))
+    table = columned("Excitation of the joints", ("joint", "from", "to", "unit", "levels"))
+    arms = experiment.system.arms
+    units = {f"{a}.{j}": "deg" if kind == "angle" else "mm" for a in arms for j, kind in arms[a].commanded.items()}
     for joint, seen in content["excitation_rad_or_m"].items():
-        table.add_row(joint, f"{seen['min']:.3f}", f"{seen['max']:.3f}", str(seen["levels"]))
+        low, high = (f"{to_unit(seen[end], units[joint]):.5g}" for end in ("min", "max"))
+        table.add_row(joint, low, high, units[joint], str(seen["levels"]))
     out.print(table)
     for line in _alignment_lines(ready.start):
         out.print(line, soft_wrap=True)

@@ -31,7 +31,7 @@ def single_joints(arm: Arm) -> list[tuple[str, Wires]]:
         if arm.commanded[one] == arm.commanded[other]:
             readings.append((f"{one} and {other} exchanged", _wires(arm, {one: other, other: one}, 1.0)))
     for factor in (_DEGREES, 1 / _DEGREES, _TURN):
-        readings.append((f"joint angles {factor:.3g} times as large", _wires(arm, angles, factor)))
+        readings.append((f"joint angles {factor:.4g} times as large", _wires(arm, angles, factor)))
     return readings
 
 
@@ -85,7 +85,7 @@ def turned_axes() -> Iterator[tuple[str, Array]]:
 def scaled_positions() -> Iterator[tuple[str, Array]]:
     """Positions, or one axis of them, in another unit (3 x 3), in words."""
     for factor in LENGTHS:
-        yield f"positions {factor:.3g} times as large", factor * np.eye(3)
+        yield f"positions {factor:.4g} times as large", factor * np.eye(3)
     for axis, factor in product(range(3), _AXIS_LENGTHS):
         scale = np.diag([factor if i == axis else 1.0 for i in range(3)])
-        yield f"{_AXES[axis]} {factor:.3g} times as large", scale
+        yield f"{_AXES[axis]} {factor:.4g} times as large", scale
