@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 import numpy as np
+from rich.table import Table
 
 from armcal.base.units import to_unit
 from armcal.cli.common import FILE, Console, data, overrides, speaking
@@ -54,13 +55,7 @@ def check(console: Console, config: Path, data: Path | None, overrides: tuple[st
         f"{len(records['set_aside'])} set aside), {content['equations']} equations for "
         f"{len(parameters['free'])} free of {len(parameters['all'])} parameters."
     )
-    table = columned("Excitation of the joints", ("joint", "from", "to", "unit", "levels"))
-    arms = experiment.system.arms
-    units = {f"{a}.{j}": "deg" if kind == "angle" else "mm" for a in arms for j, kind in arms[a].commanded.items()}
-    for joint, seen in content["excitation_rad_or_m"].items():
-        low, high = (f"{to_unit(seen[end], units[joint]):.5g}" for end in ("min", "max"))
-        table.add_row(joint, low, high, units[joint], str(seen["levels"]))
-    out.print(table)
+    out.print(_excitation(experiment, content["excitation_rad_or_m"]))
     for line in _alignment_lines(ready.start):
         out.print(line, soft_wrap=True)
     condition = parameters["scaled_condition"]
@@ -75,6 +70,17 @@ def check(console: Console, config: Path, data: Path | None, overrides: tuple[st
         say(f"armcal: {refused}", err=True)
         sys.exit(refused.exit_code)
     console.out.print("Ready to run.", style="green")
+
+
+def _excitation(experiment: Experiment, excitation: dict[str, Any]) -> Table:
+    """How far each joint moved, in degrees or mm."""
+    table = columned("Excitation of the joints", ("joint", "from", "to", "unit", "levels"))
+    arms = experiment.system.arms
+    units = {f"{a}.{j}": "deg" if kind == "angle" else "mm" for a in arms for j, kind in arms[a].commanded.items()}
+    for joint, seen in excitation.items():
+        low, high = (f"{to_unit(seen[end], units[joint]):.5g}" for end in ("min", "max"))
+        table.add_row(joint, low, high, units[joint], str(seen["levels"]))
+    return table
 
 
 def _content(experiment: Experiment, ready: Prepared, known: Identifiability) -> dict[str, Any]:
