@@ -67,7 +67,7 @@ class ChangeSettings(Settings):
     joint_creep: Annotated[Angle, Field(gt=0)] = 0.005
     slide_creep: Annotated[Length, Field(gt=0)] = 0.0005
     sensor_creep: Annotated[Length, Field(gt=0)] = 0.001
-    factor: Annotated[float, Field(gt=1)] = 10.0
+    factor: Annotated[float, Field(gt=1, le=1e6)] = 10.0
     probability: Probability = 1e-4
     odds: Annotated[float, Field(gt=1)] = 100.0
     naming_odds: Annotated[float, Field(gt=1)] = 20.0
