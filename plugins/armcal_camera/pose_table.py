@@ -14,6 +14,7 @@ from armcal.base.quaternions import nearest_rotation
 from armcal.base.units import DIMENSIONLESS
 from armcal.errors import DataError
 from armcal.io.cells import is_number
+from armcal.io.cut_file import may_be_cut, whole_rows
 from armcal.io.plain_files import input_bytes, refuse, text_of
 from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.layout import warned
@@ -191,8 +192,8 @@ def _rows(text: str) -> list[tuple[int, list[str]]]:
 def _table(path: Path, posed: _Posed, request: ReadRequest) -> Dataset:
     """base_T_flange in metres, row by row: 12 or 16 numbers a line, or a matrix in four lines of four."""
     content = input_bytes(path, _MAX_BYTES, "a table of flange poses")
-    matrices, lines = [], []
-    for line, cells in _rows(content.decode("utf-8-sig")):
+    rows, matrices, lines = _rows(content.decode("utf-8-sig")), [], []
+    for line, cells in whole_rows(rows, path, "the last column") if may_be_cut(content) else rows:
         if len(cells) not in (12, 16) or not all(is_number(cell) for cell in cells):
             refuse(path, f"found {len(cells)} cells, expected 12 or 16 numbers.", _FORMS, line)
         matrix = np.array([float(cell) for cell in cells]).reshape(-1, 4)

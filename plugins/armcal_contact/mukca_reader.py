@@ -19,6 +19,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.settings import InputPath, Settings
 from armcal.errors import DataError, Location
 from armcal.io.cells import is_missing, is_number
+from armcal.io.cut_file import may_be_cut, whole_rows
 from armcal.io.plain_files import input_bytes, refuse, text_of
 from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.contact import named_arm
@@ -166,10 +167,10 @@ def _ignored(path: Path) -> str:
 def _rows(file: SocketFile, requested_channels: Sequence[RequestedChannel]) -> tuple[list[int], Array]:
     """The lines (from 1) of a file's postures, and the joints' displacements (lines x joints)."""
     path, lines, numbers, first = file.path, [], [], 0
-    for line, text in enumerate(file.text.split("\n"), start=1):
-        if not text.strip():
-            continue
-        cells = text.split(",")
+    texts = enumerate(file.text.split("\n"), start=1)
+    rows = ((line, text.split(",")) for line, text in texts if text.strip())
+    last = f"column {len(requested_channels)}"
+    for line, cells in whole_rows(rows, path, last) if may_be_cut(file.raw) else rows:
         first = first or len(cells)
         if len(cells) != first:
             mend = "Complete the row, or remove it."

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.io.cells import is_missing, is_number, plain_numbers
+from armcal.io.cut_file import may_be_cut, whole_rows
 from armcal.io.plain_files import input_bytes, refuse
 
 MAX_BYTES = 2 * 1024**3
@@ -58,6 +59,8 @@ def read_table(path: Path, delimiter: str, numbers: Sequence[Column], texts: Seq
     places = [place_of(path, line, header, len(cells), column) for column in (*numbers, *texts)]
     body = rows if header else chain([first], rows)
     names = [header[place] if header else f"column {place + 1}" for place in places]
+    if may_be_cut(raw) and len(cells) - 1 in places[: len(numbers)]:
+        body = whole_rows(body, path, header[-1] if header else f"column {len(cells)}")
     lines, columns, words = _load(path, body, len(cells), places[: len(numbers)], places[len(numbers) :], names)
     if not lines:
         refuse(path, "found a header and no rows.", "Give a row a moment.", line)

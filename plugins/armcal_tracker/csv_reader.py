@@ -21,6 +21,7 @@ from armcal.base.settings import InputPath, Settings
 from armcal.base.units import from_unit
 from armcal.errors import DataError, Location
 from armcal.io.cells import DECIMAL_COMMA, CellFault, plain_numbers, read_cell, with_point
+from armcal.io.cut_file import may_be_cut, whole_rows
 from armcal.io.plain_files import input_file, refuse
 from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.column_match import Column, Header, Plan, header_of, match_columns, renamed
@@ -79,6 +80,8 @@ class CsvReader:
                     _refuse_delimiter(header_of(cells, source, line), s.delimiter, rows)
                 header = renamed(header_of(cells, source, line), s.columns)
                 plan = match_columns(header, request.channels)
+                if may_be_cut(_end(file)) and any(c is header.columns[-1] for c, _ in plan.channels.values()):
+                    rows = whole_rows(rows, path, header.columns[-1].name)
                 dataset = _load(rows, header, plan, s.decimal == ",")
         except OSError as fault:
             refuse(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
@@ -122,6 +125,15 @@ def _rows(lines: Iterator[str], path: Path, delimiter: str) -> Iterator[tuple[in
         refuse(path, f"found a row that is not CSV ({fault}).", hint, line)
 
 
+def _end(file: BinaryIO) -> bytes:
+    """The last byte; the file is read on from where it was."""
+    here = file.tell()
+    file.seek(-1, os.SEEK_END)
+    last = file.read(1)
+    file.seek(here)
+    return last
+
+
 def _refuse_delimiter(header: Header, delimiter: str, rows: Iterator[tuple[int, list[str]]]) -> None:
     """A header of one cell that holds another delimiter."""
     name = header.columns[0].name
@@ -151,7 +163,7 @@ def _load(rows: Iterator[tuple[int, list[str]]], header: Header, plan: Plan, has
         for line, row in block:
             count, expected = len(row), len(header.columns)
             if count != expected:
-                mend = "Fill in what is missing, leave a cell empty if its value is not known."
+                mend = "Complete the row (was the file cut off?); leave a cell empty if its value is not known."
                 if count > expected:
                     mend = "Quote text that holds the delimiter, write numbers with a decimal point (12.5), no comma."
                 message = f"found {count} cells, expected {expected} as in the header."

@@ -284,6 +284,13 @@ def test_a_flange_pose_that_is_none_is_refused(folder: Path, line: str, message:
         read(request_of(FLANGE), folder=folder, poses=path)
 
 
+def test_flange_poses_cut_in_the_last_number_are_refused(folder: Path) -> None:
+    path = folder / "flange.txt"
+    path.write_text("1 0 0 0.112 0 1 0 0 0 0 1 0.312\n" * 11 + "1 0 0 0.112 0 1 0 0 0 0 1 0.3")
+    with pytest.raises(DataError, match=r":12, the last column: the file ends in '0\.3' without a line end"):
+        read(request_of(FLANGE), folder=folder, poses=path)
+
+
 @pytest.mark.slow
 def test_without_opencv_corners_are_read_and_images_are_not(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = read(folder=folder, poses=folder / "poses.csv", corners=folder / "corners.csv")
