@@ -202,7 +202,7 @@ def test_refused_headers(tmp_path: Path, name: str) -> None:
 
 
 REFUSED_ROWS = {
-    "ragged, short": (row(3).rpartition(",")[0], ["poses.csv:4:", "found 7 cells, expected 8", "Fill in"]),
+    "ragged, short": (row(3).rpartition(",")[0], ["poses.csv:4:", "found 7 cells, expected 8", "Complete the row"]),
     "ragged, long": (row(3) + ",5", ["poses.csv:4:", "found 9 cells, expected 8", "decimal point"]),
     "decimal comma": (row(3, x_mm='"12,5"'), [":4, x_mm: found '12,5', a decimal comma", "decimal points: 12.5."]),
     "text": (row(3, y_mm="abc"), ["poses.csv:4, y_mm:", "'abc', expected a number", "Correct it"]),
