@@ -1,24 +1,30 @@
 """The arm model ``urdf``: any serial chain between two links, with six numbers for every joint on it."""
 
+import math
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any, ClassVar, Literal, Self
 
+import numpy as np
 from armcal.arm.assembly import MassSpec
 from armcal.arm.model import Attachment, Chain, Joint, Vector3
 from armcal.base import se3
 from armcal.base.parameters import ParameterBlock, scalar
+from armcal.base.quaternions import rpy_matrices, rpy_of
 from armcal.base.settings import InputPath, Settings
 from pydantic import model_validator
 
 from armcal_urdf.chain import UrdfChain, chain_of, ends
+from armcal_urdf.elements import Three
 from armcal_urdf.encoding import MAX_BYTES, Encoding, declared, encode, read_text
-from armcal_urdf.robot import Robot, read_robot
+from armcal_urdf.robot import Robot, UrdfJoint, read_robot
 
 LENGTH_SCALE_M = 0.01
 ANGLE_SCALE_RAD = 0.05
 XYZ = ("x", "y", "z")
 RPY = ("roll", "pitch", "yaw")
+LOCKED = 0.95
+"""A sine of the pitch, which is the correlation of roll and yaw: beyond it a third rotation is hardly there."""
 _STILL: Vector3 = (0.0, 0.0, 0.0)
 _EXAMPLE = """<robot name="example">
   <link name="base"/>
@@ -104,10 +110,33 @@ class UrdfSettings(Settings):
         return encode(self.text, self.encoding or "utf-8")
 
 
+def quarter_turn(joint: UrdfJoint) -> float:
+    """What is turned about y (rad) before a joint's parameters turn it: a right angle where its pitch is near one.
+
+    Such a pitch makes roll and yaw one rotation (gimbal lock); counted from the right angle, the angles are small.
+    """
+    sine = math.sin(joint.rpy[1])
+    return math.copysign(math.pi / 2, sine) if abs(sine) > LOCKED else 0.0
+
+
+def nominal_angles(joint: UrdfJoint) -> Three:
+    """The parameters roll, pitch and yaw (rad) of a joint as the URDF has it."""
+    return turned(joint.rpy, -quarter_turn(joint))
+
+
+def turned(rpy: Three, angle: float) -> Three:
+    """Roll, pitch and yaw of Rz(yaw) Ry(pitch) Rx(roll) Ry(angle) (rad); at no angle the same numbers."""
+    if not angle:
+        return rpy
+    about_y, before = rpy_matrices(np.array([0.0, angle, 0.0])), rpy_matrices(np.array(rpy))
+    return rpy_of(before @ about_y)
+
+
 class UrdfModel:
     """The arm model ``urdf``: parameters ``JOINT_x``, ``JOINT_y``, ``JOINT_z`` (m), ``JOINT_roll``, ... (rad).
 
     Every joint from root to tip has its six, fixed joints too. The base frame and the mount are the root link's.
+    A joint is turned by Rz(yaw) Ry(pitch) Rx(roll) Ry(``quarter_turn``).
     """
 
     Settings: ClassVar[type[UrdfSettings]] = UrdfSettings
@@ -130,7 +159,7 @@ class UrdfModel:
         """The origins of all joints on the chain: xyz (m) and rpy (rad)."""
         blocks: list[ParameterBlock] = []
         for joint in self.urdf_chain.joints:
-            xyz, rpy = zip(XYZ, joint.urdf.xyz, strict=True), zip(RPY, joint.urdf.rpy, strict=True)
+            xyz, rpy = zip(XYZ, joint.urdf.xyz, strict=True), zip(RPY, nominal_angles(joint.urdf), strict=True)
             blocks += [scalar(f"{joint.name}_{name}", "m", value, LENGTH_SCALE_M) for name, value in xyz]
             blocks += [scalar(f"{joint.name}_{name}", "rad", value, ANGLE_SCALE_RAD) for name, value in rpy]
         return tuple(blocks)
@@ -149,6 +178,9 @@ class UrdfModel:
             shift = se3.translation(*[values[f"{joint.name}_{axis}"] for axis in XYZ])
             roll, pitch, yaw = (values[f"{joint.name}_{angle}"] for angle in RPY)
             turn = se3.rotation_about("z", yaw) @ se3.rotation_about("y", pitch) @ se3.rotation_about("x", roll)
+            quarter = quarter_turn(joint.urdf)
+            if quarter:
+                turn = turn @ se3.rotation_about("y", quarter)
             here = here @ (shift @ turn)
             if joint.moves:
                 urdf, slides = joint.urdf, joint.urdf.kind == "prismatic"

@@ -173,6 +173,27 @@ def test_every_joint_on_the_chain_has_six_parameters_fixed_ones_too():
     assert blocks["bend_z"].nominal == (0.4,)
 
 
+UPRIGHT = ODD.replace('<origin xyz="0 0 0.4" rpy="0.1 0 0"/>', '<origin xyz="0 0 0.4" rpy="0.3 {} -0.4"/>')
+
+
+@pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2, 1.5707963, 1.45, -1.7])
+def test_a_joint_pitched_by_a_right_angle_turns_in_all_three_directions(pitch):
+    """At the format's own angles, roll and yaw would be one rotation there: gimbal lock."""
+    pin = pytest.importorskip("pinocchio")
+    text = UPRIGHT.format(pitch)
+    arm, oracle = arm_of(text), Oracle(pin, text)
+    found, expected = frames_of(arm)([0.3, 0.5, 0.1]), oracle.poses(told(arm, [0.3, 0.5, 0.1]), ["tool"], "world")
+    np.testing.assert_allclose(found[""], expected["tool"], rtol=0, atol=EXACT_M)
+    names = ("roll", "pitch", "yaw")
+    angles = [ca.SX.sym(name) for name in names]
+    blocks = {block.name: block.nominal[0] for block in arm.model.parameters()}
+    nominal = [blocks[f"bend_{name}"] for name in names]
+    values = {**blocks, **{f"bend_{name}": angle for name, angle in zip(names, angles, strict=True)}}
+    rotation = ca.densify(arm.model.chain(values).joints[1].parent_T_joint.rotation)
+    jacobian = ca.Function("j", angles, [ca.jacobian(rotation, ca.vertcat(*angles))])(*nominal)
+    assert np.linalg.svd(np.array(jacobian), compute_uv=False)[-1] > 0.7
+
+
 # Gravity
 
 

@@ -87,6 +87,17 @@ def test_a_written_arm_reads_back_to_the_last_bit(name):
     np.testing.assert_allclose(tools[0], tools[1], rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("pitch", ["1.5707963267948966", "-1.5707963", "1.4"])
+def test_a_joint_pitched_by_a_right_angle_is_written_in_the_formats_own_angles(pitch):
+    data = STRANGE.replace('rpy="0.1 0.2 0.3"', f'rpy="0.1 {pitch} 0.3"').encode()
+    assert exported(data, lambda name, value: value)[0].content == data
+    found, request = exported(data, random_change(1))
+    again = request_for(model_of(found.content), lambda name, value: value)
+    commands = random_commands(request.arm)
+    tools = [rigid_tools(each.arm, each.values, commands) for each in (request, again)]
+    np.testing.assert_allclose(tools[0], tools[1], rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("name", SOURCES)
 def test_nothing_is_touched_where_nothing_changed(name):
     found, _ = exported(SOURCES[name], lambda name, value: value)
