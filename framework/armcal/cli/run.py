@@ -116,16 +116,17 @@ def show_run(console: Console, result: RunResult, folder: Path, seconds: float) 
             out.print(compliances)
     if result.bootstrap:
         out.print(_bootstrap(result, result.bootstrap))
-    # A row a finding; how it was tested stands dimmed behind what it says.
-    table = Table(title="Verdict", title_justify="left", box=HORIZONTALS, expand=True)
+    # A row a finding: how it was tested stands dimmed behind what it says, what to do in a line below it.
+    table = Table(title="Verdict", title_justify="left", box=HORIZONTALS, expand=True, show_header=False)
     table.add_column("", no_wrap=True)
-    table.add_column("what, and how it was tested", ratio=5)
-    table.add_column("what to do", ratio=3)
+    table.add_column("", ratio=1)
     for finding in result.verdict.findings:
         text = Text(finding.text)
         if finding.test:
             text.append(f" ({finding.test})", style="dim")
-        table.add_row(Text(finding.grade, style=_STYLES[finding.grade]), text, finding.action)
+        if finding.action:
+            text.append(f"\nTo do: {finding.action}")
+        table.add_row(Text(finding.grade, style=_STYLES[finding.grade]), text)
     out.print(table)
     out.print(result.verdict.headline, style="bold")
     if result.verdict.paragraph:
