@@ -192,19 +192,25 @@ def test_a_wrong_setting_is_refused_with_its_name_and_what_was_meant(setting: st
     refused(result, *words)
 
 
-def test_a_path_in_a_file_may_not_leave_its_directory(tmp_path: Path) -> None:
-    outside = tmp_path / "outside.csv"
-    outside.write_text((CONFIGS / "demo.csv").read_text())
-    inside = tmp_path / "configs"
+def test_only_data_may_lie_outside_the_configurations_folder(tmp_path: Path) -> None:
+    inside, shared = tmp_path / "configs", tmp_path / "shared"
     inside.mkdir()
+    shared.mkdir()
+    for name in ("demo.csv", "arm.yaml"):
+        (shared / name).write_text((CONFIGS / name).read_text())
     for name in ("arm.yaml", "option1.yaml"):
         (inside / name).write_text((CONFIGS / name).read_text())
-    (inside / "mine.yaml").write_text("extends: option1.yaml\ndata: {type: csv, path: ../outside.csv}\n")
-    refused(check(config=str(inside / "mine.yaml")), "mine.yaml", "outside")
-    (inside / "link.csv").symlink_to(outside)
-    (inside / "mine.yaml").write_text("extends: option1.yaml\ndata: {type: csv, path: link.csv}\n")
-    refused(check(config=str(inside / "mine.yaml")), "mine.yaml", "link.csv")
-    assert check(config=str(inside / "mine.yaml"), data=outside).exit_code == 0
+    (inside / "link.csv").symlink_to(shared / "demo.csv")
+    mine = inside / "mine.yaml"
+    for place in ("../shared/demo.csv", str(shared / "demo.csv"), "link.csv"):
+        mine.write_text(f"extends: option1.yaml\ndata: {{type: csv, path: {place}}}\n")
+        result = check(config=str(mine))
+        assert result.exit_code == 0, result.output
+    mine.write_text("extends: ../shared/arm.yaml\n")
+    refused(check(config=str(mine)), "mine.yaml:1, extends", f"outside {inside}: only data may", "Copy the file into")
+    mine.write_text("extends: option1.yaml\nvalidation: {train_ids: ../shared/ids.csv}\n")
+    refused(check(config=str(mine)), "mine.yaml:2, validation.train_ids", "by --set")
+    assert check(config=str(inside / "option1.yaml"), data=shared / "demo.csv").exit_code == 0
 
 
 @pytest.mark.slow

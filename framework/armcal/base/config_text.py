@@ -97,9 +97,10 @@ def resolve_path(text: ConfigText | str) -> Path:
         ) from fault
     if limit is not None and not path.is_relative_to(limit):
         raise ConfigError(
-            f"the path {str(text)!r} leads to {path}, outside the root {limit}.",
+            f"the path {str(text)!r} leads to {path}, outside {limit}: only data may lie outside the configuration's "
+            "folder.",
             where=where,
-            hint="Move the file below the root, or give its path on the command line.",
+            hint="Copy the file into that folder, or give its path by --set, which may name any place.",
         )
     return path
 
