@@ -517,6 +517,6 @@ def test_assessing_needs_no_prediction_of_errors() -> None:
     found = compensator("three")
     targets = found.targets(found.forward(drawn(found, 3))[:, :3, 3])
     bench = Bench.of(calibration("three"), None, None, "nearest", discover())
-    assessed = run_compensate.assess(calibration("three"), found, bench.nominal(), targets, found.solve(targets))
+    assessed = run_compensate.assess(bench, found, targets, found.solve(targets))
     assert assessed.radii is None
     assert run_compensate.summary(assessed)["radius_95_mm"] is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +79,35 @@ def test_the_measured_target_arrives_where_it_was_measured(tmp_path: Path) -> No
     known = measured_point(calibration("three", OFF_MM).system, "arm", calibration("three", OFF_MM).parameters)
     assert known is not None and known.measurement == "tracker"
     assert np.linalg.norm(tool - target, axis=1) == pytest.approx(np.full(5, 1000 * known.distance), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("freed", "fitted"), [("target_x", True), ("target_rotation", False), ("arm.mdh.a1", False), (None, False)]
+)
+def test_only_a_target_whose_place_was_fitted_leaves_the_tools_origin_open(freed: str | None, fitted: bool) -> None:
+    known = calibration("three", *BODY)
+    name = freed if freed is None or "." in freed else f"tracker.{freed}"
+    point = measured_point(known.system, "arm", known.parameters.with_free(set() if name is None else {name}))
+    assert point is not None and point.fitted is fitted
+
+
+def test_commands_for_a_tool_beside_a_fitted_target_state_no_radius(tmp_path: Path) -> None:
+    """The target may do what a6, d6 and theta6 of the arm do: its own place is measured, the tool's origin is not."""
+    measured(tmp_path, "three", (OFF_MM,))
+    known = calibration("three", OFF_MM)
+    entries = tuple(
+        entry.model_copy(update={"free": entry.free or entry.name == "tracker.target_z"})
+        for entry in known.record.parameters
+    )
+    fitted = replace(known, record=known.record.model_copy(update={"parameters": entries}))
+    assert "tracker.target_z" in fitted.free
+    open_ones = [Bench.of(fitted, None, None, "nearest", discover(), point).is_judged for point in ("tool", "target")]
+    assert open_ones == [False, True]
+    assert Bench.of(known, None, None, "nearest", discover()).is_judged
+    path = written(fitted, tmp_path / "fitted.yaml")
+    asked = ("compensate", path, "--targets", tmp_path / "shown.csv", "--out", tmp_path / "commands.csv", "--point")
+    assert "tool frame's origin is off is not known" in armcal(*asked, "tool").output
+    assert "is not known" not in armcal(*asked, "target").output
 
 
 @pytest.mark.slow

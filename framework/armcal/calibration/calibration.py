@@ -194,6 +194,11 @@ class Calibration:
             )
 
     @property
+    def free(self) -> frozenset[str]:
+        """The parameters that the records were fitted by."""
+        return frozenset(entry.name.partition("[")[0] for entry in self.record.parameters if entry.free)
+
+    @property
     def uncertainty(self) -> Uncertainty:
         """How far its predictions may be off.
 
@@ -207,14 +212,13 @@ class Calibration:
                 hint="It was written by an earlier version; run the calibration again.",
             )
         entries = self.record.parameters
-        free = {entry.name.partition("[")[0] for entry in entries if entry.free}
         names = tuple(entry.name for entry in entries if entry.free)
         if kept.entries != names or [len(row) for row in kept.covariance] != [*range(1, len(names) + 1)]:
             raise ConfigError(
                 "the covariance in the calibration does not fit its free parameters.",
                 hint="The file was edited or damaged; run the calibration again.",
             )
-        fitted = self.parameters.with_nominal(np.array([entry.nominal for entry in entries])).with_free(free)
+        fitted = self.parameters.with_nominal(np.array([entry.nominal for entry in entries])).with_free(self.free)
         try:
             nan = float("nan")  # where null is kept
             stated: list[dict[str, Any]] = [

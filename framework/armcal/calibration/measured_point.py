@@ -27,10 +27,18 @@ _SAME_M = 1e-9
 
 @dataclass(frozen=True)
 class MeasuredPoint:
-    """What a measurement reads of a tool: its instance name, and the pose of the target (tool_T_target, 4 x 4)."""
+    """What a measurement reads of a tool.
+
+    Attributes:
+        measurement: its instance name.
+        tool_T_target: the pose of the target (4 x 4).
+        fitted: whether free parameters of the measurement say where the target sits: the records then determine where
+            the target goes, and not where the tool's origin is beside it.
+    """
 
     measurement: str
     tool_T_target: Array
+    fitted: bool = False
 
     @property
     def distance(self) -> float:
@@ -47,8 +55,8 @@ class MeasuredPoint:
 def measured_point(system: System, name: str, parameters: Parameters) -> MeasuredPoint | None:
     """The target of an arm's first measurement that reads a place in the base frame; None if no measurement does.
 
-    It stands on the tool if it has the same place there in two postures: an instrument with a frame of its own, or a
-    point of another link, has not.
+    ``parameters`` have the calibrated values as nominal ones. The target stands on the tool if it has the same place
+    there in two postures: an instrument with a frame of its own, or a point of another link, has not.
     """
     arm, values = system.arms[name], {b.name: ca.SX(list(b.nominal)) for b in parameters.blocks if not b.nuisance}
     for instance, measurement in system.measurements.items():
@@ -58,7 +66,10 @@ def measured_point(system: System, name: str, parameters: Parameters) -> Measure
         own = scoped(values, f"{instance}.")
         first, second = (_on_tool(measurement, arm, values, own, angle) for angle in (0.0, 0.3))
         if np.abs(first - second).max() <= _SAME_M:
-            return MeasuredPoint(instance, first)
+            free = scoped({block.name: block.scale for block in parameters.free}, f"{instance}.")
+            elsewhere = {name: value + free.get(name, 0.0) for name, value in own.items()}
+            moved = _on_tool(measurement, arm, values, elsewhere, 0.0)
+            return MeasuredPoint(instance, first, bool(np.abs(moved - first)[:3, 3].max() > _SAME_M))
     return None
 
 

@@ -62,7 +62,7 @@ def compensate(console: Console, calibration: Path, targets: Path, out: Path, an
     start = _start(options["start"], compensator)
     reach = compensator.follow if options["kind"] == "path" else compensator.solve
     commands = reach(file.targets, start)
-    assessed = assess(loaded, compensator, bench.nominal(), file.targets, commands)
+    assessed = assess(bench, compensator, file.targets, commands)
     write_commands(out, compensator, file.targets, file.dataset, assessed, angles)
     _show(console, file, assessed, bench, out)
 
@@ -124,4 +124,7 @@ def _show(console: Console, file: TargetFile, assessed: Assessed, bench: Bench, 
             text += f"; nominal commands: {figures['nominal_error_mm']:.3g} mm"
         if figures["radius_95_mm"] is not None:
             text += f"; measured places lie within {figures['radius_95_mm']:.3g} mm (95 %, median)"
+        elif not bench.is_judged:
+            text += "; how far the tool frame's origin is off is not known: only the target was measured, and where it "
+            text += "sits on the tool was fitted (--point target)"
         console.line(text)

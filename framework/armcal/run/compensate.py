@@ -43,7 +43,8 @@ class Assessed:
         tools: where the tool's frame is at the commands (N x 4 x 4), whichever point of it was brought to the targets.
         nominal_T_tool: where the nominal arm's would be (N x 4 x 4): what to command to a controller that takes the
             nominal arm for the real one.
-        radii: of the ball about the expected place that holds a measurement of it with 95 % (N; m); None if unknown.
+        radii: of the ball about the expected place that holds a measurement of it with 95 % (N; m); None if unknown,
+            as for a tool's origin that no measurement judges.
     """
 
     commands: Commands
@@ -91,9 +92,14 @@ class Bench:
         name = arm_named(calibration, arm)
         joints = tuple(calibration.system.arms[name].commanded)
         space = workspace_of(within, joints, registry) if within else Workspace()
-        target = measured_point(calibration.system, name, calibration.parameters)
+        target = measured_point(calibration.system, name, calibration.parameters.with_free(calibration.free))
         options = Options(limits=space.limits, redundancy=redundancy)
         return cls(calibration, name, options, space, target, point)
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether measurements judge the point that arrives: not a tool's origin beside a target that was fitted."""
+        return self.point == "target" or self.target is None or not self.target.fitted
 
     def read(self, path: Path, registry: PluginRegistry) -> TargetFile:
         """Targets from a CSV.
@@ -130,14 +136,13 @@ class Bench:
         return Compensator(expression, nominal, Options(limits=self.options.limits))
 
 
-def assess(
-    calibration: Calibration, compensator: Compensator, nominal: Compensator, targets: Targets, commands: Commands
-) -> Assessed:
+def assess(bench: Bench, compensator: Compensator, targets: Targets, commands: Commands) -> Assessed:
     """What is known about commands that were found.
 
     Raises:
         NotConvergedError: a command has no elastic equilibrium.
     """
+    nominal = bench.nominal()
     thought = nominal.solve(replace(targets, conditions={}), commands.joint_angles)
     reached = compensator.stand(thought.joint_angles, targets, commands.approach)
     away = np.linalg.norm(reached.base_T_tool[:, :3, 3] - targets.positions, axis=1)
@@ -146,7 +151,7 @@ def assess(
         nominal_distances=np.where(thought.reached & reached.settled, away, np.nan),
         tools=_of_tool(compensator, commands.base_T_tool),
         nominal_T_tool=_of_tool(nominal, nominal.forward(commands.joint_angles)),
-        radii=_radii(calibration, compensator, targets, commands),
+        radii=_radii(bench.calibration, compensator, targets, commands) if bench.is_judged else None,
     )
 
 
