@@ -103,6 +103,46 @@ class LoadCell(Instrument):
         return ("force",) * 3
 
 
+class TorqueCellSettings(InstrumentSettings):
+    """Its noise (standard deviation of each torque), and roughly the gripper's weight times how far out it is."""
+
+    noise: Annotated[float, UnitOf("torque")]
+    moment: Annotated[float, UnitOf("torque")]
+
+
+class TorqueCell(Instrument):
+    """Between flange and gripper: channels ``tx``, ``ty``, ``tz``, what the gripper's weight does about the flange."""
+
+    Settings = TorqueCellSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {"noise_Nm": 0.02, "moment_Nm": 1.2}
+
+    def parameters(self):
+        """Weight times the place of the gripper's mass, and what it reads without one (N m)."""
+        moments = zip("xyz", (0.0, 0.0, self.settings.moment), strict=True)
+        return (
+            *(scalar(f"moment_{axis}", "Nm", moment, 0.1) for axis, moment in moments),
+            *(scalar(f"bias_{axis}", "Nm", 0.0, 0.1) for axis in "xyz"),
+        )
+
+    def channels(self):
+        """What it reads."""
+        return tuple(Channel(f"t{axis}", "torque") for axis in "xyz")
+
+    def outputs(self, arms, values):
+        """What it would read without noise (N m)."""
+        down = self.base_T_tool(arms).rotation.T @ ca.vertcat(0, 0, -1)
+        torque = ca.cross(ca.vertcat(*[values[f"moment_{axis}"] for axis in "xyz"]), down)
+        return {f"t{axis}": torque[i] + values[f"bias_{axis}"] for i, axis in enumerate("xyz")}
+
+    def noise(self):
+        """Of each entry (N m)."""
+        return (self.settings.noise,) * 3
+
+    def dimensions(self):
+        """Torques alone."""
+        return ("torque",) * 3
+
+
 class PixelCameraSettings(Settings):
     """Noise and focal length in pixels, and where the camera stands; it looks along the base frame's x axis."""
 
