@@ -117,7 +117,7 @@ class OpenCvExporter(_CameraExporter):
 
 
 class HandEyeExporter(_CameraExporter):
-    """The exporter ``hand_eye``: where the camera sits, as easy_handeye writes it, with a URDF joint beside it."""
+    """The exporter ``hand_eye``: where the camera sits, for easy_handeye and easy_handeye2, and as a URDF joint."""
 
     Settings: ClassVar[type[CameraExportSettings]] = FramesSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"tool_frame": "tool0"}
@@ -134,28 +134,46 @@ class HandEyeExporter(_CameraExporter):
         tool_frame = self._settings.tool_frame or ("tool0" if carrier == TOOL_FRAME else carrier)
         parent = tool_frame if on_hand else self._settings.base_frame
         pose, child = _pose("camera", camera.numbers), self._settings.camera_frame
-        place, quaternion = [float(x) for x in pose[:3, 3]], Rotation.from_matrix(pose[:3, :3]).as_quat()
-        keys = ("qx", "qy", "qz", "qw")
-        content = {
-            "parameters": {
-                "eye_on_hand": on_hand,
-                "robot_base_frame": self._settings.base_frame,
-                "robot_effector_frame": tool_frame,
-                "tracking_base_frame": child,
-                "tracking_marker_frame": self._settings.board_frame,
-            },
-            "transformation": {
-                **dict(zip("xyz", place, strict=True)),
-                **{key: float(x) for key, x in zip(keys, quaternion, strict=True)},
-            },
-            "standard_deviation_m": {axis: camera.deviations.get(f"camera_{axis}") for axis in "xyz"},
-        }
-        text = f"# {parent} to {child}, in metres: the camera {name}.\n" + yaml.safe_dump(content, sort_keys=False)
-        numbers = " ".join(f"--{k} {x:.9g}" for k, x in zip(("x", "y", "z", *keys), (*place, *quaternion), strict=True))
-        command = f"ros2 run tf2_ros static_transform_publisher {numbers} --frame-id {parent} --child-frame-id {child}"
+        place, quaternion = pose[:3, 3].tolist(), Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+        there, turned = dict(zip("xyz", place, strict=True)), dict(zip("xyzw", quaternion, strict=True))
         stem = request.out.rpartition("/")[2].rpartition(".")[0] or "camera"
-        companions = {f"{stem}_joint.urdf": _urdf_joint(parent, child, pose).encode()}
-        return Exported(text.encode(), 7, companions=companions, remarks=(f"To publish it: {command}",))
+        first, second = self._easy_handeye(stem, on_hand, tool_frame, there, turned)
+        first["standard_deviation_m"] = {axis: camera.deviations.get(f"camera_{axis}") for axis in "xyz"}
+        numbers = " ".join(f"--{k} {x:.9g}" for k, x in first["transformation"].items())
+        command = f"ros2 run tf2_ros static_transform_publisher {numbers} --frame-id {parent} --child-frame-id {child}"
+        title = f"# {parent} to {child}, in metres: the camera {name}.\n"
+        text, ros2 = (title + yaml.safe_dump(content, sort_keys=False) for content in (first, second))
+        companions = {f"{stem}_joint.urdf": _urdf_joint(parent, child, pose).encode(), f"{stem}.calib": ros2.encode()}
+        places = (
+            f"easy_handeye reads {stem}.yaml in ~/.ros/easy_handeye, easy_handeye2 {stem}.calib in "
+            "~/.ros2/easy_handeye2/calibrations."
+        )
+        return Exported(text.encode(), 7, companions=companions, remarks=(f"To publish it: {command}", places))
+
+    def _easy_handeye(
+        self, name: str, on_hand: bool, tool_frame: str, there: Mapping[str, float], turned: Mapping[str, float]
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Files of easy_handeye and of easy_handeye2.
+
+        The first takes ``parameters`` for keyword arguments, of which ``namespace`` has no default; the second takes
+        all of it for the fields of a message. Neither may have others.
+        """
+        frames = {
+            "robot_base_frame": self._settings.base_frame,
+            "robot_effector_frame": tool_frame,
+            "tracking_base_frame": self._settings.camera_frame,
+            "tracking_marker_frame": self._settings.board_frame,
+        }
+        kind = "eye_in_hand" if on_hand else "eye_on_base"
+        first = {
+            "parameters": {"namespace": name, "eye_on_hand": on_hand, **frames},
+            "transformation": {**there, **{f"q{axis}": x for axis, x in turned.items()}},
+        }
+        second = {
+            "parameters": {"name": name, "calibration_type": kind, **frames, "freehand_robot_movement": True},
+            "transform": {"translation": dict(there), "rotation": dict(turned)},
+        }
+        return first, second
 
 
 def _intrinsics(camera: Instrument) -> tuple[Array, list[float], tuple[int, int] | None]:

@@ -9,6 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -112,7 +113,7 @@ def test_ros_takes_its_messages_and_its_command(calibration: Path, tmp_path: Pat
     assert again.p.reshape(3, 4)[:, :3].ravel() == pytest.approx(again.k) and again.k[0] > 100
     exported(calibration, "hand_eye", tmp_path / "where.yaml")
     request = request_of(armcal.Calibration.load(calibration), None)
-    (remark,) = HandEyeExporter(FramesSettings()).export(request).remarks
+    remark, _ = HandEyeExporter(FramesSettings()).export(request).remarks
     where = yaml.safe_load((tmp_path / "where.yaml").read_text())["transformation"]
     parser = argparse.ArgumentParser()  # the options of tf2_ros static_transform_publisher, from ROS 2 Humble on
     for key in where:
@@ -124,6 +125,63 @@ def test_ros_takes_its_messages_and_its_command(calibration: Path, tmp_path: Pat
     options = vars(parser.parse_args(command[4:]))
     assert (options["frame_id"], options["child_frame_id"]) == ("tool0", "camera_optical_frame")
     assert {key: options[key] for key in where} == pytest.approx(where, abs=1e-8)
+
+
+HAND_EYE = """geometry_msgs/Transform transform
+easy_handeye2_msgs/HandeyeCalibrationParameters parameters"""
+HAND_EYE_PARAMETERS = """string name
+string calibration_type
+string robot_base_frame
+string robot_effector_frame
+string tracking_base_frame
+string tracking_marker_frame
+bool freehand_robot_movement
+string move_group_namespace
+string move_group"""
+
+
+def test_easy_handeye2_fills_its_message_from_the_file(calibration: Path, tmp_path: Path) -> None:
+    stores = pytest.importorskip("rosbags.typesys", reason="rosbags is not installed: pip install 'armcal[ros2]'")
+    store, prefix = stores.get_typestore(stores.Stores.ROS2_HUMBLE), "easy_handeye2_msgs/msg/HandeyeCalibration"
+    for text, name in ((HAND_EYE_PARAMETERS, f"{prefix}Parameters"), (HAND_EYE, prefix)):
+        store.register(stores.get_types_from_msg(text, name))
+    exported(calibration, "hand_eye", tmp_path / "wrist.yaml", "--option", "tool_frame=flange")
+    content, types = yaml.safe_load((tmp_path / "wrist.calib").read_text()), store.types
+    moved = {"move_group_namespace": "/", "move_group": "manipulator"}  # which the message has by default
+    turned, there = (
+        types[f"geometry_msgs/msg/{kind}"](**content["transform"].pop(part))
+        for kind, part in (("Quaternion", "rotation"), ("Vector3", "translation"))
+    )
+    transform = types["geometry_msgs/msg/Transform"](translation=there, rotation=turned, **content.pop("transform"))
+    parameters = types[f"{prefix}Parameters"](**content.pop("parameters"), **moved)
+    message = types[prefix](transform=transform, parameters=parameters, **content)
+    again = store.deserialize_cdr(store.serialize_cdr(message, prefix), prefix)
+    assert (again.parameters.name, again.parameters.calibration_type) == ("wrist", "eye_in_hand")
+    assert (again.parameters.robot_effector_frame, again.parameters.tracking_base_frame) == (
+        "flange",
+        "camera_optical_frame",
+    )
+    assert again.transform.translation.x == numbers(calibration)["camera.camera_x"]
+
+
+def test_easy_handeye_takes_the_parameters_of_the_file(calibration: Path) -> None:
+    def parameters(  # the arguments of its HandeyeCalibrationParameters
+        namespace: str,
+        move_group_namespace: str = "/",
+        move_group: str = "manipulator",
+        eye_on_hand: bool | None = None,
+        robot_base_frame: str | None = None,
+        robot_effector_frame: str | None = None,
+        tracking_base_frame: str | None = None,
+        tracking_marker_frame: str | None = None,
+    ) -> tuple[object, ...]:
+        return namespace, eye_on_hand, robot_base_frame, robot_effector_frame, tracking_base_frame
+
+    request = request_of(armcal.Calibration.load(calibration), None)
+    content = yaml.safe_load(HandEyeExporter(FramesSettings()).export(replace(request, out="a/wrist.yaml")).content)
+    read = parameters(**content["parameters"])
+    assert read == ("wrist", True, "base_link", "tool0", "camera_optical_frame")
+    assert set(content["transformation"]) == {"x", "y", "z", "qx", "qy", "qz", "qw"}
 
 
 def test_a_camera_that_is_not_there_is_refused(calibration: Path) -> None:
