@@ -86,7 +86,7 @@ def test_without_units_coefficients_are_in_ordinary_sizes() -> None:
 def test_units_without_a_display_and_without_a_name_are_told_too() -> None:
     measures = (Measure("rad_per_Nm", 0.05), Measure("1", 0.1), Measure("furlong", 2.0))
     told = named(np.array([1.0, 0.5, -0.25]), ("k", "gain", "far"), measures, 1e-4)
-    assert str(told) == "k trades with gain and far (+1 rad_per_Nm with +1 and -10 furlong)"
+    assert str(told) == "k trades with gain and far (+1 rad/Nm with +1 and -10 furlong)"
 
 
 def test_a_long_combination_is_cut_and_keeps_its_terms() -> None:

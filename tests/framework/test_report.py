@@ -346,7 +346,8 @@ def test_matplotlib_is_not_needed() -> None:
 
 
 def test_numbers_as_people_read_them() -> None:
-    from armcal.report.numbers import fixed, ratio, shown_unit, significant
+    from armcal.base.units import shown_unit
+    from armcal.report.numbers import fixed, ratio, significant
 
     assert fixed(-0.0001, 2) == "0.00" and fixed(-1.5, 1) == "\u22121.5" and fixed(None, 2) == "\u2013"
     assert fixed(float("-inf"), 2) == "\u2212∞" and fixed(3e9, 2) == "3.00e+09" and fixed(0.5, 1, signed=True) == "+0.5"

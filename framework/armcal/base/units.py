@@ -105,6 +105,17 @@ _SPELLINGS: Mapping[str, str] = MappingProxyType(
         "1/K": "per_K",
     }
 )
+_WRITTEN: Mapping[str, str] = MappingProxyType(
+    {
+        "rad_per_Nm": "rad/Nm",
+        "deg_per_Nm": "deg/Nm",
+        "rad_per_Nm3": "rad/Nm^3",
+        "m_s2": "m/s^2",
+        "per_K": "1/K",
+        "1": "",
+    }
+)
+"""Units whose names, made for keys of a file, are not how people write them."""
 _NEAR_UNIT = 0.1
 _LONGEST_FIRST = tuple(sorted((n for n in UNITS if n != "1"), key=len, reverse=True))
 _QUANTITY = re.compile(r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*(\S.*?)?\s*", re.DOTALL)
@@ -135,6 +146,18 @@ def si_unit(dimension: str) -> Unit:
 def display_unit(dimension: str) -> Unit:
     """The unit in which people are shown values of that dimension: mm, deg, g, otherwise the SI unit."""
     return UNITS[_DISPLAY[dimension]] if dimension in _DISPLAY else si_unit(dimension)
+
+
+def shown_unit(si_unit_name: str) -> tuple[float, str]:
+    """Shown numbers per number in that unit, and what people call the shown unit: (1000, ``mm``) for ``m``.
+
+    A dimensionless unit is called nothing; a unit that is not known is shown as it is.
+    """
+    known = UNITS.get(si_unit_name)
+    if known is None:
+        return 1.0, si_unit_name
+    shown = display_unit(known.dimension)
+    return known.factor / shown.factor, _WRITTEN.get(shown.name, shown.name)
 
 
 def length_mistake(gain: float) -> tuple[str, str] | None:

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from armcal.base.domains import Semidefinite, symmetric
-from armcal.base.units import ERROR_NAMES
+from armcal.base.units import ERROR_NAMES, shown_unit
 from armcal.cli.common import FILE, Console, command_line, data, overrides, parallel, speaking
 from armcal.cli.console import columned
 from armcal.cli.outlet import say
@@ -21,7 +21,7 @@ from armcal.estimate.estimator import CHECK_THE_DATA
 from armcal.estimate.validation import ErrorSummary
 from armcal.io.parallel import Executor
 from armcal.report import plugin_sections, render
-from armcal.report.numbers import MINUS, NONE, decimals_for, shown_unit, significant
+from armcal.report.numbers import MINUS, NONE, decimals_for, significant
 from armcal.report.tables import parameter_rows, part_of
 from armcal.run import outputs
 from armcal.run.errors import ErrorTable

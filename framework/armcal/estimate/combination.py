@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armcal.base.arrays import Array
-from armcal.base.units import DIMENSIONLESS, UNITS, display_unit
+from armcal.base.units import shown_unit
 
 MOST_NAMES = 6
 """A longer combination is cut when it is shown; ``terms`` has all of it."""
@@ -21,11 +21,8 @@ class Measure:
 
     def shown(self, coefficient: float) -> tuple[float, str]:
         """So many typical scales in the unit that people are shown."""
-        known = UNITS.get(self.unit)
-        if known is None or known.dimension == DIMENSIONLESS:
-            return coefficient * self.scale, "" if known else self.unit
-        display = display_unit(known.dimension)
-        return coefficient * self.scale * known.factor / display.factor, display.name
+        factor, unit = shown_unit(self.unit)
+        return coefficient * self.scale * factor, unit
 
 
 @dataclass(frozen=True)

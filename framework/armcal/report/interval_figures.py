@@ -4,11 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from armcal.base.units import shown_unit
 from armcal.estimate.prediction import LEVELS
 from armcal.estimate.profile import Profile
 from armcal.report import svg
 from armcal.report.error_figures import roles
-from armcal.report.numbers import NONE, count, fixed, plural, shown_unit, significant
+from armcal.report.numbers import NONE, count, fixed, plural, significant
 from armcal.report.svg import DIAMOND, Axis, Box, Figure
 from armcal.run.intervals import IntervalResult
 from armcal.run.result import RunResult

@@ -6,13 +6,11 @@ from collections.abc import Iterable
 
 from armcal.base.domains import Pose, Rotation, ScrewAxis
 from armcal.base.parameters import ParameterBlock
-from armcal.base.units import UNITS, display_unit
 
 NONE = "\u2013"
 MINUS = "\u2212"
 _TIMES = "\u00d7"
 _MOST_DECIMALS = 9
-_WORDS = {"rad_per_Nm": "rad/Nm", "deg_per_Nm": "deg/Nm", "m_s2": "m/s²", "1": ""}
 
 
 def fixed(value: float | None, decimals: int, signed: bool = False) -> str:
@@ -91,12 +89,3 @@ def entry_unit(block: ParameterBlock, suffix: str) -> str:
     if isinstance(block.domain, ScrewAxis):
         return "m" if suffix.startswith("v") else "1"
     return block.unit
-
-
-def shown_unit(si_unit: str) -> tuple[float, str]:
-    """Shown numbers per SI number, and what the unit is called: (1000, mm) for m."""
-    known = UNITS.get(si_unit)
-    if known is None:
-        return 1.0, si_unit
-    shown = display_unit(known.dimension)
-    return known.factor / shown.factor, _WORDS.get(shown.name, shown.name)

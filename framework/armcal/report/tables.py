@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from armcal.base.arrays import Indices
+from armcal.base.units import shown_unit
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.validation import ErrorSummary
 from armcal.estimate.variance import VarianceComponents
-from armcal.report.numbers import MINUS, NONE, common_decimals, decimals_for, entry_unit, fixed, ratio, shown_unit
+from armcal.report.numbers import MINUS, NONE, common_decimals, decimals_for, entry_unit, fixed, ratio
 from armcal.run.errors import ErrorTable
 from armcal.run.result import GroupError, RunResult
 

@@ -9,7 +9,7 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.domains import Rotation
 from armcal.base.parameters import Parameters
-from armcal.base.units import to_unit
+from armcal.base.units import shown_unit
 from armcal.scaffold.rendering import number
 from armcal.scaffold.robot import Unit
 
@@ -21,8 +21,7 @@ UNSTATED_TARGET = {"tracker.target_x": 0.06, "tracker.target_y": -0.04, "tracker
 """Of the reach: where a target sits whose place was not stated. Most sit beside the last axis, and show more there."""
 _MOST_SD = 2.0
 _SPRING = (0.5, 1.5)
-_SHOWN = {"m": "mm", "rad": "deg", "rad_per_Nm": "rad_per_Nm"}
-_WRITTEN = {"rad_per_Nm": "rad/Nm"}
+_UNITS = frozenset({"m", "rad", "rad_per_Nm"})
 
 
 def candidates(parameters: Parameters) -> tuple[str, ...]:
@@ -30,7 +29,7 @@ def candidates(parameters: Parameters) -> tuple[str, ...]:
     return tuple(
         block.name
         for block in parameters.blocks
-        if block.unit in _SHOWN
+        if block.unit in _UNITS
         and (block.size == 1 or isinstance(block.domain, Rotation))
         and not fnmatch.fnmatch(block.name, "arm.links.*")
         and not block.name.startswith("statics.")
@@ -67,8 +66,8 @@ def as_text(parameters: Parameters, values: Mapping[str, float]) -> dict[str, st
     """Values with their units, as people write them."""
     lines = {}
     for name, value in values.items():
-        unit = _SHOWN[parameters[name].unit]
-        lines[name] = f"{number(float(f'{to_unit(value, unit):.6g}'))} {_WRITTEN.get(unit, unit)}"
+        factor, unit = shown_unit(parameters[name].unit)
+        lines[name] = f"{number(float(f'{factor * value:.6g}'))} {unit}"
     return lines
 
 
