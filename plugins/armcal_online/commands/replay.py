@@ -17,6 +17,7 @@ from armcal_online.replaying.kept_journal import (
     KeptJournal,
     journal_folder,
     kept_calibration,
+    kept_in,
     kept_journal,
     kept_settings,
 )
@@ -65,12 +66,12 @@ def replay_command(
     held = kept_journal(folder)
     held.check_until(until)
     header = held.first.header
-    settings = _evaluated(kept_settings(header), evaluator)
     other_settings = kept_settings(header, overrides) if overrides else None
     if config is not None:
         other_settings = load_settings(config, overrides)
-    begun_from = kept_calibration(header, folder, registry)
-    session = Recalibrator.begin(begun_from, settings, registry)
+    with kept_in(folder):
+        begun_from = kept_calibration(header, folder, registry)
+        session = Recalibrator.begin(begun_from, _evaluated(kept_settings(header), evaluator), registry)
     comparer = Comparer(session.evaluator)
     with console.progress() as progress:
         done = replay(held, session, comparer, until, progress)

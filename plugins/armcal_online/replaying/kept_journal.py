@@ -3,13 +3,14 @@
 import hashlib
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 from armcal.calibration.calibration import Calibration
-from armcal.errors import DataError, InputError, Location
+from armcal.errors import ConfigError, DataError, InputError, Location, PluginError
 from armcal.io.journal.files import REAL_FILES
 from armcal.io.journal.reader import read_segments, segment_numbers, segment_path
 from armcal.io.journal.segment import Cut, JournalDamagedError, Link, Segment, read_segment
@@ -144,6 +145,22 @@ def kept_calibration(header: Mapping[str, Any], folder: Path, registry: PluginRe
         path = Path(held) / "calibration.yaml"
         path.write_bytes(text.encode())
         return Calibration.load(path, registry)
+
+
+@contextmanager
+def kept_in(folder: Path) -> Iterator[None]:
+    """Around what is made of a journal's calibration and settings: a refusal names the journal, which keeps them.
+
+    Raises:
+        ConfigError, PluginError: it is none that this version takes.
+    """
+    try:
+        yield
+    except (ConfigError, PluginError) as fault:
+        where = Location(str(folder), field=fault.where.field if fault.where else None)
+        again = "Replay it with the version of armcal that wrote it, or take another copy of the journal."
+        hint = fault.hint if isinstance(fault, PluginError) else again
+        raise type(fault)(fault.message, where=where, hint=hint) from fault
 
 
 def kept_settings(header: Mapping[str, Any], overrides: Sequence[str] = ()) -> RecalibrateSettings:

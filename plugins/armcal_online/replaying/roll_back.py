@@ -12,7 +12,7 @@ from armcal.errors import InputError, Location
 from armcal.io.journal.journal import JournalLimits
 from armcal.plugins import PluginRegistry
 
-from armcal_online.replaying.kept_journal import kept_calibration, kept_journal, kept_settings
+from armcal_online.replaying.kept_journal import kept_calibration, kept_in, kept_journal, kept_settings
 from armcal_online.running.control import GOOD, entry_named, rolled_back
 from armcal_online.running.session import JOURNAL, Setup, opened
 from armcal_online.sources.source import Incoming, Source
@@ -51,8 +51,9 @@ def roll_back_ended(folder: Path, to: int | str, registry: PluginRegistry) -> Ma
         to = entry_named(journal, to)
     held.check_until(to if isinstance(to, int) else None, "rollback")
     header = held.first.header
-    calibration = kept_calibration(header, journal, registry)
-    session = Recalibrator.begin(calibration, kept_settings(header), registry)
+    with kept_in(journal):
+        calibration = kept_calibration(header, journal, registry)
+        session = Recalibrator.begin(calibration, kept_settings(header), registry)
     setup = Setup(
         folder=folder,
         calibration=Path(str(header.get("path", ""))),

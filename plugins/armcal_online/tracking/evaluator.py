@@ -4,6 +4,7 @@ import hashlib
 import inspect
 import os
 import platform
+from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -22,27 +23,40 @@ def identity(problem: Problem, estimator: object) -> dict[str, Any]:
 
     A kernel's key covers its expression, the generator, the compiler and its flags, and the processor.
     """
-    # A change of any code that may have a part in it may change the last bits.
-    sources, libraries = hashlib.sha256(), {}
-    for folder in (SOURCES, Path(__file__).parents[1], Path(inspect.getfile(type(estimator))).parent):
-        for path in sorted(folder.rglob("*.py")):
-            sources.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
-    for name in _LIBRARIES:
-        try:
-            libraries[name] = version(name)
-        except PackageNotFoundError:
-            libraries[name] = ""
+    sources = _sources(SOURCES, Path(__file__).parents[1], Path(inspect.getfile(type(estimator))).parent)
     return {
         "armcal": __version__,
-        "sources": sources.hexdigest()[:12],
+        "sources": sources[:12],
         "python": platform.python_version(),
-        "libraries": libraries,
+        "libraries": {name: _version(name) for name in _LIBRARIES},
         "backend": problem.backend,
         "kernels": {kernel.factor.name: kernel.identity for kernel in problem.kernels},
         "flags": " ".join(compiler.FLAGS) if problem.backend == "compiled" else "",
         "processor": hashlib.sha256(compiler.processor().encode()).hexdigest()[:12],
         "threads": os.environ.get(_THREADS, "as many as there are"),
     }
+
+
+@lru_cache(maxsize=16)
+def _sources(*folders: Path) -> str:
+    """A digest of the code in these folders, any of which may change the last bits.
+
+    Of hundreds of files, which are read once: a process goes on with the code that it began with.
+    """
+    digest = hashlib.sha256()
+    for folder in folders:
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+@lru_cache(maxsize=16)
+def _version(library: str) -> str:
+    """Of an installed library; empty if it is not."""
+    try:
+        return version(library)
+    except PackageNotFoundError:
+        return ""
 
 
 def differences(one: object, other: object, name: str = "") -> tuple[str, ...]:
