@@ -74,6 +74,7 @@ class PlantedArm:
         request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
         return experiment.simulator().simulate(request)
 
+    @cached_property
     def fresh(self) -> Dataset:
         """Exact readings at poses of another recording."""
         overrides = [*self.overrides, "simulation.seed=9999", "simulation.noise_mm=0"]
@@ -123,7 +124,7 @@ def outcome(arm: PlantedArm, dataset: Dataset, folder: Path, overrides: Sequence
 
 def true_error(arm: PlantedArm, experiment: Experiment, parameters) -> float:
     """Mean distance (mm) of predicted from exact tips at fresh poses."""
-    fresh, system = arm.fresh(), experiment.system
+    fresh, system = arm.fresh, experiment.system
     request = SimulationRequest(system.arms, system.measurements, parameters, system.environment)
     try:
         shown = measured_without_noise(request, fresh)

@@ -23,6 +23,7 @@ from armcal.errors import ArmcalError, CalibrationWarning, ConfigError
 from armcal.plugins import PluginRegistry, discover
 from armcal_joints.springs import TorsionalSprings
 from click.testing import CliRunner, Result
+from soak import shares
 
 ROOT = Path(__file__).resolve().parents[2]
 DEMO = str(ROOT / "configs" / "lrm_arm" / "demo.yaml")
@@ -105,11 +106,11 @@ def damaged(data: bytes, dice: random.Random) -> bytes:
     return data[:place] + new + data[place + 1 :]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("count", [250, pytest.param(10_000, marks=pytest.mark.slow)])
-def test_no_damage_of_one_byte_is_taken_or_ends_in_a_traceback(calibration: Path, tmp_path: Path, count: int) -> None:
-    data, dice, path, registry = calibration.read_bytes(), random.Random(15), tmp_path / "damaged.yaml", discover()
-    for number in range(count):
+@pytest.mark.parametrize("seeds", shares(0, 6000, 2))
+def test_no_damage_of_one_byte_is_taken_or_ends_in_a_traceback(calibration: Path, tmp_path: Path, seeds: range) -> None:
+    data, path, registry = calibration.read_bytes(), tmp_path / "damaged.yaml", discover()
+    dice = random.Random(seeds.start)
+    for number in seeds:
         changed = damaged(data, dice)
         if changed == data:
             continue
@@ -123,14 +124,13 @@ def test_no_damage_of_one_byte_is_taken_or_ends_in_a_traceback(calibration: Path
     assert predicted(path).exit_code == 2
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("count", [4, pytest.param(300, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", shares(0, 200, 4))
 def test_what_is_accepted_by_hand_is_used_or_refused_without_a_traceback(
-    calibration: Path, tmp_path: Path, count: int
+    calibration: Path, tmp_path: Path, seeds: range
 ) -> None:
     """Whoever accepts a damaged file gets a calibration that works, or a sentence."""
-    data, dice, path, taken = calibration.read_bytes(), random.Random(16), tmp_path / "damaged.yaml", 0
-    for number in range(count):
+    data, dice, path, taken = calibration.read_bytes(), random.Random(seeds.start), tmp_path / "damaged.yaml", 0
+    for number in seeds:
         path.write_bytes(damaged(data, dice))
         done = armcal("calibration", "accept", str(path))
         assert done.exit_code in (0, 2) and not isinstance(done.exception, Exception), (number, done.exception)
@@ -139,7 +139,7 @@ def test_what_is_accepted_by_hand_is_used_or_refused_without_a_traceback(
             used = predicted(path)
             assert used.exit_code in (0, 2), (number, used.exception)
             assert not isinstance(used.exception, Exception), (number, used.exception)
-    assert 0 < taken < count
+    assert 0 < taken < len(seeds)
 
 
 def test_an_edit_on_purpose_is_checked_noted_and_said_until_the_next_run(calibration: Path, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from armcal.io.journal.journal import Journal, JournalFailedError, JournalFullEr
 from armcal.io.journal.reader import read_entries, verify
 from armcal.io.journal.segment import JournalDamagedError
 from file_layers import FOLDER, MemoryFiles, PowerLossError, no_lock
+from soak import shares
 
 LIMITS = JournalLimits(segment_bytes=3000, total_bytes=12_000)
 FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -109,15 +110,9 @@ def _reopen(held: dict[Path, bytes], witness: ReplayVerifier) -> str:
     return "torn after reopening" if verify(FOLDER, files).cut else ""
 
 
-@pytest.mark.slow
-def test_power_losses_lose_nothing_acknowledged() -> None:
-    faults = {seed: fault for seed in range(500) if (fault := lives(seed))}
-    assert faults == {}
-
-
-@pytest.mark.slow
-def test_many_power_losses_lose_nothing_acknowledged() -> None:
-    faults = {seed: fault for seed in range(500, 20_000) if (fault := lives(seed))}
+@pytest.mark.parametrize("seeds", shares(0, 3000, 6))
+def test_power_losses_lose_nothing_acknowledged(seeds: range) -> None:
+    faults = {seed: fault for seed in seeds if (fault := lives(seed))}
     assert faults == {}
 
 

@@ -15,6 +15,7 @@ from armcal.cli.main import cli
 from armcal.io.journal.frames import decode_frame, encode_frame
 from click.testing import CliRunner, Result
 from small_arms import TEXTS, calibration, predicted
+from soak import shares
 
 CONFIG = """
 statics: {gravity_m_s2: [0, 0, -9.81], body: earth, payload_g: 0}
@@ -28,7 +29,6 @@ evaluator: interpreted
 SETTINGS = "evaluator: interpreted\njournal: {segment_bytes: 6000}\n"
 JUNK: tuple[Any, ...] = (None, True, -1, 1e300, 10**30, "", "x", [], {}, [1], {"a": 1})
 COMMANDS = ("replay", "recalibrate", "watch")
-SLOW = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tips = 1000 * predicted(calibration("rigid"), q)[:, :3, 3] + 0.5 * chance.normal(size=(60, 3))
     rows = [f"p{i}," + ",".join(map(repr, [*q[i].tolist(), *tips[i].tolist()])) for i in range(60)]
     head = "pose_id,q1_rad,q2_rad,q3_rad,x_mm,y_mm,z_mm"
-    for name, chosen in (("all", rows), ("first", rows[:30]), ("then", rows[30:])):
+    for name, chosen in (("all", rows), ("first", rows[:30]), ("then", rows[30:40])):
         (here / f"{name}.csv").write_text("\n".join([head, *chosen]) + "\n", encoding="utf-8")
     (here / "arm.yaml").write_text(TEXTS["rigid"] + CONFIG, encoding="utf-8")
     (here / "settings.yaml").write_text(SETTINGS, encoding="utf-8")
@@ -138,7 +138,7 @@ def rewritten(folder: Path, chance: random.Random) -> None:
 
 @pytest.mark.quick("seeds0-watch")
 @pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 400), marks=SLOW)])
+@pytest.mark.parametrize("seeds", [range(2), *shares(2, 300, 3)])
 def test_damaged_bytes_end_with_a_sentence(kept: Path, tmp_path: Path, command: str, seeds: range) -> None:
     for seed in seeds:
         chance, folder = random.Random(seed), tmp_path / "kept"
@@ -150,7 +150,7 @@ def test_damaged_bytes_end_with_a_sentence(kept: Path, tmp_path: Path, command: 
 
 
 @pytest.mark.parametrize("command", COMMANDS[:2])
-@pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 400), marks=SLOW)])
+@pytest.mark.parametrize("seeds", [range(2), *shares(2, 300, 3)])
 def test_whole_entries_that_say_something_else_end_with_a_sentence(
     kept: Path, tmp_path: Path, command: str, seeds: range
 ) -> None:

@@ -33,6 +33,7 @@ from planted_mistakes import (
     with_tips,
 )
 from scipy.spatial.transform import Rotation
+from soak import shares
 
 PRINTED = PlantedArm("printed", DEMO, "arm.mdh.base_*", 0.42)
 BY_NAME = {mistake.name: mistake for mistake in MISTAKES}
@@ -156,29 +157,35 @@ def test_distinct_poses_are_split_as_before() -> None:
     assert len(hold_out(30, 0.2, 5, numbers).holdout) == 6
 
 
+@pytest.fixture(scope="module", params=["printed", "industrial", "seven"])
+def planted_arm(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[PlantedArm, float]:
+    """An arm, and the true error of its calibration from a recording without a mistake (mm)."""
+    folder = tmp_path_factory.mktemp("arms")
+    (arm,) = (arm for arm in planted_mistakes.arms(folder) if arm.name == request.param)
+    return arm, outcome(arm, arm.recording(2), folder, QUICK).true
+
+
 @pytest.mark.slow
-def test_no_planted_mistake_is_graded_usable(tmp_path: Path) -> None:
+@pytest.mark.parametrize("first", range(0, len(MISTAKES), 10))
+def test_no_planted_mistake_is_graded_usable(planted_arm: tuple[PlantedArm, float], first: int, tmp_path: Path) -> None:
     """Fifty mistakes on three arms; what data cannot show is stated instead."""
-    for arm in planted_mistakes.arms(tmp_path):
-        usual = outcome(arm, arm.recording(2), tmp_path, QUICK)
-        for mistake in MISTAKES:
-            data = mistake.make(arm, arm.recording(1), np.random.default_rng(7))
-            found = outcome(arm, data, tmp_path, [*QUICK, *mistake.overrides(arm)])
-            usable = found.grade in ("good", "warning")
-            harmless = found.true < 5 * usual.true
-            stated = "times a typical" in found.said or "its prior" in found.said or "times as large" in found.said
-            assert not usable or harmless or (not mistake.visible and (stated or "scale" in found.notes)), (
-                f"{arm.name}, {mistake.name}: {found}"
-            )
+    arm, usual = planted_arm
+    for mistake in MISTAKES[first : first + 10]:
+        data = mistake.make(arm, arm.recording(1), np.random.default_rng(7))
+        found = outcome(arm, data, tmp_path, [*QUICK, *mistake.overrides(arm)])
+        usable = found.grade in ("good", "warning")
+        harmless = found.true < 5 * usual
+        stated = "times a typical" in found.said or "its prior" in found.said or "times as large" in found.said
+        assert not usable or harmless or (not mistake.visible and (stated or "scale" in found.notes)), (
+            f"{arm.name}, {mistake.name}: {found}"
+        )
 
 
-@pytest.mark.slow
-def test_no_clean_recording_is_graded_bad(tmp_path: Path) -> None:
-    """Two hundred recordings of three arms."""
-    printed, industrial, seven = planted_mistakes.arms(tmp_path)
-    runs = [(printed, seed) for seed in range(100, 160)] + [(industrial, seed) for seed in range(100, 170)]
-    runs += [(seven, seed) for seed in range(100, 170)]
-    for arm, seed in runs:
+@pytest.mark.parametrize("seeds", shares(100, 50, 5))
+def test_no_clean_recording_is_graded_bad(planted_arm: tuple[PlantedArm, float], seeds: range, tmp_path: Path) -> None:
+    """A hundred and fifty recordings of three arms."""
+    arm, _ = planted_arm
+    for seed in seeds:
         found = outcome(arm, arm.recording(seed), tmp_path, QUICK)
         assert found.grade in ("good", "warning"), f"{arm.name}, seed {seed}: {found.said}"
 
