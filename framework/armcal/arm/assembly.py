@@ -1,7 +1,7 @@
 """An arm: a model, its effects and its masses, put together under one instance name."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import casadi as ca
 import numpy as np
 
-from armcal.arm.effects import Condition, JointCommand, JointEffect, Spring
+from armcal.arm.effects import Condition, JointCommand, JointEffect, Spring, spring_fault
 from armcal.arm.elastic import deflections, elastic_sites, split_deflection
 from armcal.arm.environment import Environment
 from armcal.arm.model import ArmModel, Chain, forward
@@ -17,10 +17,11 @@ from armcal.arm.pose_residual import OF_TOOL, SURROUNDINGS, PoseResidual, Postur
 from armcal.arm.statics import Load, Mass, joint_efforts, wrenches
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.parameters import ParameterBlock, scalar
+from armcal.base.parameters import ParameterBlock, declared, scalar
 from armcal.base.poses import pose_transform
-from armcal.base.se3 import Expression, Transform
+from armcal.base.se3 import Expression, Transform, column
 from armcal.errors import DataError
+from armcal.plugin_faults import refuse
 
 PLACEMENT = "placement"
 """What the blocks of an arm's placement are called."""
@@ -142,13 +143,13 @@ class Arm:
         """Where all joints were commanded to go, those that follow others too, and from where, and what was around."""
         stated = {"payload": environment.payload_mass}
 
-        def column(channel: str) -> Array:
+        def recorded(channel: str) -> Array:
             default = np.full(len(dataset), stated.get(channel, 0.0))
             return np.nan_to_num(dataset.column(channel)) if dataset.has(channel) else default
 
-        commands = [column(f"{self.name}.{joint}") for joint in self.commanded]
-        approaches = [column(f"{self.name}.approach.{joint}") for joint in self.commanded]
-        around = {name: column(name) for name in SURROUNDINGS if name in stated or dataset.has(name)}
+        commands = [recorded(f"{self.name}.{joint}") for joint in self.commanded]
+        approaches = [recorded(f"{self.name}.approach.{joint}") for joint in self.commanded]
+        around = {name: recorded(name) for name in SURROUNDINGS if name in stated or dataset.has(name)}
         return Postures(np.array(self.joint_commands(commands)), np.array(self.joint_approaches(approaches)), around)
 
     @cached_property
@@ -168,9 +169,9 @@ class Arm:
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """All blocks, under their full names."""
         blocks = list(prefixed(f"{self.name}.", self.placement))
-        blocks += prefixed(self._scope(self.model_name), self.model.parameters())
+        blocks += prefixed(self._scope(self.model_name), declared(self.model))
         for name, effect in self.effects.items():
-            blocks += prefixed(self._scope(name), effect.parameters())
+            blocks += prefixed(self._scope(name), declared(effect))
         for mass in self.masses:
             local = [scalar("mass", "kg", mass.mass, 0.1)]
             local += [scalar(f"com_{axis}", "m", x, 0.01) for axis, x in zip("xyz", mass.com, strict=True)]
@@ -180,6 +181,9 @@ class Arm:
     def chain(self, values: Mapping[str, Expression]) -> Chain:
         """The model's chain, for full parameter names."""
         chain = self.model.chain(scoped(values, self._scope(self.model_name)))
+        if not isinstance(chain, Chain) or [joint.name for joint in chain.joints] != list(self.joint_names):
+            given = f"the joints {[j.name for j in chain.joints]}" if isinstance(chain, Chain) else chain
+            refuse(self.model.chain, given, f"a Chain of the joints {', '.join(self.joint_names)}")
         if not self.placement:
             return chain
         base_T_model = pose_transform(PLACEMENT, scoped(values, f"{self.name}."))
@@ -187,11 +191,15 @@ class Arm:
 
     def springs(self, values: Mapping[str, Expression]) -> tuple[Spring, ...]:
         """The springs of all effects, in the order of the effects."""
-        return tuple(
-            spring
-            for name, effect in self.effects.items()
-            for spring in effect.springs(scoped(values, self._scope(name)))
-        )
+        every: list[Spring] = []
+        for name, effect in self.effects.items():
+            springs = effect.springs(scoped(values, self._scope(name)))
+            if not isinstance(springs, Iterable):
+                refuse(effect.springs, springs, "a sequence of Spring")
+            every += springs
+            for fault in filter(None, (spring_fault(spring, len(self.joint_names)) for spring in springs)):
+                refuse(effect.springs, *fault)
+        return tuple(every)
 
     @cached_property
     def deflection_size(self) -> int:
@@ -249,7 +257,7 @@ class Arm:
         chain = self.chain(values)
         for name, effect in self.effects.items():
             try:
-                chain = effect.shaped(chain, inputs.conditions, scoped(values, self._scope(name)))
+                shaped = effect.shaped(chain, inputs.conditions, scoped(values, self._scope(name)))
             except KeyError as fault:
                 missing = fault.args[0]
                 if missing in inputs.conditions or missing not in self.conditions:
@@ -258,12 +266,18 @@ class Arm:
                     f"the effect {self._scope(name)[:-1]} reads {missing}, which is not recorded.",
                     hint=f"Add a column {missing} with its unit.",
                 ) from fault
+            if not isinstance(shaped, Chain):
+                refuse(effect.shaped, shaped, "a Chain")
+            chain = shaped
         return chain
 
     def displacement(self, values: Mapping[str, Expression], command: JointCommand) -> Expression:
         """What a joint is told, and what its effects add (rad or m)."""
-        added = [e.displacement(command, scoped(values, self._scope(n))) for n, e in self.effects.items()]
-        return command.commanded + sum(added, ca.SX(0))
+        total = ca.SX(0)
+        for name, effect in self.effects.items():
+            added = effect.displacement(command, scoped(values, self._scope(name)))
+            total += column(effect.displacement, added, 1, "one number or expression (rad or m)")
+        return command.commanded + total
 
     def _masses(self, values: Mapping[str, Expression]) -> Sequence[Mass]:
         result = []
@@ -282,6 +296,13 @@ def prefixed(scope: str, blocks: Sequence[ParameterBlock]) -> tuple[ParameterBlo
     return tuple(replace(block, name=scope + block.name) for block in blocks)
 
 
-def scoped(values: Mapping[str, Expression], scope: str) -> dict[str, Expression]:
+class LocalValues(dict[str, Expression]):
+    """Values under local names, which says of an unknown name which ones there are."""
+
+    def __missing__(self, name: str) -> Expression:
+        raise KeyError(f"found no parameter {name!r}, expected one of {', '.join(sorted(self)) or 'none'}")
+
+
+def scoped(values: Mapping[str, Expression], scope: str) -> LocalValues:
     """The values below a scope, under their local names."""
-    return {name.removeprefix(scope): value for name, value in values.items() if name.startswith(scope)}
+    return LocalValues({name.removeprefix(scope): value for name, value in values.items() if name.startswith(scope)})

@@ -4,6 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
+import numpy as np
+
 from armcal.arm.joints import unknown_joint
 from armcal.arm.model import Z_AXIS, Chain, Vector3
 from armcal.base.parameters import ParameterBlock
@@ -15,6 +17,7 @@ JointChoice = Literal["all"] | tuple[str, ...]
 XYZ: tuple[Vector3, ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), Z_AXIS)
 """The directions of a spring that gives about every axis."""
 _Settings = Settings
+_UNIT = 1e-9
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,20 @@ class Spring:
     def size(self) -> int:
         """How many coordinates it has."""
         return max(1, len(self.directions))
+
+
+def spring_fault(spring: Any, joints: int) -> tuple[str, str] | None:
+    """What is wrong with a spring of an arm of so many joints, and what was expected; None if nothing is."""
+    if not isinstance(spring, Spring):
+        return type(spring).__name__, "Spring"
+    if not 0 <= spring.site <= joints:
+        return f"a spring at the site {spring.site}", f"0 to {joints}: 0 is the mount, i is joint i"
+    if spring.site == 0 and not spring.directions:
+        return "a spring at the mount without directions", "directions: the mount has no axis of its own"
+    for direction in spring.directions:
+        if np.shape(direction) != (3,) or abs(np.linalg.norm(direction) - 1) > _UNIT:
+            return f"the direction {direction}", "a unit vector of three numbers"
+    return None if callable(spring.law) else (f"a law of type {type(spring.law).__name__}", "a function")
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from armcal.arm.effects import MOUNT, XYZ, JointCommand, Spring
 from armcal.arm.model import Chain, Frames, Joint, Vector3
 from armcal.arm.statics import SiteWrench, effort
 from armcal.base import se3
-from armcal.base.se3 import Expression
+from armcal.base.se3 import Expression, column
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,8 @@ def deflections(
             along = [ca.dot(ca.mtimes(pose.rotation, ca.SX(list(axis))), wrench.moment) for axis in axes]
             if joint is not None and not site.directions:
                 along = [effort(joint, pose, wrench)]
-            given = spring.law(ca.vertcat(*along), command)
+            expected = f"{spring.size} deflections (rad, or m): one a direction"
+            given = column(spring.law, spring.law(ca.vertcat(*along), command), spring.size, expected)
             total += given if spring.directions == site.directions else ca.mtimes(_matrix(axes), given)
         parts.append(total)
     return ca.vertcat(*parts) if parts else ca.SX(0, 1)

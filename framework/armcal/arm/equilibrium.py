@@ -87,6 +87,10 @@ def refusal(which: str, springs: Sequence[str], state: Array, slope: Array, far:
         slope: S there (n_d x n_d).
         far: whether nothing came to rest within what springs may give; else the springs do not hold what did.
     """
+    if np.isnan(slope).any():
+        names = [name for name, row in zip(springs, slope, strict=True) if np.isnan(row).any()]
+        text = f"is no number (NaN): the law of the spring of {' or '.join(names)} gives none under its load."
+        return NotConvergedError(f"the elastic equilibrium of {which} {text}", hint="Correct that law.")
     if far:
         name = springs[int(np.argmax(np.abs(state)))]
         text = f"did not settle: {name} would give by more than {MOST_DEFLECTION:g} rad (or m) under its load."

@@ -9,12 +9,15 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
 from armcal.base.arrays import Array, Indices
 from armcal.base.domains import Domain, Interval, Rotation
+from armcal.base.units import SI_UNITS, UNITS, si_unit
 from armcal.errors import ConfigError
+from armcal.plugin_faults import refuse
 
 FIT_NAME = re.compile(r"""[^\s.*?\[\]<>"'\\@]+""")
 """What a part of a parameter's name may be: dots join parts, brackets name entries, the others make patterns."""
@@ -78,6 +81,41 @@ class ParameterBlock:
 def scalar(name: str, unit: str, nominal: float, scale: float, domain: Interval | None = None) -> ParameterBlock:
     """A block of one number."""
     return ParameterBlock(name, unit, (float(nominal),), domain or Interval(), scale)
+
+
+class DeclaresParameters(Protocol):
+    """A component with parameters."""
+
+    def parameters(self) -> Sequence[ParameterBlock]:
+        """Its blocks, under local names."""
+
+
+def declared(component: DeclaresParameters) -> tuple[ParameterBlock, ...]:
+    """The blocks that a component declares, under local names.
+
+    Raises:
+        PluginError: they are no blocks, or a name, a unit, a nominal value or a scale makes no sense.
+    """
+    blocks, method = component.parameters(), component.parameters
+    if not isinstance(blocks, Iterable):
+        refuse(method, blocks, "a sequence of ParameterBlock, as scalar() makes them")
+    blocks, names = tuple(blocks), set[str]()
+    for block in blocks:
+        if not isinstance(block, ParameterBlock):
+            refuse(method, repr(block), "ParameterBlock, as scalar() makes them")
+        if not FIT_NAME.fullmatch(block.name):
+            refuse(method, f"the name {block.name!r}", "one without spaces, dots, quotes and * ? [ ] < > @ \\")
+        if block.name in names:
+            refuse(method, f"two parameters called {block.name!r}", "names that differ")
+        names.add(block.name)
+        known = UNITS.get(block.unit)
+        if known is None or known != (si := si_unit(known.dimension)):
+            expected = f"one of {', '.join(SI_UNITS)}" if known is None else f"{si.name}: parameters are held in SI"
+            refuse(method, f"the unit {block.unit!r} of {block.name!r}", expected)
+        if not (all(map(math.isfinite, block.nominal)) and 0 < block.scale < math.inf):
+            numbers = f"nominal {', '.join(map(str, block.nominal))} and scale {block.scale} of {block.name!r}"
+            refuse(method, numbers, "numbers, and a scale above zero: the size of an ordinary correction")
+    return blocks
 
 
 @dataclass(frozen=True)

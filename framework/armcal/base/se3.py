@@ -6,6 +6,7 @@ Transforms are written ``a_T_b``: they map coordinates in frame b to coordinates
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,9 +14,14 @@ import casadi as ca
 import numpy as np
 
 from armcal.base.arrays import Array
+from armcal.plugin_faults import refuse
 
 Expression = Any
 """A CasADi ``SX`` (or a number where a constant is meant)."""
+
+if hasattr(ca.GlobalOptions, "setNumpyMode"):
+    # A plugin may call numpy's functions on expressions: shapes are those of every version of CasADi, and no notice.
+    ca.GlobalOptions.setNumpyMode(-1)
 
 _SERIES_TERMS = 10
 _MOTION_TERMS = 12
@@ -54,6 +60,21 @@ class Transform:
         """The homogeneous 4x4 matrix."""
         bottom = ca.horzcat(ca.SX(1, 3), ca.SX(1))
         return ca.vertcat(ca.horzcat(self.rotation, self.translation), bottom)
+
+
+def column(method: Callable[..., Any], returned: Any, rows: int | None, expected: str) -> Expression:
+    """What a method of a component returned, as an expression (rows x 1, of any length if None).
+
+    Raises:
+        PluginError: it is none, or of another shape; with the method and its place.
+    """
+    try:
+        given = ca.SX(returned)
+    except (NotImplementedError, TypeError):
+        refuse(method, returned, expected)
+    if given.shape != (given.shape[0] if rows is None else rows, 1):
+        refuse(method, " x ".join(map(str, given.shape)) + " numbers", expected)
+    return given
 
 
 def evaluated(expression: Expression) -> Array:

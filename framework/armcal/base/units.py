@@ -74,6 +74,10 @@ _ALL = (
 UNITS: Mapping[str, Unit] = MappingProxyType({unit.name: unit for unit in _ALL})
 """Every unit by name; within a dimension the SI unit comes first."""
 
+DIMENSIONS = tuple(dict.fromkeys(unit.dimension for unit in _ALL))
+SI_UNITS = tuple(next(unit.name for unit in _ALL if unit.dimension == dimension) for dimension in DIMENSIONS)
+"""The unit that values of each dimension have inside."""
+
 _DISPLAY: Mapping[str, str] = MappingProxyType({"length": "mm", "angle": "deg", "mass": "g", "image": "px"})
 ERROR_UNITS: Mapping[str, str] = MappingProxyType(
     {"length": "mm", "image": "px", "force": "mN", "torque": "mNm", "angle": "mrad"}
@@ -133,8 +137,7 @@ def units_of(dimension: str) -> tuple[Unit, ...]:
     """The units of a dimension, the SI unit first; ValueError for an unknown dimension."""
     units = tuple(u for u in _ALL if u.dimension == dimension)
     if not units:
-        known = ", ".join(dict.fromkeys(u.dimension for u in _ALL))
-        raise ValueError(f"dimension {dimension!r} is not known; expected one of {known}.")
+        raise ValueError(f"dimension {dimension!r} is not known; expected one of {', '.join(DIMENSIONS)}.")
     return units
 
 

@@ -7,11 +7,13 @@ import sys
 from importlib import import_module
 
 import click
+from click.exceptions import Exit
 from click.shell_completion import CompletionItem
 
 from armcal.cli.outlet import Outlet, say
 from armcal.errors import EXIT_DONE, EXIT_FAULT, EXIT_INTERRUPTED, ArmcalError
 from armcal.extras import missing_library
+from armcal.plugin_faults import plugin_fault
 from armcal.plugin_files import use_plugins
 from armcal.plugins import discover
 from armcal.version import JSON_SCHEMA, __version__
@@ -92,16 +94,19 @@ class LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> object:
-        """Armcal's own errors become one message and an exit code, never a traceback."""
+        """Armcal's own errors, and faults in a plugin's code, become one message and an exit code."""
         try:
             return super().invoke(ctx)
-        except ArmcalError as fault:
-            _report(fault)
-            ctx.exit(fault.exit_code)
-        except ImportError as fault:  # of a library that is imported where it is needed
-            absent = missing_library(fault, f"armcal {ctx.invoked_subcommand}")
-            _report(absent)
-            ctx.exit(absent.exit_code)
+        except (click.ClickException, click.Abort, Exit):
+            raise
+        except (Exception, SystemExit) as fault:
+            stated = fault if isinstance(fault, ArmcalError) else plugin_fault(fault)
+            if stated is None and isinstance(fault, ImportError):  # of a library that is imported where it is needed
+                stated = missing_library(fault, f"armcal {ctx.invoked_subcommand}")
+            if stated is None:
+                raise
+            _report(stated)
+            ctx.exit(stated.exit_code)
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Names and summaries from the table: to import every command for them takes seconds."""

@@ -12,7 +12,7 @@ from armcal.arm.effects import JointEffect
 from armcal.arm.environment import STATICS, Environment, gravity_tilt
 from armcal.arm.pose_residual import PoseResidual
 from armcal.arm.statics import frame_names
-from armcal.base.parameters import FIT_NAME, ParameterBlock, Parameters
+from armcal.base.parameters import FIT_NAME, ParameterBlock, Parameters, declared
 from armcal.base.poses import PoseSettings
 from armcal.base.settings import Acceleration3, Angle, Force3, Length3, Mass, Settings, Torque3
 from armcal.config.validate import validate
@@ -21,6 +21,7 @@ from armcal.errors import ArmcalError, ConfigError, PluginError
 from armcal.measure.groups import Groups, group_blocks
 from armcal.measure.measurement import Borrowing, Carried, Measurement
 from armcal.measure.reader import surroundings
+from armcal.measure.returned import check_channels
 from armcal.plugins import Component, PluginRegistry
 
 T = TypeVar("T")
@@ -118,7 +119,7 @@ class System:
         """Every block, fixed but for what is not known of groups of records."""
         blocks: list[ParameterBlock] = [block for arm in self.arms.values() for block in arm.parameters()]
         for name, measurement in self.measurements.items():
-            blocks += prefixed(f"{name}.", measurement.parameters())
+            blocks += prefixed(f"{name}.", declared(measurement))
         blocks += gravity_tilt()
         blocks += group_blocks(self.measurements, groups or {})
         return Parameters(tuple(blocks))
@@ -142,6 +143,7 @@ def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
     for name in settings.measurements:
         at: Path = ("measurements", name)
         measurements[name], described[name] = build_component(source, registry, "measurement", at, tuple(arms))
+        check_channels(measurements[name])
         carried = measurements[name]
         if isinstance(carried, Carried):
             carrier = arms[measurements[name].arms[0]]

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 from armcal.errors import ArmcalError, InputError, Location
+from armcal.plugin_faults import blaming
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -113,7 +114,7 @@ class Workers:
                 report(0.0)
                 # One at a time: a batch might hold all the long ones.
                 at_work = joblib.Parallel(return_as="generator", batch_size=1)
-                for result in at_work(joblib.delayed(work)(task) for task in tasks):
+                for result in at_work(joblib.delayed(blaming(work))(task) for task in tasks):
                     results.append(result)
                     report(len(results) / len(tasks))
         except BrokenProcessPool as fault:

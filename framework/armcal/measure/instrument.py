@@ -12,6 +12,7 @@ from armcal.base.se3 import Expression, Transform
 from armcal.base.settings import Settings
 from armcal.measure.contact import named_arm
 from armcal.measure.measurement import Channel
+from armcal.plugin_faults import refuse
 
 _Settings = Settings
 
@@ -57,7 +58,9 @@ class Instrument(ABC):
         self, arms: Mapping[str, ArmState], measured: Mapping[str, Expression], values: Mapping[str, Expression]
     ) -> Expression:
         """Measured minus predicted, an entry a channel (n x 1, m or rad); angles by the shorter way round."""
-        predicted = self.outputs(arms, values)
+        predicted, names = self.outputs(arms, values), [channel.name for channel in self.channels()]
+        if set(predicted) != set(names):
+            refuse(self.outputs, f"only {', '.join(predicted) or 'none'}", f"every channel: {', '.join(names)}")
         off = {channel: measured[channel.name] - predicted[channel.name] for channel in self.channels()}
         turns = [ca.remainder(x, 2 * ca.pi) if channel.dimension == "angle" else x for channel, x in off.items()]
         return ca.vertcat(*turns)

@@ -20,7 +20,7 @@ from typing import Any
 import casadi as ca
 from typing_extensions import override
 
-from armcal.arm.assembly import Arm, ArmInputs, ArmState, scoped
+from armcal.arm.assembly import Arm, ArmInputs, ArmState, LocalValues, scoped
 from armcal.arm.environment import STATICS, Environment, tilted
 from armcal.arm.evaluator import ElasticPass
 from armcal.arm.model import Vector3
@@ -29,8 +29,6 @@ from armcal.arm.statics import Load
 from armcal.base.arrays import Array
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.se3 import Expression
-from armcal.base.units import ERROR_UNITS
-from armcal.errors import ProblemError
 from armcal.measure.measurement import (
     GroupedMeasurement,
     Measurement,
@@ -40,6 +38,7 @@ from armcal.measure.measurement import (
 )
 from armcal.measure.partners import OTHER
 from armcal.measure.points import LimitedView, PointMeasurement
+from armcal.measure.returned import checked_outputs, checked_residual
 
 _POINT = "point."
 
@@ -221,7 +220,7 @@ def build_factor(
     groups = measurement if isinstance(measurement, GroupedMeasurement) else None
     group, of_group = _symbols("group", groups.group_parameters("") if groups else ())
     records, states, deflections = _arm_states(measurement, arms, values, environment, available)
-    local = {**borrowed_values(measurement, values), **scoped(values, f"{name}."), **of_group}
+    local = LocalValues({**borrowed_values(measurement, values), **scoped(values, f"{name}."), **of_group})
     reading = _reading(name, measurement, records, states, local, unrolled)
     next_state = ca.densify(ca.vertcat(*[states[a].next_deflection for a in measurement.arms]))
     tools = ca.vertcat(*[ca.vec(states[a].base_T_tool.matrix()[:3, :]) for a in measurement.arms])
@@ -293,10 +292,10 @@ def _reading(
 ) -> _Reading:
     """Of the whole record, or of one point, whose numbers are channels, where there are points."""
     if unrolled or not isinstance(measurement, PointMeasurement):
-        predicted = measurement.outputs(states, local)
+        shown = checked_outputs(measurement, measurement.outputs(states, local))
         measured = {c.name: records.optional(f"{name}.{c.name}", 0.0) for c in measurement.channels()}
-        residual = _checked(name, measurement, measurement.residual(states, measured, local))
-        return _Reading(tuple(predicted), ca.vertcat(*predicted.values()), residual)
+        residual = checked_residual(name, measurement, measurement.residual(states, measured, local))
+        return _Reading(tuple(shown), ca.vertcat(*shown.values()), residual)
     points = measurement.points
     point = ca.vertcat(*[records.number(f"{name}.{_POINT}{i}") for i in range(points.shape[1])])
     shown, own = measurement.point_outputs(states, local, point), [c.name for c in measurement.point_channels()]
@@ -329,30 +328,6 @@ def _of_points(factor: Factor, measurement: Measurement, points: Array) -> Facto
         points=points[:, [numbers[channel] for channel in used]],
         of_point=of_point,
     )
-
-
-def _checked(name: str, measurement: Measurement, residual: Expression) -> Expression:
-    """The residual of a measurement whose noise, dimensions and noise columns are those of its entries.
-
-    Raises:
-        ProblemError: with what differs.
-    """
-    rows, dimensions, own = residual.numel(), residual_dimensions(measurement), noise_channels(measurement)
-    counts = {"noise": len(measurement.noise()), "dimensions": len(dimensions), "noise columns": len(own) or rows}
-    odd = [f"{kind} of {count} entries" for kind, count in counts.items() if count != rows]
-    odd += [f"dimension {kind!r}" for kind in dimensions if kind not in ERROR_UNITS]
-    odd += [
-        f"noise column {channel.name} of dimension {channel.dimension}"
-        for channels, kind in zip(own, dimensions, strict=False)
-        for channel in channels
-        if channel.dimension != kind
-    ]
-    if odd:
-        raise ProblemError(
-            f"the measurement {name} has a residual of {rows} entries ({', '.join(dimensions)}), and {', '.join(odd)}.",
-            hint="Correct noise(), dimensions() or noise_channels() in its plugin.",
-        )
-    return residual
 
 
 def _symbols(name: str, blocks: Sequence[ParameterBlock]) -> tuple[Expression, dict[str, Expression]]:

@@ -21,6 +21,7 @@ from armcal.estimate.validation import Split, error_unit, folds, hold_out, split
 from armcal.measure.measurement import GroupedMeasurement
 from armcal.measure.reader import read_ids
 from armcal.problem.drift import with_drift
+from armcal.problem.finite import require_numbers
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.readings import with_joint_noise
 from armcal.run.experiment import Experiment
@@ -104,6 +105,7 @@ def assemble(
         records = problem.records(dataset)
         start = with_proposals(aligned_start(problem, records, dataset), records, dataset)
         problem = started(start.problem, records)
+        require_numbers(problem, records, dataset)
         records = acting(problem, records, dataset)
     with watch.stage("check"):
         unlearned(system)

@@ -33,7 +33,7 @@ KNOWN_CHECKS: Mapping[str, int] = MappingProxyType(
         "model": 28,
         "effect": 26,
         "residual": 22,
-        "measurement": 29,
+        "measurement": 28,
         "reader": 23,
         "estimator": 22,
         "online": 20,

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from armcal.arm.assembly import Arm
-from armcal.arm.effects import MOUNT, JointCommand, JointEffect, Spring, reshapes
+from armcal.arm.effects import MOUNT, JointCommand, JointEffect, Spring, reshapes, spring_fault
 from armcal.arm.model import Attachment, Chain, Joint
 from armcal.base import se3
 from armcal.base.arrays import Array
@@ -60,7 +60,8 @@ def check_effect(record: Recorder, subject: Subject) -> None:
     with record.needed("its springs have a site and unit directions"):
         springs = tuple(effect.springs(values))
         for spring in springs:
-            _expect_sound(spring)
+            fault = spring_fault(spring, len(JOINTS))
+            expect(fault is None, "found {}, expected {}".format(*(fault or ("", ""))))
     if springs:
         _check_laws(record, springs, blocks, stacked(list(values.values())))
 
@@ -136,21 +137,6 @@ def _check_laws(
             expect_derivatives(function, at, "the deflections", names)
     with record.check("deflections are in rad, of loads in N m"):
         _expect_law_gains(blocks, given, loads, expressions)
-
-
-def _expect_sound(spring: Spring) -> None:
-    expect(isinstance(spring, Spring), f"found {type(spring).__name__} among the springs, expected Spring")
-    expect(0 <= spring.site <= len(JOINTS), f"found the site {spring.site}, expected 0 to {len(JOINTS)}")
-    expect(
-        spring.site > 0 or len(spring.directions) > 0,
-        "found a spring at the base without directions; the base has no axis of its own",
-    )
-    for direction in spring.directions:
-        length = float(np.linalg.norm(direction))
-        expect(
-            len(direction) == 3 and abs(length - 1) <= 1e-9,
-            f"found the direction {direction} of length {length:g}, expected a unit vector",
-        )
 
 
 def _displacement(effect: JointEffect, values: Mapping[str, Expression]) -> tuple[Expression, Expression]:

@@ -110,9 +110,7 @@ def check_measurement(record: Recorder, subject: Subject) -> None:
 
 def _check_residual(record: Recorder, case: _Case) -> None:
     factor = case.factor
-    with record.check("noise is positive"):
-        positive = all(np.isfinite(noise) and noise > 0 for noise in factor.noise)
-        expect(positive, f"found the noise {factor.noise}, expected standard deviations above zero")
+    with record.check("noise is plausible in its unit"):
         for number, dimension in zip(factor.noise, factor.dimensions, strict=False):
             largest = _NOISIEST.get(dimension, math.inf)
             unit = si_unit(dimension).name
@@ -121,9 +119,6 @@ def _check_residual(record: Recorder, case: _Case) -> None:
     with record.check("residuals depend on what is given"):
         expect_only(stacked([factor.residual, factor.outputs]), [factor.values, factor.record])
     measured = {f"{_INSTRUMENT}.{channel.name}" for channel in case.channels}
-    with record.check("outputs are channels"):
-        unknown = [name for name in factor.output_channels if name not in measured]
-        expect(not unknown, f"found the outputs {', '.join(unknown)}, expected names of channels")
     with record.check("the residual is zero where outputs are measured"):
         if not factor.output_channels:
             raise NotRun("it reads nothing")

@@ -1,0 +1,179 @@
+"""What authors of plugins do wrong: each ends in one sentence that names file, method, what was found and expected."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from armcal import plugin_files, use_plugins
+from armcal.cli.main import cli
+from armcal.errors import PluginError
+from armcal.io.parallel import Workers
+from armcal.plugin_faults import blaming
+
+IMPORTS = """import math
+
+import casadi as ca
+from armcal import Channel, Instrument, InstrumentSettings, JointEffect, Length, Spring, hookimpl, scalar
+
+"""
+EFFECT = (
+    IMPORTS
+    + """
+class E(JointEffect):
+    def parameters(self):
+        return [scalar(f"s{joint}", "rad", 0.0, 0.01) for joint in self.joints]
+
+    def displacement(self, command, values):
+        s = values["s2"]
+        return s * ca.sin(command.commanded) if command.joint == 2 else 0
+
+    def springs(self, values):
+        return ()
+
+
+@hookimpl
+def armcal_register_effects(register):
+    register("mine", E, "")
+"""
+)
+GAUGE = (
+    IMPORTS
+    + """
+class G(Instrument):
+    def channels(self):
+        return [Channel("r", "length")]
+
+    def outputs(self, arms, values):
+        return {"r": ca.norm_2(self.base_T_tool(arms).translation)}
+
+    def noise(self):
+        return (1e-4,)
+
+
+@hookimpl
+def armcal_register_measurements(register):
+    register("mine", G, "")
+"""
+)
+MOVED, NO_SPRINGS, DECLARED = "s * ca.sin(command.commanded)", "return ()", 'scalar(f"s{joint}", "rad", 0.0, 0.01)'
+LAW = "lambda load, command: values['s2'] * load"
+
+EFFECTS = {  # what stands in the place of what, and what the sentence says
+    "another name": (MOVED, "s * command.angle", "E.displacement raised AttributeError: .* has no attribute 'angle'"),
+    "unknown parameter": ('"s2"', '"k2"', "E.displacement .*found no parameter 'k2', expected one of s1, s2"),
+    "a list": (MOVED, "[s]", "E.displacement returned an object of type list, expected one number or expression"),
+    "a vector": (MOVED, "ca.vertcat(s, s)", "E.displacement returned 2 x 1 numbers, expected one number"),
+    "no return": ("return s *", "s *", "E.displacement returned None, expected one number"),
+    "not a number": (MOVED, "s * ca.sqrt(-9 - command.commanded ** 2)", "E.displacement returned nan for q2 comm.* 1"),
+    "of math": (MOVED, "s * math.sin(command.commanded)", "E.displacement returned nan for q2 commanded to"),
+    "no slope": (MOVED, "ca.sqrt(s)", "derivative of the residuals by arm.mine.s2 is no number"),
+    "if": (MOVED, "s if command.commanded > 0 else -s", "E.displacement raised RuntimeError: .*Choose by casadi.if_el"),
+    "an exit": (MOVED, "exit('bye')", "E.displacement raised SystemExit: bye. To check it by itself"),
+    "arguments": ("command, values", "command", r"E.displacement\(\) takes 2 positional arguments but 3 were given"),
+    "degrees": ('"rad"', '"deg"', "E.parameters returned the unit 'deg' of 's1', expected rad: parameters are held"),
+    "no unit": ('"rad"', '"radians"', "E.parameters returned the unit 'radians' of 's1', expected one of m, rad, kg"),
+    "no scale": ("0.01", "0", "E.parameters returned nominal 0.0 and scale 0 of 's1', expected numbers, and a scale"),
+    "nominal NaN": ("0.0,", "math.nan,", "E.parameters returned nominal nan and scale 0.01 of 's1', expected numbers"),
+    "one name": ('f"s{joint}"', '"s2"', "E.parameters returned two parameters called 's2', expected names that differ"),
+    "a dot": ('f"s{joint}"', 'f"s.{joint}"', "E.parameters returned the name 's.1', expected one without spaces, dots"),
+    "a text": (DECLARED, "'s2'", "E.parameters returned 's2', expected ParameterBlock, as scalar.. makes them"),
+    "none": ("return [", "[", "E.parameters returned None, expected a sequence of ParameterBlock"),
+    "no springs": (NO_SPRINGS, "pass", "E.springs returned None, expected a sequence of Spring"),
+    "no such site": (NO_SPRINGS, f"return [Spring(9, (), {LAW})]", "E.springs returned a spring at the site 9, expec"),
+    "a direction": (NO_SPRINGS, f"return [Spring(2, (1, 0, 0), {LAW})]", "E.springs returned the direction 1, expecte"),
+    "no law": (NO_SPRINGS, "return [Spring(2, (), values['s2'])]", "returned a law of type SX, expected a function"),
+    "a law of one": (NO_SPRINGS, f"return [Spring(2, (), {LAW.replace(', command', '')})]", "takes 1 positional"),
+    "a long law": (NO_SPRINGS, f"return [Spring(2, (), {LAW} * ca.SX([1, 2]))]", "<lambda> returned 2 x 1 numbers"),
+}  # fmt: skip
+GAUGES = {
+    "another channel": ('"r": ca', '"d": ca', "G.outputs returned the channels d, expected .* of each channel .* r"),
+    "no channel": ('{"r": ', '{"r": 0} and {} and {"r": ', "G.outputs returned only none, expected every channel: r"),
+    "no mapping": ('{"r": ', "{", "G.outputs returned an object of type set, expected the expression of each channel"),
+    "a whole vector": ("ca.norm_2", "", "G.outputs returned 3 x 1 numbers, expected one number as 'r'"),
+    "a text": ('Channel("r", "length")', '"r"', "G.channels returned 'r', expected Channel.name, dimension., of"),
+    "no dimension": ('"length"', '"mm"', "G.channels returned Channel.name='r', dimension='mm'., expected Chan"),
+    "bare noise": ("(1e-4,)", "1e-4", "G.noise returned 0.0001, expected a sequence of standard deviations above zero"),
+    "no noise": ("(1e-4,)", "(0.0,)", r"G.noise returned \(0.0,\), expected a sequence of standard deviations above z"),
+    "not a number": ("ca.norm_2", "ca.sqrt(-1) * ca.norm_2", "the measurement m predicts no number .* the record 1 at"),
+    "no parameter": ('{"r"', 'values["x"] or {"r"', "G.outputs .*found no parameter .x., expected one of none"),
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    for variable in (plugin_files.CHOSEN, plugin_files.DISABLED):
+        monkeypatch.setenv(variable, "")
+    yield
+
+
+def ended(folder: Path, plugin: str, effects: str, measurement: str, free: str, *arguments: str) -> int:
+    """How ``armcal run`` ends on a planar arm with a plugin file."""
+    (folder / "mine.py").write_text(plugin, encoding="utf-8")
+    rows = "\n".join(f"{i},{10 * i - 20},{7 * i % 50},{5 * i},{500 + i},{i * i},3,600" for i in range(1, 9))
+    (folder / "data.csv").write_text(f"pose_id,q1_deg,q2_deg,q3_deg,x_mm,y_mm,z_mm,r_mm\n{rows}\n", encoding="utf-8")
+    (folder / "run.yaml").write_text(
+        f"""
+arms:
+  arm:
+    model: {{type: mdh, convention: standard, rows: [{{a_mm: 300, alpha_deg: 90}}, {{a_mm: 200}}, {{a_mm: 150}}]}}
+    effects: {effects}
+statics: {{gravity_m_s2: [0, 0, -9.81], payload_g: 100}}
+measurements: {{m: {measurement}}}
+data: {{type: csv, path: data.csv}}
+parameters: {{free: [{free}]}}
+""",
+        encoding="utf-8",
+    )
+    os.chdir(folder)
+    done = cli.main(["run", "run.yaml", "--plugin", "mine.py", *arguments], "armcal", standalone_mode=False)
+    assert isinstance(done, int)
+    return done
+
+
+@pytest.mark.parametrize("mistake", EFFECTS)
+def test_a_mistake_in_an_effect(mistake: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    right, wrong, sentence = EFFECTS[mistake]
+    assert right in EFFECT
+    code = EFFECT.replace(right, wrong, 1)
+    tip = "{type: tip_position, noise_mm: 0.1}"
+    assert ended(tmp_path, code, "{mine: {type: mine}}", tip, "arm.mine.s2", "--accept") == 2
+    _expect(capsys.readouterr().err, sentence, "" if sentence.startswith("derivative") else "mine.py")
+
+
+@pytest.mark.parametrize("mistake", GAUGES)
+def test_a_mistake_in_a_measurement(mistake: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    right, wrong, sentence = GAUGES[mistake]
+    assert right in GAUGE
+    assert ended(tmp_path, GAUGE.replace(right, wrong, 1), "{}", "{type: mine}", "arm.mdh.a2") == 2
+    _expect(capsys.readouterr().err, sentence, "" if sentence.startswith("the measurement") else "mine.py")
+
+
+def _expect(shown: str, sentence: str, file: str) -> None:
+    last = [line for line in shown.splitlines() if line.startswith("armcal: ")]
+    assert len(last) == 1 and "Traceback" not in shown
+    assert re.search(sentence, last[0]) and file in last[0], last[0]
+
+
+def _work(task: int) -> int:
+    from armcal.plugins import discover
+
+    effect = discover().find("effect", "mine").load()({}, ["q1", "q2"])
+    return int(effect.displacement(task, {"s2": 1}))
+
+
+def test_a_fault_is_placed_in_any_process(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(EFFECT, encoding="utf-8")
+    use_plugins(tmp_path / "mine.py")
+    for work in (lambda: Workers("threading", 2).map(_work, [1, 2]), lambda: [blaming(_work)(1)]):
+        with pytest.raises(PluginError, match=r"mine.py:\d+: E.displacement raised AttributeError: 'int' object"):
+            work()
+
+
+def test_armcals_own_faults_keep_their_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("armcal.run.prepare.check_reach", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        ended(tmp_path, EFFECT, "{mine: {type: mine}}", "{type: tip_position, noise_mm: 1}", "arm.mine.s2", "--accept")
