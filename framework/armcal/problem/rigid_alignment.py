@@ -8,7 +8,7 @@ Gauss-Newton steps whose weights fall with the distance [Huber1981], so that a f
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 
@@ -84,11 +84,11 @@ def alignments(tools: Tools, measured: Array, basis: Array, turned: Array | None
     few = np.arange(0, measured.shape[1], max(1, measured.shape[1] // _FEW))
     some, seen = tools.subset(few), measured[:, few]
     starts = [_started(some, seen, *start) for start in _starts(tools, measured, basis, turned)]
-    short = sorted((_led(some, seen, basis, start, _SHORT) for start in starts), key=lambda alignment: alignment.left)
+    short = sorted(_led(some, seen, basis, starts, _SHORT), key=lambda alignment: alignment.left)
     near, apart = _SAME * spread_of(measured), list[Alignment]()
     for start in short:
         if len(apart) < _KEPT and all(_between(tools, start, other) > near for other in apart):
-            alignment = _led(tools, measured, basis, start, _LONG)
+            (alignment,) = _led(tools, measured, basis, [start], _LONG)
             if all(_between(tools, alignment, other) > near for other in apart):
                 apart.append(alignment)
     return tuple(sorted(apart, key=lambda alignment: alignment.left))
@@ -98,9 +98,9 @@ def nearest(tools: Tools, measured: Array, basis: Array) -> Alignment:
     """The best of few quick alignments."""
     few = np.arange(0, measured.shape[1], max(1, measured.shape[1] // _FEW))
     some, seen = tools.subset(few), measured[:, few]
-    starts = islice(_starts(some, seen, basis, None), _QUICK)
-    led = [_led(some, seen, basis, _started(some, seen, *start), _SHORT) for start in starts]
-    return _led(tools, measured, basis, min(led, key=lambda one: one.left), _QUICK)
+    starts = [_started(some, seen, *start) for start in islice(_starts(some, seen, basis, None), _QUICK)]
+    best = min(_led(some, seen, basis, starts, _SHORT), key=lambda alignment: alignment.left)
+    return _led(tools, measured, basis, [best], _QUICK)[0]
 
 
 def _between(tools: Tools, one: Alignment, other: Alignment) -> float:
@@ -110,9 +110,9 @@ def _between(tools: Tools, one: Alignment, other: Alignment) -> float:
 
 def undetermined(tools: Tools, alignment: Alignment, basis: Array) -> tuple[str, ...]:
     """Combinations of base and target that such positions do not determine, in words."""
-    slopes, _ = _slopes(tools, alignment, basis)
-    size = spread_of(alignment.moved(tools))
-    slopes[:, :, :3] /= max(size, _SINGULAR)
+    shown = alignment.moved(tools)
+    slopes = _slopes(shown.T, alignment.turn @ tools.rotations @ basis)
+    slopes[:, :, :3] /= max(spread_of(shown), _SINGULAR)
     _, sizes, directions = np.linalg.svd(slopes.reshape(-1, slopes.shape[2]), full_matrices=False)
     words = [f"the base {how} {axis}" for how in ("about", "along") for axis in "xyz"]
     for column in basis.T:
@@ -167,36 +167,51 @@ def _started(tools: Tools, measured: Array, offset: Array, turn: Array | None) -
     return Alignment(turn, shift, offset, np.inf)
 
 
-def _led(tools: Tools, measured: Array, basis: Array, alignment: Alignment, steps: int) -> Alignment:
-    """An alignment after Gauss-Newton steps, to rest or so many; the base turns about the middle of the targets."""
-    size = max(spread_of(measured), _SINGULAR)
+def _led(tools: Tools, measured: Array, basis: Array, starts: Sequence[Alignment], steps: int) -> list[Alignment]:
+    """Each start after Gauss-Newton steps, to rest or so many; the base turns about the middle of the targets."""
+    size, seen, ways = max(spread_of(measured), _SINGULAR), measured.T, tools.rotations @ basis
+    turn, shift, offset = (np.array([getattr(s, name) for s in starts]) for name in ("turn", "shift", "offset"))
+    moving = np.arange(len(starts))
     for _ in range(steps):
-        slopes, shown = _slopes(tools, alignment, basis)
-        slopes[:, :, :3] /= size
-        off = (measured - shown).T
-        distance = np.sqrt(np.einsum("ni,ni->n", off, off))
-        root = np.repeat(1 / np.sqrt(np.maximum(distance, 1.5 * np.median(distance) + _SINGULAR)), 3)[:, None]
-        weighted = slopes.reshape(len(root), -1) * root
-        step = np.linalg.lstsq(weighted.T @ weighted, weighted.T @ (off.reshape(-1, 1) * root), rcond=_SINGULAR)[0][
-            :, 0
-        ]
-        turn, middle = Rotation.from_rotvec(step[:3] / size).as_matrix(), shown.mean(axis=1)
-        shift = turn @ (alignment.shift - middle) + middle + step[3:6]
-        alignment = Alignment(turn @ alignment.turn, shift, alignment.offset + basis @ step[6:], alignment.left)
-        if np.linalg.norm(step) < _AT_REST * size:
+        now, shown = turn[moving], _shown(tools, turn[moving], shift[moving], offset[moving])
+        slopes = _slopes(shown, now[:, None] @ ways)
+        slopes[..., :3] /= size
+        off = seen - shown
+        distance = np.sqrt(np.sum(off**2, axis=2))
+        root = 1 / np.sqrt(np.maximum(distance, 1.5 * np.median(distance, axis=1, keepdims=True) + _SINGULAR))
+        weighted = (slopes * root[..., None, None]).reshape(len(now), -1, slopes.shape[3])
+        gradient = weighted.transpose(0, 2, 1) @ (off * root[..., None]).reshape(len(now), -1, 1)
+        sizes, axes = np.linalg.eigh(weighted.transpose(0, 2, 1) @ weighted)
+        kept = np.where(sizes > _SINGULAR * sizes[:, -1:], sizes, np.inf)
+        step = (axes @ (axes.transpose(0, 2, 1) @ gradient / kept[..., None]))[..., 0]
+        further, middle = Rotation.from_rotvec(step[:, :3] / size).as_matrix(), shown.mean(axis=1)
+        shift[moving] = (further @ (shift[moving] - middle)[..., None])[..., 0] + middle + step[:, 3:6]
+        turn[moving], offset[moving] = further @ now, offset[moving] + step[:, 6:] @ basis.T
+        moving = moving[np.linalg.norm(step, axis=1) >= _AT_REST * size]
+        if not len(moving):
             break
-    left = float(np.median(np.linalg.norm(measured - alignment.moved(tools), axis=0)))
-    return Alignment(alignment.turn, alignment.shift, alignment.offset, left)
+    left = np.median(np.linalg.norm(seen - _shown(tools, turn, shift, offset), axis=2), axis=1)
+    return [Alignment(t, s, o, float(own)) for t, s, o, own in zip(turn, shift, offset, left, strict=True)]
 
 
-def _slopes(tools: Tools, alignment: Alignment, basis: Array) -> tuple[Array, Array]:
-    """How targets move (N x 3 x 6+k) by a turn about their middle, a shift and the offset; and where they are."""
-    shown = alignment.moved(tools)
-    arm = (shown - shown.mean(axis=1, keepdims=True)).T
-    slopes = np.zeros((len(arm), 3, 6 + basis.shape[1]))
+def _shown(tools: Tools, turns: Array, shifts: Array, offsets: Array) -> Array:
+    """Where targets are by k alignments, in the instrument's frame (k x N x 3, m)."""
+    places = tools.places.T + (tools.rotations @ offsets[:, None, :, None])[..., 0]
+    return np.asarray(places @ turns.transpose(0, 2, 1) + shifts[:, None])
+
+
+def _slopes(shown: Array, along: Array) -> Array:
+    """How targets move (... x N x 3 x 6+n) by a turn about their middle, a shift, and along directions of the offset.
+
+    Args:
+        shown: where they are (... x N x 3, m).
+        along: those directions in the instrument's frame (... x N x 3 x n).
+    """
+    arm = shown - shown.mean(axis=-2, keepdims=True)
+    slopes = np.zeros((*shown.shape, 6 + along.shape[-1]))
     for axis in range(3):
         after, last = (axis + 1) % 3, (axis + 2) % 3
-        slopes[:, after, axis], slopes[:, last, axis] = -arm[:, last], arm[:, after]
-    slopes[:, :, 3:6] = np.eye(3)
-    slopes[:, :, 6:] = alignment.turn @ tools.rotations @ basis
-    return slopes, shown
+        slopes[..., after, axis], slopes[..., last, axis] = -arm[..., last], arm[..., after]
+    slopes[..., 3:6] = np.eye(3)
+    slopes[..., 6:] = along
+    return slopes
