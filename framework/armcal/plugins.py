@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import difflib
+import sys
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from importlib import import_module
 from importlib.metadata import Distribution, EntryPoint, entry_points
+from pathlib import Path
 from typing import Any
 
 import pluggy
@@ -17,7 +19,7 @@ from armcal import plugin_files
 from armcal.errors import Location, PluginError
 from armcal.extras import extra_of, missing_library
 from armcal.hook_trace import Answer, HookTrace
-from armcal.registration import new_manager, registered, said
+from armcal.registration import Loaded, registered, said
 
 
 @dataclass(frozen=True)
@@ -170,11 +172,12 @@ def discover(points: Iterable[EntryPoint] | None = None) -> PluginRegistry:
         PluginError: a plugin's file is not there, does not load or registers nothing, or has another plugin's name; or
             a plugin that is to be left out is not there.
     """
-    trace, manager, alone = HookTrace.from_environment(), new_manager(), new_manager()
-    trace.watch(alone)
+    trace = HookTrace.from_environment()
+    chosen = _chosen(_installed(tuple(map(_state, sys.path))) if points is None else points)
+    ask = registered if trace.active else _registered_before  # calls that are traced are made
+    manager, outcomes = ask(tuple(map(Loaded.of, chosen)), trace)
     plugins, components = [], []
-    for point in _chosen(entry_points(group=plugin_files.GROUP) if points is None else points):
-        outcome = registered(manager, alone, point)
+    for point, outcome in zip(chosen, outcomes, strict=True):
         if isinstance(point, plugin_files.FilePoint) and (outcome.fault or not outcome.works):
             text = outcome.fault or "it registers nothing: write a function armcal_register_... after @hookimpl."
             raise PluginError(text, where=None if str(point.file) in text else Location(str(point.file)))
@@ -186,6 +189,24 @@ def discover(points: Iterable[EntryPoint] | None = None) -> PluginRegistry:
             for announcement in outcome.announced
         ]
     return PluginRegistry(tuple(plugins), tuple(components), manager, trace)
+
+
+_registered_before = lru_cache(maxsize=8)(registered)
+"""Of the same modules: a command, its experiment and its calibration each look for plugins."""
+
+
+def _state(folder: str) -> tuple[str, int]:
+    """A place where modules are found, and when anything was last put into it or taken out (ns)."""
+    try:
+        return folder, Path(folder).stat().st_mtime_ns
+    except OSError:
+        return folder, 0
+
+
+@lru_cache(maxsize=8)
+def _installed(path: tuple[tuple[str, int], ...]) -> tuple[EntryPoint, ...]:
+    """The entry points of all that is installed there, whose files are read once."""
+    return tuple(entry_points(group=plugin_files.GROUP))
 
 
 def _chosen(installed: Iterable[EntryPoint]) -> list[EntryPoint]:

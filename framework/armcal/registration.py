@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint
-from typing import Any
+from typing import Any, Self
 
 import pluggy
 
 from armcal import hooks
 from armcal.errors import ArmcalError
+from armcal.hook_trace import HookTrace
 
 
 @dataclass(frozen=True)
@@ -44,27 +45,53 @@ def new_manager() -> pluggy.PluginManager:
     return manager
 
 
-def registered(manager: pluggy.PluginManager, alone: pluggy.PluginManager, point: EntryPoint) -> Registration:
-    """Register one plugin; one that fails in any way is left out, and says why.
+@dataclass(frozen=True)
+class Loaded:
+    """What an entry point names, equal to another if it is the very same object under the same name.
 
-    Args:
-        manager: of all plugins.
-        alone: a manager without plugins, in which this one is asked alone. It is empty again afterwards.
-        point: names the plugin.
+    Attributes:
+        name: of the plugin, with what its entry point names.
+        module: None where ``fault`` says why it does not load.
     """
-    name = f"{point.name} ({point.value})"
+
+    name: str
+    identity: int
+    fault: str
+    module: Any = field(compare=False)
+
+    @classmethod
+    def of(cls, point: EntryPoint) -> Self:
+        """A plugin may fail to load in any way."""
+        name = f"{point.name} ({point.value})"
+        try:
+            module = point.load()
+        except (Exception, SystemExit) as fault:  # whatever a third party's module does, the others must work
+            return cls(name, 0, said(fault), None)
+        return cls(name, id(module), "", module)
+
+
+def registered(plugins: tuple[Loaded, ...], trace: HookTrace) -> tuple[pluggy.PluginManager, tuple[Registration, ...]]:
+    """A manager of all plugins, and what became of each; one that fails in any way is left out, and says why."""
+    manager, alone = new_manager(), new_manager()
+    trace.watch(alone)
+    return manager, tuple(_registered(manager, alone, plugin) for plugin in plugins)
+
+
+def _registered(manager: pluggy.PluginManager, alone: pluggy.PluginManager, plugin: Loaded) -> Registration:
+    """One is asked ``alone``, in a manager that is empty before and afterwards."""
+    if plugin.fault:
+        return Registration(plugin.fault)
     try:
-        module = point.load()
-        alone.register(module, name)
+        alone.register(plugin.module, plugin.name)
         alone.check_pending()
-        _require_marks(module)
-        announced, works = _announced(alone), bool(alone.get_hookcallers(module))
-        manager.register(module, name)
+        _require_marks(plugin.module)
+        announced, works = _announced(alone), bool(alone.get_hookcallers(plugin.module))
+        manager.register(plugin.module, plugin.name)
     except (Exception, SystemExit) as fault:  # whatever a third party's module does, the others must work
         return Registration(said(fault))
     finally:
-        if alone.has_plugin(name):
-            alone.unregister(name=name)
+        if alone.has_plugin(plugin.name):
+            alone.unregister(name=plugin.name)
     return Registration("", announced, works)
 
 
