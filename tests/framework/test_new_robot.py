@@ -197,7 +197,7 @@ def test_names_stay_text_in_yaml(name: str) -> None:
     assert yaml.safe_load(f"[{word(name)}]") == [name]
 
 
-@pytest.mark.parametrize("name", ["on", "no"])
+@pytest.mark.parametrize("name", ["on", pytest.param("no", marks=pytest.mark.slow)])
 def test_a_robots_files_can_be_used_whatever_it_is_called(name: str, here: Path) -> None:
     done = new_robot(
         name,

@@ -149,8 +149,9 @@ def test_late_joints_of_an_arm_that_moved_are_named_with_their_delay(lrm, late_s
     assert first.effect.startswith("delay on all joints") and "synchronise the clocks" in first.effect
 
 
-def test_joints_that_moved_and_are_not_late_are_not_said_to_be(lrm):
-    kinds = [s.kind for seed in range(20, 26) for s in looked_at(*moving(lrm, 0.0, seed)).structures]
+@pytest.mark.parametrize("seeds", [(20, 21), pytest.param((22, 23, 24, 25), marks=pytest.mark.slow)])
+def test_joints_that_moved_and_are_not_late_are_not_said_to_be(lrm, seeds):
+    kinds = [s.kind for seed in seeds for s in looked_at(*moving(lrm, 0.0, seed)).structures]
     assert "delay" not in kinds
 
 

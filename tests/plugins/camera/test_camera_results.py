@@ -7,8 +7,6 @@ import csv
 import json
 import shlex
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -20,8 +18,10 @@ import yaml
 from armcal.api import Run
 from armcal.base.arrays import Array
 from armcal.calibration.exporter import request_of
+from armcal.cli.main import cli
 from armcal.errors import ConfigError
 from armcal_camera.export import FramesSettings, HandEyeExporter
+from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -40,8 +40,7 @@ def calibration(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def exported(calibration: Path, kind: str, out: Path, *options: str) -> None:
-    command = [sys.executable, "-m", "armcal.cli", "export", str(calibration), "--format", kind, "--out", str(out)]
-    subprocess.run([*command, *options], check=True, capture_output=True, timeout=120)
+    armcal_says("export", str(calibration), "--format", kind, "--out", str(out), *options)
 
 
 def numbers(calibration: Path) -> dict[str, float]:
@@ -254,8 +253,9 @@ def test_commands_that_go_on_from_a_camera_take_its_records(calibration: Path, t
 
 
 def armcal_says(*arguments: str) -> str:
-    command = [sys.executable, "-m", "armcal.cli", *arguments]
-    return subprocess.run(command, check=True, capture_output=True, text=True, timeout=200).stdout
+    done = CliRunner().invoke(cli, list(arguments))
+    assert done.exit_code == 0, done.output
+    return done.stdout
 
 
 def test_what_a_record_lacks_is_empty_in_the_residuals(tmp_path: Path) -> None:

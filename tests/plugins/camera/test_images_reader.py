@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -38,19 +39,26 @@ class Camera:
     boards: tuple[Board, ...] = (BOARD,)
 
 
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+@pytest.fixture(autouse=True, name="cache")
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("ARMCAL_CACHE_DIR", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
 
+@cache
+def image(i: int) -> bytes:
+    """Of the board, as a PNG."""
+    shown = render([(BOARD, facing(BOARD, TURNS[i]))], LENS, SIZE, Exposure())
+    return bytes(cv2.imencode(".png", shown)[1])
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Images 1.png to 5.png, and a file of joint angles beside them."""
+    """Images 8.png to 12.png, and a file of joint angles beside them."""
     place = tmp_path / "images"
     place.mkdir()
-    for i, turn in enumerate(TURNS):
-        cv2.imwrite(str(place / f"{i + 8}.png"), render([(BOARD, facing(BOARD, turn))], LENS, SIZE, Exposure()))
+    for i in range(COUNT):
+        (place / f"{i + 8}.png").write_bytes(image(i))
     rows = "".join(f"{10 * i},{5 - i},{20 + i}\n" for i in range(COUNT))
     (place / "poses.csv").write_text(f"q1_deg,q2_deg,temperature_C\n{rows}")
     return place
@@ -238,10 +246,9 @@ def test_a_file_of_corners_is_refused_with_its_line(tmp_path: Path, text: str, m
 POSES = [Rotation.from_euler("ZYX", (0.3 * i, -0.2, 3.0 + 0.1 * i)) for i in range(COUNT)]
 
 
-@pytest.mark.quick("quaternion", "three rows", "four lines")
 @pytest.mark.parametrize("form", ["matrix", "three rows", "four lines", "quaternion", "euler"])
-def test_flange_poses_become_coordinates(folder: Path, form: str) -> None:
-    path, settings = folder / "flange.txt", None
+def test_flange_poses_become_coordinates(tmp_path: Path, form: str) -> None:
+    path, settings = tmp_path / "flange.txt", None
     matrices = [np.hstack([turn.as_matrix(), [[0.1 * i], [0.2], [0.5]]]) for i, turn in enumerate(POSES)]
     if form in ("matrix", "three rows"):
         rows = [[*m.ravel(), *([0, 0, 0, 1] if form == "matrix" else [])] for m in matrices]
@@ -260,7 +267,9 @@ def test_flange_poses_become_coordinates(folder: Path, form: str) -> None:
         euler = {"columns": ["a", "b", "c"], "order": "XYZ", "unit": "deg"}
         settings = {"type": "pose_csv", "path": str(path), "euler": euler}
     path.write_text(text)
-    dataset = read(request_of(FLANGE), folder=folder, poses=settings or path)
+    corners = tmp_path / "corners.csv"
+    corners.write_text(corners_text({f"{i}.png": truth(i) for i in range(COUNT)}, (BOARD,)))
+    dataset = read(request_of(FLANGE), corners=corners, poses=settings or path)
     values = {name: dataset.column(f"arm.{name}") for name in FLANGE}
     np.testing.assert_allclose(values["x"], 0.1 * np.arange(COUNT), atol=1e-9)
     turns = Rotation.from_euler("ZYX", np.stack([values["rz"], values["ry"], values["rx"]], axis=1))
