@@ -76,9 +76,10 @@ class CsvReader:
                     refuse(path, "it is empty.", "Give a header and one line a record.")
                 rows = _rows(_text_lines(file, path, digest), path, s.delimiter)
                 line, cells = next(rows, (1, []))
+                header = header_of(cells, source, line, request.layout_hint)
                 if len(cells) == 1:
-                    _refuse_delimiter(header_of(cells, source, line), s.delimiter, rows)
-                header = renamed(header_of(cells, source, line), s.columns)
+                    _refuse_delimiter(header, s.delimiter, rows)
+                header = renamed(header, s.columns)
                 plan = match_columns(header, request.channels)
                 if may_be_cut(_end(file)) and any(c is header.columns[-1] for c, _ in plan.channels.values()):
                     rows = whole_rows(rows, path, header.columns[-1].name)
@@ -147,9 +148,9 @@ def _refuse_delimiter(header: Header, delimiter: str, rows: Iterator[tuple[int, 
     written = other.replace("\t", "\\t")
     mend = f'Set delimiter: "{written}" in the data section'
     if comma is None:
-        header.refuse(f"{text}.", f"{mend}.")
+        header.refuse_layout(f"{text}.", f"{mend}.")
     text = f"{text}, and numbers with a decimal comma ({comma})."
-    header.refuse(text, f'{mend}, and decimal: ",".')
+    header.refuse_layout(text, f'{mend}, and decimal: ",".')
 
 
 def _load(rows: Iterator[tuple[int, list[str]]], header: Header, plan: Plan, has_commas: bool) -> Dataset:
@@ -201,7 +202,7 @@ def _number(cell: str, line: int, column: Column, header: Header, has_commas: bo
         number = CellFault(f"found {cell!r}, expected a decimal comma.", 'Write 12,5, or leave decimal: "," out.')
     if isinstance(number, CellFault):
         where = Location(header.source, line=line, field=column.name)
-        is_comma = not has_commas and DECIMAL_COMMA.fullmatch(cell)
+        is_comma = not (has_commas or header.layout_hint) and DECIMAL_COMMA.fullmatch(cell)
         other = ' Or set decimal: "," in the data section, if all numbers of the file have one.' if is_comma else ""
         raise DataError(number.text, where=where, hint=number.hint + other)
     return number

@@ -296,6 +296,24 @@ def test_decimal_commas_with_the_right_delimiter(tmp_path: Path) -> None:
         np.testing.assert_array_equal(with_commas.column(name), column)
 
 
+@pytest.mark.parametrize("name", ["missing column", "semicolons", "decimal comma", "unknown name"])
+def test_where_no_configuration_describes_the_file_the_caller_says_what_to_do(tmp_path: Path, name: str) -> None:
+    content = {
+        "missing column": table(header=HEADER.replace("x_mm", "X_mm")),
+        "semicolons": table().replace(",", ";"),
+        "decimal comma": table(row(1, x_mm='"12,5"')),
+        "unknown name": table(),
+    }[name]
+    path = tmp_path / "poses.csv"
+    path.write_text(content)
+    reader = CsvReader(CsvSettings(path=path, columns={"x_mm": "nowhere"} if name == "unknown name" else {}))
+    with pytest.raises(DataError) as caught:
+        reader.read(ReadRequest({}, {}, wanted(), layout_hint="Name columns by --columns."))
+    hint = caught.value.hint
+    assert "data section" not in hint and "configuration" not in hint
+    assert hint == ("Write decimal points: 12.5." if name == "decimal comma" else "Name columns by --columns.")
+
+
 def test_points_among_decimal_commas_are_refused(tmp_path: Path) -> None:
     text = table().replace(",", ";").replace("10.0", "1.250,5", 1)
     message = refusal(tmp_path, text, delimiter=";", decimal=",")

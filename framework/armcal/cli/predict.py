@@ -26,6 +26,7 @@ from armcal.run.compensate import short_texts
 
 _MOST_BYTES, _LONGEST_HEADER = 1 << 31, 1 << 20
 _MOST_NAMED = 8
+_LAYOUT = "Say what the file calls a column by --columns NAME=COLUMN, with commas between columns and decimal points."
 _RECORDINGS: Mapping[str, Literal["same", "new"]] = {"calibrated": "same", "new": "new"}
 
 
@@ -141,7 +142,7 @@ def read_commands(registry: PluginRegistry, loaded: Calibration, poses: Path, co
             )
         named[name] = own
     reader = reader_class(reader_class.Settings(path=ConfigText(str(poses)), columns=named))
-    return noticed(reader.read(ReadRequest(arms, {}, requested)))
+    return noticed(reader.read(ReadRequest(arms, {}, requested, layout_hint=_LAYOUT)))
 
 
 def _known_columns(loaded: Calibration, poses: Path, requested: Sequence[RequestedChannel]) -> dict[str, str]:

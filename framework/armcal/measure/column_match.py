@@ -28,15 +28,23 @@ class Column:
 
 @dataclass(frozen=True)
 class Header:
-    """The columns of a source, and the line that names them (none where every record names its own)."""
+    """The columns of a source, and the line that names them (none where every record names its own).
+
+    ``layout_hint`` is that of the request.
+    """
 
     source: str
     line: int | None
     columns: tuple[Column, ...]
+    layout_hint: str = ""
 
     def refuse(self, message: str, hint: str, column: str | None = None) -> NoReturn:
         """Raise a DataError at this place, perhaps at one column."""
         raise DataError(message, where=Location(self.source, line=self.line, field=column), hint=hint)
+
+    def refuse_layout(self, message: str, hint: str, column: str | None = None) -> NoReturn:
+        """The same, where ``hint`` names settings of the data section: the caller's hint if there is none."""
+        self.refuse(message, self.layout_hint or hint, column)
 
 
 @dataclass(frozen=True)
@@ -48,14 +56,14 @@ class Plan:
     extra: tuple[Column, ...]
 
 
-def header_of(cells: Sequence[str], source: str, line: int | None) -> Header:
+def header_of(cells: Sequence[str], source: str, line: int | None, layout_hint: str = "") -> Header:
     """A header from its cells.
 
     Raises:
         DataError: it has no names, too many, a nameless column, or numbers for names.
     """
     names = [cell.strip() for cell in cells]
-    header = Header(source, line, tuple(Column(i, name, name) for i, name in enumerate(names)))
+    header = Header(source, line, tuple(Column(i, name, name) for i, name in enumerate(names)), layout_hint)
     if not names:
         header.refuse("it is empty.", "Give a header and one line a record.")
     if len(names) > MAX_COLUMNS:
@@ -81,7 +89,7 @@ def renamed(header: Header, columns: Mapping[str, str]) -> Header:
     by_column = {own: name for name, own in columns.items()}
     for name, own in columns.items():
         if own not in names:
-            header.refuse(
+            header.refuse_layout(
                 f"found no column {own!r}, expected it for {name}{_nearest([own], names)}.",
                 "Correct it under columns in the data section.",
                 own,
@@ -138,7 +146,7 @@ def match_columns(header: Header, requested_channels: Sequence[RequestedChannel]
     if vain is not None:
         names = [name for w in requested_channels if w.channel not in channels for name in spellings(w)]
         hint = f"Correct {vain.known_as} under columns in the data section{_nearest([vain.known_as], names)}."
-        header.refuse(f"{vain.name} is mapped to {vain.known_as}, which nothing here uses.", hint, vain.name)
+        header.refuse_layout(f"{vain.name} is mapped to {vain.known_as}, which nothing here uses.", hint, vain.name)
     return Plan(channels, record_id, extra)
 
 
@@ -166,7 +174,7 @@ def _refuse_unit(header: Header, w: RequestedChannel, unused: Mapping[str, Colum
 def refuse_missing(header: Header, w: RequestedChannel, unused: Sequence[str]) -> NoReturn:
     """Raise a DataError: no column is this channel's; ``unused`` names come near it, perhaps."""
     written = " or ".join(spellings(replace(w, columns=(min(w.columns, key=len),))))
-    header.refuse(
+    header.refuse_layout(
         f"found no column for {w.what}, expected {written}{_nearest(written.split(' or '), unused)}.",
         f"Add it, or say which column it is: columns: {{{written.split(' or ')[0]}: NAME}} in the configuration.",
         written,

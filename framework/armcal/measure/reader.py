@@ -56,13 +56,16 @@ class RequestedChannel:
 class ReadRequest:
     """What a reader is asked for: channels, for these arms and measurements (by instance name).
 
-    A reader that takes long calls ``report`` with the fraction of its work that is done.
+    A reader that takes long calls ``report`` with the fraction of its work that is done. Where no configuration
+    describes the file, ``layout_hint`` says what a user does about its columns and signs (a sentence); else the reader
+    names settings of the data section.
     """
 
     arms: Mapping[str, Arm]
     measurements: Mapping[str, Measurement]
     channels: tuple[RequestedChannel, ...]
     report: Report = unreported
+    layout_hint: str = ""
 
 
 class Reader(Protocol):

@@ -108,13 +108,7 @@ def _read(path: Path, expression: ToolExpression, registry: PluginRegistry) -> D
         channels.append(RequestedChannel(f"{expression.name}.{APPROACH}{joint}", names, DIMENSIONLESS, False))
     reader_class = registry.find("reader", "csv").load()
     reader = reader_class(reader_class.Settings(path=ConfigText(str(path))))
-    try:
-        dataset = noticed(reader.read(ReadRequest({}, {}, tuple(channels))))
-    except DataError as fault:
-        # Measured data are described in a configuration; targets are not.
-        described = "data section" in fault.hint or "in the configuration" in fault.hint
-        hint = _AS_DOCUMENTED if described else fault.hint
-        raise DataError(fault.message, where=fault.where, hint=hint) from fault
+    dataset = noticed(reader.read(ReadRequest({}, {}, tuple(channels), layout_hint=_AS_DOCUMENTED)))
     units = {name: split_suffix(name) for name in dataset.extra if not any(name in w for w in dataset.warnings)}
     # Commands that stand in the file already give way to those that are found.
     idle = [name for name, split in units.items() if split is not None and split[0] not in expression.joints]
