@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 import pytest
 from armcal.base.domains import Interval
 from armcal.base.parameters import ParameterBlock, Parameters
+from armcal.errors import ProblemError
 from armcal.planning.candidates import Candidates, deviations, parameter_draws, whitened_rows
 from armcal.planning.criterion import GOALS, criterion
 from armcal.planning.planning import built_up, choose, detmax, in_order, value_of
@@ -167,6 +169,15 @@ def test_a_plan_built_up_is_a_local_optimum() -> None:
     value = by_hand(candidates, "D", chosen)
     others = set(range(20)) - set(chosen.tolist())
     assert all(by_hand(candidates, "D", [*set(chosen) - {o}, i]) <= value + 1e-9 for o in chosen for i in others)
+
+
+def test_information_that_is_not_finite_is_refused_in_a_sentence() -> None:
+    whole = made()
+    for place in ("base", "rows"):
+        spoiled = getattr(whole, place).copy()
+        spoiled.flat[7] = np.nan
+        with pytest.raises(ProblemError, match="is not finite at the values they are planned for"):
+            replace(whole, **{place: spoiled})
 
 
 def test_deviations_are_those_of_the_inverse_and_infinite_where_nothing_is_known() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
+from armcal.errors import ProblemError
 from armcal.problem.many_points import as_seen
 from armcal.problem.problem import Problem, triangular
 from armcal.problem.projection import as_predicted
@@ -34,6 +35,12 @@ class Candidates:
 
     base: Array
     rows: Array
+
+    def __post_init__(self) -> None:
+        """Raises ProblemError: not all of it is finite."""
+        if not np.isfinite(self.base.sum() + self.rows.sum()):
+            text = "what the poses would add to the parameters is not finite at the values they are planned for."
+            raise ProblemError(text, hint="Check these values: plan about a calibration that converged, or without.")
 
     @property
     def draws(self) -> int:

@@ -41,7 +41,7 @@ def suggest(
 
     Candidates combine recorded levels of each joint (``joints`` names their channels and dimensions), or lie between
     its recorded ends where there are many; load and gravity are those of the middle record. Clearance is not
-    considered.
+    considered. There are none where the estimate is not finite; poses at which it gives nothing finite are left out.
     """
     poses = _candidates(dataset, tuple(joints), seed)
     base = estimate.square_root_information * estimate.parameters.scales()
@@ -49,6 +49,10 @@ def suggest(
     if any(kernel.points is not None for kernel in problem.kernels):
         scale = _as_these(problem, dataset, estimate, base)
     rows = whitened_rows(problem, estimate.values, poses) / scale
+    usable = np.flatnonzero(np.isfinite(rows).all(axis=(0, 2)))
+    if not (np.isfinite(base).all() and len(usable)):
+        return ()
+    rows, poses = rows[:, usable], poses.subset(usable)
     candidates = Candidates(base[None], rows[None])
     chosen = built_up(Task(candidates, criterion("D"), min(count, len(poses))))
     before = deviations(base)
