@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
-from armcal.arm.assembly import Arm
+from armcal.arm.assembly import Arm, only_arm
 from armcal.base.settings import InputPath, Settings
 from armcal.config.system import build_component
 from armcal.config.validate import validate
@@ -76,12 +76,8 @@ class Bench:
         Raises:
             ConfigError: there are several.
         """
-        arms = list(self.experiment.system.arms.values())
-        if len(arms) != 1:
-            text = f"found {len(arms)} arms, expected one: a bench moves a single arm."
-            hint = "Configure each arm's bench on its own."
-            raise ConfigError(text, where=self.experiment.source.where(("arms",)), hint=hint)
-        return arms[0]
+        where, hint = self.experiment.source.where(("arms",)), "Configure each arm's bench on its own."
+        return only_arm(self.experiment.system.arms, "a bench moves a single arm", hint, where)
 
     @contextmanager
     def clock(self) -> Iterator[Clock]:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from armcal.arm.assembly import Arm
+from armcal.arm.assembly import Arm, only_arm
 from armcal.arm.clearance import ClearanceCheck
 from armcal.arm.joints import by_dimension, joint_limits, unknown_joint
 from armcal.base.arrays import Array, Mask
@@ -118,7 +118,7 @@ def of_calibration(calibration: Calibration, rules: ConfigSource | None, name: s
     Raises:
         ConfigError: there are several arms, no limits, or the clearance is refused.
     """
-    arm = only_arm(calibration.system, name)
+    arm = examined_arm(calibration.system, name)
     nominal = calibration.parameters.with_nominal(np.array([e.nominal for e in calibration.record.parameters]))
     plain = arm_expression(arm, nominal, calibration.system.environment)
     limits, check = _rules(arm, calibration.system, rules, name)
@@ -135,7 +135,7 @@ def of_config(
         PluginError: a component is missing or broken.
     """
     system = build_system(source, registry)
-    arm = only_arm(system, name)
+    arm = examined_arm(system, name)
     parameters = system.parameters()
     if corrections is not None:
         parameters = corrections.applied(parameters)
@@ -143,19 +143,14 @@ def of_config(
     return Subject(name, arm, arm_expression(arm, parameters, system.environment), None, limits, check)
 
 
-def only_arm(system: System, name: str) -> Arm:
+def examined_arm(system: System, name: str) -> Arm:
     """The arm of a system that has one.
 
     Raises:
         ConfigError: it has several; ``name`` is of its file.
     """
-    if len(system.arms) != 1:
-        raise ConfigError(
-            f"found {len(system.arms)} arms ({', '.join(system.arms)}), expected one.",
-            where=Location(name),
-            hint="Describe the arm to be examined alone.",
-        )
-    return next(iter(system.arms.values()))
+    hint = "Describe the arm to be examined alone."
+    return only_arm(system.arms, "a single arm is examined", hint, Location(name))
 
 
 def _rules(arm: Arm, system: System, source: ConfigSource | None, name: str) -> tuple[Array, ClearanceCheck | None]:

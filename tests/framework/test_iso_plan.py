@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from armcal.arm.assembly import only_arm
 from armcal.cli.main import cli
+from armcal.errors import ConfigError
 from armcal.run.iso_cube.placement import corners_about, points_about
 from click.testing import CliRunner, Result
 from scipy.spatial.transform import Rotation
@@ -59,6 +61,12 @@ def planned(config: Path) -> tuple[dict, list[dict[str, str]]]:
     done = armcal("plan", config, "--iso-cube", 250, "--cycles", 3, "--out", out, "--json")
     assert done.exit_code == 0, done.output
     return json.loads(done.stdout), table_of(out)
+
+
+def test_the_one_arm_of_a_system_or_a_sentence() -> None:
+    assert only_arm({"left": 1}, "", "") == 1  # type: ignore[dict-item,comparison-overlap]
+    with pytest.raises(ConfigError, match=r"found 2 arms \(left, right\), expected one: a bench moves a single arm\. "):
+        only_arm({"left": 1, "right": 2}, "a bench moves a single arm", "Configure each alone.")  # type: ignore[dict-item]
 
 
 def test_the_poses_are_on_the_diagonals_a_tenth_of_their_length_from_the_corners() -> None:

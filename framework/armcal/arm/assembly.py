@@ -20,7 +20,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock, declared, scalar
 from armcal.base.poses import pose_transform
 from armcal.base.se3 import Expression, Transform, column
-from armcal.errors import DataError
+from armcal.errors import ConfigError, DataError, Location
 from armcal.plugin_faults import refuse
 
 PLACEMENT = "placement"
@@ -306,3 +306,16 @@ class LocalValues(dict[str, Expression]):
 def scoped(values: Mapping[str, Expression], scope: str) -> LocalValues:
     """The values below a scope, under their local names."""
     return LocalValues({name.removeprefix(scope): value for name, value in values.items() if name.startswith(scope)})
+
+
+def only_arm(arms: Mapping[str, Arm], purpose: str, hint: str, where: Location | None = None) -> Arm:
+    """The arm of a system that has one; ``purpose`` says why one is expected.
+
+    Raises:
+        ConfigError: there are several.
+    """
+    if len(arms) != 1:
+        raise ConfigError(
+            f"found {len(arms)} arms ({', '.join(arms)}), expected one: {purpose}.", where=where, hint=hint
+        )
+    return next(iter(arms.values()))

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Self, TypeAlias
 import numpy as np
 from pydantic import Field, model_validator
 
-from armcal.arm.assembly import Arm
+from armcal.arm.assembly import Arm, only_arm
 from armcal.arm.clearance import (
     EVERYTHING,
     Box,
@@ -123,13 +123,7 @@ def clearance_check(settings: ClearanceSettings, arms: Mapping[str, Arm], source
         DataError: a mesh cannot be read.
         PluginError: a mesh is asked for and its library is not there.
     """
-    if len(arms) != 1:
-        raise ConfigError(
-            f"found {len(arms)} arms, expected one: clearance is checked for a single arm.",
-            where=source.where(_AT),
-            hint="Leave the clearance out.",
-        )
-    arm = next(iter(arms.values()))
+    arm = only_arm(arms, "clearance is checked for a single arm", "Leave the clearance out.", source.where(_AT))
     frames = joints_of_frames(arm)
     parts = {
         name: tuple(_shape(shape, frames, source, ("parts", name, index)) for index, shape in enumerate(shapes))

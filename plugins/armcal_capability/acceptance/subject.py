@@ -15,7 +15,7 @@ from armcal.measure.measurement import Measurement
 from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment, with_data
 
-from armcal_capability.subject import only_arm
+from armcal_capability.subject import examined_arm
 
 CSV = {"type": "csv"}
 
@@ -89,7 +89,7 @@ def _files(path: Path, source: ConfigSource) -> tuple[Path, ...]:
 
 def _judged(system: System, path: Path) -> System:
     """With the measurement that reads positions of a target on the only arm."""
-    only_arm(system, str(path))
+    examined_arm(system, str(path))
     chosen = {name: m for name, m in system.measurements.items() if {c.name for c in m.channels()}.issuperset("xyz")}
     if not chosen:
         raise ConfigError(

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Annotated, Literal, Self, TypeVar
 
-from armcal.arm.assembly import Arm
+from armcal.arm.assembly import Arm, only_arm
 from armcal.arm.joints import unknown_joint
 from armcal.arm.loading import holding_function
 from armcal.base.poses import PoseSettings
@@ -111,10 +111,10 @@ def tracked_arm(settings: BenchTruthSettings, experiment: Experiment) -> Tracked
     Raises:
         ConfigError: there are several arms or measurements, or the truth is refused.
     """
-    arms, measurements = experiment.system.arms, experiment.system.measurements
-    if len(arms) != 1:
-        raise ConfigError(f"found {len(arms)} arms, expected one: a servo bench moves a single arm.")
-    arm = without_effects(next(iter(arms.values())), settings.without_effects)
+    measurements, hint = experiment.system.measurements, "Configure each arm's bench on its own."
+    arm = without_effects(
+        only_arm(experiment.system.arms, "a servo bench moves a single arm", hint), settings.without_effects
+    )
     if sliding := [joint for joint, dimension in arm.commanded.items() if dimension != "angle"]:
         raise ConfigError(f"the joint {sliding[0]} slides, expected joints that turn: servos do.")
     name = settings.measurement or next(iter(measurements))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from armcal.arm.assembly import only_arm
 from armcal.arm.joints import joint_limits
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
@@ -13,7 +14,6 @@ from armcal.base.units import display_unit, to_unit
 from armcal.calibration.compensation.compensator import Compensator
 from armcal.calibration.compensation.request import Options
 from armcal.calibration.tool_expression import arm_expression
-from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment
 from armcal.run.iso_cube.placement import DIRECTED, NAMES, Cube, Placed, placed
 from armcal.run.plan_approaches import approach_channels
@@ -128,11 +128,9 @@ def make_iso_plan(
         ConfigError: there are several arms, or joints without limits.
         ProblemError: no cube fits.
     """
-    arms = experiment.system.arms
-    if len(arms) != 1:
-        text = f"found {len(arms)} arms ({', '.join(arms)}), expected one."
-        raise ConfigError(text, hint="Describe the arm that is to be tested alone.")
-    arm, space = next(iter(arms.values())), JointSpace.of(experiment)
+    hint = "Describe the arm that is to be tested alone."
+    arm = only_arm(experiment.system.arms, "the test is of a single arm", hint)
+    space = JointSpace.of(experiment)
     settings = experiment.settings.plan or PlanSettings()
     # Of each joint, stated or the model's own; ``spread`` refuses a joint without.
     own, stated, check = joint_limits(arm.nominal_chain), space.limits(settings), clearance_of(experiment)
