@@ -11,7 +11,7 @@ from armcal.arm.effects import JOINT_RATE
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.quaternions import nearest_rotation
-from armcal.base.units import DIMENSIONLESS
+from armcal.base.units import DIMENSIONLESS, split_suffix
 from armcal.errors import DataError
 from armcal.io.cells import is_number
 from armcal.io.cut_file import may_be_cut, whole_rows
@@ -35,6 +35,8 @@ _FORMS = (
     "Give base_T_flange row by row, or name the columns in a first line: x_mm,y_mm,z_mm,qw,qx,qy,qz. For angles write "
     "poses: {type: pose_csv, path: FILE, rpy: {columns: [...], unit: deg}}, or euler, or rotation_vector."
 )
+_TURNS = (("roll", "pitch", "yaw"), ("rx", "ry", "rz"), ("w", "p", "r"), ("a", "b", "c"))
+"""Angles of a pose as robots call them."""
 _UNREACHED = "the nominal arm reaches this pose in no posture within its joints' limits"
 
 
@@ -116,6 +118,8 @@ def read_poses(
         if posed is not None and set(_QUATERNION) <= set(header):
             quaternion = {"columns": _QUATERNION, "order": "wxyz"}
             settings = {"type": "pose_csv", "path": str(poses), "quaternion": quaternion}
+        elif posed is not None:
+            _refuse_angles_of_pose(poses, header, posed.arm)
     else:
         settings = dict(poses)
     if posed is not None and settings.get("type") == "pose_csv":
@@ -161,6 +165,28 @@ def _first_line(path: Path) -> list[str]:
     text = text_of(input_bytes(path, _MAX_BYTES, "a file of poses"), path, "Save it as text in UTF-8.")
     lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
     return next((line.replace(",", " ").split() for line in lines), [])
+
+
+def _refuse_angles_of_pose(path: Path, header: Sequence[str], arm: Arm) -> None:
+    """Columns of a place and of three turns, where joint angles are expected: conventions of turns differ.
+
+    Raises:
+        DataError: the file has them, and not the joints of the arm.
+    """
+    names = {(split_suffix(name) or (name,))[0].lower(): name for name in header}
+    turns = next((three for three in _TURNS if names.keys() >= {*three, "x", "y", "z"}), None)
+    if turns is None or names.keys() >= {name.lower() for name in arm.commanded}:
+        return
+    place, columns = (", ".join(names[name] for name in three) for three in ("xyz", turns))
+    unit = "rad" if columns.endswith("_rad") else "deg"
+    refuse(
+        path,
+        f"found {place}, {columns}: a pose of the flange by three angles, which robots write in several ways.",
+        f"Say which: poses: {{type: pose_csv, path: {path.name}, rpy: {{columns: [{columns}], unit: {unit}}}}} for "
+        "turns about the fixed axes x, y, z (roll, pitch, yaw); euler, with its order, for turns about moving axes; "
+        "rotation_vector for an axis times an angle (Universal Robots). A quaternion is qw, qx, qy, qz.",
+        1,
+    )
 
 
 def _flange_poses(settings: dict[str, Any], posed: _Posed, request: ReadRequest) -> Dataset:

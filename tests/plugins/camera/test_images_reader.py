@@ -293,6 +293,16 @@ def test_a_flange_pose_that_is_none_is_refused(folder: Path, line: str, message:
         read(request_of(FLANGE), folder=folder, poses=path)
 
 
+@pytest.mark.parametrize("joints", [FLANGE, ("q1", "q2")])
+def test_angles_of_a_flange_pose_are_named_and_not_taken_for_joints(folder: Path, joints: tuple[str, ...]) -> None:
+    path = folder / "flange.csv"
+    path.write_text("image,x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg\n8.png,1,2,3,4,5,6\n")
+    with pytest.raises(DataError, match=r":1: found x_mm, .*yaw_deg: a pose of the flange by three angles") as caught:
+        read(request_of(joints), folder=folder, poses=path)
+    assert "rpy: {columns: [roll_deg, pitch_deg, yaw_deg], unit: deg}" in caught.value.hint
+    assert "rotation_vector" in caught.value.hint and "qw, qx, qy, qz" in caught.value.hint
+
+
 def test_flange_poses_cut_in_the_last_number_are_refused(folder: Path) -> None:
     path = folder / "flange.txt"
     path.write_text("1 0 0 0.112 0 1 0 0 0 0 1 0.312\n" * 11 + "1 0 0 0.112 0 1 0 0 0 0 1 0.3")
