@@ -147,7 +147,7 @@ def test_in_short_nothing_is_left_only_where_no_function_of_the_pose_is(smooth):
 
     def short(predicted):
         left = replace(found, structures=(), lag_after_p=1.0, predictable=predicted)
-        return " ".join(_in_short("", sure, Finding("good", ""), Evidence(left), (), ()))
+        return " ".join(_in_short("", sure, Finding("good", ""), Evidence(left), "", ()))
 
     assert "is not noise: other records predict it" in short(found.predictable)
     assert "nothing" not in short(found.predictable) and "nothing" not in short(None)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.cli.main import cli
+from armcal.diagnose.suspects import outlier_findings, suspicious_in_short
 from armcal.diagnose.verdict import _good_for
 from armcal.estimate.estimator import estimate
 from armcal.estimate.identifiability import POOR_CONDITION, analyse
@@ -80,8 +81,20 @@ def test_gross_errors_are_counted(tmp_path: Path) -> None:
         points[[5, 50, 120]] += 25
         return points
 
-    told = sentences("validation.holdout=0", data=disturbed(tmp_path, spoil))
-    assert "five robust deviations of the training errors: 3 records, the worst" in told
+    verdict = judged("validation.holdout=0", data=disturbed(tmp_path, spoil))["verdict"]
+    assert any(
+        "five robust deviations of the training errors: 3 records, the worst" in f["text"] for f in verdict["findings"]
+    )
+    assert "3 of 200 training records are suspicious, by id: " in verdict["paragraph"]
+
+
+def test_an_id_does_not_read_as_a_number_of_records_and_many_suspects_are_none() -> None:
+    assert suspicious_in_short(["2020"], 2224) == "1 of 2224 training records is suspicious, by id: 2020."
+    many = [str(i) for i in range(50)]
+    assert "50 of 200 training records lie beyond the limit" in suspicious_in_short(many, 200)
+    (finding,) = outlier_findings(many, [str(i) for i in range(200)], None)
+    assert "So many are no outliers: their noise is larger" in finding.text and "residuals.csv" in finding.action
+    assert "noise.loss: reject" in outlier_findings(many[:30], [str(i) for i in range(200)], None)[0].action
 
 
 @pytest.mark.slow
@@ -193,6 +206,8 @@ def test_suggested_poses_tell_more_than_random_ones() -> None:
     chosen = suggest(problem, dataset, found, joints, count=3)
     assert len({tuple(s.commands.values()) for s in chosen}) == 3
     assert chosen[2].shrink < chosen[0].shrink < 1
+    spoiled = replace(found, square_root_information=found.square_root_information * np.nan)
+    assert suggest(problem, dataset, spoiled, joints) == ()
 
     def information(angles) -> float:
         count = len(dataset) + len(angles)

@@ -1,7 +1,7 @@
 """The verdict: what a person should conclude, each sentence from a test with a stated level."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -20,7 +20,8 @@ from armcal.diagnose.evidence_findings import (
     structure_findings,
     what_neighbours_cost,
 )
-from armcal.diagnose.noise_findings import Finding, component_findings, first_few, suspect_findings
+from armcal.diagnose.noise_findings import Finding, component_findings, first_few
+from armcal.diagnose.suspects import outlier_findings, suspicious_in_short, suspicious_records
 from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
 from armcal.estimate.identifiability import POOR_CONDITION, bound_together, correlated_pairs
 from armcal.estimate.prediction import NewRecording
@@ -30,10 +31,8 @@ from armcal.planning.suggestion import CANDIDATES, Suggestion, is_worth_measurin
 
 LEVEL = 0.05
 SHARE = 0.95
-DEVIATIONS = 5.0
 DO_NOT_USE = "Do not use this calibration"
 _ORDER = {"bad": 0, "warning": 1, "note": 2, "good": 3}
-_SMALLEST_SPREAD_MM = 1e-6
 
 
 @dataclass(frozen=True)
@@ -76,31 +75,31 @@ def judge(
         whitened: residuals in units of the declared noise, in recorded order (n_r x N).
         errors_mm: calibrated error of each record (N).
         train: which records trained.
-        judged_mm: errors of the records that did not train, or of cross-validation; empty if there are none.
-        judged_on: what these are, in words.
+        judged_mm: errors of records that did not train, or of cross-validation (``judged_on``, in words); or empty.
         ids: of all records (N).
         suggestions: poses that would add most information.
         fitted: how the training records weighed; None for plain least squares.
         predicted: whether prediction intervals cover their share.
-        evidence: what residuals still depend on, which records are missed, what priors alone hold.
+        evidence: what residuals depend on, which records are missed, what priors alone hold; none unless given.
     """
     seen = evidence or Evidence()
     determined = determined_finding(estimate, seen.priors_alone, np.median(judged_mm) if len(judged_mm) else None)
     own, kept = [ids[i] for i in train], train if fitted is None else train[fitted.kept]
-    suspicious = _suspicious(errors_mm[train], own, fitted)
+    suspicious = suspicious_records(errors_mm[train], own, fitted)
     noise = component_findings(fitted.components) if fitted and fitted.components else [_size(estimate, seen)]
     findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
     findings += [*shift_findings(estimate), *noise]
     findings += structure_findings(seen.structure, seen.unit) if estimate.verdict.converged else []
     findings += neighbour_findings(seen.structure, estimate, seen.unit) or _neighbours(whitened, kept, estimate)
     findings += [*_correlated(estimate), *predicted, *large_error_findings(seen.large_errors, seen.unit)]
-    findings += _outliers(suspicious, own, fitted) + _next(estimate, suggestions)
+    findings += [*outlier_findings(suspicious, own, fitted), *_next(estimate, suggestions)]
     ranked = tuple(sorted(findings, key=lambda finding: _ORDER[finding.grade]))
     headline = _errors_text(judged_mm, judged_on, seen.unit)
     first = _good_for(judged_mm, judged_on, seen.unit, seen.new_recording)
     if ranked[0].grade == "bad":
         headline, first = f"{DO_NOT_USE}. {headline}", f"{DO_NOT_USE}: {ranked[0].text}"
-    return Verdict(headline, ranked, " ".join(_in_short(first, estimate, determined, seen, suspicious, suggestions)))
+    short = _in_short(first, estimate, determined, seen, suspicious_in_short(suspicious, len(own)), suggestions)
+    return Verdict(headline, ranked, " ".join(short))
 
 
 def _errors_text(judged_mm: Array, judged_on: str, unit: str) -> str:
@@ -141,7 +140,7 @@ def _in_short(
     estimate: Estimate,
     determined: Finding,
     seen: Evidence,
-    suspicious: Sequence[str],
+    suspicious: str,
     suggestions: Sequence[Suggestion],
 ) -> list[str]:
     """What it is good for, what is not determined, suspicious, left over, and to be measured next; a sentence each."""
@@ -154,10 +153,9 @@ def _in_short(
     if missed is not None and missed.beyond:
         ids = ", ".join(miss.record_id for miss in missed.explained[:MOST_TOLD])
         more = f" and {missed.beyond - MOST_TOLD} more" if missed.beyond > MOST_TOLD else ""
-        sentences.append(f"Error above {missed.limit_mm:.2f} {seen.unit}: {ids}{more}.")
-    sentences.append(
-        f"Suspicious records: {first_few(suspicious)}." if suspicious else "No training record is suspicious."
-    )
+        named = "the record" if missed.beyond == 1 else f"{missed.beyond} records"
+        sentences.append(f"Error above {missed.limit_mm:.2f} {seen.unit} in {named}, by id: {ids}{more}.")
+    sentences.append(suspicious)
     sentences += _left(seen)
     if is_worth_measuring(suggestions):
         sentences.append(f"Measure these poses next: {'; '.join(suggestion.text for suggestion in suggestions)}.")
@@ -275,29 +273,6 @@ def _correlated(estimate: Estimate) -> list[Finding]:
         return []
     listed = first_few([f"{a} with {b} ({value:+.3f})" for a, b, value in pairs])
     return [Finding("note", f"Strongly correlated: {listed}.", "correlation of estimates above 0.95")]
-
-
-def _suspicious(errors_mm: Array, ids: Sequence[str], fitted: WeighedFit | None) -> list[str]:
-    """Ids of training records beyond their limit, the farthest first."""
-    if fitted is not None and fitted.loss != "none":
-        return list(dict.fromkeys(ids[suspect.record] for suspect in fitted.suspects))
-    middle = float(np.median(errors_mm))
-    spread = 1.4826 * float(np.median(np.abs(errors_mm - middle)))
-    beyond = np.flatnonzero(errors_mm > middle + DEVIATIONS * max(spread, _SMALLEST_SPREAD_MM))
-    return [ids[i] for i in beyond[np.argsort(-errors_mm[beyond], kind="stable")]]
-
-
-def _outliers(suspicious: Sequence[str], ids: Sequence[str], fitted: WeighedFit | None) -> list[Finding]:
-    """Records beyond their limits if the loss sought them, else beyond five robust deviations of the errors."""
-    if fitted is not None and fitted.loss != "none":
-        action = "Look at them in residuals.csv, and measure them again."
-        return [replace(f, action=action) if f.grade == "warning" else f for f in suspect_findings(fitted, ids)]
-    if not suspicious:
-        return []
-    listed = ", ".join(suspicious[:MOST_TOLD])
-    text = f"Beyond five robust deviations of the training errors: {len(suspicious)} records, the worst {listed}."
-    test = "median and median absolute deviation"
-    return [Finding("warning", text, test, "Measure them again, or set noise.loss: reject; residuals.csv has all.")]
 
 
 def _next(estimate: Estimate, suggestions: Sequence[Suggestion]) -> list[Finding]:
