@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from armcal.arm.horn import TOOTH_DEG, teeth_text
 from armcal.base.arrays import Array
 from armcal.devices.device import MeasuringDevice
 from armcal.devices.wiring import WiringRecord
@@ -31,7 +32,6 @@ _TURNS_DEG = (12.0, -12.0, 6.0, -6.0)
 _BASE = "base"
 _LEVER_M, _MODEL_SD_M, _ZERO_SD, _TARGET_SD_M = 0.1, 0.004, math.radians(15.0), 0.01
 """Of the pose of an arm that sags and is not as drawn; of its zeros; of where the tracker's body sits."""
-_TOOTH_DEG = 360 / 25
 """Of the splines of hobby and bus servos."""
 _REST_DEG, _MOST_TEETH = 5.0, 12
 """The standard deviation of a zero that was set by hand; a horn is a tooth off in one case of ten, two in a hundred."""
@@ -65,7 +65,7 @@ class Zero:
         """By how many teeth the horn may well be off, and the probability of each, the most likely one first."""
         degrees, variance = math.degrees(self.value), _REST_DEG**2 + math.degrees(self.sd) ** 2
         weights = {
-            k: 0.1 ** abs(k) * math.exp(-((degrees - k * _TOOTH_DEG) ** 2) / (2 * variance))
+            k: 0.1 ** abs(k) * math.exp(-((degrees - k * TOOTH_DEG) ** 2) / (2 * variance))
             for k in range(-_MOST_TEETH, _MOST_TEETH + 1)
         }
         total = sum(weights.values())
@@ -84,9 +84,8 @@ class Zero:
         amount = f"{math.degrees(self.value):+.1f} +- {math.degrees(self.sd):.1f} deg"
         causes = []
         for number, share in self.teeth:
-            count, zero = abs(number), math.degrees(self.value) - number * _TOOTH_DEG
-            teeth = f"{count} {'tooth' if count == 1 else 'teeth'} of its horn ({_TOOTH_DEG:.1f} deg each)"
-            cause = f"{teeth} and a zero of {zero:+.1f} deg" if number else "a zero set by hand"
+            zero = math.degrees(self.value) - number * TOOTH_DEG
+            cause = f"{teeth_text(number)} and a zero of {zero:+.1f} deg" if number else "a zero set by hand"
             causes.append(cause if self.is_sure else f"{cause} ({100 * share:.0f} %)")
         mend = " Remount the horn, or move its zero_count." if self.is_far else ""
         return f"{joint} stands {amount} from where its servo says: {', or '.join(causes)}.{mend}"

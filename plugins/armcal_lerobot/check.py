@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from armcal.arm.horn import teeth_text
 from armcal.base.arrays import Array
 from armcal.calibration.joint_zeros import Zero
 from armcal.cli.common import Console
@@ -28,7 +29,6 @@ from armcal_lerobot.motors import (
     is_gripper,
     remount,
     teeth_of,
-    teeth_text,
     zero_shift_deg,
 )
 from armcal_lerobot.recordings import open_recording

@@ -4,12 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from armcal.arm.horn import teeth_text
 from armcal.base.arrays import Array
 from scipy.stats import t as student
 
 from armcal_lerobot.gripper import Cost, Gripper
 from armcal_lerobot.motion import Motion
-from armcal_lerobot.motors import teeth_of, teeth_text
+from armcal_lerobot.motors import teeth_of
 from armcal_lerobot.tracking import SLOW_A_SECOND, Figure, Torque, Tracking, delayed
 
 _FEWEST_STARTS = 3

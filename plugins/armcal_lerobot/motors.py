@@ -9,6 +9,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from armcal.arm.horn import TOOTH_DEG, teeth_text
+
 Units = Literal["degrees", "percent"]
 
 LAST_COUNT = 4095
@@ -16,8 +18,6 @@ COUNTS_A_TURN = 4096
 LARGEST_OFFSET = 2047
 DEGREES_A_COUNT = 360 / LAST_COUNT
 """As LeRobot has it; a count of the encoder itself is 360 / 4096 deg."""
-TOOTH_DEG = 14.4
-"""A horn of 25 teeth, remounted one tooth further."""
 
 
 @dataclass(frozen=True)
@@ -81,11 +81,6 @@ def teeth_of(degrees: float, within_deg: float = 2.0) -> int:
     return teeth if teeth and abs(degrees - teeth * TOOTH_DEG) <= within_deg else 0
 
 
-def teeth_text(teeth: int) -> str:
-    """So many teeth of a horn, either way."""
-    return f"{'one tooth' if abs(teeth) == 1 else f'{abs(teeth)} teeth'} of a horn ({TOOTH_DEG:g} deg each)"
-
-
 def remount(offset: float) -> str:
     """What to do about a homing offset (counts) that the servo cannot store."""
     degrees = offset * 360 / COUNTS_A_TURN
@@ -93,7 +88,6 @@ def remount(offset: float) -> str:
     other = round(offset - math.copysign(COUNTS_A_TURN, offset))
     within = f" (within one turn of the encoder the same angle is {other})" if abs(other) <= LARGEST_OFFSET else ""
     return (
-        f"Switch the arm's power off and on, and calibrate again{within}; or take the horn off, turn it by {teeth} "
-        f"{'tooth' if teeth == 1 else 'teeth'} ({TOOTH_DEG:g} deg each) towards the middle of the encoder, and then "
-        "calibrate again."
+        f"Switch the arm's power off and on, and calibrate again{within}; or remount it by "
+        f"{teeth_text(teeth)} towards the middle of the encoder, and then calibrate again."
     )

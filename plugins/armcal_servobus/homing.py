@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from armcal.arm.horn import teeth_text
 from armcal.devices.device import DeviceError
 from armcal.errors import InputError, Location
 from armcal.io.file_set import write_new
@@ -62,8 +63,7 @@ class Homing:
         number = round(self.change / tooth)
         if not teeth or not number or abs(self.change / tooth - number) > _TOOTH_SHARE:
             return ""
-        turned, unit = math.degrees(number * tooth), "tooth" if abs(number) == 1 else "teeth"
-        return f"about {abs(number)} {unit} of its spline ({turned:+.1f} deg): is its horn put on wrong?"
+        return f"about {teeth_text(number, math.degrees(tooth))}: is it put on wrong?"
 
 
 Targets = Callable[[ServoJoint, int, int], float]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Literal
 
+from armcal.arm.horn import teeth_text
 from armcal.base.quantities import UnitOf
 from armcal.base.settings import Settings
 from armcal.devices.device import DeviceRefusedError
@@ -169,15 +170,13 @@ def check_offset(model: ServoModel, offset: int) -> None:
     beyond = abs(offset) - model.offset_limit
     if beyond <= 0:
         return
-    amount = f"{math.degrees(beyond * model.step):.0f} deg or more"
+    amount = f"its horn by {math.degrees(beyond * model.step):.0f} deg or more"
     if model.teeth:
         tooth = model.counts / model.teeth
-        number = math.ceil(beyond / tooth)
-        unit = "tooth" if number == 1 else "teeth"
-        amount = f"{number} {unit} of {math.degrees(tooth * model.step):.1f} deg ({tooth:.0f} counts)"
+        amount = "it by " + teeth_text(math.ceil(beyond / tooth), math.degrees(tooth * model.step))
     raise ValueError(
         f"found an offset of {offset} counts, expected -{model.offset_limit} to {model.offset_limit}, which is all "
-        f"that a {model.name} holds: remount its horn by {amount}"
+        f"that a {model.name} holds: remount {amount}"
     )
 
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
+from armcal.arm.horn import SPLINE_TEETH
 from armcal.arm.joints import unknown_joint
 from armcal.devices.simulated import BenchRequest, SimulatedBench
 from armcal.errors import ConfigError
@@ -18,7 +19,7 @@ from armcal_simulation.bench.safety import SafetySettings
 from armcal_simulation.bench.world import BenchWorld, serve_world
 from armcal_simulation.boards.pca9685_model import Commit
 from armcal_simulation.bus.motor import BusMotor, BusMotorSettings
-from armcal_simulation.bus.registers import SPLINE_TEETH, TABLES, ServoTable
+from armcal_simulation.bus.registers import TABLES, ServoTable
 from armcal_simulation.bus.servo import BusServo
 from armcal_simulation.bus.servo_bus import ServoBus
 

@@ -13,8 +13,6 @@ from armcal_simulation.bus.packets import ProtocolName
 
 Area = Literal["eeprom", "ram", "read"]
 _RPM = 2 * math.pi / 60
-SPLINE_TEETH = 25
-"""Of the output shafts: a horn that is put on by one tooth too many is 14.4 degrees off."""
 
 
 @dataclass(frozen=True)

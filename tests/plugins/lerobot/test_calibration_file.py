@@ -96,7 +96,7 @@ def test_a_new_zero_brings_the_joint_where_the_command_says(tmp_path: Path, sens
 
 def test_a_zero_that_a_servo_cannot_store_is_refused_with_the_mend(tmp_path: Path) -> None:
     file = read_motors(write_motors(tmp_path / "arm.json", elbow_flex={"homing_offset": 2000}))
-    with pytest.raises(InputError, match=r"would be 2114.*turn it by 13 teeth \(14.4 deg each\)"):
+    with pytest.raises(InputError, match=r"would be 2114.*remount it by 13 teeth of its horn \(14.4 deg each\)"):
         rezeroed(file, {"elbow_flex": (Zero(-114 * 360 / 4095, 0.1), 1)})
     with pytest.raises(InputError, match="more than half of the range"):
         rezeroed(file, {"shoulder_lift": (Zero(-110.0, 0.1), 1)})

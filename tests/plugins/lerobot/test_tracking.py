@@ -134,7 +134,7 @@ def test_faults_of_a_motor_are_named(tmp_path: Path) -> None:
     planted = {"elbow_flex": Planted(offset=-28.8), "wrist_roll": Planted(gain=-1.0), "wrist_flex": Planted(gain=0.8)}
     findings = findings_of(trackings(motion_of(tmp_path / "set", episodes(planted, count=4, frames=600))))
     assert len(findings) == 3
-    assert "elbow_flex stands -28.8 deg from its command: 2 teeth of a horn" in findings[0]
+    assert "elbow_flex stands -28.8 deg from its command: 2 teeth of its horn" in findings[0]
     assert "wrist_flex moves 0.800 times as far" in findings[1] and "wrist_roll is inverted" in findings[2]
 
 
@@ -178,7 +178,7 @@ def moved(made: list, motor: str, offset: float, factor: float = 1.0) -> list:
 @pytest.mark.parametrize(
     ("offset", "factor", "text"),
     [
-        (14.4, 1, "elbow_flex begins .14.. deg elsewhere: one tooth of a horn"),
+        (14.4, 1, "elbow_flex begins .14.. deg elsewhere: 1 tooth of its horn"),
         (6.0, 1, r"elbow_flex begins \+(5.9|6.0|6.1) deg elsewhere: its zero differs"),
         (0, -1, "elbow_flex is inverted in one of them"),
     ],

@@ -145,7 +145,7 @@ def test_offsets_at_the_ends_of_the_register(tmp_path):
     """Half a turn off is the one offset that an STS3215 cannot hold: -2048."""
     with FakeBus([sts(1, 0), sts(2)]) as fake:
         ran = called("home", written(tmp_path, fake.path), "--yes")
-        assert "remount its horn by 1 tooth of 14.4 deg" in refusal(ran)
+        assert "remount it by 1 tooth of its horn (14.4 deg each)" in refusal(ran)
         assert not [i for i in fake.instructions if i[1] in (3, 0x83)]
         for count, offset in ((1, -2047), (4095, 2047), (2049, 1)):
             fake.servos[0].memory[56:58] = count.to_bytes(2, "little")
@@ -159,7 +159,7 @@ def test_a_horn_that_is_a_tooth_off_is_named():
     with FakeBus([sts(1, 2048 - tooth), sts(2, 2048 + 80)]) as fake:
         bus, joints = joints_of(fake)
         first, second = planned(bus, joints, held_at({}))
-        assert first.finding == "about 1 tooth of its spline (+14.4 deg): is its horn put on wrong?"
+        assert first.finding == "about 1 tooth of its horn (14.4 deg each): is it put on wrong?"
         assert second.finding == ""
         bus.close()
 

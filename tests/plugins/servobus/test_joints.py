@@ -62,9 +62,9 @@ def test_a_range_over_the_seam_cannot_be_driven():
 
 def test_an_offset_beyond_the_register_is_refused_with_what_to_do():
     check_offset(MODELS["sts3215"], -2047)
-    with pytest.raises(ValueError, match=r"-2047 to 2047.*remount its horn by 1 tooth of 14\.4 deg"):
+    with pytest.raises(ValueError, match=r"-2047 to 2047.*remount it by 1 tooth of its horn \(14\.4 deg each\)"):
         check_offset(MODELS["sts3215"], 2048)
-    with pytest.raises(ValueError, match=r"remount its horn by 6 teeth"):
+    with pytest.raises(ValueError, match=r"remount it by 6 teeth"):
         check_offset(MODELS["sts3215"], -3000)
     with pytest.raises(ValueError, match=r"-1024 to 1024.*remount its horn by 26 deg or more"):
         check_offset(MODELS["xl430-w250"], 1320)
@@ -75,7 +75,7 @@ def test_an_offset_beyond_the_register_is_refused_with_what_to_do():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"offset": 2500}, "remount its horn by 3 teeth"),
+        ({"offset": 2500}, "remount it by 3 teeth"),
         ({"model": "sts9999"}, "expected one of sts3215"),
         ({"range_deg": [10, -10]}, "does not rise"),
         ({"model": "xl430-w250"}, "set protocol: dynamixel2"),
