@@ -121,6 +121,9 @@ class PluginRegistry:
         known = sorted(n for k, n in self._by_name if k == kind)
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"Did you mean {near[0]!r}?" if near else f"Known: {', '.join(known) or 'none'}."
+        if others := [_spoken(k) for k, n in self._by_name if n == name]:
+            hint = f"It is registered as {' and '.join(others)}."
+        hint += " A plugin's file is loaded by --plugin FILE."
         if self.faults:
             failed = "; ".join(f"{p.name}: {p.fault}" for p in self.faults)
             hint += f" These plugins failed to load and may have had it: {failed}."
@@ -180,7 +183,8 @@ def discover(points: Iterable[EntryPoint] | None = None) -> PluginRegistry:
     for point, outcome in zip(chosen, outcomes, strict=True):
         if isinstance(point, plugin_files.FilePoint) and (outcome.fault or not outcome.works):
             text = outcome.fault or "it registers nothing: write a function armcal_register_... after @hookimpl."
-            raise PluginError(text, where=None if str(point.file) in text else Location(str(point.file)))
+            place = Location(str(point.file), line=outcome.line)
+            raise PluginError(text, where=None if str(point.file) in text else place)
         plugins.append(PluginInfo(point.name, point.value, *_release(point), outcome.fault))
         components += [
             Component(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+import traceback
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint
 from typing import Any, Self
@@ -29,6 +31,7 @@ class Registration:
 
     Attributes:
         fault: why it is left out; empty if it is not.
+        line: of its module, which the fault came through; None if it came through none.
         announced: its components.
         works: whether it has any hook.
     """
@@ -36,6 +39,7 @@ class Registration:
     fault: str = ""
     announced: tuple[Announcement, ...] = ()
     works: bool = False
+    line: int | None = None
 
 
 def new_manager() -> pluggy.PluginManager:
@@ -82,17 +86,19 @@ def _registered(manager: pluggy.PluginManager, alone: pluggy.PluginManager, plug
     if plugin.fault:
         return Registration(plugin.fault)
     try:
+        _require_marks(plugin.module)
         alone.register(plugin.module, plugin.name)
         alone.check_pending()
-        _require_marks(plugin.module)
         announced, works = _announced(alone), bool(alone.get_hookcallers(plugin.module))
         manager.register(plugin.module, plugin.name)
     except (Exception, SystemExit) as fault:  # whatever a third party's module does, the others must work
-        return Registration(said(fault))
+        file = getattr(plugin.module, "__file__", None)
+        lines = [frame.lineno for frame in traceback.extract_tb(fault.__traceback__) if frame.filename == file]
+        return Registration(said(fault), line=lines[-1] if lines else None)
     finally:
         if alone.has_plugin(plugin.name):
             alone.unregister(name=plugin.name)
-    return Registration("", announced, works)
+    return Registration(announced=announced, works=works)
 
 
 def said(fault: BaseException) -> str:
@@ -102,7 +108,13 @@ def said(fault: BaseException) -> str:
 
 
 def _require_marks(module: Any) -> None:
-    """Refuse a hook that would be passed over without a word."""
+    """Refuse a hook that would be passed over without a word, and one that there is none of."""
+    for name, own in vars(module).items():
+        if hasattr(own, f"{hooks.PROJECT}_impl") and not hasattr(hooks, name):
+            known = [hook for hook in dir(hooks) if hook.startswith(f"{hooks.PROJECT}_")]
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean {near[0]}" if near else "armcal plugins hooks lists them"
+            raise ValueError(f"unknown hook {name!r}: {hint}")
     for name in dir(hooks):
         specified = getattr(hooks, name)
         own = getattr(module, name, None) if name.startswith(f"{hooks.PROJECT}_") else None

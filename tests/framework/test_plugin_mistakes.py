@@ -102,6 +102,72 @@ GAUGES = {
     "no parameter": ('{"r"', 'values["x"] or {"r"', "G.outputs .*found no parameter .x., expected one of none"),
 }  # fmt: skip
 
+READER = (
+    IMPORTS
+    + """
+import numpy as np
+from armcal.base.dataset import Dataset
+from armcal.base.settings import InputPath, Settings
+
+
+class S(Settings):
+    path: InputPath
+
+
+class R:
+    Settings = S
+
+    def __init__(self, settings):
+        pass
+
+    def read(self, request):
+        angles = np.radians([[10.0, 20.0, -30.0], [5.0, -40.0, 60.0], [0.0, 30.0, 20.0]])
+        values = {f"arm.q{i}": numbers for i, numbers in enumerate(angles, start=1)}
+        values |= {f"m.{axis}": np.array([0.5, 0.1, 0.2])[: len(angles)] for axis in "xyz"}
+        return Dataset(("a", "b", "c"), values)
+
+
+@hookimpl
+def armcal_register_readers(register):
+    register("mine", R, "")
+"""
+)
+READERS = {
+    "none": ("return Dataset", "Dataset", "R.read returned None, expected a Dataset"),
+    "a mapping": (
+        'Dataset(("a", "b", "c"), values)',
+        "values",
+        "R.read returned an object of type dict, expected a Da",
+    ),
+    "lists": (": numbers for", ": list(numbers) for", "R.read returned the channel 'arm.q1' as list of the shape .3,."),
+    "few": (
+        "[: len(angles)]",
+        "[:2]",
+        r"R.read returned the channel 'm.x' as ndarray of the shape \(2,\), expected a nu",
+    ),
+    "NaN": (
+        "0.1, 0.2]",
+        "math.nan, 0.2]",
+        "row 2: found no number for m.x, m.y, m.z in the record b. A reader refuses",
+    ),
+    "a file": (
+        "        angles =",
+        "        open('no')\n        angles =",
+        "R.read raised FileNotFoundError: .* 'no'. To che",
+    ),
+}
+REGISTRATIONS = {
+    "another hook": (
+        "armcal_register_effects",
+        "armcal_register_effect",
+        "'armcal_register_effect': did you mean armcal_",
+    ),
+    "no mark": ("@hookimpl\n", "", "armcal_register_effects is not marked: put @hookimpl before it"),
+    "another kind": ("armcal_register_effects", "armcal_register_models", "'mine'. It is registered as a model."),
+    "another name": ('register("mine"', 'register("yours"', "'mine'. .* A plugin's file is loaded by --plugin FILE."),
+    "in a hook": ("    register(", "    1 / 0\n    register(", r"mine.py:\d+: ZeroDivisionError: division by zero"),
+}
+
 
 @pytest.fixture(autouse=True)
 def _forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
@@ -110,7 +176,7 @@ def _forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     yield
 
 
-def ended(folder: Path, plugin: str, effects: str, measurement: str, free: str, *arguments: str) -> int:
+def ended(folder: Path, plugin: str, effects: str, measurement: str, free: str, *more: str, reader: str = "csv") -> int:
     """How ``armcal run`` ends on a planar arm with a plugin file."""
     (folder / "mine.py").write_text(plugin, encoding="utf-8")
     rows = "\n".join(f"{i},{10 * i - 20},{7 * i % 50},{5 * i},{500 + i},{i * i},3,600" for i in range(1, 9))
@@ -123,13 +189,13 @@ arms:
     effects: {effects}
 statics: {{gravity_m_s2: [0, 0, -9.81], payload_g: 100}}
 measurements: {{m: {measurement}}}
-data: {{type: csv, path: data.csv}}
+data: {{type: {reader}, path: data.csv}}
 parameters: {{free: [{free}]}}
 """,
         encoding="utf-8",
     )
     os.chdir(folder)
-    done = cli.main(["run", "run.yaml", "--plugin", "mine.py", *arguments], "armcal", standalone_mode=False)
+    done = cli.main(["run", "run.yaml", "--plugin", "mine.py", *more], "armcal", standalone_mode=False)
     assert isinstance(done, int)
     return done
 
@@ -150,6 +216,24 @@ def test_a_mistake_in_a_measurement(mistake: str, tmp_path: Path, capsys: pytest
     assert right in GAUGE
     assert ended(tmp_path, GAUGE.replace(right, wrong, 1), "{}", "{type: mine}", "arm.mdh.a2") == 2
     _expect(capsys.readouterr().err, sentence, "" if sentence.startswith("the measurement") else "mine.py")
+
+
+@pytest.mark.parametrize("mistake", READERS)
+def test_a_mistake_in_a_reader(mistake: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    right, wrong, sentence = READERS[mistake]
+    assert right in READER
+    tip, code = "{type: tip_position, noise_mm: 0.1}", READER.replace(right, wrong, 1)
+    assert ended(tmp_path, code, "{}", tip, "arm.mdh.a2", "--accept", reader="mine") == 2
+    _expect(capsys.readouterr().err, sentence, "" if sentence.startswith("row") else "mine.py")
+
+
+@pytest.mark.parametrize("mistake", REGISTRATIONS)
+def test_a_mistake_in_a_registration(mistake: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    right, wrong, sentence = REGISTRATIONS[mistake]
+    assert right in EFFECT
+    tip = "{type: tip_position, noise_mm: 0.1}"
+    assert ended(tmp_path, EFFECT.replace(right, wrong, 1), "{mine: {type: mine}}", tip, "arm.mine.s2") == 2
+    _expect(capsys.readouterr().err, sentence, "")
 
 
 def _expect(shown: str, sentence: str, file: str) -> None:

@@ -1,14 +1,35 @@
-"""What the methods of a measurement return, checked where a factor is built of it."""
+"""What the methods of readers and measurements return, checked where it is used."""
 
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
+from armcal.base.dataset import Dataset
 from armcal.base.se3 import Expression, column
 from armcal.base.units import DIMENSIONS, ERROR_UNITS
 from armcal.errors import ProblemError
 from armcal.measure.measurement import Channel, Measurement, noise_channels, residual_dimensions
+from armcal.measure.reader import Reader, ReadRequest
 from armcal.plugin_faults import refuse
+
+
+def records_of(reader: Reader, request: ReadRequest) -> Dataset:
+    """The records of a reader.
+
+    Raises:
+        DataError: the source is refused.
+        PluginError: it returned no dataset, or a channel is no array of a number each record.
+    """
+    dataset = reader.read(request)
+    if not isinstance(dataset, Dataset):
+        refuse(reader.read, dataset, "a Dataset")
+    for name, values in dataset.channels.items():
+        if np.shape(values) != (len(dataset),) or getattr(values, "dtype", None) != np.float64:
+            given = f"the channel {name!r} as {type(values).__name__} of the shape {np.shape(values)}"
+            refuse(reader.read, given, f"a numpy array of {len(dataset)} numbers (float64), one a record")
+    return dataset
 
 
 def check_channels(measurement: Measurement) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from armcal.arm.assembly import scoped
 from armcal.arm.effects import JointCommand
 from armcal.base.dataset import Dataset
-from armcal.errors import ProblemError
+from armcal.errors import DataError, ProblemError
 from armcal.plugin_faults import refuse
 from armcal.problem.factor_records import FactorRecords
 from armcal.problem.problem import Problem
@@ -18,6 +18,7 @@ def require_numbers(problem: Problem, records: Sequence[FactorRecords], dataset:
     """Refuse a problem whose residuals or derivatives are no numbers (NaN, infinite) at the nominal values.
 
     Raises:
+        DataError: a record has no number where the measurement needs one.
         PluginError: the displacement of an effect is none; with its method.
         ProblemError: another residual or a derivative is none; with measurement and record, or parameters.
     """
@@ -26,6 +27,11 @@ def require_numbers(problem: Problem, records: Sequence[FactorRecords], dataset:
         lost = np.flatnonzero(own.measured & ~np.isfinite(residual).all(axis=0))
         if len(lost):
             record = dataset.ids[lost[0]]
+            numbers = zip(kernel.factor.channels, own.record[:, lost[0]], strict=True)
+            if empty := [channel for channel, number in numbers if not np.isfinite(number)]:
+                text = f"found no number for {', '.join(empty)} in the record {record}."
+                hint = "A reader refuses or sets aside such records: armcal.measure.checks.check_dataset does."
+                raise DataError(text, where=dataset.where(int(lost[0])), hint=hint)
             _check_displacements(problem, dataset)
             raise ProblemError(
                 f"the measurement {kernel.factor.name} predicts no number (NaN) for the record {record} at the nominal "

@@ -26,6 +26,7 @@ from armcal.estimate.weighing import weighed
 from armcal.measure.environment import noticed, require_conditions, warn_beyond_limits
 from armcal.measure.groups import grouped_instances, groups_of, pose_numbers, unmatched
 from armcal.measure.reader import Reader, ReadRequest, evidence_channels, requested_channels
+from armcal.measure.returned import records_of
 from armcal.plugins import PluginRegistry, discover
 from armcal.run.settings import ExperimentSettings
 
@@ -115,7 +116,7 @@ class Experiment:
         reader: Reader
         reader, _ = build_component(self.source, self.registry, "reader", ("data",))
         request = replace(self.request(measured=True), report=partial(progress, "reading"))
-        dataset = reader.read(request)
+        dataset = records_of(reader, request)
         elastic = [block.name for block in self.parameters.free if block.unit == "rad_per_Nm"]
         if elastic and self.settings.statics.payload is None and not dataset.has("payload"):
             # A compliance fitted under an unknown load is wrong by that load.

@@ -18,6 +18,7 @@ from armcal.config.system import build_component
 from armcal.errors import ConfigError, DataError, Location, ProblemError
 from armcal.io.plain_files import input_file
 from armcal.measure.reader import MAX_ID_LIST_BYTES, Reader, read_ids
+from armcal.measure.returned import records_of
 from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment, with_data
 from armcal.run.plan_clearance import clearance_check
@@ -147,7 +148,7 @@ def read_poses(experiment: Experiment, path: Path | None) -> Dataset:
         )
     reader: Reader
     reader, _ = build_component(source, experiment.registry, "reader", ("data",))
-    return reader.read(experiment.request(measured=False))
+    return records_of(reader, experiment.request(measured=False))
 
 
 def given_records(experiment: Experiment, path: Path) -> Dataset:
