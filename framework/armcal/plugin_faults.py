@@ -92,7 +92,8 @@ def refuse(method: Callable[..., Any], returned: Any, expected: str) -> NoReturn
     name = getattr(function, "__qualname__", type(method).__qualname__)
     if not isinstance(returned, str):
         returned = "None" if returned is None else f"an object of type {type(returned).__name__}"
-    raise PluginError(f"{name} returned {returned}, expected {expected}.", where=where, hint="Correct that method.")
+    text = f"{name} returned {' '.join(returned.split())}, expected {expected}."
+    raise PluginError(text, where=where, hint="Correct that method.")
 
 
 def _package(plugin: PluginInfo) -> str:

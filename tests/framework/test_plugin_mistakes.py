@@ -132,6 +132,7 @@ def armcal_register_readers(register):
     register("mine", R, "")
 """
 )
+MDH = "mdh, convention: standard, rows: [{a_mm: 300, alpha_deg: 90}, {a_mm: 200}, {a_mm: 150}]"
 READERS = {
     "none": ("return Dataset", "Dataset", "R.read returned None, expected a Dataset"),
     "a mapping": (
@@ -156,6 +157,61 @@ READERS = {
         "R.read raised FileNotFoundError: .* 'no'. To che",
     ),
 }
+MODEL = (
+    IMPORTS
+    + """
+from armcal import Settings
+from armcal.arm.model import Attachment, Chain, Joint
+from armcal.base import se3
+
+
+class M:
+    Settings = Settings
+    joint_names = ("q1", "q2", "q3")
+
+    def __init__(self, settings):
+        pass
+
+    def parameters(self):
+        return [scalar("a2", "m", 0.3, 0.01)]
+
+    def chain(self, values):
+        link, at = se3.translation_along("x", values["a2"]), se3.identity()
+        joints = tuple(Joint(name, link, angular=(0, 0, 1)) for name in ("q1", "q2", "q3"))
+        return Chain(at, joints, Attachment(3, link))
+
+
+@hookimpl
+def armcal_register_models(register):
+    register("mine", M, "")
+"""
+)
+MODELS = {
+    "none": ("return Chain", "Chain", "M.chain returned None, expected a Chain of the joints q1, q2, q3"),
+    "other joints": (
+        'in ("q1"',
+        'in ("p1"',
+        "M.chain returned the joints p1, q2, q3, expected a sequence of the joint",
+    ),
+    "no names": ("    joint_names", "    names", "the plugin 'mine' is broken: it has no joint_names; the contract"),
+    "an axis": (
+        "(0, 0, 1)",
+        "(0, 0, 2)",
+        r"the joint q1 about \(0, 0, 2\), along .*, expected one of them of length 1",
+    ),
+    "no transform": (
+        "Attachment(3, link)",
+        "Attachment(3, values['a2'])",
+        "M.chain returned the frame 'tool' as Attach",
+    ),
+    "no joint": ("Attachment(3", "Attachment(4", "M.chain returned the frame 'tool' on the joint 4, expected 0 to 3"),
+    "an offset": (
+        "(0, 0, 1)",
+        "(0, 0, 1), offset='a2'",
+        "M.chain returned the offset 'a2' of the joint q1, expected an",
+    ),
+    "no mount": ("Chain(at", "Chain(0", "M.chain returned 0, expected a Transform base_T_mount"),
+}
 REGISTRATIONS = {
     "another hook": (
         "armcal_register_effects",
@@ -176,7 +232,16 @@ def _forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     yield
 
 
-def ended(folder: Path, plugin: str, effects: str, measurement: str, free: str, *more: str, reader: str = "csv") -> int:
+def ended(
+    folder: Path,
+    plugin: str,
+    effects: str,
+    measurement: str,
+    free: str,
+    *more: str,
+    reader: str = "csv",
+    model: str = "",
+) -> int:
     """How ``armcal run`` ends on a planar arm with a plugin file."""
     (folder / "mine.py").write_text(plugin, encoding="utf-8")
     rows = "\n".join(f"{i},{10 * i - 20},{7 * i % 50},{5 * i},{500 + i},{i * i},3,600" for i in range(1, 9))
@@ -185,7 +250,7 @@ def ended(folder: Path, plugin: str, effects: str, measurement: str, free: str, 
         f"""
 arms:
   arm:
-    model: {{type: mdh, convention: standard, rows: [{{a_mm: 300, alpha_deg: 90}}, {{a_mm: 200}}, {{a_mm: 150}}]}}
+    model: {{type: {model or MDH}}}
     effects: {effects}
 statics: {{gravity_m_s2: [0, 0, -9.81], payload_g: 100}}
 measurements: {{m: {measurement}}}
@@ -225,6 +290,15 @@ def test_a_mistake_in_a_reader(mistake: str, tmp_path: Path, capsys: pytest.Capt
     tip, code = "{type: tip_position, noise_mm: 0.1}", READER.replace(right, wrong, 1)
     assert ended(tmp_path, code, "{}", tip, "arm.mdh.a2", "--accept", reader="mine") == 2
     _expect(capsys.readouterr().err, sentence, "" if sentence.startswith("row") else "mine.py")
+
+
+@pytest.mark.parametrize("mistake", MODELS)
+def test_a_mistake_in_a_model(mistake: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    right, wrong, sentence = MODELS[mistake]
+    assert right in MODEL
+    tip, code = "{type: tip_position, noise_mm: 0.1}", MODEL.replace(right, wrong, 1)
+    assert ended(tmp_path, code, "{}", tip, "arm.mine.a2", "--accept", model="mine") == 2
+    _expect(capsys.readouterr().err, sentence, "mine.py")
 
 
 @pytest.mark.parametrize("mistake", REGISTRATIONS)

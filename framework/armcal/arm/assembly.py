@@ -12,7 +12,7 @@ import numpy as np
 from armcal.arm.effects import Condition, JointCommand, JointEffect, Spring, spring_fault
 from armcal.arm.elastic import deflections, elastic_sites, split_deflection
 from armcal.arm.environment import Environment
-from armcal.arm.model import ArmModel, Chain, forward
+from armcal.arm.model import ArmModel, Chain, chain_fault, forward
 from armcal.arm.pose_residual import OF_TOOL, SURROUNDINGS, PoseResidual, Postures, corrected, correction_names
 from armcal.arm.statics import Load, Mass, joint_efforts, wrenches
 from armcal.base.arrays import Array
@@ -181,9 +181,8 @@ class Arm:
     def chain(self, values: Mapping[str, Expression]) -> Chain:
         """The model's chain, for full parameter names."""
         chain = self.model.chain(scoped(values, self._scope(self.model_name)))
-        if not isinstance(chain, Chain) or [joint.name for joint in chain.joints] != list(self.joint_names):
-            given = f"the joints {[j.name for j in chain.joints]}" if isinstance(chain, Chain) else chain
-            refuse(self.model.chain, given, f"a Chain of the joints {', '.join(self.joint_names)}")
+        if fault := chain_fault(chain, self.joint_names):
+            refuse(self.model.chain, *fault)
         if not self.placement:
             return chain
         base_T_model = pose_transform(PLACEMENT, scoped(values, f"{self.name}."))
@@ -266,8 +265,8 @@ class Arm:
                     f"the effect {self._scope(name)[:-1]} reads {missing}, which is not recorded.",
                     hint=f"Add a column {missing} with its unit.",
                 ) from fault
-            if not isinstance(shaped, Chain):
-                refuse(effect.shaped, shaped, "a Chain")
+            if wrong := chain_fault(shaped, self.joint_names):
+                refuse(effect.shaped, *wrong)
             chain = shaped
         return chain
 

@@ -1,10 +1,11 @@
 """Arm models: the chain of joints that a model describes, and the pose of every frame of it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import casadi as ca
+import numpy as np
 
 from armcal.base import se3
 from armcal.base.parameters import ParameterBlock
@@ -12,6 +13,7 @@ from armcal.base.se3 import Expression, Transform
 
 Vector3 = tuple[float, float, float]
 Z_AXIS: Vector3 = (0.0, 0.0, 1.0)
+_UNIT, _SHOWN = 1e-9, 80
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,27 @@ class Chain:
     joints: tuple[Joint, ...]
     tool: Attachment
     frames: Mapping[str, Attachment] = field(default_factory=dict)
+
+
+def chain_fault(chain: Any, joint_names: Sequence[str]) -> tuple[Any, str] | None:
+    """What is wrong with what a model gives as the chain of these joints, and what was expected; None if nothing is."""
+    if not isinstance(chain, Chain):
+        return chain, f"a Chain of the joints {', '.join(joint_names)}"
+    for joint in (joints := tuple(chain.joints) if isinstance(chain.joints, Iterable) else (chain.joints,)):
+        if not isinstance(joint, Joint) or not isinstance(joint.parent_T_joint, Transform):
+            return repr(joint)[:_SHOWN], "a Joint(name, parent_T_joint) with a Transform"
+        if abs(np.linalg.norm(joint.axis) - 1) > _UNIT:
+            return f"the joint {joint.name} about {joint.angular}, along {joint.linear}", "one of them of length 1"
+        if not isinstance(joint.offset, ca.SX | ca.DM | float | int):
+            return f"the offset {joint.offset!r} of the joint {joint.name}", "an expression (rad or m)"
+    if not isinstance(chain.joints, Sequence) or [joint.name for joint in joints] != list(joint_names):
+        return f"the joints {', '.join(j.name for j in joints)}", f"a sequence of the joints {', '.join(joint_names)}"
+    for name, frame in {"tool": chain.tool, **chain.frames}.items():
+        if not isinstance(frame, Attachment) or not isinstance(frame.joint_T_frame, Transform):
+            return f"the frame {name!r} as {frame!r}"[:_SHOWN], "an Attachment(joint, joint_T_frame) with a Transform"
+        if not 0 <= frame.joint <= len(joints):
+            return f"the frame {name!r} on the joint {frame.joint}", f"0 to {len(joints)}: 0 is the mount"
+    return None if isinstance(chain.base_T_mount, Transform) else (repr(chain.base_T_mount), "a Transform base_T_mount")
 
 
 class ArmModel(Protocol):

@@ -2,22 +2,23 @@
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
-from types import MappingProxyType
+from pkgutil import resolve_name
 from typing import Any, Literal, TypeVar
 
 from pydantic import Field, field_validator
+from typing_extensions import get_protocol_members, is_protocol
 
+from armcal import plugin_files
 from armcal.arm.assembly import PLACEMENT, Arm, MassiveModel, MassSpec, prefixed
-from armcal.arm.effects import JointEffect
 from armcal.arm.environment import STATICS, Environment, gravity_tilt
-from armcal.arm.pose_residual import PoseResidual
 from armcal.arm.statics import frame_names
 from armcal.base.parameters import FIT_NAME, ParameterBlock, Parameters, declared
 from armcal.base.poses import PoseSettings
 from armcal.base.settings import Acceleration3, Angle, Force3, Length3, Mass, Settings, Torque3
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource
-from armcal.errors import ArmcalError, ConfigError, PluginError
+from armcal.errors import ArmcalError, ConfigError, Location, PluginError
+from armcal.hooks import COMPONENTS
 from armcal.measure.groups import Groups, group_blocks
 from armcal.measure.measurement import Borrowing, Carried, Measurement
 from armcal.measure.reader import surroundings
@@ -26,8 +27,6 @@ from armcal.plugins import Component, PluginRegistry
 
 T = TypeVar("T")
 Path = tuple[str | int, ...]
-_BASES: Mapping[str, type] = MappingProxyType({"effect": JointEffect, "residual": PoseResidual})
-"""What a component of a kind derives from."""
 
 
 class LinkSettings(Settings):
@@ -193,15 +192,20 @@ def build_component(
         raise
     except Exception as fault:  # a plugin may fail in any way; the error names it and the reason
         raise _broken(registered, f"building it raised {type(fault).__name__}: {fault}") from fault
-    base = _BASES.get(kind, object)
-    if not isinstance(built, base):
-        raise _broken(registered, f"it does not derive from armcal.{base.__name__}")
+    contract = resolve_name(COMPONENTS[kind].protocol)
+    if not is_protocol(contract) and not isinstance(built, contract):
+        raise _broken(registered, f"it does not derive from armcal.{contract.__name__}")
+    members = sorted(get_protocol_members(contract)) if is_protocol(contract) else []
+    if lacking := [name for name in members if not hasattr(built, name)]:
+        raise _broken(registered, f"it has no {', '.join(lacking)}; the contract is printed by armcal plugins hooks")
     return built, {"type": name, **settings.to_config()}
 
 
 def _broken(component: Component, fault: str) -> PluginError:
+    file = plugin_files.files().get(component.plugin)
     return PluginError(
         f"the {component.kind} {component.name!r} of the plugin {component.plugin!r} is broken: {fault}.",
+        where=Location(str(file)) if file else None,
         hint=f"See armcal plugins check {component.plugin}.",
     )
 
