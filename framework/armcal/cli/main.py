@@ -86,11 +86,11 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """A name that is none is refused with the nearest that is."""
-        if args[0] not in COMMANDS and not args[0].startswith("-"):
-            known = self.list_commands(ctx)
-            near = difflib.get_close_matches(args[0], known, n=1, cutoff=0.6)
-            if args[0] not in known and near:
-                ctx.fail(f"No such command {args[0]!r}. Did you mean {near[0]!r}?")
+        if (command := self.get_command(ctx, args[0])) is not None:
+            return args[0], command, args[1:]
+        near = difflib.get_close_matches(args[0], self.list_commands(ctx), n=1, cutoff=0.6)
+        if near and not args[0].startswith("-"):
+            ctx.fail(f"No such command {args[0]!r}. Did you mean {near[0]!r}?")
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> object:
