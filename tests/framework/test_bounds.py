@@ -11,12 +11,10 @@ import pytest
 from armcal.cli.run import _compliances, _matrices
 from armcal.diagnose.evidence_findings import shift_findings
 from armcal.estimate.estimator import Estimate, estimate
-from armcal.estimate.polish import bounded_step
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
-from armcal.problem.problem import NormalEquations, Problem
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from rich.console import Console
-from scipy.optimize import lsq_linear
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 NOISE_M = 0.0005
@@ -123,24 +121,3 @@ def test_what_a_cone_shifts_beside_its_matrix_is_named() -> None:
     assert f"Bounds that hold arm.flex.C2 shift other estimates: {worst} ({moved[worst]:+.1f} sd)" in finding.text
     assert finding.grade == "note" and "C2[" not in finding.text
     assert not shift_findings(inside)
-
-
-@pytest.mark.parametrize("alike", [False, True], ids=["apart", "alike"])
-def test_a_bounded_step_is_that_of_an_active_set_method(alike: bool) -> None:
-    """Unknowns of very different sizes, some without bounds, some on theirs; two of them nearly the same."""
-    random = np.random.default_rng(4)
-    for count in random.integers(1, 30, 150):
-        rows = random.normal(size=(count + 2, count)) * 10 ** random.uniform(-3, 3, count)
-        if alike:
-            rows[:, 0] = rows[:, -1] * (1 + 1e-3 * random.normal(size=count + 2))
-        target = 3 * random.normal(size=count + 2)
-        ends = random.exponential(size=(2, count)) / np.linalg.norm(rows, axis=0)
-        ends[random.random((2, count)) < 0.3] = np.inf
-        ends[0, random.random(count) < 0.2] = 0.0
-        model = NormalEquations(0.5 * float(target @ target), -rows.T @ target, rows.T @ rows)
-        step = bounded_step(model, -ends[0], ends[1])
-        assert step is not None and (-ends[0] <= step).all() and (step <= ends[1]).all()
-        size = np.linalg.norm(rows, axis=0)
-        oracle = lsq_linear(rows / size, target, (-ends[0] * size, ends[1] * size), method="bvls", tol=1e-14)
-        assert np.allclose(step * size, oracle.x, rtol=1e-8, atol=1e-8)
-        assert ((step == -ends[0]) | (step == ends[1])).sum() == (oracle.active_mask != 0).sum()
