@@ -12,12 +12,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg.lapack import dpstrf
 
 from armcal.base.arrays import Array, Indices
 
+_TOGETHER = 48
+"""Rows of nodes that one matrix leads over: more are more arithmetic, fewer more steps."""
 _LEAST_SHARED = 1e-3
 """Of the noise's variance: a part of the covariance that is smaller is left out of its root."""
 
@@ -63,11 +66,9 @@ class Correlation:
         """Whitened and weighted rows, one (n_r x N x k) a factor, made independent: of covariance I (same shapes)."""
         both = self._stacked(rows)
         made, state = np.empty_like(both), np.zeros((len(self._start), both.shape[2]))
-        for step in self._steps:
-            state = step.left[:, None] * state
-            new = both[step.records].reshape(-1, both.shape[2]) - step.slopes @ state
-            made[step.records] = (step.whitening @ new).reshape(-1, *both.shape[1:])
-            state = state + step.gain @ new
+        for records, passes in self._passes:
+            out = passes @ np.vstack([state, both[records].reshape(-1, both.shape[2])])
+            state, made[records] = out[: len(state)], out[len(state) :].reshape(-1, *both.shape[1:])
         return self._apart(made, rows)
 
     def states(self, rows: Sequence[Array]) -> Array:
@@ -158,6 +159,26 @@ class Correlation:
             nodes.append(_Node(left, records, slopes, covariance, whitening, own.T @ whitening))
             covariance = covariance - own.T @ own
         return tuple(nodes)
+
+    @cached_property
+    def _passes(self) -> tuple[tuple[Indices, Array], ...]:
+        """The filter over several nodes at once: their records, and what makes the state after them and independent
+        rows (n_s+m x k) of the state before them and rows as they are (n_s+m x k), as a matrix."""
+        passes, states = [], len(self._start)
+        after = np.cumsum([len(step.slopes) for step in self._steps])
+        cuts = np.flatnonzero(np.diff(after // _TOGETHER)) + 1
+        for first, last in pairwise([0, *cuts, len(self._steps)]):
+            steps = self._steps[first:last]
+            ends = np.cumsum([states, *(len(step.slopes) for step in steps)])
+            given = np.eye(int(ends[-1]))
+            state, made = given[:states], list[Array]()
+            for step, (start, end) in zip(steps, pairwise(ends), strict=True):
+                state = step.left[:, None] * state
+                new = given[start:end] - step.slopes @ state
+                made.append(step.whitening @ new)
+                state = state + step.gain @ new
+            passes.append((np.concatenate([step.records for step in steps]), np.vstack([state, *made])))
+        return tuple(passes)
 
     def _stacked(self, rows: Sequence[Array]) -> Array:
         """Rows of all factors, a record's together (width x R x k); zero where they end before the records."""
