@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import shutil
 import sys
@@ -45,6 +46,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     missing = [f"{family}[{member}]" for family, left in named.items() for member in left]
     if missing and not any("::" in each for each in config.args):
         raise pytest.UsageError(f"quick: found no {', '.join(missing)}; name members by their ids")
+
+
+def pytest_collection_finish() -> None:
+    """What was imported and collected stays: the garbage collector does not look through it again and again."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
