@@ -80,7 +80,7 @@ def refusal(folder: Path, text: str, *overrides: str) -> str:
         (
             "data: poses.csv",
             "data: ../x.csv",
-            ["c.yaml:12, data: the path '../x.csv' leads to", "Move the file below"],
+            ["c.yaml:12, data: the path '../x.csv' leads to", "Copy the file into that folder"],
         ),
         ("payload_g: 50", "payload: [1]", ["c.yaml:10, payload: found [1] with its unit missing"]),
         ("{j1: 0.05,", "{j1: x,", ["c.yaml:9, compliance_rad_per_Nm.j1: 'x' is not a number"]),
