@@ -298,16 +298,19 @@ class Camera(PointInstrument):
         return f"its place {where} is known to {1000 * mm:.2g} mm and {np.rad2deg(deg):.2g} deg (95 %)."
 
     def mistakes(self) -> Sequence[Mistake]:
-        """A camera that was bumped, a lens that focuses by itself, boards that are not flat."""
+        """Boards that are not flat, another lens, a camera that was bumped, a lens that focuses by itself."""
         place = tuple(f"camera_{part}" for part in ("x", "y", "z", "rotation"))
         moved = "the camera, or the board, was moved there"
         again = "repeat some of the first poses now, fasten what moved, and calibrate the records after it apart"
         focus = "the recorded order: the focal length changes (autofocus, zoom, warming)"
         boards = self.board_names if self.lender is None else ()
-        flat = "lay a straight edge on the board, and fasten the sheet to something flat"
-        bends = ((f"the bend of {b}, which is not flat", (f"{b}_bend_x", f"{b}_bend_y")) for b in boards)
+        flat = "Lay a straight edge on the board, and glue the sheet to a flat plate"
+        bends = ((f"{b} is not flat", (f"{b}_bend_x", f"{b}_bend_y")) for b in boards)
+        lens = ("fx", "fy", "cx", "cy", *DISTORTION[self.settings.model])
+        intrinsics = "Take the intrinsics of this lens at this focus and image size"
         return (
             *(Mistake("bend", words, flat, names, "always") for words, names in bends),
+            Mistake("lens", "the lens is another than stated", intrinsics, lens, "always"),
             Mistake("bump", moved, again, place, "once"),
             Mistake("focus", focus, "turn autofocus off, and repeat the first poses", ("fx", "fy"), "slowly", True),
         )

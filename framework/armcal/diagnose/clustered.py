@@ -6,7 +6,7 @@ of the records' errors, and so its covariance is the sandwich of the weights and
 random order poses weigh correlated errors with changing signs, and little is wider; along a path it is.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -75,13 +75,21 @@ def _of_alike_points(problem: Problem, records: Sequence[FactorRecords], estimat
     rows = FitRows.of(problem, records, estimate)
     basis = np.linalg.qr(rows.slopes)[0]
     together = 0.0
-    for own in rows.by_record:
-        values, axes = np.linalg.eigh(np.eye(len(own)) - basis[own] @ basis[own].T)
-        left = (axes / np.sqrt(np.maximum(values, LEAST_LEFT))) @ (axes.T @ rows.residual[own])
-        together += float(np.sum((basis[own].T @ left) ** 2))
+    for own, root in unbiased_roots(rows, basis):
+        together += float(np.sum((basis[own].T @ (root @ rows.residual[own])) ** 2))
     apart = estimate.noise_scale**2 * float(np.sum(basis[: len(rows.record_of)] ** 2))
     factor = np.sqrt(max(together / max(apart, 1e-300), 1.0))
     return _wider(estimate, np.full(problem.increments, factor), np.full(len(estimate.free_entries), factor))
+
+
+def unbiased_roots(rows: FitRows, basis: Array) -> Iterator[tuple[Indices, Array]]:
+    """Rows of each record, and what multiplies their residuals so that they vary as errors do (symmetric).
+
+    The inverse root of what a fit leaves of them that takes up an orthonormal ``basis``. [Bell2002]
+    """
+    for own in rows.by_record:
+        values, axes = np.linalg.eigh(np.eye(len(own)) - basis[own] @ basis[own].T)
+        yield own, (axes / np.sqrt(np.maximum(values, LEAST_LEFT))) @ axes.T
 
 
 def _wider(estimate: Estimate, by_coordinate: Array, by_entry: Array) -> Estimate:

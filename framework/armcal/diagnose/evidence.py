@@ -8,6 +8,7 @@ import numpy as np
 
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
+from armcal.diagnose.held import Contradiction
 from armcal.diagnose.large_errors import LargeErrors
 from armcal.diagnose.residual_structure import ResidualStructure
 from armcal.diagnose.unseen import HiddenPayload
@@ -50,6 +51,7 @@ class Evidence:
     unit: str = "mm"
     new_recording: NewRecording | None = None
     hidden_payload: HiddenPayload | None = None
+    contradictions: tuple[Contradiction, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json."""
@@ -60,6 +62,7 @@ class Evidence:
             "priors_alone": alone
             and {"worst_mm": alone.worst_mm, "between_mm": alone.between_mm, "poses": alone.poses},
             "hidden_payload": self.hidden_payload and asdict(self.hidden_payload),
+            "contradictions": [asdict(one) for one in self.contradictions],
         }
 
 

@@ -1,7 +1,6 @@
 """What residuals might depend on outside of the arm: gravity, load, the instrument's scale and axes, sudden jumps."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -118,23 +117,19 @@ def _of_steps(here: Records, problem: Problem) -> Iterator[Dependence]:
 def _of_mistakes(
     here: Records, problem: Problem, values: Array, records: Sequence[FactorRecords]
 ) -> Iterator[Dependence]:
-    """What instruments say may have gone wrong with them."""
+    """What instruments say may have gone wrong with them meanwhile."""
     order, many = recorded_order(here.dataset), len(problem.blueprint.measurements) > 1
     ranked = np.argsort(order, kind="stable")
     rank = np.argsort(ranked, kind="stable")
     for name, measurement in problem.blueprint.measurements.items():
         for one in measurement.mistakes() if isinstance(measurement, NamesMistakes) else ():
-            always, blocks = one.course == "always", [problem.parameters[f"{name}.{p}"] for p in one.parameters]
-            if any(block.free == always for block in blocks):
+            blocks = [problem.parameters[f"{name}.{p}"] for p in one.parameters]
+            if one.course == "always" or not all(block.free for block in blocks):
                 continue
-            moves = _moves(freed(problem, blocks) if always else problem, values, records, blocks, one.together)
+            moves = _moves(problem, values, records, blocks, one.together)
             subject, words = (name if many else ""), f"{name}: {one.words}" if many else one.words
             labels, unit = (("change",), "1") if one.together and one.course != "once" else ((), "")
-            if always:
-                names, unit = tuple(block.name for block in blocks), blocks[0].unit
-                effect = f"free {', '.join(names)}"
-                yield Dependence(one.kind, subject, "", words, effect, one.measure, moves, names, unit)
-            elif np.ptp(order) > 0 and one.course == "slowly":
+            if np.ptp(order) > 0 and one.course == "slowly":
                 course = tuple(move * (rank / max(len(rank) - 1, 1) - 0.5)[:, None] for move in moves)
                 yield Dependence(one.kind, subject, "", words, "", one.measure, course, labels, unit)
             elif np.ptp(order) > 0:
@@ -142,17 +137,6 @@ def _of_mistakes(
                     jump = tuple(move * (rank >= place)[:, None] for move in moves)
                     at = f"whether a record was measured before or after {here.dataset.ids[ranked[place]]}: {words}"
                     yield Dependence(one.kind, subject, "", at, "", one.measure, jump)
-
-
-def freed(problem: Problem, blocks: Sequence[ParameterBlock]) -> Problem:
-    """The problem as a function of fixed parameters too; its records serve both."""
-    plan = problem.blueprint
-    parameters = plan.parameters.with_free([b.name for b in (*plan.parameters.free, *blocks)])
-    plan, kept = replace(plan, parameters=parameters), ("channels", "output_channels", "noise", "dimensions", "points")
-    kernels = plan.kernels(0, dict.fromkeys(plan.measurements, "interpreted"))
-    pairs = zip(kernels, problem.kernels, strict=True)  # of the points that are looked at, which may be few
-    same = (replace(k, factor=replace(k.factor, **{n: getattr(own.factor, n) for n in kept})) for k, own in pairs)
-    return replace(problem, parameters=parameters, kernels=tuple(same), blueprint=plan)
 
 
 def _moves(

@@ -14,40 +14,20 @@ from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.gross import Figure
+from armcal.diagnose.held import OFF, HeldParameter
 from armcal.diagnose.noise_findings import Finding, first_few
-from armcal.diagnose.outside import freed
 from armcal.estimate.estimator import Estimate
-from armcal.measure.measurement import HasScale
 from armcal.problem.motion import LOADS, Motion
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.tool_motion import apart_from
 
-MOST_RECORDS = 60
 UNSEEN = 0.2
 """An error of a scale that is larger than this and would not show is said to be of any size."""
-_SURE = 2.0
 _HIDDEN = 0.5
 """Where more than this share of what a payload does is left, the score tests of unstated loads see it."""
 _LEAST_SHARE = 0.1
 """A parameter that takes up less of it is not named."""
 _MOST_NAMED = 3
-
-
-@dataclass(frozen=True)
-class HeldScale:
-    """A scale that was not free.
-
-    Attributes:
-        name: of its parameter.
-        off: by how much it should differ from the value at which it is held, as a share.
-        sd: standard deviation of that, records that err alike counted.
-        check: how a user finds out what it is.
-    """
-
-    name: str
-    off: float
-    sd: float
-    check: str
 
 
 @dataclass(frozen=True)
@@ -63,31 +43,6 @@ class HiddenPayload:
     sd: float
     taken_up: float
     by: tuple[str, ...]
-
-
-def held_scales(problem: Problem, estimate: Estimate, records: Sequence[FactorRecords]) -> list[HeldScale]:
-    """Of all measurements that have one and hold it; ``records`` with the weights they had in the fit.
-
-    The deviation is the larger of the fit's and of that of sums over records, whose rows may err alike. [Bell2002]
-    """
-    stated, held = problem.blueprint.measurements.items(), []
-    scaled = {f"{instance}.{m.scale}": m.scale_check for instance, m in stated if isinstance(m, HasScale)}
-    for name, check in scaled.items():
-        if name not in problem.parameters.names or problem.parameters[name].free:
-            continue
-        wider = freed(problem, [problem.parameters[name]])
-        rows, at = FitRows.of(wider, records, estimate), wider.parameters.coordinate_names.index(name)
-        alone = apart_from(np.delete(rows.slopes, at, axis=1), rows.slopes[:, [at]])[:, 0]
-        size, unit, data = float(alone @ alone), float(wider.parameters.scales()[at]), len(rows.record_of)
-        off, sd = 0.0, np.inf
-        if size > 0:
-            off = -float(alone @ rows.residual) / size
-            pulls = alone * (rows.residual + alone * off)
-            by_record = np.bincount(rows.record_of, pulls[:data], minlength=records[0].count)
-            together = np.sqrt(np.sum(by_record**2) + np.sum(alone[data:] ** 2)) / size
-            sd = max(estimate.noise_scale / np.sqrt(size), float(together))
-        held.append(HeldScale(name, off * unit, sd * unit, check))
-    return held
 
 
 def scale_deviation(problem: Problem, rows: FitRows, positions: Sequence[Array], noise_scale: float) -> float | None:
@@ -108,7 +63,9 @@ def scale_deviation(problem: Problem, rows: FitRows, positions: Sequence[Array],
     return noise_scale / left if left > 0 else float("inf")
 
 
-def scale_findings(figure: Figure, instrument_sd: float | None, held: Sequence[HeldScale]) -> list[Finding]:
+def scale_findings(
+    figure: Figure, instrument_sd: float | None, held: Sequence[tuple[HeldParameter, str]]
+) -> list[Finding]:
     """In which frame the answer is, which error of a scale would not show, and which held scale the data contradict."""
     findings = []
     if instrument_sd is not None:
@@ -119,17 +76,18 @@ def scale_findings(figure: Figure, instrument_sd: float | None, held: Sequence[H
         )
         action = "Measure a known length with the instrument, if the scale matters."
         findings.append(Finding("note", text, "two standard deviations of a scale beside the parameters", action))
-    for one in held:
-        contradicts = abs(one.off) > _SURE * one.sd
+    for one, check in held:
+        contradicts = one.p_value < OFF
         put = f"records and priors put it {100 * one.off:+.2g} +- {100 * one.sd:.2g} % from there"
         text = f"{one.name} is held, {'although' if contradicts else 'and'} {put}."
         if 2 * one.sd > UNSEEN:
             text = f"{one.name} is held: an error of it {_unseen(one.sd, figure)}."
         elif not contradicts:
             text += f" An error {_unseen(one.sd, figure)}."
-        action = f"{one.check}; or free the scale with a prior."
-        test = "the scale beside the free parameters, two standard deviations"
-        findings.append(Finding("warning" if contradicts else "note", text, test, action))
+        test = f"the scale beside the free parameters, records as clusters, t, {100 * OFF:g} %"
+        findings.append(
+            Finding("warning" if contradicts else "note", text, test, f"{check}; or free the scale with a prior.")
+        )
     return findings
 
 

@@ -20,6 +20,7 @@ from armcal.diagnose.evidence_findings import (
     structure_findings,
     what_neighbours_cost,
 )
+from armcal.diagnose.held import contradiction_findings
 from armcal.diagnose.noise_findings import Finding, component_findings, first_few
 from armcal.diagnose.suspects import outlier_findings, suspicious_in_short, suspicious_records
 from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
@@ -88,7 +89,7 @@ def judge(
     suspicious = suspicious_records(errors_mm[train], own, fitted)
     noise = component_findings(fitted.components) if fitted and fitted.components else [_size(estimate, seen)]
     findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
-    findings += [*shift_findings(estimate), *noise]
+    findings += [*shift_findings(estimate), *noise, *contradiction_findings(seen.contradictions)]
     findings += structure_findings(seen.structure, seen.unit) if estimate.verdict.converged else []
     findings += neighbour_findings(seen.structure, estimate, seen.unit) or _neighbours(whitened, kept, estimate)
     findings += [*_correlated(estimate), *predicted, *large_error_findings(seen.large_errors, seen.unit)]
@@ -164,10 +165,9 @@ def _in_short(
 
 def _left(seen: Evidence) -> list[str]:
     """What is left in the residuals; that nothing was found only where all that was looked at says so."""
-    left = seen.structure
+    left, sentences = seen.structure, [finding.text for finding in contradiction_findings(seen.contradictions)]
     if left is None:
-        return ["Whether the model lacks anything is not known: the training records are too few."]
-    sentences = []
+        return sentences or ["Whether the model lacks anything is not known: the training records are too few."]
     if left.predictable is not None and left.is_predictable:
         sentences.append(predicted_in_short(left.predictable))
     if left.worthwhile:
@@ -235,9 +235,10 @@ def _size(estimate: Estimate, seen: Evidence) -> Finding:
     total, test = ratio**2 * freedom, "chi-square, 5 %"
     if total > chdtri(freedom, LEVEL / 2):
         why = "the model's error or the instrument's, which this test cannot separate"
-        if seen.structure is not None:
+        if seen.structure is not None or seen.contradictions:
             known = "some of it is the model's: what residuals depend on is named below"
-            is_seen = seen.structure.structures or seen.structure.is_predictable
+            left = seen.structure
+            is_seen = seen.contradictions or (left is not None and (left.structures or left.is_predictable))
             why += f"; {known if is_seen else 'none of the causes that were tested is in it'}"
         text = f"Residuals are {ratio:.1f} times the declared noise: {why}. Intervals are widened to the residuals."
         action = (
@@ -247,7 +248,7 @@ def _size(estimate: Estimate, seen: Evidence) -> Finding:
     if ratio < 0.5:
         text = f"Residuals are only {ratio:.2f} times the declared noise: was it stated too large?"
         return Finding("note", text, "ratio below 0.5", "State the noise as the instrument's data sheet does.")
-    explained = seen.structure is None or not seen.structure.is_predictable
+    explained = not seen.contradictions and (seen.structure is None or not seen.structure.is_predictable)
     text = f"Residuals are as large as the declared noise{': the model explains the data' if explained else ''}."
     return Finding("good", text, test)
 

@@ -12,13 +12,14 @@ from armcal.diagnose.evidence_findings import worse_than_nominal
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.gross import MOST_RECORDS, figure_of, thinned
 from armcal.diagnose.gross_findings import contradicting, displacement_findings, gross_error, overfitted, size_findings
+from armcal.diagnose.held import MOST_RECORDS as MOST_FOR_HELD
+from armcal.diagnose.held import contradictions, freed, held_scales
 from armcal.diagnose.large_errors import Judged, large_errors
 from armcal.diagnose.majority import minority, moved_findings, moved_groups
 from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.outside import predicted_positions
 from armcal.diagnose.residual_structure import structure
-from armcal.diagnose.unseen import MOST_RECORDS as MOST_FOR_SCALES
-from armcal.diagnose.unseen import held_scales, hidden_payload, hidden_payload_findings, scale_deviation, scale_findings
+from armcal.diagnose.unseen import hidden_payload, hidden_payload_findings, scale_deviation, scale_findings
 from armcal.diagnose.verdict import Verdict, judge
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.start import certificates
@@ -125,13 +126,16 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     if len(estimate.identifiability.null):
         poses = (unseen_poses(training, motion.channels, between) for between in (False, True))
         alone = priors_alone(problem, estimate, *poses)
-    few, acting = with_few_points(problem, problem.weighted(run.fitted.records, run.fitted.weights))
+    acting = problem.weighted(run.fitted.records, run.fitted.weights)
+    held = contradictions(problem, estimate, _for_held(problem, acting))
+    few, acting = with_few_points(problem, acting)
     own = (training, motion.subset(train), position[train])
     effects = [e for arm in system.description["arms"].values() for e in (arm.get("effects") or {}).values()]
-    left = structure(few, acting, estimate, *own, modelled=frozenset(str(effect.get("type")) for effect in effects))
+    wider = freed(few, [parameter.name for one in held for parameter in one.parameters])
+    left = structure(wider, acting, estimate, *own, modelled=frozenset(str(effect.get("type")) for effect in effects))
     hidden = hidden_payload(few, acting, estimate, own[0], own[1])
     new = predictor(problem, run.fitted).new_recording(run.records, np.flatnonzero(np.isfinite(judged_mm)))
-    return Evidence(left, missed, alone, error_unit(problem), new, hidden)
+    return Evidence(left, missed, alone, error_unit(problem), new, hidden, held)
 
 
 def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array, evidence: Evidence) -> list[Finding]:
@@ -140,7 +144,8 @@ def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array
     looked_at = thinned(train, MOST_RECORDS)
     figure = figure_of(problem, estimate, problem.subset(run.records, looked_at))
     own = thinned(np.arange(len(train)), MOST_RECORDS)
-    scales = held_scales(problem, estimate, problem.subset(acting, thinned(own, MOST_FOR_SCALES)))
+    wider = freed(problem, [parameter.name for one in evidence.contradictions for parameter in one.parameters])
+    scales = held_scales(wider, estimate, _for_held(problem, acting))
     problem, acting = with_few_points(problem, problem.subset(acting, own))
     rows = FitRows.of(problem, acting, estimate)
     dataset = run.dataset.subset(looked_at)
@@ -154,6 +159,11 @@ def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array
         *scale_findings(figure, scale_deviation(problem, rows, read, estimate.noise_scale), scales),
         *hidden_payload_findings(evidence.hidden_payload),
     ]
+
+
+def _for_held(problem: Problem, acting: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
+    """Records enough to judge what was held."""
+    return problem.subset(acting, thinned(np.arange(acting[0].count), MOST_FOR_HELD))
 
 
 def _worse(run: FittedRecords, errors: RecordErrors, judged_mm: Array) -> list[Finding]:

@@ -26,7 +26,8 @@ SENTENCES = {
     "rolled": "the hand does not turn between images as the board is seen to turn",
     "bumped": "the camera, or the board, was moved there",
     "focus": "the recorded order: the focal length changes (autofocus, zoom, warming)",
-    "bent": "the bend of board, which is not flat (camera.board_bend_x",
+    "bent": "Board is not flat: camera.board_bend_x is held at 0 mm, but the records put it at ",
+    "lens": "The lens is another than stated: camera.p1 is held at 0, but the records put it at 0.00",
 }
 
 
@@ -88,6 +89,8 @@ class Bench:
             channels |= {k: np.where(which, other[k], v) for k, v in channels.items() if k.startswith("camera.")}
         if mistake == "bent":
             return self.simulated({**self.truth, "camera.board_bend_x": "1 mm"}, clean)
+        if mistake == "lens":
+            return self.simulated({**self.truth, "camera.p1": 0.003}, clean)
         if mistake == "focus":
             for axis, centre in (("u", 0.633), ("v", 0.487)):
                 for k in range(54):
@@ -117,14 +120,21 @@ def test_the_errors_of_a_poor_arm_are_no_second_board(tmp_path: Path, mounting: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mistake", ["clean", "bumped", "focus", "bent"])
+@pytest.mark.parametrize(
+    ("count", "mistake"),
+    [(60, "clean"), (60, "bumped"), (60, "focus"), (60, "bent"), (25, "clean"), (25, "bent"), (25, "lens")],
+)
 @pytest.mark.parametrize("mounting", ["eye_in_hand", "eye_to_hand"])
-def test_what_changed_meanwhile_or_is_bent_is_named_by_the_verdict(tmp_path: Path, mounting: str, mistake: str) -> None:
-    bench = Bench(tmp_path, mounting, 60)
+def test_what_changed_meanwhile_or_is_bent_is_named_by_the_verdict(
+    tmp_path: Path, mounting: str, count: int, mistake: str
+) -> None:
+    bench = Bench(tmp_path, mounting, count)
     verdict = calibrate(bench.recorded(bench.planted(mistake))).verdict
     text = " ".join(finding.text for finding in verdict.findings)
     for name, sentence in SENTENCES.items():
         assert (sentence in text) == (name == mistake)
+    for size, sd in re.findall(r"board_bend_x is held at 0 mm, but the records put it at (\S+) \+- (\S+) mm", text):
+        assert abs(float(size) - 1) < 3 * float(sd) < 0.15
 
 
 def scale_held(*changes: str) -> tuple[str, str]:
