@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from few_records import World, calibrated, kept_true
+from soak import TIMES
 
 NOMINAL = 0.001
 """Share of good records that the gate rejects by default."""
 
 
-@pytest.mark.slow
 @dataclass(frozen=True)
 class Study:
     """Of good records after calibrations: those rejected, all of them, decisions, levels at the end."""
@@ -46,11 +46,11 @@ def test_good_records_after_few_are_believed(rows: int, trained: int, tmp_path: 
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [1.0, 3.0])
 def test_the_share_of_good_records_rejected_is_the_nominal_one(noise: float, tmp_path: Path) -> None:
-    """20 calibrations each, in all twice the stated share at most; those after one calibration share its noise."""
+    """4 calibrations each, in all twice the stated share at most; those after one calibration share its noise."""
     shares = []
     for rows in (3, 6, 12, 40):
         for trained in (5, 10, 30, 100):
-            found = Study.of(rows, trained, range(20), 300, tmp_path, noise)
+            found = Study.of(rows, trained, range(4 * TIMES), 150, tmp_path, noise)
             shares.append(found.rejected / found.records)
             print(f"noise {noise}, {rows} rows, {trained} records: {100 * shares[-1]:.3f} %, {found.decisions}")
             assert found.decisions == () and found.levels == {"nominal"}
