@@ -17,7 +17,7 @@ from docs_commands import blocks, commands, plain_words
 from scaffolds import armcal, files_of, install, need, page, run
 
 NAME = "made_here"
-MOST_LINES = {"gear_wave.py": 30, "soft_joint.py": 30, "total_station.py": 60, "worst_sector.py": 30}
+MOST_LINES = {"two_link.py": 40, "gear_wave.py": 30, "soft_joint.py": 30, "total_station.py": 60, "worst_sector.py": 30}
 """Of files on the page, that an author writes for a component of their own."""
 FEWEST_CHECKS = 15
 RULES = (
