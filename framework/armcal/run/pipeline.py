@@ -30,8 +30,8 @@ from armcal.run.result import RunResult, SuspiciousRecord, noise_result, run_gro
 
 
 @dataclass(frozen=True)
-class _Means:
-    """What a run is done with."""
+class _RunContext:
+    """What every stage of a run needs; ``executor`` does starts and folds, in this process if None."""
 
     experiment: Experiment
     progress: Progress
@@ -52,29 +52,33 @@ def calibrate(
     ready = prepare(experiment, watch, accept, progress)
     faults = list(registry.notify("armcal_run_started", name=experiment.name, records=len(ready.dataset)))
     faults += _notify_rejected(registry, ready.dataset.set_aside)
-    means = _Means(experiment, progress, executor, watch)
-    before = FittedRecords(**vars(ready), fitted=_fitted(means, ready))
+    context = _RunContext(experiment, progress, executor, watch)
+    before = FittedRecords(**vars(ready), fitted=_fitted(context, ready))
     faults += registry.notify("armcal_estimate_changed", estimate=before.fitted.estimate)
-    run, outcome = _with_pose_residual(means, before)
-    resampled, profiled = _uncertainty(means, run)
-    result = _judged(means, run, outcome, *_validated(means, before, run, outcome))
+    run, outcome = _with_pose_residual(context, before)
+    resampled, profiled = _uncertainty(context, run)
+    result = _judged(context, run, outcome, *_validated(context, before, run, outcome))
     faults += _notify_rejected(registry, result.noise.set_aside)
     warnings = (*result.warnings, *dict.fromkeys(faults))
     return replace(result, command=command, warnings=warnings, bootstrap=resampled, profiles=profiled)
 
 
 def _judged(
-    means: _Means, run: FittedRecords, outcome: ResidualOutcome | None, errors: RecordErrors, intervals: IntervalResult
+    context: _RunContext,
+    run: FittedRecords,
+    outcome: ResidualOutcome | None,
+    errors: RecordErrors,
+    intervals: IntervalResult,
 ) -> RunResult:
     """What a run knows of its fit, with the verdict on it."""
-    experiment, dataset, split, fitted = means.experiment, run.dataset, run.split, run.fitted
+    experiment, dataset, split, fitted = context.experiment, run.dataset, run.split, run.fitted
     system, validation = experiment.system, experiment.settings.validation
     if outcome is not None:
         system = outcome.system(system)
-    with means.watch.stage("judge"):
-        means.progress("judging", 0.0)
+    with context.watch.stage("judge"):
+        context.progress("judging", 0.0)
         verdict, evidence = verdict_of(run, errors, intervals, system, validation.limit)
-        means.progress("judging", 1.0)
+        context.progress("judging", 1.0)
     return RunResult(
         name=experiment.name,
         command="",
@@ -89,7 +93,7 @@ def _judged(
         evidence=evidence,
         warnings=(*run.warnings, *fitted.warnings, *errors.fold_warnings(validation.folds)),
         backend=run.problem.backend,
-        seconds=means.watch.seconds,
+        seconds=context.watch.seconds,
         provenance=replace(experiment, system=system).provenance(dataset),
         noise=noise_result(run.problem, fitted, dataset, split, errors.calibrated_mm),
         intervals=intervals,
@@ -98,27 +102,27 @@ def _judged(
     )
 
 
-def _uncertainty(means: _Means, run: FittedRecords) -> tuple[Bootstrap | None, tuple[Profile, ...]]:
+def _uncertainty(context: _RunContext, run: FittedRecords) -> tuple[Bootstrap | None, tuple[Profile, ...]]:
     """What was asked for beyond the covariance, of a fit that converged."""
-    experiment, parts = means.experiment, (means.executor, means.progress)
+    experiment, parts = context.experiment, (context.executor, context.progress)
     settings, estimate = experiment.settings.uncertainty, run.fitted.estimate
     resampled: Bootstrap | None = None
     profiled: tuple[Profile, ...] = ()
     if settings.bootstrap and estimate.verdict.converged and estimate.names:
-        with means.watch.stage("bootstrap"):
+        with context.watch.stage("bootstrap"):
             poses = experiment.poses(run.dataset.subset(run.split.train))
             resampled = bootstrap(run.problem, run.training, experiment.estimator, estimate, settings, *parts, poses)
     if settings.profile and estimate.verdict.converged:
-        with means.watch.stage("profile"):
+        with context.watch.stage("profile"):
             profiled = profiles(run.problem, run.fitted, experiment.estimator, settings.profile, *parts)
     return resampled, profiled
 
 
-def _fitted(means: _Means, ready: Prepared) -> WeighedFit:
+def _fitted(context: _RunContext, ready: Prepared) -> WeighedFit:
     """The fit to the training records, as sure as records that may err alike allow."""
-    problem, data, progress = ready.problem, ready.dataset.subset(ready.split.train), means.progress
-    estimator = spread(means.experiment.estimator, means.executor)
-    with means.watch.stage("fit"):
+    problem, data, progress = ready.problem, ready.dataset.subset(ready.split.train), context.progress
+    estimator = spread(context.experiment.estimator, context.executor)
+    with context.watch.stage("fit"):
         starts = ready.start.values(problem)
         given_up = [hopeless(problem, ready.training, data, start) for start in starts]
         left = [start for start, hopeless_from in zip(starts, given_up, strict=True) if hopeless_from is None]
@@ -143,14 +147,14 @@ def _widened(ready: Prepared, fitted: WeighedFit) -> WeighedFit:
     return replace(fitted, estimate=widened(ready.problem, acting, fitted.estimate, position))
 
 
-def _with_pose_residual(means: _Means, run: FittedRecords) -> tuple[FittedRecords, ResidualOutcome | None]:
+def _with_pose_residual(context: _RunContext, run: FittedRecords) -> tuple[FittedRecords, ResidualOutcome | None]:
     """The problem and the fit with the pose residual that is to be learned, where it is kept, and what became of it."""
-    experiment, progress, executor = means.experiment, means.progress, means.executor
+    experiment, progress, executor = context.experiment, context.progress, context.executor
     training = run.dataset.subset(run.split.train)
     layer = layer_of(experiment.system, training)
     if layer is None or not run.fitted.estimate.verdict.converged:
         return run, None
-    with means.watch.stage("pose residual"):
+    with context.watch.stage("pose residual"):
         splits = folds_of(experiment, run) if experiment.settings.validation.folds else ()
         order = np.argsort(recorded_position(training), kind="stable")
         own = (run.problem, run.training, run.fitted, splits, order)
@@ -179,16 +183,16 @@ def _notify_rejected(registry: PluginRegistry, records: Sequence[SetAside | Susp
 
 
 def _validated(
-    means: _Means, before: FittedRecords, run: FittedRecords, outcome: ResidualOutcome | None
+    context: _RunContext, before: FittedRecords, run: FittedRecords, outcome: ResidualOutcome | None
 ) -> tuple[RecordErrors, IntervalResult]:
     """Errors of all records and prediction intervals, by cross-validation over the training records if configured.
 
     Nominal errors are those ``before`` a pose residual was learned. Nothing is predicted, nor cross-validated, by a fit
     that did not converge: its folds would not either, and each would take as long.
     """
-    experiment, problem, estimator = means.experiment, run.problem, means.experiment.estimator
+    experiment, problem, estimator = context.experiment, run.problem, context.experiment.estimator
     crossed: tuple[CrossValidation, tuple[Split, ...]] | None = None
-    with means.watch.stage("validate"):
+    with context.watch.stage("validate"):
         if not run.fitted.estimate.verdict.converged:
             return errors_of(run, None), IntervalResult()
         if outcome is not None and outcome.residual is not None and outcome.crossed is not None:
@@ -196,7 +200,7 @@ def _validated(
         elif experiment.settings.validation.folds:
             splits, start = folds_of(experiment, run), problem.parameters.nominal()
             training = problem.subset(run.records, run.split.train)
-            parts = (training, splits, estimator, start, means.progress, means.executor, fit_and_predict)
+            parts = (training, splits, estimator, start, context.progress, context.executor, fit_and_predict)
             crossed = cross_validate(problem, *parts), splits
         intervals = interval_result(problem, run.fitted, run.records, run.split, estimator, crossed, run.dataset)
         errors = errors_of(run, crossed and crossed[0])
