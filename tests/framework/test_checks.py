@@ -215,6 +215,21 @@ def test_one_of_two_instruments_frozen() -> None:
     assert len(checks.set_aside_frozen(both, roles).set_aside) == 4
 
 
+def test_a_position_of_zeros_was_not_measured() -> None:
+    dataset = records()
+    for channel in POSITION:
+        dataset.channels[channel][[2, 5]] = 0.0
+    dataset.channels[POSITION[0]][6] = 0.0
+    kept = check_dataset(dataset, layout())
+    assert [(a.row, a.reason) for a in kept.set_aside] == [
+        (4, "tracker is exactly (0, 0, 0)"),
+        (7, "tracker is exactly (0, 0, 0)"),
+    ]
+    assert "2 of 8 records were set aside because their position is exactly (0, 0, 0)" in kept.warnings[0]
+    dataset.channels.update({channel: np.zeros(8) for channel in POSITION})
+    assert not checks.set_aside_zeros(dataset, layout()).set_aside
+
+
 def test_exact_duplicates() -> None:
     moments = np.arange(8.0)
     dataset = with_row(records(time=moments), 6, 2, "time")

@@ -66,6 +66,16 @@ def test_an_error_of_five_times_the_noise_is_bad_unless_it_is_explained(tmp_path
 
 
 @pytest.mark.slow
+def test_what_time_predicts_excuses_no_error(tmp_path: Path) -> None:
+    """The tracker was bumped by 1.7 mm in the middle: 0.4 % of the reach; the mean of both halves is no arm."""
+    moved = 1.7 * (np.arange(200) >= 100)[:, None]
+    code, verdict = ran(tmp_path, "measurements.tracker.noise_mm=0.1", change=lambda points: points + moved)
+    told = next(f for f in verdict["findings"] if f["grade"] == "bad")
+    assert code == 3 and "times the declared noise" in told["text"]
+    assert "the base, the tracker or the target moved" in told["action"]
+
+
+@pytest.mark.slow
 def test_a_noise_that_nobody_stated_is_estimated_and_said(tmp_path: Path) -> None:
     """No fault is found in 0.5 mm of noise where 0.07 mm was a guess; priors are weighed against 0.5 mm."""
     code, verdict = ran(tmp_path, "measurements.tracker.noise_mm=0.07", "noise.estimate=instruments")

@@ -68,6 +68,23 @@ def test_a_noise_stated_too_small_or_too_large_is_noticed() -> None:
 
 
 @pytest.mark.slow
+def test_a_fit_without_degrees_of_freedom_is_no_evidence() -> None:
+    """Ten records: 30 equations for 28 parameters. That residuals are small then says nothing of the noise."""
+    told = sentences("validation.holdout=0.95")
+    assert "warning: Only 2 degrees of freedom are left" in told and "stated too large" not in told
+
+
+@pytest.mark.slow
+def test_a_joint_that_stood_still_is_named(tmp_path: Path) -> None:
+    header, *lines = (CONFIGS / "demo.csv").read_text().splitlines()
+    column, path = header.split(",").index("q6_deg"), tmp_path / "still.csv"
+    still = [line for line in lines if float(line.split(",")[column]) == 50]
+    path.write_text("\n".join([header, *still]) + "\n")
+    told = sentences("parameters.free=[arm.mdh.theta[2-4], arm.mdh.base_[xyz]]", data=path)
+    assert "warning: Hardly moved in the training records: q6 at 50 deg." in told
+
+
+@pytest.mark.slow
 def test_a_drift_of_the_tracker_shows_as_correlated_neighbours(tmp_path: Path) -> None:
     data = disturbed(tmp_path, lambda points: points + 3 * np.sin(np.linspace(0, 9, len(points)))[:, None])
     told = sentences(data=data)

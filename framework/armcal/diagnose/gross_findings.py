@@ -24,6 +24,10 @@ _MEDIAN_OF_NOISE = 0.6745
 """The median size of a normal number of deviation 1."""
 _NO_EXCUSE = frozenset({"order", "step", "slip", "scale"})
 """Kinds of structure that explain no gross error: something may have moved, or a frame be wrong."""
+_MOVED = (
+    "The error depends on when a record was measured: the base, the tracker or the target moved or drifted. Measure "
+    "again what differs, or calibrate the records before and after by themselves. parameters.drift models a slow drift."
+)
 SIZE, GROSS_SIZE = 0.02, 0.05
 """How far the calibrated arm may be larger or smaller than the nominal one: worth a look, and gross."""
 MOST_NAMED = 3
@@ -66,17 +70,22 @@ def gross_error(
         f"limits {100 * limit:g} % and {TIMES_NOISE:g} times; one cause explains at most {100 * explained:.0f} % of "
         f"it, other poses predict {100 * predicted:.0f} %"
     )
-    return [
-        Finding("bad", text, test, f"The cause is not known: is the stated noise the instrument's? {CHECK_THE_DATA}")
-    ]
+    action = f"The cause is not known: is the stated noise the instrument's? {CHECK_THE_DATA}"
+    return [Finding("bad", text, test, _MOVED if _by_time(left) else action)]
+
+
+def _by_time(left: ResidualStructure | None) -> bool:
+    """Whether time is what predicts most of the residuals."""
+    seen = None if left is None or not left.is_predictable else left.predictable
+    return seen is not None and [carrier.kind for carrier in seen.carriers[:1]] == ["time"]
 
 
 def _explained(left: ResidualStructure | None) -> tuple[float, float]:
-    """Which shares of the error one cause makes up at most, and other records predict, whatever the cause."""
+    """Which shares of the error one cause makes up at most, and other poses predict, whatever the cause."""
     if left is None:
         return 0.0, 0.0
     causes = [s.falls_mm for s in left.worthwhile if s.kind not in _NO_EXCUSE]
-    predicted = left.predictable.falls if left.predictable is not None and left.is_predictable else 0.0
+    predicted = left.predictable.falls_beside_time if left.predictable is not None and left.is_predictable else 0.0
     return max(causes, default=0.0) / max(left.mean_mm, 1e-12), predicted
 
 

@@ -32,6 +32,7 @@ from armcal.planning.suggestion import CANDIDATES, Suggestion, is_worth_measurin
 
 LEVEL = 0.05
 SHARE = 0.95
+FEWEST_FREEDOM = 10
 DO_NOT_USE = "Do not use this calibration"
 _ORDER = {"bad": 0, "warning": 1, "note": 2, "good": 3}
 
@@ -89,7 +90,7 @@ def judge(
     suspicious = suspicious_records(errors_mm[train], own, fitted)
     noise = component_findings(fitted.components) if fitted and fitted.components else [_size(estimate, seen)]
     findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
-    findings += [*shift_findings(estimate), *noise, *contradiction_findings(seen.contradictions)]
+    findings += [*shift_findings(estimate), *noise, *_freedom(estimate), *contradiction_findings(seen.contradictions)]
     findings += structure_findings(seen.structure, seen.unit) if estimate.verdict.converged else []
     findings += neighbour_findings(seen.structure, estimate, seen.unit) or _neighbours(whitened, kept, estimate)
     findings += [*_correlated(estimate), *predicted, *large_error_findings(seen.large_errors, seen.unit)]
@@ -245,12 +246,25 @@ def _size(estimate: Estimate, seen: Evidence) -> Finding:
             "Repeat some poses, each from elsewhere: the spread of the repeats is noise, the rest the model's error."
         )
         return Finding("warning", text, test, action)
-    if ratio < 0.5:
+    if ratio < 0.5 and total < chdtri(freedom, 1 - LEVEL / 2):
         text = f"Residuals are only {ratio:.2f} times the declared noise: was it stated too large?"
-        return Finding("note", text, "ratio below 0.5", "State the noise as the instrument's data sheet does.")
+        return Finding("note", text, f"ratio below 0.5, {test}", "State the noise as the instrument's data sheet does.")
     explained = not seen.contradictions and (seen.structure is None or not seen.structure.is_predictable)
     text = f"Residuals are as large as the declared noise{': the model explains the data' if explained else ''}."
     return Finding("good", text, test)
+
+
+def _freedom(estimate: Estimate) -> list[Finding]:
+    """Are equations enough left to judge the residuals by? Ten give the noise to within a fifth or so."""
+    freedom = estimate.degrees_of_freedom
+    if freedom >= FEWEST_FREEDOM:
+        return []
+    text = (
+        f"Only {freedom:.2g} degrees of freedom are left beside the free parameters: small residuals are no evidence "
+        "that the model is right."
+    )
+    action = "Measure more poses: three to five times as many numbers as free parameters; or free fewer parameters."
+    return [Finding("warning", text, f"equations less parameters, at least {FEWEST_FREEDOM}", action)]
 
 
 def _neighbours(whitened: Array, train: Indices, estimate: Estimate) -> list[Finding]:

@@ -33,6 +33,7 @@ __all__ = [
     "set_aside_frozen",
     "set_aside_not_finite",
     "set_aside_without_noise",
+    "set_aside_zeros",
     "warn_repeated_poses",
     "warn_small_degrees",
 ]
@@ -63,7 +64,7 @@ def check_dataset(dataset: Dataset, layout: Layout) -> Dataset:
     dataset = warn_small_degrees(dataset, layout)
     refuse_conflicting_ids(dataset, layout)
     dataset = set_aside_backward_time(dataset, layout)
-    dataset = set_aside_duplicates(set_aside_frozen(dataset, layout), layout)
+    dataset = set_aside_duplicates(set_aside_frozen(set_aside_zeros(dataset, layout), layout), layout)
     return warn_repeated_poses(require_records(dataset), layout)
 
 
@@ -255,6 +256,20 @@ def set_aside_frozen(dataset: Dataset, layout: Layout) -> Dataset:
                 reason = f"{instance} repeats the values of {since} while the joints moved: it had frozen"
                 faulty.update(dict.fromkeys(run[1:].tolist(), reason))
     return set_aside(dataset, layout, faulty, "the instrument had frozen", "Measure these poses again.")
+
+
+def set_aside_zeros(dataset: Dataset, layout: Layout) -> Dataset:
+    """Set aside positions of exactly (0, 0, 0), which many instruments write when they see nothing."""
+    faulty: dict[int, str] = {}
+    for x in (channel for channel in layout.measured if channel.endswith(".x")):
+        instance = x.removesuffix("x")
+        position = [instance + axis for axis in "xyz"]
+        if set(position) <= set(layout.measured):
+            zeros = np.flatnonzero((dataset.stacked(position) == 0).all(axis=0))
+            reason = f"{instance[:-1]} is exactly (0, 0, 0)"
+            faulty |= dict.fromkeys(zeros.tolist(), reason) if 2 * len(zeros) < len(dataset) else {}
+    why = "their position is exactly (0, 0, 0)"
+    return set_aside(dataset, layout, faulty, why, "Many instruments write that when they do not see their target.")
 
 
 def set_aside_duplicates(dataset: Dataset, layout: Layout) -> Dataset:

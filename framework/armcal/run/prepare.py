@@ -8,8 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from armcal.base.dataset import Dataset
+from armcal.base.units import to_unit
 from armcal.config.system import System
-from armcal.diagnose.noise_findings import Finding
+from armcal.diagnose.noise_findings import Finding, first_few
 from armcal.diagnose.permuted_axes import MUCH_BETTER, find_permuted_axes
 from armcal.errors import ConfigError, DataError, Location, ProblemError
 from armcal.estimate.estimator import Progress, no_progress
@@ -31,6 +32,8 @@ _MEND = {True: "the order or the directions of the joints in the model", False: 
 _REACH_RATIO = 10.0
 _ALIKE = 0.35
 """In powers of ten: so alike are two distances of one unit."""
+_STILL = {"angle": ("deg", 1.0), "length": ("mm", 1.0)}
+"""A joint that moved by less stood still, but for the noise of its reading."""
 _FEWEST_ROWS, _NEARLY_ALL, _NEAREST = 3, 0.95, 1e-6
 
 
@@ -249,6 +252,28 @@ def check_permuted_axes(
         "stands: armcal run --accept."
     )
     raise DataError(text, where=Location(dataset.source), hint=hint)
+
+
+def still_findings(system: System, dataset: Dataset) -> list[Finding]:
+    """A warning of joints that stood still in all records that trained."""
+    still = []
+    for name, arm in system.arms.items():
+        for joint, kind in arm.commanded.items():
+            values, (unit, least) = dataset.column(f"{name}.{joint}"), _STILL[kind]
+            known = to_unit(values[np.isfinite(values)], unit)
+            if known.size and np.ptp(known) < least:
+                at = f"{np.mean(known):.4g} {unit}"
+                still.append(f"{joint if len(system.arms) == 1 else f'{name}.{joint}'} at {at}")
+    if not still:
+        return []
+    text = (
+        f"Hardly moved in the training records: {first_few(still)}. Predictions elsewhere rest on nominal values and "
+        "priors, and no record judges them."
+    )
+    test = "range, limits " + " and ".join(f"{least:g} {unit}" for unit, least in _STILL.values())
+    return [
+        Finding("warning", text, test, "Move these joints too, or use the calibration only where they stand there.")
+    ]
 
 
 def gravity_findings(system: System, dataset: Dataset) -> list[Finding]:
