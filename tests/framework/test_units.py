@@ -11,6 +11,7 @@ import pytest
 from armcal.base.units import (
     UNITS,
     Unit,
+    digits,
     display_unit,
     from_unit,
     parse_quantity,
@@ -49,6 +50,15 @@ def test_a_value_comes_in_as_the_float_its_si_spelling_has(value: float, unit: s
 def test_millimetres_and_metres_make_the_same_float_where_a_multiplication_would_not() -> None:
     assert all(from_unit(n, "mm") == float(f"{n}e-3") for n in range(5000))
     assert any(n * 1e-3 != float(f"{n}e-3") for n in range(5000))  # the trap is real
+
+
+@pytest.mark.parametrize(
+    ("value", "count", "text"),
+    [(1984.4, 3, "1980"), (139.9, 2, "140"), (0.00012345, 3, "0.000123"), (378123.0, 3, "378000"), (0.5, 3, "0.5")],
+)
+def test_significant_digits_are_written_without_an_exponent(value: float, count: int, text: str) -> None:
+    assert digits(value, count) == text
+    assert digits(math.inf) == "inf" and digits(-12.34) == "-12.3" and digits(0.0) == "0"
 
 
 def test_arrays_are_converted_like_numbers() -> None:

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, overload
 
@@ -251,3 +252,8 @@ def to_unit(si_value: Any, unit_name: str) -> Any:
     """The value in the named unit of an SI number or array; ValueError for an unknown unit."""
     known = unit(unit_name)
     return si_value * known.denominator / known.numerator
+
+
+def digits(value: float, count: int = 3) -> str:
+    """A number with so many significant digits, never with an exponent."""
+    return format(Decimal(f"{value:.{count - 1}e}").normalize() + 0, "f") if math.isfinite(value) else str(value)

@@ -9,7 +9,7 @@ import click
 import numpy as np
 from rich.table import Table
 
-from armcal.base.units import to_unit
+from armcal.base.units import digits, to_unit
 from armcal.cli.common import FILE, Console, data, overrides, speaking
 from armcal.cli.console import columned
 from armcal.cli.outlet import say
@@ -137,8 +137,8 @@ def _alignment_lines(start: Start) -> list[str]:
         "alignment of the nominal arm with the positions: its base frame stands at "
         f"{pose_words(start.alignment)} in the "
         f"instrument's frame, the target is ({target}) mm from its configured place on the tool.",
-        f"typical error of the nominal arm: {start.configured * _MM:.3g} mm as configured, "
-        f"{start.alignment.left * _MM:.3g} mm aligned; the fit starts from "
+        f"typical error of the nominal arm: {digits(start.configured * _MM)} mm as configured, "
+        f"{digits(start.alignment.left * _MM)} mm aligned; the fit starts from "
         f"{'the alignment' if start.taken else 'the configuration'}.",
     ]
     lines += [f"not determined by these positions: {gauge}." for gauge in start.gauges]

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from armcal.base.arrays import Array
+from armcal.base.units import digits
 from armcal.diagnose.gross import BEYOND, FAR_BEYOND, Displaced, Figure
 from armcal.diagnose.majority import Minority
 from armcal.diagnose.noise_findings import Finding, first_few
@@ -56,7 +57,7 @@ def gross_error(
         return []
     mean, scale, (whole, name) = float(np.mean(seen)), estimate.noise_scale, wholes[unit]
     share = mean / whole
-    error = f"The mean error of records that did not train is {mean:.3g} {unit}, {100 * share:.2g} % of {name}"
+    error = f"The mean error of records that did not train is {digits(mean)} {unit}, {100 * share:.2g} % of {name}"
     if share > OF_REACH:
         test = f"mean, limit {100 * OF_REACH:g} % of {whole:.0f} {unit}"
         return [Finding("bad", f"{error}: the values do not describe this arm.", test, CHECK_THE_DATA)]
@@ -120,7 +121,7 @@ def contradicting(minority: Minority | None, ids: Sequence[str]) -> list[Finding
     count, total = len(minority.far), len(ids)
     text = (
         f"{count} of {total} training records ({100 * count / total:.0f} %) contradict the others: a fit to the "
-        f"majority is off by {minority.typical_mm:.2g} mm there, and by {minority.far_mm:.3g} mm in these"
+        f"majority is off by {digits(minority.typical_mm, 2)} mm there, and by {digits(minority.far_mm)} mm in these"
     )
     listed = f"{', '.join(ids[i] for i in minority.far[:MOST_NAMED])}{', ...' if count > MOST_NAMED else ''}"
     test = "sum of residual lengths minimised; far is beyond 8 times the lower quartile"
@@ -173,7 +174,7 @@ def _listed(group: Sequence[Displaced]) -> str:
     measures = ["its prior" if displaced.by_prior else "a typical correction" for displaced in group]
     return first_few(
         [
-            f"{d.name} by {d.amount:.3g} {d.unit} ({d.times:.0f} times {m})"
+            f"{d.name} by {digits(d.amount)} {d.unit} ({d.times:.0f} times {m})"
             for d, m in zip(group, measures, strict=True)
         ],
         MOST_NAMED,

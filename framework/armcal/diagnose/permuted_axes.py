@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from armcal.arm.assembly import Arm
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
+from armcal.base.units import digits
 from armcal.diagnose.readings import LEFT_HANDED, Wires, scaled_positions, several_joints, single_joints, turned_axes
 from armcal.errors import NotConvergedError
 from armcal.estimate.placing import Placing, placings
@@ -211,8 +212,9 @@ def _of(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, arm: Ar
     if min(reading.left for reading in readings) > enough:
         if seen.placing is None:
             turn, shift = rigid_fit(straight.predicted, seen.measured)
-            angle = np.rad2deg(np.linalg.norm(Rotation.from_matrix(turn).as_rotvec()))
-            words = f"the arm's base elsewhere by {np.linalg.norm(shift) * _MM:.3g} mm and {angle:.2g} deg"
+            angle = float(np.rad2deg(np.linalg.norm(Rotation.from_matrix(turn).as_rotvec())))
+            apart = f"{digits(float(np.linalg.norm(shift)) * _MM)} mm and {digits(angle, 2)} deg"
+            words = f"the arm's base elsewhere by {apart}"
             left = straight.left(turn.T @ (seen.measured - shift[:, None]))
             if left <= enough and straight.can_move(turn, shift):
                 return None  # the fit moves the base there by itself

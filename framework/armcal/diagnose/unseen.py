@@ -12,6 +12,7 @@ import numpy as np
 
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
+from armcal.base.units import digits
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.gross import Figure
 from armcal.diagnose.held import OFF, HeldParameter
@@ -70,9 +71,9 @@ def scale_findings(
     findings = []
     if instrument_sd is not None:
         text = (
-            f"The answer is in the instrument's frame: in it the arm stands {figure.moved_mm:.3g} mm and "
-            f"{figure.turned_deg:.2g} deg from where the configuration has it. An error of the instrument's scale "
-            f"{_unseen(instrument_sd, figure)}."
+            f"The answer is in the instrument's frame: in it the arm stands {digits(figure.moved_mm)} mm and "
+            f"{digits(figure.turned_deg, 2)} deg from where the configuration has it. An error of the instrument's "
+            f"scale {_unseen(instrument_sd, figure)}."
         )
         action = "Measure a known length with the instrument, if the scale matters."
         findings.append(Finding("note", text, "two standard deviations of a scale beside the parameters", action))
@@ -95,7 +96,7 @@ def _unseen(sd: float, figure: Figure) -> str:
     """Which errors of a scale would not show: two standard deviations of it."""
     if 2 * sd > UNSEEN:
         return "would not show in these data at all"
-    return f"of up to {200 * sd:.2g} % would not show ({2 * sd * figure.reach_mm:.2g} mm at the arm's reach)"
+    return f"of up to {200 * sd:.2g} % would not show ({digits(2 * sd * figure.reach_mm, 2)} mm at the arm's reach)"
 
 
 def hidden_payload(
@@ -123,8 +124,8 @@ def hidden_payload_findings(hidden: HiddenPayload | None) -> list[Finding]:
     if hidden is None:
         return []
     text = (
-        f"A payload of up to {2000 * hidden.sd:.2g} g that hangs at the tool without being stated would not show: "
-        f"{first_few(hidden.by, _MOST_NAMED)} would take up {100 * hidden.taken_up:.0f} % of what it does."
+        f"A payload of up to {digits(2000 * hidden.sd, 2)} g that hangs at the tool without being stated would not "
+        f"show: {first_few(hidden.by, _MOST_NAMED)} would take up {100 * hidden.taken_up:.0f} % of what it does."
     )
     test = "two standard deviations of a mass beside the free parameters"
     return [Finding("note", text, test, "Weigh what hangs on the tool, and state it: statics.payload_g.")]

@@ -16,6 +16,7 @@ from armcal.arm.statics import BASE_FRAME, TOOL_FRAME
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock
+from armcal.base.units import digits
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.placing import Placing, placings
 from armcal.measure.measurement import Carried, borrowed_names
@@ -147,9 +148,9 @@ def _disagreement(problem: Problem, values: Array, configured: float, left: floa
     named = ", ".join(f"{name} ({times:.0f} standard deviations)" for name, times in beyond)
     return named and (
         f"The records place the arm's base or the target elsewhere than the configuration does: {named} from its "
-        f"prior. There the nominal arm would be typically {left * _MM:.3g} mm off, where the configuration has it "
-        f"{configured * _MM:.3g} mm off. The fit starts from the configuration. Correct the values or the frame of the "
-        "measurements, or leave the priors out: then base and target are found."
+        f"prior. There the nominal arm would be typically {digits(left * _MM)} mm off, where the configuration has it "
+        f"{digits(configured * _MM)} mm off. The fit starts from the configuration. Correct the values or the frame of "
+        "the measurements, or leave the priors out: then base and target are found."
     )
 
 

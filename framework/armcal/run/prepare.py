@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from armcal.base.dataset import Dataset
-from armcal.base.units import to_unit
+from armcal.base.units import digits, to_unit
 from armcal.config.system import System
 from armcal.diagnose.noise_findings import Finding, first_few
 from armcal.diagnose.permuted_axes import MUCH_BETTER, find_permuted_axes
@@ -239,9 +239,9 @@ def check_permuted_axes(
     if reading is None:
         return []
     text = (
-        f"{reading.measurement}: as they stand, the data are typically {reading.as_given_mm:.3g} mm off the model, "
+        f"{reading.measurement}: as they stand, the data are typically {digits(reading.as_given_mm)} mm off the model, "
         f"however its free parameters adapt; with {', or with '.join(reading.readings)}, they are "
-        f"{reading.left_mm:.3g} mm off."
+        f"{digits(reading.left_mm)} mm off."
     )
     mend = _MEND[reading.of_joints]
     hint = f"Check the unit in the column names; mend columns in the file or by data.columns, or {mend}."
