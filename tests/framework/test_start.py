@@ -159,6 +159,22 @@ def test_mistakes_are_named_in_any_frame(anywhere: Prepared, change, words: str)
     assert found.as_given_mm > 3 * found.left_mm
 
 
+@pytest.mark.parametrize("since", [40, 100, 170])
+def test_a_tracker_that_was_moved_in_the_middle_is_named_with_the_record(anywhere: Prepared, since: int) -> None:
+    """Half of the record's positions in one frame, half in another: no single one fits."""
+    dataset = seen_from(anywhere.dataset, Rotation.random(random_state=4).as_matrix(), np.array([1.0, -2.0, 0.5]))
+    names = [f"tracker.{axis}" for axis in AXES]
+    moved = Rotation.from_euler("z", 0.4).as_matrix() @ dataset.stacked(names) + np.array([[0.3], [0.1], [0.0]])
+    both = np.where(np.arange(len(dataset)) >= since, moved, dataset.stacked(names))
+    dataset = replace(dataset, channels={**dataset.channels, **dict(zip(names, both, strict=True))})
+    start = aligned_start(anywhere.problem, anywhere.problem.records(dataset), dataset)
+    found = find_permuted_axes(start.problem, start.problem.records(dataset), dataset)
+    assert (
+        found is not None
+        and f"from record {dataset.ids[since]} on taken for those in another frame" in found.readings[0]
+    )
+
+
 def test_mixed_up_data_are_refused_until_accepted_and_then_a_bad_finding(tmp_path: Path) -> None:
     header, *rows = DEMO.with_suffix(".csv").read_text().splitlines()
     path = tmp_path / "swapped.csv"

@@ -18,6 +18,7 @@ from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.units import digits
 from armcal.diagnose.readings import LEFT_HANDED, Wires, scaled_positions, several_joints, single_joints, turned_axes
+from armcal.diagnose.two_frames import two_frames
 from armcal.errors import NotConvergedError
 from armcal.estimate.placing import Placing, placings
 from armcal.problem.factor_records import subset
@@ -81,12 +82,14 @@ class _Seen:
         records: of its kernel alone, their noise as declared.
         rows: what was measured a row before and a row after, in words (3 x n each, m).
         placing: what places the arm; None where its base may not stand anywhere.
+        ids: of the records (n).
     """
 
     sighting: Sighting
     records: FactorRecords
     rows: tuple[tuple[str, Array], ...]
     placing: Placing | None
+    ids: tuple[str, ...] = ()
 
     @property
     def measured(self) -> Array:
@@ -176,7 +179,7 @@ def _seen(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, 
     if 3 * len(sighting.chosen) < _EQUATIONS * max(problem.increments, 6):
         return None
     own = replace(problem.subset(records, sighting.chosen)[number], whitening=None, correlation=None)
-    return _Seen(sighting, own, rows, None)
+    return _Seen(sighting, own, rows, None, tuple(dataset.ids[i] for i in sighting.chosen))
 
 
 def _neighbours(
@@ -208,7 +211,7 @@ def _of(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, arm: Ar
     if as_given <= MISSES * spread:
         return None
     enough = min(FITS * spread, as_given / MUCH_BETTER)
-    readings = list(_single(problem, seen, arm, straight, enough))
+    readings = [*_single(problem, seen, arm, straight, enough), *_in_two_frames(problem, seen)]
     if min(reading.left for reading in readings) > enough:
         if seen.placing is None:
             turn, shift = rigid_fit(straight.predicted, seen.measured)
@@ -304,6 +307,18 @@ def _single(
     for words, read_as in single_joints(arm):
         left = _left(problem, seen, read_as, seen.measured, enough)
         yield _Reading(smaller.left(left, spread), words, True)
+
+
+def _in_two_frames(problem: Problem, seen: _Seen) -> Iterator[_Reading]:
+    """The records from one on in another frame, where base and target are found for each part by itself."""
+    if seen.placing is None:
+        return
+    nominal = problem.blueprint.parameters.nominal()
+    tools = tools_of(problem, nominal, seen.records, seen.sighting.kernel)
+    apart = two_frames(tools, seen.measured, seen.placing.basis)
+    if apart is not None:
+        words = f"the positions from record {seen.ids[apart.begins]} on taken for those in another frame"
+        yield _Reading(apart.left, f"{words} (something moved there: calibrate both parts by themselves)", False)
 
 
 def _several(problem: Problem, seen: _Seen, arm: Arm, enough: float) -> Iterator[_Reading]:
