@@ -184,7 +184,7 @@ REFUSED_HEADERS = {
     "unit of none": (HEADER.replace("ach1", "ach1_deg"), [":1, approach1_deg:", "no unit", "Write approach1."]),
     "missing column": (
         HEADER.replace("x_mm", "X_mm"),
-        ["poses.csv:1", "no column for tracker.x", "x_m or x_cm or x_mm", "nearest is X_mm", "columns: {x_m: NAME}"],
+        ["poses.csv:1", "no column for tracker.x", "x_m or x_cm or x_mm", "nearest is X_mm", "columns: {x_mm: NAME}"],
     ),
     "two units": (HEADER.replace("z_mm", "q1_rad"), ["poses.csv:1", "both q1_rad and q1_deg", "Remove one."]),
     "name twice": (HEADER.replace("z_mm", "y_mm"), [":1, y_mm:", "y_mm twice (columns 7 and 8)", "Rename or"]),

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NoReturn
 
-from armcal.base.units import DIMENSIONLESS, UNITS, units_of
+from armcal.base.units import DIMENSIONLESS, UNITS, display_unit, units_of
 from armcal.errors import DataError, Location
 from armcal.io.cells import is_number
 from armcal.measure.checks import refuse_joint_count
@@ -173,10 +173,12 @@ def _refuse_unit(header: Header, w: RequestedChannel, unused: Mapping[str, Colum
 
 def refuse_missing(header: Header, w: RequestedChannel, unused: Sequence[str]) -> NoReturn:
     """Raise a DataError: no column is this channel's; ``unused`` names come near it, perhaps."""
-    written = " or ".join(spellings(replace(w, columns=(min(w.columns, key=len),))))
+    spelled = spellings(replace(w, columns=(min(w.columns, key=len),)))
+    written, usual = " or ".join(spelled), {unit: name for name, unit in spelled.items()}
+    example = usual.get("1") or usual[display_unit(w.dimension).name]
     header.refuse_layout(
         f"found no column for {w.what}, expected {written}{_nearest(written.split(' or '), unused)}.",
-        f"Add it, or say which column it is: columns: {{{written.split(' or ')[0]}: NAME}} in the configuration.",
+        f"Add it, or say which column it is: columns: {{{example}: NAME}} in the configuration, with its unit.",
         written,
     )
 

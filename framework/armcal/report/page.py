@@ -105,6 +105,7 @@ def _accuracy(result: RunResult) -> dict[str, Any]:
         before, after = from_set.nominal, from_set.calibrated
         pairs = [("Mean error", before.mean, after.mean), ("95 % below", before.p95, after.p95)]
         pairs.append(("Largest error", before.max, after.max))
+        pairs = [pair for pair in pairs if pair[2] is not None]  # few records have no 95 %
         decimals = common_decimals([v for _, b, a in pairs for v in (b, a)], most=3)
         tiles = [(name, fixed(b, decimals), fixed(a, decimals), ratio(b, a)) for name, b, a in pairs]
     rows = group_rows(result.groups.errors)
