@@ -26,8 +26,8 @@ from armcal.run.pipeline import calibrate
 from armcal.run.prepare import Stopwatch, prepare
 from armcal.scaffold.dh_table import read_rows
 from armcal.scaffold.rendering import number, word
-from armcal.scaffold.robot import Row, robot_of_rows
-from armcal.scaffold.robot_files import RECORDS, SIMULATED, RobotFolder, write_robot
+from armcal.scaffold.robot import RobotJoint, Row, robot_of_rows
+from armcal.scaffold.robot_files import RECORDS, SIMULATED, RobotFolder, _levels, write_robot
 from click.testing import CliRunner, Result
 from scaffolds import ROOT, commands_of, files_of, page
 
@@ -145,6 +145,12 @@ def test_the_rows_are_those_of_the_table(here: Path) -> None:
     plan = yaml.safe_load((here / "arm5" / "plan.yaml").read_text(encoding="utf-8"))["plan"]
     assert plan["limits_deg"]["shoulder"] == [-60, 100]
     assert plan["levels_deg"]["shoulder"] == [-60, 20, 100]
+
+
+@pytest.mark.parametrize(("degrees", "levels"), [(360, [-120, 0, 120]), (179, [-120, 0, 120]), (150, [-150, 0, 150])])
+def test_the_levels_of_a_joint_that_turns_around_are_different_angles(degrees: float, levels: list[float]) -> None:
+    joint = RobotJoint("q1", True, (-np.radians(degrees), np.radians(degrees)))
+    assert [float(text) for text in _levels(joint)] == pytest.approx(levels)
 
 
 def test_units_names_and_kinds_of_a_table(here: Path) -> None:

@@ -37,6 +37,7 @@ NOISE_MM, NOISE_SEED = 0.1, 4
 GRAVITY_M_S2 = 9.81
 _SMALLEST_REACH_M = 0.01
 _TRIED_POSES = 60
+_NEARLY_HALF_A_TURN = 3.0
 RECORDS_MADE = 600
 """Of so many, chance makes one verdict in twenty warn; of 100 to 200 it is one in five, for each finding has a level of
 its own."""
@@ -153,9 +154,11 @@ def _shown(value: float, dimension: str) -> str:
 
 
 def _levels(joint: RobotJoint) -> list[str]:
-    """Low, middle and high, in deg or mm."""
-    low, high = joint.limits
-    return [_shown(value, "angle" if joint.turns else "length") for value in (low, 0.5 * (low + high), high)]
+    """Low, middle and high, in deg or mm; a third of a turn apart where the ends would be one angle, or beyond it."""
+    middle, half = 0.5 * sum(joint.limits), 0.5 * (joint.limits[1] - joint.limits[0])
+    if joint.turns and half > _NEARLY_HALF_A_TURN:
+        half = 2 * math.pi / 3
+    return [_shown(value, "angle" if joint.turns else "length") for value in (middle - half, middle, middle + half)]
 
 
 @dataclass(frozen=True)
