@@ -259,7 +259,8 @@ def still_findings(system: System, dataset: Dataset) -> list[Finding]:
     still = []
     for name, arm in system.arms.items():
         for joint, kind in arm.commanded.items():
-            values, (unit, least) = dataset.column(f"{name}.{joint}"), _STILL[kind]
+            channel, (unit, least) = f"{name}.{joint}", _STILL[kind]
+            values = dataset.column(channel) if dataset.has(channel) else np.array([])
             known = to_unit(values[np.isfinite(values)], unit)
             if known.size and np.ptp(known) < least:
                 at = f"{np.mean(known):.4g} {unit}"
