@@ -256,7 +256,7 @@ def test_repeated_poses_count_once() -> None:
     assert len(kept) == 8
     assert kept.warnings == (
         "poses.csv: 8 records at 6 poses (the first repeat: line 8 that of line 4). Records of one pose are held out "
-        "together; measure more different ones.",
+        "together, unless you state which train; measure more different ones.",
     )
     from_other_side = with_row(records(), 6, 2, *POSITION, "arm.approach.q1")
     assert "8 records at 7 poses" in check_dataset(from_other_side, layout()).warnings[0]

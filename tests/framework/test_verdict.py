@@ -75,6 +75,23 @@ def test_a_fit_without_degrees_of_freedom_is_no_evidence() -> None:
 
 
 @pytest.mark.slow
+def test_poses_that_trained_do_not_judge(tmp_path: Path) -> None:
+    """The measurements that trained, rounded anew: no exact copies, and the model is judged nowhere else."""
+    header, *lines = (CONFIGS / "demo.csv").read_text().splitlines()
+    columns = [header.split(",").index(f"{axis}_mm") for axis in "xyz"]
+    again = [line.split(",") for line in lines]
+    for cells in again:
+        cells[0] = f"again{cells[0]}"
+        for column in columns:
+            cells[column] = f"{float(cells[column]):.2f}"
+    both = [f"{header},split", *(f"{line},train" for line in lines), *(",".join([*c, "test"]) for c in again)]
+    path = tmp_path / "both.csv"
+    path.write_text("\n".join(both) + "\n")
+    split = ("validation.holdout=0", "validation.group_by=split", "validation.train_groups=[train]")
+    assert "warning: 200 of 200 held-out records are at poses that trained" in sentences(*split, data=path)
+
+
+@pytest.mark.slow
 def test_a_joint_that_stood_still_is_named(tmp_path: Path) -> None:
     header, *lines = (CONFIGS / "demo.csv").read_text().splitlines()
     column, path = header.split(",").index("q6_deg"), tmp_path / "still.csv"

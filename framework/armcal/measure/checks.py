@@ -297,7 +297,7 @@ def warn_repeated_poses(dataset: Dataset, layout: Layout) -> Dataset:
     return warned(
         dataset,
         f"{len(dataset)} records at {len(dataset) - repeats.size} poses (the first repeat: {again} that of {before}). "
-        "Records of one pose are held out together; measure more different ones.",
+        "Records of one pose are held out together, unless you state which train; measure more different ones.",
     )
 
 

@@ -33,7 +33,7 @@ from armcal.problem.motion import Motion, recorded_position
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.run.errors import FittedRecords, RecordErrors
 from armcal.run.intervals import IntervalResult
-from armcal.run.prepare import gravity_findings, still_findings
+from armcal.run.prepare import gravity_findings, same_pose_findings, still_findings
 
 _MM = 1000.0
 _AT_REST = ", as in a new recording (its drift not known)"
@@ -81,8 +81,9 @@ def verdict_of(
 
 
 def _of_records(system: System, run: FittedRecords) -> list[Finding]:
-    """What the records themselves leave open: joints that stood still, gravity that nobody stated."""
-    return [*still_findings(system, run.dataset.subset(run.split.train)), *gravity_findings(system, run.dataset)]
+    """What the records themselves leave open: joints that stood still, poses that trained, gravity not stated."""
+    still = still_findings(system, run.dataset.subset(run.split.train))
+    return [*still, *same_pose_findings(system, run.dataset, run.split), *gravity_findings(system, run.dataset)]
 
 
 def _accuracies(run: FittedRecords) -> list[Finding]:

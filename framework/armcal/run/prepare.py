@@ -19,6 +19,7 @@ from armcal.estimate.profile import profiled
 from armcal.estimate.start import Start, aligned_start, with_proposals
 from armcal.estimate.structure import require_solvable
 from armcal.estimate.validation import Split, error_unit, folds, hold_out, split_by_id, split_by_label
+from armcal.measure.groups import first_of_pose
 from armcal.measure.measurement import GroupedMeasurement
 from armcal.measure.reader import read_ids
 from armcal.problem.drift import with_drift
@@ -275,6 +276,20 @@ def still_findings(system: System, dataset: Dataset) -> list[Finding]:
     return [
         Finding("warning", text, test, "Move these joints too, or use the calibration only where they stand there.")
     ]
+
+
+def same_pose_findings(system: System, dataset: Dataset, split: Split) -> list[Finding]:
+    """A warning of held-out records at poses that trained, as a stated split may have them."""
+    channels = [f"{name}.{joint}" for name, arm in system.arms.items() for joint in arm.commanded]
+    pose = first_of_pose(dataset, [channel for channel in channels if dataset.has(channel)])
+    count, held = int(np.isin(pose[split.holdout], pose[split.train]).sum()), len(split.holdout)
+    if not count:
+        return []
+    text = (
+        f"{count} of {held} held-out records are at poses that trained: their errors show how well a pose repeats, not "
+        "how good the model is elsewhere."
+    )
+    return [Finding("warning", text, "poses alike in all joints, under the same load", "Hold out other poses.")]
 
 
 def gravity_findings(system: System, dataset: Dataset) -> list[Finding]:
