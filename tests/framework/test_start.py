@@ -255,7 +255,7 @@ NAMED = (
     (lambda p: p[[1, 0, 2]], "a left-handed frame"),
     (lambda p: np.roll(p, 1, axis=1), "positions of the row after"),
     (lambda p: np.roll(p, -1, axis=1), "positions of the row before"),
-    (lambda p: p / 1000, "positions 1e+03 times"),
+    (lambda p: p / 1000, "positions 1000 times"),
     (lambda p: p / 25.4, "positions 25.4 times"),
 )
 
