@@ -135,7 +135,7 @@ def test_of_too_few_poses_nothing_is_known_however_often_they_were_repeated(lrm)
     assert Residuals(*parts).judged() is None
     problem, records, estimate, motion, dataset = parts
     left = structure(problem, records, estimate, dataset, motion, recorded_position(dataset))
-    assert any("is not known" in finding.text for finding in structure_findings(left))
+    assert any("too few distinct poses" in finding.text for finding in structure_findings(left))
     assert all("nothing" not in sentence for sentence in _left(Evidence(left)))
     none = structure_findings(None)
     assert "too few" in none[0].text and none[0].grade == "note"

@@ -97,7 +97,7 @@ def test_a_joint_that_stood_still_is_named(tmp_path: Path) -> None:
     column, path = header.split(",").index("q6_deg"), tmp_path / "still.csv"
     still = [line for line in lines if float(line.split(",")[column]) == 50]
     path.write_text("\n".join([header, *still]) + "\n")
-    told = sentences("parameters.free=[arm.mdh.theta[2-4], arm.mdh.base_[xyz]]", data=path)
+    told = sentences('parameters.free=["arm.mdh.theta[2-4]", "arm.mdh.base_[xyz]"]', data=path)
     assert "warning: Hardly moved in the training records: q6 at 50 deg." in told
 
 
