@@ -28,15 +28,15 @@ def two_frames(tools: Tools, measured: Array, basis: Array) -> TwoFrames | None:
     every = np.arange(measured.shape[1])
     if len(every) < 2 * FEWEST:
         return None
-    found = []
+    divisions = []
     for part in _PARTS:
         begins = round(part * len(every))
         for _ in range(_ROUNDS):
             begins = min(max(begins, FEWEST), len(every) - FEWEST)
             halves = [nearest(tools.subset(own), measured[:, own], basis) for own in (every[:begins], every[begins:])]
             squares = [np.sum((measured - alignment.moved(tools)) ** 2, axis=0) for alignment in halves]
-            before, after = (np.concatenate([[0.0], np.cumsum(each)]) for each in squares)
+            before, after = (np.concatenate([[0.0], np.cumsum(square)]) for square in squares)
             left = before + after[-1] - after
             begins = int(np.argmin(left[FEWEST:-FEWEST])) + FEWEST
-            found.append(TwoFrames(begins, float(np.sqrt(left[begins] / len(every)))))
-    return min(found, key=lambda one: one.left)
+            divisions.append(TwoFrames(begins, float(np.sqrt(left[begins] / len(every)))))
+    return min(divisions, key=lambda one: one.left)
