@@ -153,6 +153,10 @@ def _explained(made: _Finding, error: Mapping[str, Any]) -> _Finding:
     if made.kind == "union_tag_not_found":
         key = str(context.get("discriminator")).strip("'")
         return replace(made, message=f"found nothing, expected the key {key!r}: write '{key}: ...'.")
+    if made.kind in ("too_short", "too_long"):
+        least = context.get("min_length")
+        expected = f"at most {context.get('max_length')}" if least is None else f"at least {least}"
+        return replace(made, expected=expected, mend="remove the rest" if least is None else "add what is missing")
     expected = message.removeprefix("Input should be ")
     return replace(made, expected=expected[:1].lower() + expected[1:], mend="correct it")
 

@@ -81,6 +81,8 @@ def named_arm(text: str | None, arm_names: Sequence[str]) -> str:
     Raises:
         ValueError: there is no such arm, or several and none is named.
     """
+    if not arm_names:
+        raise ValueError("there is no arm; describe one under arms")
     if text is None and len(arm_names) != 1:
         raise ValueError(f"there are {len(arm_names)} arms ({', '.join(arm_names)}); say which by arm: NAME")
     name = text or arm_names[0]

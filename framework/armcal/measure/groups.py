@@ -124,11 +124,14 @@ def refuse_lost(dataset: Dataset, measurements: Mapping[str, Measurement], lost:
     """
     if not lost.any():
         return
+    if not measurements:
+        hint = "Say what the records measure: measurements: {tracker: {type: tip_position, noise_mm: 0.5}}."
+        raise ConfigError("found no measurement: nothing is known of what the records say of the arm.", hint=hint)
     labels = [n for m in measurements.values() if isinstance(m, GroupedMeasurement) for n in m.group_labels]
     first, named = int(np.argmax(lost)), ", ".join(dict.fromkeys(labels))
     raise DataError(
         f"found {int(lost.sum())} records that no measurement applies to, the first: {dataset.ids[first]}; "
-        f"expected a reading, or labels of a group in {named}.",
+        f"expected a reading{f', or labels of a group in {named}' if named else ''}.",
         where=dataset.where(first),
         hint="Fill in the labels, or leave the record out.",
     )

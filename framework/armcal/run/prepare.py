@@ -148,13 +148,26 @@ def acting(problem: Problem, records: tuple[FactorRecords, ...], dataset: Datase
 
 
 def split_of(experiment: Experiment, dataset: Dataset) -> Split:
-    """Which records train, and which are held out, as configured."""
+    """Which records train, and which are held out, as configured.
+
+    Raises:
+        ConfigError: no column separates the groups that are asked for, or no record is held out.
+    """
     validation = experiment.settings.validation
+    if validation.group_by is not None:
+        labels_of(experiment, dataset)
     if validation.train_groups:
         return split_by_label(labels_of(experiment, dataset), validation.train_groups)
     if validation.train_ids is not None:
         return split_by_id(dataset.ids, read_ids(validation.train_ids))
-    return hold_out(len(dataset), validation.holdout, validation.seed, experiment.poses(dataset))
+    split = hold_out(len(dataset), validation.holdout, validation.seed, experiment.poses(dataset))
+    if validation.holdout > 0 and not len(split.holdout):
+        raise ConfigError(
+            f"a share of {validation.holdout:g} of {len(dataset)} records is no record: none would be held out.",
+            where=experiment.source.where(("validation", "holdout")),
+            hint="Hold out a quarter (0.25), or none (0) and give folds: 5.",
+        )
+    return split
 
 
 def folds_of(experiment: Experiment, ready: Prepared) -> tuple[Split, ...]:

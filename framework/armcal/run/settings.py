@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any, Literal, Self, TypeAlias
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from armcal.base.settings import Angle, InputPath, Length, Settings
 from armcal.config.selection import ParameterSettings
@@ -27,13 +27,20 @@ class ValidationSettings(Settings):
     ``limit`` are listed and explained; without one, those above three times the median error.
     """
 
-    holdout: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    holdout: float = 0.0
     folds: Annotated[int, Field(ge=0)] = 0
     seed: Annotated[int, Field(ge=0)] = 0
     train_ids: InputPath | None = None
     train_groups: tuple[str, ...] | None = None
     group_by: str | None = None
     limit: Length | None = None
+
+    @field_validator("holdout")
+    @classmethod
+    def _share(cls, value: float) -> float:
+        if not 0 <= value < 1:
+            raise ValueError(f"found {value:g}, expected a share from 0 to below 1: write 0.25 for a quarter")
+        return value
 
     @model_validator(mode="after")
     def _one_split(self) -> Self:
