@@ -65,7 +65,8 @@ class StretchRecord(Settings):
 class PredictionRecord(Settings):
     """What predictions need beyond values: covariance of the free entries (lower triangle), stretches, a recording.
 
-    ``columns`` are what the calibration's data called its columns.
+    ``columns`` are what the calibration's data called its columns; ``ranges`` those of joints and payload in its
+    records (SI; see ``recorded_range``).
     """
 
     entries: tuple[str, ...]
@@ -73,6 +74,7 @@ class PredictionRecord(Settings):
     stretches: dict[Literal["same", "new"], StretchRecord] = Field(default_factory=dict)
     columns: dict[str, str] = Field(default_factory=dict)
     recording: RecordingRecord | None = None
+    ranges: dict[str, tuple[float, float]] = Field(default_factory=dict)
 
     @property
     def symmetric_covariance(self) -> Array:

@@ -12,9 +12,10 @@ from armcal.base.units import parse_quantity
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.compensation.compensator import Compensator
 from armcal.calibration.compensation.request import Redundancy
+from armcal.calibration.recorded_range import beyond_records
 from armcal.cli.common import FILE, Console, accept, arm, point, spare_inputs, speaking, warn_of_target, within
 from armcal.errors import InputError, Location
-from armcal.run.compensate import Assessed, Bench, assess, summary, write_commands
+from armcal.run.compensate import Assessed, Bench, assess, commanded, summary, write_commands
 from armcal.run.target_file import TargetFile, check_units
 
 _SHOWN = 5
@@ -64,6 +65,10 @@ def compensate(console: Console, calibration: Path, targets: Path, out: Path, an
     commands = reach(file.targets, start)
     assessed = assess(bench, compensator, file.targets, commands)
     write_commands(out, compensator, file.targets, file.dataset, assessed, angles)
+    if kept := bench.calibration.record.prediction:
+        poses = commanded(compensator, file.targets, commands).subset(np.flatnonzero(commands.reached))
+        if text := beyond_records(kept.ranges, poses, {bench.arm: compensator.expression.arm}):
+            console.warn(text)
     _show(console, file, assessed, bench, out)
 
 

@@ -15,6 +15,7 @@ from armcal.base.quaternions import quaternion_of
 from armcal.base.units import DIMENSIONLESS, split_suffix, to_unit
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.intervals import PlusMinus
+from armcal.calibration.recorded_range import beyond_records
 from armcal.cli.common import FILE, Console, accept, spare_inputs, speaking
 from armcal.errors import DataError, InputError, Location
 from armcal.io.plain_files import input_file
@@ -177,6 +178,8 @@ def _warn_of_missing(console: Console, loaded: Calibration, commands: Dataset, r
     for text in commands.warnings:
         console.warn(text)
     kept = loaded.record.prediction
+    if kept is not None and (text := beyond_records(kept.ranges, commands, loaded.system.arms)):
+        console.warn(text)
     if kept is not None and kept.recording is None and recording == "calibrated":
         console.warn("no parameter drifts in this calibration: all recordings are alike.")
     if kept is not None and kept.recording is not None and recording == "new" and any(map(commands.has, order)):

@@ -7,6 +7,7 @@ import numpy as np
 
 from armcal.base.dataset import SetAside
 from armcal.calibration.intervals import PredictionRecord, covariance_rows, recording_record, stretch_records
+from armcal.calibration.recorded_range import recorded_ranges
 from armcal.diagnose.clustered import widened
 from armcal.diagnose.coverage import fit_and_predict
 from armcal.estimate.bootstrap import Bootstrap, bootstrap
@@ -219,4 +220,5 @@ def _prediction(experiment: Experiment, run: FittedRecords, intervals: IntervalR
         stretches=stretch_records(intervals.stretches),
         columns={str(name): str(own) for name, own in columns.items()},
         recording=recording_record(run.problem, run.dataset.subset(run.split.train), fitted.records),
+        ranges=recorded_ranges(run.dataset, experiment.system.arms, experiment.settings.statics.payload),
     )
