@@ -19,6 +19,8 @@ from armcal.run.compensate import Assessed, Bench, assess, commanded, summary, w
 from armcal.run.target_file import TargetFile, check_units
 
 _SHOWN = 5
+_AT_THE_TARGET_MM = 1e-3
+"""A command so near was found, and something else keeps the arm from it."""
 _ARRIVES = {"tool": "by the tool frame's origin", "target": "by the measured target"}
 
 
@@ -115,7 +117,8 @@ def _show(console: Console, file: TargetFile, assessed: Assessed, bench: Bench, 
     for target in missed[:_SHOWN]:
         away = target["nearest_mm"]
         console.warn(
-            f"{target['id']}: {target['reason']}" + ("" if away is None else f"; the nearest is {away:.3f} mm away")
+            f"{target['id']}: {target['reason']}"
+            + ("" if away is None or away < _AT_THE_TARGET_MM else f"; the nearest is {away:.3f} mm away")
         )
     if len(missed) > _SHOWN:
         console.warn(f"{len(missed) - _SHOWN} more targets cannot be reached; the file says why")

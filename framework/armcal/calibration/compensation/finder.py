@@ -187,7 +187,7 @@ class Finder:
         solutions.put(todo[closer], attempt, near[closer])
 
     def _nearest(self, record: Array, target: Array, lost: Rows, solutions: Solutions, start: Array | None) -> None:
-        """Of targets that cannot be reached, the commands that come nearest."""
+        """Of targets that were not reached, the commands that come nearest; a longer search reaches some after all."""
         wide = min(_NEAREST_STARTS, self._seeds.commands.shape[1] - 1)
         for todo in _chunks(lost, wide + 1):
             picks = self._picked(target[:, todo], 0, wide)
@@ -200,6 +200,7 @@ class Finder:
             left = np.where(self._may(attempt.commands), left, np.inf)
             best = left.reshape(-1, wide + 1).argmin(axis=1) + np.arange(len(todo)) * (wide + 1)
             solutions.put(todo, attempt, best)
+            solutions.there[todo] = attempt.there[best] & np.isfinite(left[best])  # a longer search may arrive
 
     def _goal(
         self, record: Array, target: Array, rows: Rows, commands: Array, states: Array, start: Array | None
