@@ -165,7 +165,9 @@ def _load(rows: Iterator[tuple[int, list[str]]], header: Header, plan: Plan, has
             count, expected = len(row), len(header.columns)
             if count != expected:
                 mend = "Complete the row (was the file cut off?); leave a cell empty if its value is not known."
-                if count > expected:
+                if row[0].lstrip().startswith("#"):
+                    mend = "Remove the line: comments are not read."
+                elif count > expected:
                     mend = "Quote text that holds the delimiter, write numbers with a decimal point (12.5), no comma."
                 message = f"found {count} cells, expected {expected} as in the header."
                 raise DataError(message, where=Location(header.source, line=line), hint=mend)
@@ -202,6 +204,8 @@ def _number(cell: str, line: int, column: Column, header: Header, has_commas: bo
         number = CellFault(f"found {cell!r}, expected a decimal comma.", 'Write 12,5, or leave decimal: "," out.')
     if isinstance(number, CellFault):
         where = Location(header.source, line=line, field=column.name)
+        if cell.strip() == column.name:
+            raise DataError("found the header again.", where=where, hint="Remove this line.")
         is_comma = not (has_commas or header.layout_hint) and DECIMAL_COMMA.fullmatch(cell)
         other = ' Or set decimal: "," in the data section, if all numbers of the file have one.' if is_comma else ""
         raise DataError(number.text, where=where, hint=number.hint + other)

@@ -84,6 +84,8 @@ def test_exchanged_joints_are_named(demo: Prepared) -> None:
         ("tracker.", 0.1, "positions 10 times as large"),
         ("tracker.", 10, "positions 0.1 times as large"),
         ("arm.q", np.pi / 180, "joint angles 57.3 times as large"),
+        ("arm.q", 180 / np.pi / 1000, "joint angles 17.45 times as large"),
+        ("arm.q4", np.pi / 180, "q4 57.3 times as large"),
     ],
 )
 def test_units_are_named(demo: Prepared, channels: str, factor: float, words: str) -> None:

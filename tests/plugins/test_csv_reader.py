@@ -210,6 +210,8 @@ REFUSED_ROWS = {
     "other digits": (row(3, y_mm="\u0661\u0662"), ["poses.csv:4, y_mm:", "expected a number"]),
     "unit in the cell": (row(3, y_mm="12.5 mm"), ["poses.csv:4, y_mm:", "its unit belongs in the column's name"]),
     "row of units": ("-,[deg],,,,[mm],[mm],[mm]", [":4, q1_deg:", "looks like a row of units", "Remove it"]),
+    "comment": ("# a pause", ["poses.csv:4:", "Remove the line: comments are not read."]),
+    "header again": (HEADER, ["poses.csv:4, q1_deg: found the header again. Remove this line."]),
     "approach": (row(3, approach2=2), ["poses.csv:4, approach2:", "approach 2, expected -1, 0 or 1", "sign of"]),
     "same id": (row(1, x_mm=5), ["poses.csv:4:", "'1'", "line 2", "Give each record its own id"]),
     "open quote": (row(3, y_mm='"12'), ["poses.csv:4:", "not CSV", "Close every quote"]),

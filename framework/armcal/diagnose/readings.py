@@ -10,7 +10,7 @@ from armcal.base.arrays import Array
 
 Wires = Mapping[str, tuple[str, float]]
 """Channels, each read as another one times a factor."""
-_DEGREES, _TURN = 180 / np.pi, 360.0
+_DEGREES, _TURN, _MRAD = 180 / np.pi, 360.0, 1000 * np.pi / 180
 _MOST_SIGNS = 8
 _AXES = "xyz"
 _INCH = 25.4
@@ -21,7 +21,7 @@ LEFT_HANDED = "a left-handed frame made right-handed (one axis reversed, or two 
 
 
 def single_joints(arm: Arm) -> list[tuple[str, Wires]]:
-    """Each joint's sign, each two joints of a kind exchanged, and all angles in another unit."""
+    """Each joint's sign, each two joints of a kind exchanged, and all angles or one of them in another unit."""
     joints = tuple(arm.commanded)
     angles = {joint: joint for joint, dimension in arm.commanded.items() if dimension == "angle"}
     readings: list[tuple[str, Wires]] = [
@@ -30,8 +30,10 @@ def single_joints(arm: Arm) -> list[tuple[str, Wires]]:
     for one, other in combinations(joints, 2):
         if arm.commanded[one] == arm.commanded[other]:
             readings.append((f"{one} and {other} exchanged", _wires(arm, {one: other, other: one}, 1.0)))
-    for factor in (_DEGREES, 1 / _DEGREES, _TURN):
+    for factor in (_DEGREES, 1 / _DEGREES, _TURN, _MRAD, 1 / _MRAD):
         readings.append((f"joint angles {factor:.4g} times as large", _wires(arm, angles, factor)))
+    for joint in angles if len(angles) > 1 else ():
+        readings.append((f"{joint} {_DEGREES:.4g} times as large (rad)", _wires(arm, {joint: joint}, _DEGREES)))
     return readings
 
 
