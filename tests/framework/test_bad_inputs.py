@@ -127,6 +127,14 @@ def test_a_prediction_without_the_payload_its_calibration_had_is_refused(tmp_pat
     refused(check("statics.payload_g=-5"), "payload", "below zero")
 
 
+def test_grams_called_kilograms_are_warned_of() -> None:
+    warned(
+        check("statics.payload_g=100000"),
+        "a payload of 100 kg is",
+        "times the mass of the links (0.779 kg): is it in g?",
+    )
+
+
 @pytest.mark.slow
 def test_millimetres_called_metres_and_the_reverse_are_refused(tmp_path: Path) -> None:
     metres = {f"{axis}_mm": f"{axis}_m" for axis in "xyz"}

@@ -86,6 +86,17 @@ def test_layout_of_wanted_channels() -> None:
     )
 
 
+def test_payloads_below_zero_and_times_in_milliseconds_are_refused_and_kelvin_is_warned_of() -> None:
+    heavy = records(payload=[0.1, -0.02, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1])
+    assert "found a payload of -0.02" in refusal(lambda: check_dataset(heavy, layout()))
+    late = records(time=[1.7e12 + 3000 * i for i in range(8)])
+    assert "after the year 5000. If these are milliseconds" in refusal(lambda: check_dataset(late, layout()))
+    assert check_dataset(records(time=[1.7e9 + 3 * i for i in range(8)]), layout()).warnings == ()
+    warm = check_dataset(records(temperature=[295.0] * 8), layout())
+    assert "is typically 295 C: are these kelvin?" in warm.warnings[0]
+    assert check_dataset(records(temperature=[22.0] * 8), layout()).warnings == ()
+
+
 def test_rows_are_named_as_rows_unless_they_are_lines() -> None:
     dataset = records(arm_approach_q1=[0.5] * 8)
     assert str(layout().where(dataset, 0, "arm.approach.q1")) == "poses.csv:2, approach1"

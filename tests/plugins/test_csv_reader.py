@@ -190,6 +190,7 @@ REFUSED_HEADERS = {
     "name twice": (HEADER.replace("z_mm", "y_mm"), [":1, y_mm:", "y_mm twice (columns 7 and 8)", "Rename or"]),
     "nameless": (HEADER.replace("z_mm", " "), ["poses.csv:1", "column 8 has no name", "Name it"]),
     "no header": (row(1), ["poses.csv:1", "expected a header", "first line"]),
+    "comment": ("# monday", ["poses.csv:1: found the comment '# monday', expected a header. Remove the line."]),
     "optional": (HEADER.replace("pose_id", "payload"), [":1, payload: payload has no unit. Write payload_kg"]),
 }
 

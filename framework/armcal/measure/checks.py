@@ -25,6 +25,7 @@ __all__ = [
     "layout_of",
     "refuse_approaches",
     "refuse_conflicting_ids",
+    "refuse_impossible_surroundings",
     "refuse_joint_count",
     "refuse_joint_units",
     "require_records",
@@ -34,6 +35,7 @@ __all__ = [
     "set_aside_not_finite",
     "set_aside_without_noise",
     "set_aside_zeros",
+    "warn_kelvin",
     "warn_repeated_poses",
     "warn_small_degrees",
 ]
@@ -48,6 +50,7 @@ _FULL_TURN = 2 * math.pi
 _SMALL_DEGREES = (0.5, 6.3)
 """A largest joint angle between these, in degrees, is more likely one in radians (6.3 is one turn)."""
 _MAX_DEGREES = 720.0
+_LATEST_S, _HOTTEST_C = 1e11, 150.0
 _VARIES_AT_REST = ("time", "temperature")
 """Channels that may differ between a record and its copy."""
 
@@ -61,7 +64,8 @@ def check_dataset(dataset: Dataset, layout: Layout) -> Dataset:
     dataset = set_aside_without_noise(set_aside_not_finite(dataset, layout), layout)
     refuse_approaches(dataset, layout)
     refuse_joint_units(dataset, layout)
-    dataset = warn_small_degrees(dataset, layout)
+    refuse_impossible_surroundings(dataset, layout)
+    dataset = warn_kelvin(warn_small_degrees(dataset, layout), layout)
     refuse_conflicting_ids(dataset, layout)
     dataset = set_aside_backward_time(dataset, layout)
     dataset = set_aside_duplicates(set_aside_frozen(set_aside_zeros(dataset, layout), layout), layout)
@@ -143,6 +147,39 @@ def refuse_approaches(dataset: Dataset, layout: Layout) -> None:
                 where=layout.where(dataset, first, channel),
                 hint="Write the sign of the joint's last motion before the pose, 0 if it is not known.",
             )
+
+
+def refuse_impossible_surroundings(dataset: Dataset, layout: Layout) -> None:
+    """Payloads and times that cannot be.
+
+    Raises:
+        DataError: a payload below zero, or a time after the year 5000: milliseconds called seconds.
+    """
+    if dataset.has("payload") and (below := np.flatnonzero(dataset.column("payload") < 0)).size:
+        first = int(below[0])
+        raise DataError(
+            f"found a payload of {layout.shown('payload', dataset.column('payload')[first])}, which is below zero.",
+            where=layout.where(dataset, first, "payload"),
+            hint="Give the mass that hangs on the tool.",
+        )
+    if dataset.has("time") and (late := np.flatnonzero(dataset.column("time") > _LATEST_S)).size:
+        first = int(late[0])
+        raise DataError(
+            f"found the time {layout.shown('time', dataset.column('time')[first])}, after the year 5000.",
+            where=layout.where(dataset, first, "time"),
+            hint="If these are milliseconds, end the column's name in _ms (time_ms), microseconds in _us.",
+        )
+
+
+def warn_kelvin(dataset: Dataset, layout: Layout) -> Dataset:
+    """Warn of temperatures that no arm has in degrees Celsius."""
+    if not dataset.has("temperature") or not len(dataset):
+        return dataset
+    typical = float(np.nanmedian(dataset.column("temperature")))
+    if not typical > _HOTTEST_C:
+        return dataset
+    column = layout.column("temperature")
+    return warned(dataset, f"{column} is typically {typical:.4g} C: are these kelvin? If so, subtract 273.15.")
 
 
 def refuse_joint_units(dataset: Dataset, layout: Layout) -> None:

@@ -68,6 +68,8 @@ def header_of(cells: Sequence[str], source: str, line: int | None, layout_hint: 
         header.refuse("it is empty.", "Give a header and one line a record.")
     if len(names) > MAX_COLUMNS:
         header.refuse(f"found {len(names)} columns, expected at most {MAX_COLUMNS}.", "Check the delimiter.")
+    if names[0].startswith("#"):
+        header.refuse(f"found the comment {names[0][:40]!r}, expected a header.", "Remove the line.")
     if all(is_number(name) for name in names):
         header.refuse(
             f"found numbers ({', '.join(names[:3])}, ...), expected a header.",

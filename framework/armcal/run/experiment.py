@@ -32,6 +32,7 @@ from armcal.run.settings import ExperimentSettings
 
 STANDARD_GRAVITY = {"earth": 9.80665, "moon": 1.62, "mars": 3.71}
 """m/s^2; [Williams2024]"""
+_HEAVY = 20.0
 _GRAVITY_TOLERANCE = 0.02
 
 
@@ -127,11 +128,23 @@ class Experiment:
             )
         require_conditions(dataset, request.channels)
         dataset = warn_beyond_limits(noticed(dataset), self.system.arms)
+        if text := self._heavy(dataset):
+            dataset = replace(dataset, warnings=(*dataset.warnings, text))
         if not dataset.has("gravity_z"):
             return dataset
         typical = np.median(dataset.stacked(["gravity_x", "gravity_y", "gravity_z"]), axis=1)
         texts = [f"by its columns, {text}" for text in _gravity_warnings(self.settings, typical)]
         return replace(dataset, warnings=(*dataset.warnings, *texts))
+
+    def _heavy(self, dataset: Dataset) -> str:
+        """A warning of a payload that no arm of this mass carries: grams called kilograms; else empty."""
+        configured = self.settings.statics.payload or 0.0
+        payload = float(np.max(dataset.column("payload"))) if dataset.has("payload") else configured
+        own = sum(mass.mass for arm in self.system.arms.values() for mass in arm.masses)
+        if not own or payload <= _HEAVY * own:
+            return ""
+        times = f"{payload / own:.0f} times the mass of the links ({own:.3g} kg)"
+        return f"a payload of {payload:g} kg is {times}: is it in g?"
 
     def of_records(self, dataset: Dataset) -> Self:
         """The experiment with the parameters that the groups of these records bring.

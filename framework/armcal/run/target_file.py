@@ -56,12 +56,6 @@ def read_targets(path: Path, expression: ToolExpression, registry: PluginRegistr
         name = f"{expression.name}.{channel}" if channel.startswith(APPROACH) else channel
         if channel not in expression.joints and dataset.has(name):
             acting[i] = dataset.column(name)
-    if dataset.has("payload") and (below := np.flatnonzero(dataset.column("payload") < 0)).size:
-        raise DataError(
-            f"found a payload of {1000 * dataset.column('payload')[below[0]]:g} g, which is below zero.",
-            where=Location(str(path), line=_line(dataset, int(below[0])), field="payload"),
-            hint="Give the mass that hangs on the tool.",
-        )
     positions = np.stack([dataset.column(axis) for axis in "xyz"], axis=1)
     row, axis = np.unravel_index(np.abs(positions).argmax(), positions.shape)
     if abs(positions[row, axis]) > FARTHEST_M:
