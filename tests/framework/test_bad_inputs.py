@@ -190,7 +190,6 @@ def test_binary_tables_are_refused_with_how_to_convert(tmp_path: Path, name: str
         ("validation.holdout=0.001", ("a share of 0.001 of 200 records is no record", "a quarter (0.25)")),
         ("validation.group_by=nowhere", ("found no column nowhere in the records", "group_by: NAME")),
         ("validation.folds=1", ("folds",)),
-        ("measurements.tracker.noise_mm=0.5 um", ("'0.5 um' is in um and its key in mm", "leave one of them out")),
         ("measurements={}", ("found no measurement", "tip_position")),
         ("arms={}", ("there is no arm", "under arms")),
         ("arms.arm.model.rows=[]", ("found a list of 0 values, expected at least 1: add what is missing",)),

@@ -267,7 +267,7 @@ def test_one_arm_of_two(tmp_path: Path) -> None:
         ("x_mm,y_mm,z_mm,qw,qx,qy,qz", [1, 2, 3, 0, 0, 0, 0], "its quaternion has the norm 0"),
         ("x_mm,y_mm,z_mm,gravity_z_m_s2", [1, 2, 3, -1.62], "gravity has no gravity_x, gravity_y"),
         ("x_mm,y_mm,z_mm,approach1", [1, 2, 3, 5], "approach"),
-        ("x_mm,y_mm,z_mm,payload_g", [200, 50, 300, -50], ":2, payload: found a payload of -50 g"),
+        ("x_mm,y_mm,z_mm,payload_g", [200, 50, 300, -50], ":2, payload_g: found a payload of -50 g"),
         ("x_m,y_m,z_m", [200, 50, 300], "Check the unit in the column names: x_mm or x_m."),
         ("x_mm,y_mm,z_mm", [0.2, 0.05, 0.3], "Check the unit in the column names: x_mm or x_m."),
     ],

@@ -161,7 +161,7 @@ def convert(name: str, value: Any, kind: Kind, unit: str) -> Any:
     if isinstance(value, Mapping) and kind.maps:
         return {key: convert(name, entry, kind, unit) for key, entry in value.items()}
     if isinstance(value, str):
-        return _read_text(name, value, kind, unit)
+        return _read_text(name, value, kind)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return value
     try:
@@ -170,16 +170,12 @@ def convert(name: str, value: Any, kind: Kind, unit: str) -> Any:
         return Fault("found a number that is too large, expected a finite one: correct it.")
 
 
-def _read_text(name: str, text: str, kind: Kind, unit: str | None = None) -> Any:
+def _read_text(name: str, text: str, kind: Kind) -> Any:
     dimension = kind.dimension or ""
     if kind.takes_text and not _STARTS_A_NUMBER.match(text):
         return text
     try:
-        value = parse_quantity(text, dimension)
+        return parse_quantity(text, dimension)
     except ValueError as fault:
         message = str(fault).removesuffix(".")
         return Fault(f"{message}; or give the unit in the key, {accepted(name, dimension)}.")
-    try:
-        return parse_quantity(text, dimension, unit) if unit else value
-    except ValueError as fault:
-        return Fault(str(fault))

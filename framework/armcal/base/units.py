@@ -192,20 +192,19 @@ def split_suffix(name: str, dimension: str | None = None) -> tuple[str, Unit] | 
     return None
 
 
-def parse_quantity(text: str, dimension: str, stated: str | None = None) -> float:
+def parse_quantity(text: str, dimension: str) -> float:
     """Read a number with its unit, ``"5 mm"`` or ``"9.81 m/s^2"``.
 
     Args:
         text: the number, and its unit unless the dimension is dimensionless.
         dimension: what is expected, for example ``"length"``.
-        stated: the unit that a key states for it too, if one does.
 
     Returns:
         The value in SI units.
 
     Raises:
-        ValueError: not a number, no unit, a unit of another dimension or another than the stated one, or too large;
-            lists the accepted units.
+        ValueError: not a number, no unit, a unit of another dimension, or too large; lists the accepted
+            units.
     """
     if _DECIMAL_COMMA.match(text):
         raise ValueError(_expected(f"{text!r} has a decimal comma, write a point", dimension))
@@ -221,10 +220,6 @@ def parse_quantity(text: str, dimension: str, stated: str | None = None) -> floa
         raise ValueError(_expected(f"{text!r} has an unknown unit {written!r}", dimension))
     if unit.dimension != dimension:
         raise ValueError(_expected(f"{text!r} has a unit of {unit.dimension}", dimension))
-    if stated not in (None, unit.name):
-        raise ValueError(
-            f"{text!r} is in {unit.name} and its key in {stated}; expected one unit: leave one of them out."
-        )
     value = from_unit(float(number), unit.name)
     if not math.isfinite(value):
         raise ValueError(_expected(f"{text!r} is too large to be a number", dimension))
