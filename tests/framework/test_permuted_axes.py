@@ -93,6 +93,13 @@ def test_units_are_named(demo: Prepared, channels: str, factor: float, words: st
     assert told(demo, replace(demo.dataset, channels=scaled)) == (words,)
 
 
+@pytest.mark.parametrize("record", [41, 42])
+def test_one_record_far_off_is_no_other_reading(demo: Prepared, record: int) -> None:
+    x = demo.dataset.channels["tracker.x"].copy()
+    x[record] = 2.0
+    assert told(demo, replace(demo.dataset, channels={**demo.dataset.channels, "tracker.x": x})) == ()
+
+
 def test_few_records_tell_nothing(demo: Prepared) -> None:
     mixed = changed(demo.dataset, tracker__x="tracker.y", tracker__y="tracker.x")
     assert told(demo, mixed.subset(range(10))) == ()

@@ -118,7 +118,7 @@ def _show(console: Console, file: TargetFile, assessed: Assessed, bench: Bench, 
         away = target["nearest_mm"]
         console.warn(
             f"{target['id']}: {target['reason']}"
-            + ("" if away is None or away < _AT_THE_TARGET_MM else f"; the nearest is {away:.3f} mm away")
+            + (f"; the nearest is {away:.3f} mm away" if isinstance(away, float) and away > _AT_THE_TARGET_MM else "")
         )
     if len(missed) > _SHOWN:
         console.warn(f"{len(missed) - _SHOWN} more targets cannot be reached; the file says why")

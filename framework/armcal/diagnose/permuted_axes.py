@@ -223,6 +223,9 @@ def _of(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, arm: Ar
                 return None  # the fit moves the base there by itself
             readings = [_Reading(left, words, False)] if left <= enough else []
         if seen.placing is not None or not readings:
+            few = seen.thinned(_SEVERAL_RECORDS)
+            if _left(problem, few, {}, few.measured, np.inf) <= MISSES * spread:
+                return None  # as they stand, the records that are looked at fit: a few others are off
             readings = list(_several(problem, seen, arm, enough))
     if min((reading.left for reading in readings), default=np.inf) > enough:
         enough = min(_ROUGHLY_FITS * spread, as_given / _FAR_BETTER)

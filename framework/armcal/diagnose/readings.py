@@ -33,7 +33,7 @@ def single_joints(arm: Arm) -> list[tuple[str, Wires]]:
     for factor in (_DEGREES, 1 / _DEGREES, _TURN, _MRAD, 1 / _MRAD):
         readings.append((f"joint angles {factor:.4g} times as large", _wires(arm, angles, factor)))
     for joint in angles if len(angles) > 1 else ():
-        readings.append((f"{joint} {_DEGREES:.4g} times as large (rad)", _wires(arm, {joint: joint}, _DEGREES)))
+        readings.append((f"{joint} {_DEGREES:.4g} times as large", _wires(arm, {joint: joint}, _DEGREES)))
     return readings
 
 
