@@ -19,7 +19,7 @@ from armcal_urdf.chain import ChainJoint
 from armcal_urdf.edit import Placed, with_origins
 from armcal_urdf.elements import Three
 from armcal_urdf.encoding import encode
-from armcal_urdf.model import RPY, XYZ, UrdfModel, UrdfSettings, nominal_angles, quarter_turn, turned
+from armcal_urdf.model import RPY, XYZ, UrdfModel, UrdfSettings, turned
 
 TOLERANCE_M = 1e-9
 TOLERANCE_RAD = 1e-9
@@ -56,7 +56,7 @@ class UrdfExporter:
         scope = f"{request.name}.{request.arm.model_name}."
         values = {n.removeprefix(scope): float(v[0]) for n, v in request.values.items() if n.startswith(scope)}
         placed = [
-            Placed(joint.urdf, _three(joint.name, XYZ, values), _rpy(joint, values))
+            Placed(joint.urdf, _three(joint.name, XYZ, values), _rpy(joint, model.settings, values))
             for joint in model.urdf_chain.joints
         ]
         old = model.settings
@@ -82,10 +82,11 @@ def _three(joint: str, names: tuple[str, ...], values: Mapping[str, float]) -> T
     return x, y, z
 
 
-def _rpy(joint: ChainJoint, values: Mapping[str, float]) -> Three:
+def _rpy(joint: ChainJoint, settings: UrdfSettings, values: Mapping[str, float]) -> Three:
     """As the format has them; those of the file where nothing turned the joint."""
     angles = _three(joint.name, RPY, values)
-    return joint.urdf.rpy if angles == nominal_angles(joint.urdf) else turned(angles, quarter_turn(joint.urdf))
+    nominal = settings.nominal_angles(joint.urdf)
+    return joint.urdf.rpy if angles == nominal else turned(angles, settings.quarter_turn(joint.urdf))
 
 
 def _nominal(model: UrdfModel) -> dict[str, float]:

@@ -60,6 +60,8 @@ class UrdfSettings(Settings):
         root: the link that the chain stands on, and whose frame is the base; the tree's root unless given.
         tip: the link whose frame is the tool; the tree's only leaf unless given.
         inertials: whether stated masses load the arm.
+        gimbal_lock: ``avoid`` counts the angles of a joint whose pitch is near a right angle from that right angle;
+            ``keep`` has the roll, pitch and yaw of the file there too, of which two are then one rotation.
     """
 
     path: InputPath | None = None
@@ -69,6 +71,7 @@ class UrdfSettings(Settings):
     root: str | None = None
     tip: str | None = None
     inertials: Literal["use", "ignore"] = "use"
+    gimbal_lock: Literal["avoid", "keep"] = "avoid"
 
     @model_validator(mode="after")
     def _read(self) -> Self:
@@ -99,6 +102,19 @@ class UrdfSettings(Settings):
         """Without a path: the text is enough."""
         return {name: value for name, value in super().to_config().items() if name != "path"}
 
+    def quarter_turn(self, joint: UrdfJoint) -> float:
+        """What is turned about y (rad) before a joint's parameters turn it: a right angle where its pitch is near one.
+
+        Such a pitch makes roll and yaw one rotation (gimbal lock); counted from the right angle, the angles are small.
+        """
+        sine = math.sin(joint.rpy[1])
+        locked = abs(sine) > LOCKED and self.gimbal_lock == "avoid"
+        return math.copysign(math.pi / 2, sine) if locked else 0.0
+
+    def nominal_angles(self, joint: UrdfJoint) -> Three:
+        """The parameters roll, pitch and yaw (rad) of a joint as the URDF has it."""
+        return turned(joint.rpy, -self.quarter_turn(joint))
+
     @property
     def robot(self) -> Robot:
         """Its links and joints."""
@@ -108,20 +124,6 @@ class UrdfSettings(Settings):
     def content(self) -> bytes:
         """The URDF as its file had it."""
         return encode(self.text, self.encoding or "utf-8")
-
-
-def quarter_turn(joint: UrdfJoint) -> float:
-    """What is turned about y (rad) before a joint's parameters turn it: a right angle where its pitch is near one.
-
-    Such a pitch makes roll and yaw one rotation (gimbal lock); counted from the right angle, the angles are small.
-    """
-    sine = math.sin(joint.rpy[1])
-    return math.copysign(math.pi / 2, sine) if abs(sine) > LOCKED else 0.0
-
-
-def nominal_angles(joint: UrdfJoint) -> Three:
-    """The parameters roll, pitch and yaw (rad) of a joint as the URDF has it."""
-    return turned(joint.rpy, -quarter_turn(joint))
 
 
 def turned(rpy: Three, angle: float) -> Three:
@@ -159,7 +161,8 @@ class UrdfModel:
         """The origins of all joints on the chain: xyz (m) and rpy (rad)."""
         blocks: list[ParameterBlock] = []
         for joint in self.urdf_chain.joints:
-            xyz, rpy = zip(XYZ, joint.urdf.xyz, strict=True), zip(RPY, nominal_angles(joint.urdf), strict=True)
+            xyz = zip(XYZ, joint.urdf.xyz, strict=True)
+            rpy = zip(RPY, self.settings.nominal_angles(joint.urdf), strict=True)
             blocks += [scalar(f"{joint.name}_{name}", "m", value, LENGTH_SCALE_M) for name, value in xyz]
             blocks += [scalar(f"{joint.name}_{name}", "rad", value, ANGLE_SCALE_RAD) for name, value in rpy]
         return tuple(blocks)
@@ -178,7 +181,7 @@ class UrdfModel:
             shift = se3.translation(*[values[f"{joint.name}_{axis}"] for axis in XYZ])
             roll, pitch, yaw = (values[f"{joint.name}_{angle}"] for angle in RPY)
             turn = se3.rotation_about("z", yaw) @ se3.rotation_about("y", pitch) @ se3.rotation_about("x", roll)
-            quarter = quarter_turn(joint.urdf)
+            quarter = self.settings.quarter_turn(joint.urdf)
             if quarter:
                 turn = turn @ se3.rotation_about("y", quarter)
             here = here @ (shift @ turn)
