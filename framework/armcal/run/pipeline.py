@@ -31,7 +31,7 @@ from armcal.run.result import RunResult, SuspiciousRecord, noise_result, run_gro
 
 
 @dataclass(frozen=True)
-class _RunContext:
+class RunContext:
     """What every stage of a run needs; ``executor`` does starts and folds, in this process if None."""
 
     experiment: Experiment
@@ -53,7 +53,7 @@ def calibrate(
     ready = prepare(experiment, watch, accept, progress)
     faults = list(registry.notify("armcal_run_started", name=experiment.name, records=len(ready.dataset)))
     faults += _notify_rejected(registry, ready.dataset.set_aside)
-    context = _RunContext(experiment, progress, executor, watch)
+    context = RunContext(experiment, progress, executor, watch)
     before = FittedRecords(**vars(ready), fitted=_fitted(context, ready))
     faults += registry.notify("armcal_estimate_changed", estimate=before.fitted.estimate)
     run, outcome = _with_pose_residual(context, before)
@@ -65,7 +65,7 @@ def calibrate(
 
 
 def _judged(
-    context: _RunContext,
+    context: RunContext,
     run: FittedRecords,
     outcome: ResidualOutcome | None,
     errors: RecordErrors,
@@ -103,7 +103,7 @@ def _judged(
     )
 
 
-def _uncertainty(context: _RunContext, run: FittedRecords) -> tuple[Bootstrap | None, tuple[Profile, ...]]:
+def _uncertainty(context: RunContext, run: FittedRecords) -> tuple[Bootstrap | None, tuple[Profile, ...]]:
     """What was asked for beyond the covariance, of a fit that converged."""
     experiment, parts = context.experiment, (context.executor, context.progress)
     settings, estimate = experiment.settings.uncertainty, run.fitted.estimate
@@ -119,7 +119,7 @@ def _uncertainty(context: _RunContext, run: FittedRecords) -> tuple[Bootstrap | 
     return resampled, profiled
 
 
-def _fitted(context: _RunContext, ready: Prepared) -> WeighedFit:
+def _fitted(context: RunContext, ready: Prepared) -> WeighedFit:
     """The fit to the training records, as sure as records that may err alike allow."""
     problem, data, progress = ready.problem, ready.dataset.subset(ready.split.train), context.progress
     estimator = spread(context.experiment.estimator, context.executor)
@@ -148,7 +148,7 @@ def _widened(ready: Prepared, fitted: WeighedFit) -> WeighedFit:
     return replace(fitted, estimate=widened(ready.problem, acting, fitted.estimate, position))
 
 
-def _with_pose_residual(context: _RunContext, run: FittedRecords) -> tuple[FittedRecords, ResidualOutcome | None]:
+def _with_pose_residual(context: RunContext, run: FittedRecords) -> tuple[FittedRecords, ResidualOutcome | None]:
     """The problem and the fit with the pose residual that is to be learned, where it is kept, and what became of it."""
     experiment, progress, executor = context.experiment, context.progress, context.executor
     training = run.dataset.subset(run.split.train)
@@ -184,7 +184,7 @@ def _notify_rejected(registry: PluginRegistry, records: Sequence[SetAside | Susp
 
 
 def _validated(
-    context: _RunContext, before: FittedRecords, run: FittedRecords, outcome: ResidualOutcome | None
+    context: RunContext, before: FittedRecords, run: FittedRecords, outcome: ResidualOutcome | None
 ) -> tuple[RecordErrors, IntervalResult]:
     """Errors of all records and prediction intervals, by cross-validation over the training records if configured.
 
