@@ -14,8 +14,8 @@ from armcal.base.quaternions import quaternion_of
 from armcal.estimate.estimator import Estimate
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import _fitted as fitted_of
 from armcal.run.pipeline import RunContext
+from armcal.run.pipeline import _fitted as fitted_of
 from armcal.run.prepare import Stopwatch, prepare
 from scipy.spatial.transform import Rotation
 

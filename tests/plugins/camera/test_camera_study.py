@@ -10,8 +10,8 @@ import pytest
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.problem.problem import Problem
-from armcal.run.pipeline import _fitted as fitted_of
 from armcal.run.pipeline import RunContext
+from armcal.run.pipeline import _fitted as fitted_of
 from armcal.run.prepare import Stopwatch, prepare
 
 DEMO = Path(__file__).resolve().parents[3] / "configs" / "camera" / "demo.yaml"
