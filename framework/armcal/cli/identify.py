@@ -12,10 +12,10 @@ from armcal.base.arrays import Array
 from armcal.base.config_text import finite
 from armcal.base.parameters import Parameters
 from armcal.cli.common import FILE, Console, data, overrides, speaking
-from armcal.diagnose.minimal import Dropped, minimal_set
 from armcal.errors import ConfigError, Location
 from armcal.estimate.combination import Combination, Measure
 from armcal.estimate.identifiability import CORRELATED, Identifiability, correlated_pairs, expected_covariance
+from armcal.estimate.minimal import Dropped, minimal_set
 from armcal.estimate.structure import CAUSES, explain, held_by_nothing, identify_from
 from armcal.estimate.validation import error_unit
 from armcal.planning.criterion import observability

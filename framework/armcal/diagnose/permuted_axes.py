@@ -17,8 +17,15 @@ from armcal.arm.assembly import Arm
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.units import digits
-from armcal.diagnose.readings import LEFT_HANDED, Wires, scaled_positions, several_joints, single_joints, turned_axes
-from armcal.diagnose.two_frames import two_frames
+from armcal.diagnose.readings import (
+    LEFT_HANDED,
+    Wires,
+    scaled_positions,
+    several_joints,
+    single_joints,
+    turned_axes,
+    two_frames,
+)
 from armcal.errors import NotConvergedError
 from armcal.estimate.placing import Placing, placings
 from armcal.problem.factor_records import subset

@@ -1,12 +1,17 @@
-"""Other readings of recorded joints and positions: exchanged, reversed, of another unit, a row early or late."""
+"""Other readings of recorded joints and positions: exchanged, reversed, of another unit, a row early or late.
+
+And positions in one frame up to a record and in another from there on: the instrument was moved.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations, permutations, product
 
 import numpy as np
 
 from armcal.arm.assembly import Arm
 from armcal.base.arrays import Array
+from armcal.problem.rigid_alignment import Tools, nearest
 
 Wires = Mapping[str, tuple[str, float]]
 """Channels, each read as another one times a factor."""
@@ -14,6 +19,9 @@ _DEGREES, _TURN, _MRAD = 180 / np.pi, 360.0, 1000 * np.pi / 180
 _MOST_SIGNS = 8
 _AXES = "xyz"
 _INCH = 25.4
+FEWEST_IN_PART = 8
+"""Records in a part: an alignment has nine numbers."""
+_PARTS, _ROUNDS = (0.25, 0.5, 0.75), 3
 LENGTHS = (10.0, 0.1, 1000.0, 0.001, _INCH, 1 / _INCH, 1000 / _INCH, _INCH / 1000)
 """What lengths are off by that were read in mm, cm, m or inches and taken for another of these."""
 _AXIS_LENGTHS = (10.0, 0.1, 1000.0, 0.001)
@@ -91,3 +99,33 @@ def scaled_positions() -> Iterator[tuple[str, Array]]:
     for axis, factor in product(range(3), _AXIS_LENGTHS):
         scale = np.diag([factor if i == axis else 1.0 for i in range(3)])
         yield f"{_AXES[axis]} {factor:.4g} times as large", scale
+
+
+@dataclass(frozen=True)
+class TwoFrames:
+    """Where the second frame begins (a place among the records), and what both leave (root mean square, m)."""
+
+    begins: int
+    left: float
+
+
+def two_frames(tools: Tools, measured: Array, basis: Array) -> TwoFrames | None:
+    """Records (3 x n, m) in recorded order, each part aligned by itself; None where they are too few.
+
+    From a few divisions on, each part is aligned and the division put where both alignments leave least, in turn.
+    """
+    every = np.arange(measured.shape[1])
+    if len(every) < 2 * FEWEST_IN_PART:
+        return None
+    divisions = []
+    for part in _PARTS:
+        begins = round(part * len(every))
+        for _ in range(_ROUNDS):
+            begins = min(max(begins, FEWEST_IN_PART), len(every) - FEWEST_IN_PART)
+            halves = [nearest(tools.subset(own), measured[:, own], basis) for own in (every[:begins], every[begins:])]
+            squares = [np.sum((measured - alignment.moved(tools)) ** 2, axis=0) for alignment in halves]
+            before, after = (np.concatenate([[0.0], np.cumsum(square)]) for square in squares)
+            left = before + after[-1] - after
+            begins = int(np.argmin(left[FEWEST_IN_PART:-FEWEST_IN_PART])) + FEWEST_IN_PART
+            divisions.append(TwoFrames(begins, float(np.sqrt(left[begins] / len(every)))))
+    return min(divisions, key=lambda one: one.left)

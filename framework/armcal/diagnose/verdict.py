@@ -21,8 +21,14 @@ from armcal.diagnose.evidence_findings import (
     what_neighbours_cost,
 )
 from armcal.diagnose.held import contradiction_findings
-from armcal.diagnose.noise_findings import Finding, component_findings, first_few
-from armcal.diagnose.suspects import outlier_findings, suspicious_in_short, suspicious_records
+from armcal.diagnose.noise_findings import (
+    Finding,
+    component_findings,
+    first_few,
+    outlier_findings,
+    suspicious_in_short,
+    suspicious_records,
+)
 from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
 from armcal.estimate.identifiability import POOR_CONDITION, bound_together, correlated_pairs
 from armcal.estimate.prediction import NewRecording
