@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from armcal import plugin_files
 from armcal.cli.main import cli
 from click.testing import CliRunner, Result
 
@@ -123,3 +124,53 @@ def test_positions_alone_have_none(folder: Path) -> None:
     assert done.exit_code in (0, 3), done.output
     assert "orientation_error_deg" not in (folder / "positions" / "metrics.json").read_text()
     assert "Orientation error" not in done.stdout and "deg" not in (folder / "positions" / "residuals.csv").read_text()
+
+
+RANGE = """
+import casadi as ca
+from armcal import Channel, Instrument, InstrumentSettings, Length, hookimpl
+
+
+class RangeSettings(InstrumentSettings):
+    noise: Length
+    angle_noise: float
+
+
+class Range(Instrument):
+    Settings = RangeSettings
+    EXAMPLE = {"noise_mm": 0.1, "angle_noise": 0.001}
+
+    def channels(self):
+        return [Channel("range", "length"), Channel("bearing", "angle")]
+
+    def outputs(self, arms, values):
+        sight = self.base_T_tool(arms).translation - ca.vertcat(-3, 1, 0.5)
+        return {"range": ca.norm_2(sight), "bearing": ca.atan2(sight[1], sight[0])}
+
+    def noise(self):
+        return (self.settings.noise, self.settings.angle_noise)
+
+
+@hookimpl
+def armcal_register_measurements(register):
+    register("range", Range, "how far off a prism is, and where")
+"""
+
+
+def test_ranges_and_bearings_are_no_errors_of_a_tip_or_of_an_orientation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(plugin_files.CHOSEN, "")
+    text = CONFIG.replace(
+        "tip_pose, noise_mm: 0.1, orientation_noise_deg: 0.05", "range, noise_mm: 0.1, angle_noise: 0.01"
+    )
+    text = text.replace("a[123]", "a[23]").replace(', "arm.mdh.alpha[12]"', "")
+    for name, content in (("arm.yaml", text), ("truth.yaml", TRUTH), ("range.py", RANGE)):
+        (tmp_path / name).write_text(content, encoding="utf-8")
+    plugin = ("--plugin", tmp_path / "range.py")
+    armcal("simulate", tmp_path / "arm.yaml", "--out", tmp_path / "records.csv", *plugin)
+    done = armcal("run", tmp_path / "arm.yaml", "--out", tmp_path / "out", *plugin)
+    assert done.exit_code in (0, 3), done.output
+    assert "Length error, mm" in done.stdout and "Angle error, deg" in done.stdout
+    verdict = json.loads((tmp_path / "out" / "metrics.json").read_text())["verdict"]["headline"]
+    assert "Length error " in verdict and not re.search("Tip|Orientation", done.stdout + verdict)

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from armcal.base.domains import Semidefinite, symmetric
-from armcal.base.units import ERROR_NAMES, shown_unit
+from armcal.base.units import shown_unit
 from armcal.cli.common import FILE, Console, command_line, data, overrides, parallel, speaking
 from armcal.cli.console import columned
 from armcal.cli.outlet import say
@@ -105,10 +105,10 @@ def _end(result: RunResult, folder: Path, accept: bool) -> None:
 def show_run(console: Console, result: RunResult, folder: Path, seconds: float) -> None:
     """The end of a run: errors, compliances, verdict, where the report is."""
     out = console.out
-    unit = result.errors.unit
-    out.print(_errors(f"{ERROR_NAMES[unit]} error, {unit}: {result.name}", result.table))
+    out.print(_errors(f"{result.errors.name} error, {result.errors.unit}: {result.name}", result.table))
     if result.table.turns is not None:
-        out.print(_errors(f"Orientation error, deg: {result.name}", result.table.turns))
+        what = "Orientation" if result.errors.name == "Tip" else "Angle"
+        out.print(_errors(f"{what} error, deg: {result.name}", result.table.turns))
     if result.groups.errors:
         out.print(_groups(result))
     for compliances in (_compliances(result), _matrices(result)):

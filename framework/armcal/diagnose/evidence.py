@@ -43,7 +43,10 @@ class PriorsAlone:
 
 @dataclass(frozen=True)
 class Evidence:
-    """All of it; what was not looked at, or is not known, is None. ``unit`` is that of all errors, mm or mrad."""
+    """All of it; what was not looked at, or is not known, is None.
+
+    ``unit`` is that of all errors, mm or mrad; ``name`` what they are errors of.
+    """
 
     structure: ResidualStructure | None = None
     large_errors: LargeErrors | None = None
@@ -52,6 +55,7 @@ class Evidence:
     new_recording: NewRecording | None = None
     hidden_payload: HiddenPayload | None = None
     contradictions: tuple[Contradiction, ...] = ()
+    name: str = "Tip"
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json."""

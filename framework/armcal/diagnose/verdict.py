@@ -8,7 +8,6 @@ import numpy as np
 from scipy.special import bdtr, chdtri, ndtri
 
 from armcal.base.arrays import Array, Indices
-from armcal.base.units import ERROR_NAMES
 from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.evidence_findings import (
     MOST_TOLD,
@@ -102,7 +101,7 @@ def judge(
     findings += [*_correlated(estimate), *predicted, *large_error_findings(seen.large_errors, seen.unit)]
     findings += [*outlier_findings(suspicious, own, fitted), *_next(estimate, suggestions)]
     ranked = tuple(sorted(findings, key=lambda finding: _ORDER[finding.grade]))
-    headline = _errors_text(judged_mm, judged_on, seen.unit)
+    headline = _errors_text(judged_mm, judged_on, seen)
     first = _good_for(judged_mm, judged_on, seen.unit, seen.new_recording)
     if ranked[0].grade == "bad":
         headline, first = f"{DO_NOT_USE}. {headline}", f"{DO_NOT_USE}: {ranked[0].text}"
@@ -110,13 +109,13 @@ def judge(
     return Verdict(headline, ranked, " ".join(short))
 
 
-def _errors_text(judged_mm: Array, judged_on: str, unit: str) -> str:
+def _errors_text(judged_mm: Array, judged_on: str, seen: Evidence) -> str:
     if not len(judged_mm):
         return "No record was held out: how good the model is on new poses is not known."
-    errors = summarise(judged_mm)
+    errors, unit = summarise(judged_mm), seen.unit
     most = "all of them" if errors.p95 is None else "95 % of poses"
     return (
-        f"{ERROR_NAMES[unit]} error {errors.mean:.2f} {unit} on average, {most} below "
+        f"{seen.name} error {errors.mean:.2f} {unit} on average, {most} below "
         f"{errors.max if errors.p95 is None else errors.p95:.2f} {unit}, judged on {judged_on}."
     )
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from armcal.base.arrays import Array, Indices
-from armcal.base.units import ERROR_UNITS
+from armcal.base.units import ERROR_NAMES, ERROR_UNITS
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.estimator import Estimator, Progress, Solution, no_progress
 from armcal.estimate.nuisance import restricted, settled
@@ -109,6 +109,14 @@ def _sizes(problem: Problem, records: Sequence[FactorRecords], raw: Sequence[Arr
 def error_unit(problem: Problem) -> str:
     """The unit in which errors are shown, a thousandth of that inside: mm; px, mN, ... where no length is measured."""
     return ERROR_UNITS[error_dimension(problem)]
+
+
+def error_name(problem: Problem) -> str:
+    """What errors are errors of: of the tip, but of lengths where instruments read lengths that are no position."""
+    read = [kernel.factor for kernel in problem.kernels if "length" in kernel.factor.dimensions]
+    if read and all(factor.output_channels and not factor.position_channels for factor in read):
+        return "Length"
+    return ERROR_NAMES[error_unit(problem)]
 
 
 def in_unit(content: Any, unit: str) -> Any:

@@ -15,6 +15,7 @@ from armcal.estimate.validation import (
     CrossValidation,
     ErrorSummary,
     Split,
+    error_name,
     error_unit,
     errors_and_turns,
     record_errors,
@@ -61,6 +62,7 @@ class RecordErrors:
         cross_validated_at_rest_mm: the same by the fold that did not train on it.
         residual_columns: names of the rows of the residuals, with their units (mm; mrad for angles).
         unit: of all errors, ``mm`` or ``mrad``.
+        name: what they are errors of, ``Tip``.
         turns: of orientations, where they are measured beside lengths.
     """
 
@@ -75,6 +77,7 @@ class RecordErrors:
     cross_validated_at_rest_mm: Array | None = None
     residual_columns: tuple[str, ...] = ()
     unit: str = "mm"
+    name: str = "Tip"
     turns: TurnErrors | None = None
 
     def with_nominal(self, other: Self) -> Self:
@@ -129,6 +132,7 @@ def errors_of(run: FittedRecords, crossed: CrossValidation | None) -> RecordErro
             cross_validated_at_rest_mm=judged_at_rest if drifts else None,
             residual_columns=("dx_mm", "dy_mm", "dz_mm") if dimensions == ["length"] * 3 else columns,
             unit=error_unit(problem),
+            name=error_name(problem),
             turns=turned,
         )
     except NotConvergedError as fault:

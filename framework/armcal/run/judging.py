@@ -23,7 +23,7 @@ from armcal.diagnose.unseen import hidden_payload, hidden_payload_findings, scal
 from armcal.diagnose.verdict import Verdict, judge
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.start import certificates
-from armcal.estimate.validation import error_unit
+from armcal.estimate.validation import error_name, error_unit
 from armcal.measure.measurement import StatesAccuracy
 from armcal.planning.candidates import deviations as deviations_of
 from armcal.planning.suggestion import Suggestion, suggest
@@ -121,7 +121,7 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     """
     problem, estimate, dataset = run.problem, run.fitted.estimate, run.dataset
     if not estimate.verdict.converged:
-        return Evidence(unit=error_unit(problem))
+        return Evidence(unit=error_unit(problem), name=error_name(problem))
     few, records = with_few_points(problem, run.records)
     position, motion = recorded_position(dataset), Motion.of(few, estimate.values, records, dataset)
     judged = Judged(judged_mm, few.residuals(estimate.values, records), position)
@@ -141,7 +141,7 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     left = structure(wider, acting, estimate, *own, modelled=frozenset(str(effect.get("type")) for effect in effects))
     hidden = hidden_payload(few, acting, estimate, own[0], own[1])
     new = predictor(problem, run.fitted).new_recording(run.records, np.flatnonzero(np.isfinite(judged_mm)))
-    return Evidence(left, missed, alone, error_unit(problem), new, hidden, held)
+    return Evidence(left, missed, alone, error_unit(problem), new, hidden, held, error_name(problem))
 
 
 def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array, evidence: Evidence) -> list[Finding]:
