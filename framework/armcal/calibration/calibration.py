@@ -162,7 +162,7 @@ class Calibration:
         return readable(self.system)
 
     def predict(self, commands: Dataset) -> tuple[dict[str, Array], Array]:
-        """What instruments would read and where the first measurement's arms' tools are, in elastic equilibrium.
+        """What instruments would read and where the tools of all arms are, in elastic equilibrium.
 
         Args:
             commands: records with joint angles; load and gravity where they differ from the configured ones.

@@ -99,7 +99,9 @@ def predict(system: System, parameters: Parameters, commands: Dataset) -> tuple[
         NotConvergedError: a record has no equilibrium.
     """
     fixed = parameters.with_free(())
-    measurements = readable(system) or {"pose": ArmsAlone(tuple(system.arms))}
+    measurements, names = dict(readable(system)), tuple(system.arms)
+    if tuple(next((m.arms for m in measurements.values()), ())) != names:  # the first shows where tools are
+        measurements = {"_arms": ArmsAlone(names), **measurements}
     parts = (system.arms, measurements, fixed, system.environment, commands)
     problem = Problem.build(*parts, "interpreted", groups={})
     shown = problem.predict(fixed.nominal(), problem.records(commands))
