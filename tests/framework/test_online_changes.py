@@ -14,6 +14,8 @@ from armcal_online.tracking.recalibrator import Recalibrator
 from online_arm import PROBES, World, begun, predicted, settings, tip_error_mm, told
 from scipy.spatial.transform import Rotation
 
+from tests.soak import TIMES
+
 NAMING = ("joint_slipped", "joint_replaced", "joint_named")
 RESETS = (*NAMING, "joint_stepped", "sensor_moved", "general_change", "drift", "model_no_longer_fits")
 SETTLED = 150
@@ -299,7 +301,7 @@ def test_an_instrument_that_was_bumped_is_found_anew(bump: str, seeds: int) -> N
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [400, 100_000])
+@pytest.mark.parametrize("count", [400, 10_000 * TIMES])
 def test_outliers_alone_never_reset_anything(count: int) -> None:
     recalibrator, fresh = _shared()
     recalibrator.restore(fresh)
