@@ -97,10 +97,11 @@ def resolve_path(text: ConfigText | str) -> Path:
         ) from fault
     if limit is not None and not path.is_relative_to(limit):
         raise ConfigError(
-            f"the path {str(text)!r} leads to {path}, outside {limit}: only data may lie outside the configuration's "
-            "folder.",
+            f"the path {str(text)!r} leads to {path}, outside {limit}: what a configuration names lies below "
+            "its folder.",
             where=where,
-            hint="Copy the file into that folder, or give its path by --set, which may name any place.",
+            hint="Copy the file into that folder, or name it on the command line, which may name any place: data by "
+            "--data PATH, other files by --set.",
         )
     return path
 

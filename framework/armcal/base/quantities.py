@@ -75,7 +75,7 @@ def _resolve(value: Any) -> Any:
 
 
 InputPath: TypeAlias = Annotated[Path, BeforeValidator(_resolve)]
-"""A file to read: text is resolved against the config it was written in, and stays below its root, if it has one."""
+"""A file to read: text is resolved against the config it was written in, and stays below the run's root."""
 
 
 @dataclass(frozen=True)

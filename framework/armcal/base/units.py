@@ -111,16 +111,9 @@ _SPELLINGS: Mapping[str, str] = MappingProxyType(
     }
 )
 _WRITTEN: Mapping[str, str] = MappingProxyType(
-    {
-        "rad_per_Nm": "rad/Nm",
-        "deg_per_Nm": "deg/Nm",
-        "rad_per_Nm3": "rad/Nm^3",
-        "m_s2": "m/s^2",
-        "per_K": "1/K",
-        "1": "",
-    }
+    {name: spelling for spelling, name in reversed(tuple(_SPELLINGS.items())) if "_" in name} | {"1": ""}
 )
-"""Units whose names, made for keys of a file, are not how people write them."""
+"""Units whose names, made for keys of a file, are not how people write them: their first spelling."""
 _NEAR_UNIT = 0.1
 _LONGEST_FIRST = tuple(sorted((n for n in UNITS if n != "1"), key=len, reverse=True))
 _QUANTITY = re.compile(r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*(\S.*?)?\s*", re.DOTALL)

@@ -86,7 +86,8 @@ class Experiment:
     def of(cls, source: ConfigSource, data: str | Path | None = None, registry: PluginRegistry | None = None) -> Self:
         """Check a configuration that was read; else as ``load``."""
         registry = registry or discover()
-        source = with_data_anywhere(source) if data is None else with_data(source, data)
+        if data is not None:
+            source = with_data(source, data)
         settings = validate(ExperimentSettings, source)
         system = build_system(source, registry)
         known = without_groups(settings.parameters, grouped_instances(system.measurements))
@@ -213,25 +214,6 @@ def with_data(source: ConfigSource, data: str | Path) -> ConfigSource:
     section: dict[str, Any] = dict(source.data.get("data") or {"type": "csv"})
     section["path"] = ConfigText(str(data))
     return replace(source, data={**source.data, "data": section})
-
-
-def with_data_anywhere(source: ConfigSource) -> ConfigSource:
-    """The configuration whose data may lie anywhere: measurements are often kept in a folder that many share.
-
-    What describes the arm stays below the configuration's folder, so that they are copied together. Which records were
-    read is kept with a calibration by their path and hash.
-    """
-
-    def freed(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: freed(entry) for key, entry in value.items()}
-        if isinstance(value, ConfigText):
-            return ConfigText(value, value.location, value.base_dir)
-        return value
-
-    if "data" not in source.data:
-        return source
-    return replace(source, data={**source.data, "data": freed(source.data["data"])})
 
 
 def _gravity_warnings(settings: ExperimentSettings, gravity: Array) -> list[str]:
