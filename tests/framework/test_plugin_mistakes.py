@@ -132,6 +132,7 @@ def armcal_register_readers(register):
     register("mine", R, "")
 """
 )
+TIP, MINE = "{type: tip_position, noise_mm: 0.1}", "{mine: {type: mine}}"
 MDH = "mdh, convention: standard, rows: [{a_mm: 300, alpha_deg: 90}, {a_mm: 200}, {a_mm: 150}]"
 READERS = {
     "none": ("return Dataset", "Dataset", "R.read returned None, expected a Dataset"),
@@ -235,12 +236,11 @@ def _forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def ended(
     folder: Path,
     plugin: str,
-    effects: str,
-    measurement: str,
-    free: str,
-    *more: str,
+    effects: str = "{}",
+    measurement: str = TIP,
+    free: str = "arm.mdh.a2",
     reader: str = "csv",
-    model: str = "",
+    model: str = MDH,
 ) -> int:
     """How ``armcal run`` ends on a planar arm with a plugin file."""
     (folder / "mine.py").write_text(plugin, encoding="utf-8")
@@ -250,7 +250,7 @@ def ended(
         f"""
 arms:
   arm:
-    model: {{type: {model or MDH}}}
+    model: {{type: {model}}}
     effects: {effects}
 statics: {{gravity_m_s2: [0, 0, -9.81], payload_g: 100}}
 measurements: {{m: {measurement}}}
@@ -260,60 +260,32 @@ parameters: {{free: [{free}]}}
         encoding="utf-8",
     )
     os.chdir(folder)
-    done = cli.main(["run", "run.yaml", "--plugin", "mine.py", *more], "armcal", standalone_mode=False)
+    done = cli.main(["run", "run.yaml", "--plugin", "mine.py", "--accept"], "armcal", standalone_mode=False)
     assert isinstance(done, int)
     return done
 
 
-@pytest.mark.parametrize("mistake", EFFECTS)
-def test_a_mistake_in_an_effect(mistake: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    right, wrong, sentence = EFFECTS[mistake]
-    assert right in EFFECT
-    code = EFFECT.replace(right, wrong, 1)
-    tip = "{type: tip_position, noise_mm: 0.1}"
-    assert ended(tmp_path, code, "{mine: {type: mine}}", tip, "arm.mine.s2", "--accept") == 2
-    _expect(capsys.readouterr().err, sentence, "" if sentence.startswith("derivative") else "mine.py")
+KINDS: dict[str, tuple[str, dict[str, tuple[str, str, str]], dict[str, str]]] = {  # its plugin, mistakes, and the run
+    "effect": (EFFECT, EFFECTS, {"effects": MINE, "free": "arm.mine.s2"}),
+    "measurement": (GAUGE, GAUGES, {"measurement": "{type: mine}"}),
+    "reader": (READER, READERS, {"reader": "mine"}),
+    "model": (MODEL, MODELS, {"model": "mine", "free": "arm.mine.a2"}),
+    "registration": (EFFECT, REGISTRATIONS, {"effects": MINE, "free": "arm.mine.s2"}),
+}
+OF_NO_LINE = ("derivative", "the measurement", "row", "'mine'")
+"""Sentences about numbers, or a name, that no single line of a plugin gave."""
 
 
-@pytest.mark.parametrize("mistake", GAUGES)
-def test_a_mistake_in_a_measurement(mistake: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    right, wrong, sentence = GAUGES[mistake]
-    assert right in GAUGE
-    assert ended(tmp_path, GAUGE.replace(right, wrong, 1), "{}", "{type: mine}", "arm.mdh.a2") == 2
-    _expect(capsys.readouterr().err, sentence, "" if sentence.startswith("the measurement") else "mine.py")
-
-
-@pytest.mark.parametrize("mistake", READERS)
-def test_a_mistake_in_a_reader(mistake: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    right, wrong, sentence = READERS[mistake]
-    assert right in READER
-    tip, code = "{type: tip_position, noise_mm: 0.1}", READER.replace(right, wrong, 1)
-    assert ended(tmp_path, code, "{}", tip, "arm.mdh.a2", "--accept", reader="mine") == 2
-    _expect(capsys.readouterr().err, sentence, "" if sentence.startswith("row") else "mine.py")
-
-
-@pytest.mark.parametrize("mistake", MODELS)
-def test_a_mistake_in_a_model(mistake: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    right, wrong, sentence = MODELS[mistake]
-    assert right in MODEL
-    tip, code = "{type: tip_position, noise_mm: 0.1}", MODEL.replace(right, wrong, 1)
-    assert ended(tmp_path, code, "{}", tip, "arm.mine.a2", "--accept", model="mine") == 2
-    _expect(capsys.readouterr().err, sentence, "mine.py")
-
-
-@pytest.mark.parametrize("mistake", REGISTRATIONS)
-def test_a_mistake_in_a_registration(mistake: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    right, wrong, sentence = REGISTRATIONS[mistake]
-    assert right in EFFECT
-    tip = "{type: tip_position, noise_mm: 0.1}"
-    assert ended(tmp_path, EFFECT.replace(right, wrong, 1), "{mine: {type: mine}}", tip, "arm.mine.s2") == 2
-    _expect(capsys.readouterr().err, sentence, "")
-
-
-def _expect(shown: str, sentence: str, file: str) -> None:
+@pytest.mark.parametrize(("kind", "mistake"), [(kind, name) for kind, (_, table, _) in KINDS.items() for name in table])
+def test_a_mistake(kind: str, mistake: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plugin, mistakes, options = KINDS[kind]
+    right, wrong, sentence = mistakes[mistake]
+    assert right in plugin
+    assert ended(tmp_path, plugin.replace(right, wrong, 1), **options) == 2
+    shown = capsys.readouterr().err
     last = [line for line in shown.splitlines() if line.startswith("armcal: ")]
     assert len(last) == 1 and "Traceback" not in shown
-    assert re.search(sentence, last[0]) and file in last[0], last[0]
+    assert re.search(sentence, last[0]) and (sentence.startswith(OF_NO_LINE) or "mine.py" in last[0]), last[0]
 
 
 def _work(task: int) -> int:
@@ -334,4 +306,4 @@ def test_a_fault_is_placed_in_any_process(tmp_path: Path) -> None:
 def test_armcals_own_faults_keep_their_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("armcal.run.prepare.check_reach", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        ended(tmp_path, EFFECT, "{mine: {type: mine}}", "{type: tip_position, noise_mm: 1}", "arm.mine.s2", "--accept")
+        ended(tmp_path, EFFECT, effects=MINE, free="arm.mine.s2")
