@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import base64
-import sys
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from armcal.base.arrays import Array
@@ -21,7 +20,7 @@ from armcal.run.result import RunResult
 
 from armcal_camera.images import MOST_BYTES, grey_image, opencv
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # importing it takes 0.1 s, which a run without a camera must not wait for
     from armcal_camera.camera import Camera
 
 _PX = 1000.0
@@ -36,14 +35,14 @@ _CROSS = "m-3 0h6m-3-3v6"
 
 def cameras(result: RunResult) -> ReportSection | None:
     """Reprojection residuals over the sensor and by image, of every camera of the run."""
-    if (built := sys.modules.get("armcal_camera.camera")) is None:  # importing it takes 0.1 s, and none is there
-        return None
-    start, parts, count = 0, list[str](), sum(isinstance(m, built.Camera) for m in result.system.measurements.values())
+    described = result.system.description["measurements"]
+    start, parts, count = 0, list[str](), sum(section["type"] == "camera" for section in described.values())
     for name, measurement in result.system.measurements.items():
         rows = len(measurement.noise())
-        if isinstance(measurement, built.Camera):
+        if described[name]["type"] == "camera":
             own = result.errors.calibrated_residual_mm[start : start + rows]
-            parts += _of_camera(residuals_of(result, name, measurement, own), _MOST_BYTES // count)
+            residuals = residuals_of(result, name, cast("Camera", measurement), own)
+            parts += _of_camera(residuals, _MOST_BYTES // count)
         start += rows
     return ReportSection("Cameras", "".join(parts)) if parts else None
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import base64
 import re
+import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
-from armcal_camera.report import CameraResiduals, drawn_images
+from armcal_camera.report import CameraResiduals, cameras, drawn_images
 
 PIXELS = np.array([[100.0, 300, 500], [80, 200, 320]])
 
@@ -51,3 +54,11 @@ def test_errors_that_would_not_be_seen_are_drawn_longer() -> None:
 
 def test_a_camera_that_saw_nothing_has_no_images() -> None:
     assert not drawn_images(residuals(error=np.nan), 1)
+
+
+def test_a_run_without_a_camera_imports_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "armcal_camera.camera", None)  # importing it fails
+    measurements = {"tip": SimpleNamespace(noise=lambda: (1e-4,) * 3)}
+    system = SimpleNamespace(measurements=measurements, description={"measurements": {"tip": {"type": "tip_position"}}})
+    result: Any = SimpleNamespace(system=system)
+    assert cameras(result) is None
