@@ -96,12 +96,15 @@ class Answerer:
         else:
             conditions = {TEMPERATURE: request.temperature}
             poses = arm.at_temperature(TEMPERATURE_KEY).forward(rows, acting, approach.T, conditions)
+        beyond, warning = arm.beyond_records(rows, acting)
         return {
             "armcal_serve": VERSION,
             "id": request.id,
             "ok": True,
             "arm": arm.name,
             "tools": [_tool(pose) for pose in poses],
+            "beyond_records": beyond,
+            "warning": warning,
         }
 
     def _compensate(self, request: CompensateRequest) -> CompensateAnswer:
@@ -117,13 +120,18 @@ class Answerer:
             start = np.asarray(arm.angles([request.start], "start")[0])
         if request.start_joints is not None:
             start = np.asarray(arm.named([request.start_joints], "start_joints")[0])
+        targets = _targets(arm, request)
         solved: list[tuple[Sequence[int], Commands]] = []
         try:
-            for compensator, targets, places in shares(arm, request, _targets(arm, request)):
+            for compensator, share, places in shares(arm, request, targets):
                 find = compensator.follow if request.path else compensator.solve
-                solved.append((places, find(targets, start)))
+                solved.append((places, find(share, start)))
         except ValueError as fault:
             raise DataError(f"{fault}.", where=Location(field="targets"), hint="Correct the request.") from fault
+        angles = np.empty((len(targets), len(arm.joints)))
+        for places, commands in solved:
+            angles[places] = commands.joint_angles
+        beyond, warning = arm.beyond_records(angles, targets.acting)
         rows = {
             place: row
             for places, commands in solved
@@ -136,6 +144,8 @@ class Answerer:
             "arm": arm.name,
             "joint_names": [*arm.joints],
             "commands": [rows[place] for place in sorted(rows)],
+            "beyond_records": beyond,
+            "warning": warning,
         }
 
     def _arm(self, name: str | None) -> ServedArm:

@@ -14,6 +14,7 @@ from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import lost_calibration
 from armcal.calibration.compensation.request import Options, Redundancy
 from armcal.calibration.measured_point import Point
+from armcal.calibration.recorded_range import PAYLOAD, RecordedRange
 from armcal.errors import ArmcalError, ConfigError, InputError, Location
 from armcal.functions.batch_function import EvaluatorChoice
 
@@ -137,8 +138,13 @@ def _arm(calibration: Calibration, name: str, order: Order) -> ServedArm:
     except ValueError as fault:
         hint = "Correct the limits in the plan."
         raise ConfigError(f"{fault}.", where=Location(order.within or order.shown), hint=hint) from fault
-    needs_payload = bool(arm.deflection_size) and statics.payload is None
-    return ServedArm(name, dict(arm.commanded), compensator, needs_payload, heated, order.point)
+    needs_payload = arm.depends_on_payload and statics.payload is None
+    kept, recorded = calibration.record.prediction, None
+    if kept is not None and kept.ranges:
+        is_known = needs_payload or statics.payload is not None
+        ranges = {channel: ends for channel, ends in kept.ranges.items() if channel != PAYLOAD or is_known}
+        recorded = RecordedRange.of(ranges, [*(f"{name}.{joint}" for joint in joints), PAYLOAD], {name: arm})
+    return ServedArm(name, dict(arm.commanded), compensator, needs_payload, heated, order.point, recorded)
 
 
 def _warm_up(answerer: Answerer, arm: ServedArm, acting: Mapping[str, float]) -> None:

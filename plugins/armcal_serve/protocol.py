@@ -192,10 +192,24 @@ class Refusal(Answer):
     where: str
 
 
-class ForwardAnswer(Answer):
-    """Where the tool is, by posture."""
+class PoseAnswer(Answer):
+    """The fields of answers with poses, which may lie where nothing tested how far off predictions are.
+
+    Attributes:
+        arm: which one.
+        beyond_records: places (from 0) of the tools or commands that lie beyond the calibration's records; null where
+            the calibration keeps no ranges of them.
+        warning: a sentence about those, with joint or payload, the farthest value and the recorded ones; else empty.
+    """
 
     arm: str
+    beyond_records: list[int] | None
+    warning: str
+
+
+class ForwardAnswer(PoseAnswer):
+    """Where the tool is, by posture."""
+
     tools: list[Tool]
 
 
@@ -227,10 +241,9 @@ class Command(TypedDict):
     tool: Tool
 
 
-class CompensateAnswer(Answer):
+class CompensateAnswer(PoseAnswer):
     """What to command, by target."""
 
-    arm: str
     joint_names: list[str]
     commands: list[Command]
 

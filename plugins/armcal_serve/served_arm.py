@@ -11,6 +11,7 @@ from armcal.base.arrays import Array
 from armcal.base.units import from_unit, split_suffix, to_unit
 from armcal.calibration.compensation.compensator import Compensator
 from armcal.calibration.measured_point import Point
+from armcal.calibration.recorded_range import PAYLOAD, RecordedRange
 from armcal.errors import DataError, Location
 
 from armcal_serve.protocol import Acting
@@ -30,9 +31,10 @@ class ServedArm:
         name: the arm's instance name.
         dimensions: ``angle`` or ``length`` by commanded joint, in order.
         compensator: of the calibration as it was loaded.
-        needs_payload: whether it deflects under load and the calibration states no payload.
+        needs_payload: whether what hangs on it moves it and the calibration does not state that.
         heated: the compensator of requests that state the temperature; None where the arm does not change with it.
         point: what requests and answers are about: the tool's frame, or the target that was measured.
+        recorded: the joints' ranges in the calibration's records, then the payload's; None where it keeps none.
     """
 
     name: str
@@ -41,6 +43,7 @@ class ServedArm:
     needs_payload: bool
     heated: Compensator | None = None
     point: Point = "tool"
+    recorded: RecordedRange | None = None
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -128,11 +131,24 @@ class ServedArm:
         stated = general.payload is not None or (single and all(acting.payload is not None for acting in single))
         if self.needs_payload and not stated:
             _refuse(
-                "the arm deflects under load, and neither the request nor the calibration states its payload.",
+                "what hangs on the arm moves it, and neither the request nor the calibration states its payload.",
                 "payload_g",
                 "Give payload_g, 0 where nothing hangs on it.",
             )
         return loads
+
+    def beyond_records(self, commands: Array, acting: Array) -> tuple[list[int] | None, str]:
+        """Which poses lie beyond the records, and a sentence about them; None where the records' ranges are not known.
+
+        Args:
+            commands: N x n; rad or m.
+            acting: LOAD_CHANNELS x N; SI.
+        """
+        if self.recorded is None:
+            return None, ""
+        values = np.vstack([commands.T, acting[LOAD_CHANNELS.index(PAYLOAD)]])
+        places: list[int] = np.flatnonzero(self.recorded.beyond(values).any(axis=0)).tolist()
+        return places, self.recorded.sentence(values) if places else ""
 
     def at_temperature(self, field: str) -> Compensator:
         """The compensator where a field of the request states the temperature.
@@ -173,7 +189,7 @@ class ServedArm:
 def _put(loads: Array, acting: Acting, columns: slice) -> None:
     """Write what is stated into columns of loads (LOAD_CHANNELS x N)."""
     if acting.payload is not None:
-        loads[LOAD_CHANNELS.index("payload"), columns] = acting.payload
+        loads[LOAD_CHANNELS.index(PAYLOAD), columns] = acting.payload
     for field in _VECTORS:
         vector = getattr(acting, field)
         if vector is not None:

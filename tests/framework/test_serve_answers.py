@@ -18,6 +18,7 @@ from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import sealed
 from armcal.calibration.compensation.request import Commands
+from armcal.calibration.recorded_range import beyond_records
 from armcal.errors import ConfigError, DataError
 from armcal_serve.answering import Answerer, command_rows
 from armcal_serve.calibration_watch import CalibrationWatch
@@ -246,6 +247,27 @@ def test_counts_pulses_and_sliding_joints() -> None:
     assert arm.named([{"s_mm": 5, "q1_deg": 180}], "joints") == pytest.approx(np.array([[np.pi, 0.005]]))
     with pytest.raises(DataError, match="sliding"):
         arm.angles([[1.0, 2.0]], "joint_angles")
+
+
+def test_poses_beyond_the_records_are_named(answerer: Answerer, calibration: Calibration) -> None:
+    """In the words of ``armcal predict``; commands are judged as postures are."""
+    ranges = calibration.record.prediction.ranges if calibration.record.prediction else {}
+    edges = np.rad2deg([ranges[f"arm.{name}"] for name in NAMES])
+    middle = edges.mean(axis=1)
+    far = middle + 0.7 * np.ptp(edges, axis=1) * (np.arange(6) == 1)
+    answer = told(answerer, do="forward", joint_angles_deg=[middle.tolist(), far.tolist()])
+    channels = {f"arm.{name}": np.deg2rad([a, b]) for name, a, b in zip(NAMES, middle, far, strict=True)}
+    sentence = beyond_records(ranges, Dataset(("1", "2"), channels), calibration.system.arms)
+    assert answer["beyond_records"] == [1] and answer["warning"] == sentence and "(q2 " in sentence
+    moves = {"targets": answer["tools"], "path": True, "start_deg": middle.tolist()}
+    heavy = told(answerer, do="compensate", **moves, payload_kg=9)
+    assert heavy["beyond_records"] == [0, 1] and "payload 9000 g, recorded" in heavy["warning"]
+    assert told(answerer, do="compensate", targets=answer["tools"][0], start_deg=middle.tolist())["warning"] == ""
+
+
+def test_no_range_is_no_promise(answerer: Answerer) -> None:
+    arm = replace(answerer.arms["arm"], recorded=None)
+    assert arm.beyond_records(np.zeros((1, 6)), np.zeros((13, 1))) == (None, "")
 
 
 def test_an_elastic_arm_whose_payload_nobody_states_asks_for_it(answerer: Answerer) -> None:

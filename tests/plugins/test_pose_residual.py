@@ -21,6 +21,7 @@ from armcal_residual.linear import Products, packed, regressed, unpacked
 from armcal_residual.tool_processes import _Likelihood, _squares
 from compiled_arm import CompiledArm
 from outside import armcal
+from serving import ask, made
 
 ARM = """
 arms:
@@ -301,6 +302,13 @@ def test_errors_that_depend_on_the_load_are_learned_and_hold_on_unseen_records()
     assert [own.of for own in part.terms[0].inputs][-1] == "payload"
     with pytest.raises(DataError, match="learned what loads do and its payload is not stated"):
         run.calibration.forward(np.zeros(3))
+
+
+def test_a_server_asks_for_the_load_that_was_learned(monkeypatch):
+    monkeypatch.setattr("armcal_serve.loaded._TRIES", 1)
+    content = (loaded_run().folder / "run/calibration.yaml").read_text()
+    answer = ask(made(content), do="forward", joint_angles_deg=[0, 0, 0])
+    assert not answer["ok"] and "nor the calibration states its payload" in answer["error"]
 
 
 @pytest.mark.slow

@@ -205,6 +205,11 @@ class Arm:
         """How many numbers an elastic state of this arm has."""
         return len(self.spring_names)
 
+    @property
+    def depends_on_payload(self) -> bool:
+        """Whether what hangs on the tool moves it: the arm is elastic, or its residual has learned what loads do."""
+        return bool(self.deflection_size) or (self.residual is not None and self.residual.knows_load)
+
     @cached_property
     def spring_names(self) -> tuple[str, ...]:
         """What gives, in words, for each number of an elastic state."""

@@ -184,9 +184,9 @@ class Calibration:
             DataError: neither says.
         """
         arms = self.system.arms.values()
-        elastic = any(arm.deflection_size for arm in arms)
-        moved = elastic or any(arm.residual is not None and arm.residual.knows_load for arm in arms)
+        moved = any(arm.depends_on_payload for arm in arms)
         if moved and self.system.statics.payload is None and not stated:
+            elastic = any(arm.deflection_size for arm in arms)
             raise DataError(
                 f"the arm {'is elastic' if elastic else 'has learned what loads do'} and its payload is not stated.",
                 where=Location(source or None),

@@ -1,11 +1,14 @@
 """Whether poses lie beyond the records of their calibration, where nothing tested how far off predictions are."""
 
-from collections.abc import Mapping
-from math import radians
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import inf, radians
+from typing import Self
 
 import numpy as np
 
 from armcal.arm.assembly import Arm
+from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.units import display_unit, to_unit
 
@@ -29,25 +32,54 @@ def recorded_ranges(dataset: Dataset, arms: Mapping[str, Arm], payload: float | 
     return ranges
 
 
+@dataclass(frozen=True)
+class RecordedRange:
+    """Where predictions were tested, by channel; in SI.
+
+    Attributes:
+        names: what messages call each channel.
+        units: in which they show it.
+        ends: smallest and largest recorded value (C x 2); infinite where none is known.
+        limits: the same with their margins (C x 2).
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    ends: Array
+    limits: Array
+
+    @classmethod
+    def of(cls, ranges: Ranges, channels: Sequence[str], arms: Mapping[str, Arm]) -> Self:
+        """Of some channels: joints of these arms, and the payload."""
+        kinds = {f"{name}.{joint}": kind for name, arm in arms.items() for joint, kind in arm.commanded.items()}
+        names = tuple(channel.rpartition(".")[2] if len(arms) == 1 else channel for channel in channels)
+        units = tuple(display_unit(kinds.get(channel, "mass")).name for channel in channels)
+        low, high = ends = np.array([ranges.get(channel, (-inf, inf)) for channel in channels]).reshape(-1, 2).T
+        is_payload = np.array([channel == PAYLOAD for channel in channels], dtype=bool)
+        margin = np.where(is_payload, _MARGIN * high, np.maximum(_MARGIN * (high - low), _LEAST))
+        return cls(names, units, ends.T, np.column_stack([low - margin, high + margin]))
+
+    def beyond(self, values: Array) -> Mask:
+        """Which values (C x N) lie beyond (C x N); a value that is not known (NaN) does not."""
+        return (values < self.limits[:, :1]) | (values > self.limits[:, 1:])
+
+    def sentence(self, values: Array) -> str:
+        """About the poses (C x N) that lie beyond; empty if none does."""
+        beyond = self.beyond(values)
+        texts = []
+        for i in np.flatnonzero(beyond.any(axis=1)):
+            low, high = self.ends[i]
+            farthest = values[i, np.nanargmax(np.maximum(low - values[i], values[i] - high))]
+            value, first, last = (f"{to_unit(float(x), self.units[i]):.4g}" for x in (farthest, low, high))
+            recorded = first if first == last else f"{first} to {last}"
+            texts.append(f"{self.names[i]} {value} {self.units[i]}, recorded {recorded}")
+        if not texts:
+            return ""
+        count = f"{int(beyond.any(axis=0).sum())} of {values.shape[1]} poses are beyond the calibration's records"
+        return f"{count} ({'; '.join(texts)}): how far off predictions are was not tested there."
+
+
 def beyond_records(ranges: Ranges, dataset: Dataset, arms: Mapping[str, Arm]) -> str:
     """A sentence about the poses of a dataset that lie beyond these ranges; empty if none does."""
-    kinds = {f"{name}.{joint}": kind for name, arm in arms.items() for joint, kind in arm.commanded.items()}
-    beyond, texts = np.zeros(len(dataset), dtype=bool), []
-    for channel, (low, high) in ranges.items():
-        if not dataset.has(channel):
-            continue
-        margin = _MARGIN * high if channel == PAYLOAD else max(_MARGIN * (high - low), _LEAST)
-        values = np.nan_to_num(dataset.column(channel), nan=low)
-        excess = np.maximum(low - margin - values, values - high - margin)
-        if excess.max(initial=0.0) <= 0:
-            continue
-        beyond |= excess > 0
-        unit = display_unit("mass" if channel == PAYLOAD else kinds[channel]).name
-        farthest, first, last = (f"{to_unit(x, unit):.4g}" for x in (float(values[np.argmax(excess)]), low, high))
-        shown = channel.rpartition(".")[2] if len(arms) == 1 else channel
-        recorded = first if first == last else f"{first} to {last}"
-        texts.append(f"{shown} {farthest} {unit}, recorded {recorded}")
-    if not texts:
-        return ""
-    count = f"{int(beyond.sum())} of {len(dataset)} poses are beyond the calibration's records"
-    return f"{count} ({'; '.join(texts)}): how far off predictions are was not tested there."
+    channels = [*filter(dataset.has, ranges)]
+    return RecordedRange.of(ranges, channels, arms).sentence(dataset.stacked(channels))
