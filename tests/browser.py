@@ -78,8 +78,9 @@ class Browser:
         raise TimeoutError(method)
 
     def open(self, address: str) -> None:
-        """Go there."""
+        """Go there; what the page before logged is forgotten."""
         self.ask("Page.navigate", url=address)
+        self.logged.clear()
 
     def value(self, script: str) -> Any:
         """What a script gives."""

@@ -1,4 +1,4 @@
-"""A made-up recalibration to watch: the folder that it leaves, a server over it, and a client of its stream."""
+"""A made-up recalibration to watch: the folder that it leaves, and a server over it."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ import json
 import math
 import random
 import shutil
-import socket
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from armcal_online.watch.feed import Feed
 from armcal_online.watch.server import WatchServer
@@ -145,7 +144,7 @@ class Served:
         self, folder: Path, host: str = "127.0.0.1", shape: Shape | None = None, port: int = 0, patience: float = 10.0
     ) -> None:
         self.folder, self.feed = folder, Feed(folder, shape)
-        self.server = WatchServer(self.feed, host, port, heartbeat=0.2, patience=patience)
+        self.server = WatchServer(self.feed, host, port, patience)
         self.stop = threading.Event()
         for run in (lambda: self.feed.follow(self.stop), lambda: self.server.serve_forever(0.02)):
             threading.Thread(target=run, daemon=True).start()
@@ -158,8 +157,8 @@ class Served:
         answer = connection.getresponse()
         return answer.status, answer, answer.read()
 
-    def state(self) -> dict[str, Any]:
-        found: dict[str, Any] = json.loads(self.ask("/state")[2])
+    def state(self, after: str = "") -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(self.ask(f"/state?after={quote(after)}")[2])
         return found
 
     def wait_for(self, sequence: int) -> dict[str, Any]:
@@ -176,42 +175,5 @@ class Served:
 
     def close(self) -> None:
         self.stop.set()
-        self.server.ending.set()
         self.server.shutdown()
         self.server.server_close()
-
-
-class Stream:
-    """A client of the stream of events, on a real socket."""
-
-    def __init__(self, served: Served, after: str = "", last_event_id: str | None = None) -> None:
-        self.socket = socket.create_connection(("127.0.0.1", served.server.server_port), timeout=5)
-        more = f"Last-Event-ID: {last_event_id}\r\n" if last_event_id else ""
-        self.socket.sendall(f"GET /events?after={after} HTTP/1.1\r\nHost: localhost\r\n{more}\r\n".encode())
-        self.file = self.socket.makefile("r", encoding="utf-8", newline="\n")
-        self.status = int(self.file.readline().split()[1])
-        while self.file.readline().strip():
-            pass
-
-    def blocks(self) -> Iterator[dict[str, str]]:
-        block: dict[str, str] = {}
-        for raw in self.file:
-            name, found, value = raw.rstrip("\n").partition(": ")
-            if found:
-                block[name or "comment"] = value
-            elif block:
-                yield block
-                block = {}
-
-    def messages(self, count: int) -> list[tuple[str, dict[str, Any]]]:
-        found: list[tuple[str, dict[str, Any]]] = []
-        for block in self.blocks():
-            if "data" in block:
-                found.append((block.get("id", block.get("event", "")), json.loads(block["data"])))
-            if len(found) == count:
-                break
-        return found
-
-    def close(self) -> None:
-        self.file.close()
-        self.socket.close()

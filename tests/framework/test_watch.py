@@ -199,12 +199,14 @@ def test_what_was_rotated_away_is_told_by_the_status_and_the_calibration(tmp_pat
     (tmp_path / "events.jsonl").write_text(written(events))
     feed = Feed(tmp_path)
     feed.step()
-    row = feed.state()["estimates"]["rows"][-1]
+    before = feed.state()
+    row = before["estimates"]["rows"][-1]
     assert row["change"] == [pytest.approx(0.02)] and feed.state()["estimates"]["parameters"][0]["unit"] == ""
     shutil.copy(calibration, tmp_path / "calibration.yaml")
     counts = {"accepted": 890, "rejected": 9, "ignored": 3}
     (tmp_path / "status.json").write_text(json.dumps({"level": "watch", "why": "Because.", "counts": counts}))
-    assert {"event": "reset"} in feed.step()
+    feed.step()
+    assert feed.state(before["place"])["whole"]  # pages begin anew, with the units
     estimates = feed.state()["estimates"]
     assert estimates["parameters"][0]["unit"] == "deg"
     assert estimates["rows"][-1]["change"] == [pytest.approx(math.degrees(0.02), rel=1e-5)]

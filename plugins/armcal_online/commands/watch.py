@@ -103,5 +103,4 @@ def _serve(folder: Path, host: str, port: int, stop: threading.Event) -> None:
             while not stop.wait(_REFRESH):
                 pass
         finally:
-            server.ending.set()
             server.shutdown()

@@ -82,8 +82,8 @@ class Estimates:
         self._followed: dict[str, Followed] = {}
         self._rows: Thinned[dict[str, Any]] = Thinned(_RECENT, _OLDER)
 
-    def start(self, event: Mapping[str, Any]) -> dict[str, Any] | None:
-        """The values at a start; where a parameter started before, its start stays."""
+    def start(self, event: Mapping[str, Any], step: int) -> dict[str, Any] | None:
+        """The values at a start (taken at a step of ``History``); where a parameter started before, its start stays."""
         listed = event.get("parameters")
         entries = [entry for entry in listed if isinstance(entry, Mapping)] if isinstance(listed, list) else []
         estimates = {}
@@ -92,10 +92,10 @@ class Estimates:
             if name is not None and value is not None:
                 estimates[name] = (value, number(entry.get("sd")))
                 self._follow(name, estimates[name], entry.get("unit"))
-        return self._row(event, estimates)
+        return self._row(event, estimates, step)
 
-    def take(self, event: Mapping[str, Any]) -> dict[str, Any] | None:
-        """An estimate as a message to pages: columns in the order of the parameters."""
+    def take(self, event: Mapping[str, Any], step: int) -> dict[str, Any] | None:
+        """An estimate as a row: columns in the order of the parameters."""
         listed = event.get("parameters")
         estimates = {}
         for key, pair in listed.items() if isinstance(listed, Mapping) else ():
@@ -103,7 +103,7 @@ class Estimates:
             if name is not None and value is not None:
                 estimates[name] = (value, number(pair[1]) if len(pair) > 1 else None)
                 self._follow(name, estimates[name], None)
-        return self._row(event, estimates)
+        return self._row(event, estimates, step)
 
     def state(self) -> dict[str, Any]:
         """For pages."""
@@ -141,7 +141,7 @@ class Estimates:
             self.add_units({name: unit})
 
     def _row(
-        self, event: Mapping[str, Any], estimates: Mapping[str, tuple[float, float | None]]
+        self, event: Mapping[str, Any], estimates: Mapping[str, tuple[float, float | None]], step: int
     ) -> dict[str, Any] | None:
         if not estimates:
             return None
@@ -152,13 +152,15 @@ class Estimates:
             change.append(None if value is None else rounded((value - followed.start) * followed.factor))
             deviations.append(None if sd is None else rounded(sd * followed.factor, 4))
         row = {
+            "event": "estimate",
+            "step": step,
             "sequence": whole(event.get("sequence")) or 0,
             "at": number(event.get("at")),
             "change": change,
             "sd": deviations,
         }
         self._rows.add(row)
-        return {"event": "estimate", **row}
+        return row
 
 
 def _shown(unit: Any) -> tuple[str, str, float]:

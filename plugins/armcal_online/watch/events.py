@@ -115,7 +115,7 @@ def named_record(value: Any) -> Message | None:
 
 def shortened(record: Message) -> Message:
     """What is kept of a record that is no longer one of the newest."""
-    keys = ("event", "sequence", "at", "verdict", "nis", "limit", "id", "level", "off_mm")
+    keys = ("event", "step", "sequence", "at", "verdict", "nis", "limit", "id", "level", "off_mm")
     return {key: record[key] for key in keys if key in record}
 
 

@@ -1,12 +1,10 @@
-"""What pages are fed with: the history, kept up to date from the folder, and the newest messages for each to fetch."""
+"""What pages are fed with: the history, kept up to date from the folder, of which each fetches what is new to it."""
 
 import contextlib
-import json
 import shlex
 import threading
 import time
-from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from secrets import token_hex
 from typing import Any
@@ -20,8 +18,6 @@ from armcal_online.watch.hours import MISSION, Truth, truth_beside
 from armcal_online.watch.shape import Shape
 
 STATUS, CALIBRATION = "status.json", "calibration.yaml"
-MOST_MESSAGES = 1000
-"""Messages kept for pages that were away; a page that missed more begins anew."""
 TIPS = 40
 """Measured tips that are drawn."""
 _LONGEST_STATUS = 1 << 16
@@ -42,7 +38,6 @@ class Feed:
         self.folder = folder
         self.history = History()
         self.trouble: str | None = None
-        self.run = token_hex(4)
         self._shape = shape
         self._tail = EventTail(folder)
         self._status: dict[str, Any] = {}
@@ -50,50 +45,42 @@ class Feed:
         self._units_after = 0.0
         self._truth: Truth | None = None
         self._truth_time = 0
-        self._situation: Message | None = None
-        self._arm: Message | None = None
-        self._drawn: int | None = None
-        self._messages: deque[tuple[int, str]] = deque(maxlen=MOST_MESSAGES)
-        self._number = 0
+        self._arm: dict[str, Any] | None = None
+        self._run, self._number = token_hex(4), 0
         self._event_at = time.time()
         self._changed = threading.Condition()
 
     def step(self) -> list[Message]:
-        """Read what is new; returns the messages to pages about it."""
-        messages: list[Message] = []
+        """Read what is new; returns the messages about it."""
         try:
             lines = self._tail.lines()
             self.trouble = None
         except OSError as fault:
             lines, self.trouble = [], f"{self.folder} cannot be read: {fault}"
         with self._changed:
-            for line in lines:
-                messages += self.history.take(parsed(line))
+            self.history.step = self._number + 1
+            messages = [message for line in lines for message in self.history.take(parsed(line))]
             if lines:
                 self._event_at = time.time()
                 with contextlib.suppress(OSError):
                     self._event_at = (self.folder / EVENTS).stat().st_mtime
-            estimates, path = self.history.estimates, self.folder / CALIBRATION
-            if estimates.without_unit and time.monotonic() >= self._units_after and path.exists():
-                self._units_after = time.monotonic() + _RETRY
-                if estimates.add_units(units_of(path)):
-                    messages.append({"event": "reset"})  # pages begin anew, with the units
-            messages += self._new_status()
-            if messages or self._situation:
-                messages += self._new_situation()
-            self._publish(messages)
+            is_other, has_status = self._read_truth() | self._found_units(), self._read_status()
+            if is_other or {"event": "reset"} in messages:
+                self._run = token_hex(4)  # what pages have is void: they begin anew
+            if is_other or has_status or lines:
+                self._renew()
         return messages
 
     def draw(self) -> None:
         """The arm at the newest record, where there is a newer one than that drawn."""
         last = self.history.last
-        if self._shape is None or last is None or not last.get("inputs") or last["sequence"] == self._drawn:
+        drawn = self._arm and self._arm["sequence"]
+        if self._shape is None or last is None or not last.get("inputs") or last["sequence"] == drawn:
             return
         points = self._shape.points(last["inputs"], self.history.calibration, time.monotonic())
         with self._changed:
-            self._drawn = last["sequence"]
-            self._arm = {"event": "arm", "sequence": self._drawn, "points_mm": points, "fault": self._shape.fault}
-            self._publish([self._arm])
+            self._arm = {"sequence": last["sequence"], "points_mm": points, "fault": self._shape.fault}
+            self._renew()
 
     def follow(self, stop: threading.Event) -> None:
         """Read on until ``stop``; the arm is drawn when all is read, or every 2 s while much comes."""
@@ -106,13 +93,23 @@ class Feed:
             if not busy:
                 stop.wait(_PAUSE)
 
-    def state(self) -> dict[str, Any]:
-        """Everything, for a page that begins."""
+    def state(self, place: str = "", patience: float = 0.0) -> dict[str, Any]:
+        """What a page shows.
+
+        Args:
+            place: of an earlier state, as that had it: of records, events, estimates and hours only those since then
+                are given, and ``whole`` is false.
+            patience: how long to wait for something new since then (s).
+        """
         with self._changed:
+            self._changed.wait_for(lambda: place != self._place, patience)
+            run, _, number = place.rpartition("-")
+            is_known = run == self._run and number.isascii() and number.isdigit() and len(number) < 16
+            since = int(number) if is_known else 0
             return {
-                **self.history.state(),
+                **self.history.state(since),
                 "situation": self.history.situation(str(self.folder), self._status),
-                "over_time": self.history.over_time(self._truth),
+                "over_time": self.history.over_time(self._truth, since),
                 "folder": str(self.folder),
                 "control": f"armcal control {shlex.quote(str(self.folder))}",
                 "waiting": self.waiting,
@@ -122,7 +119,8 @@ class Feed:
                 "status_s": self._since(self._status_time / 1e9) if self._status else None,
                 "arm": self._arm,
                 "tips": TIPS,
-                "after": f"{self.run}-{self._number}",
+                "whole": not is_known,
+                "place": self._place,
             }
 
     @property
@@ -135,74 +133,59 @@ class Feed:
         missing = "there" if self.folder.is_dir() else "not there yet"
         return f"Waiting for a recalibration to begin: {self.folder} is {missing}, and no event is written."
 
-    def after(self, place: str, patience: float) -> Sequence[tuple[str, str]] | None:
-        """Messages after a place in the stream, each with its own place; waits for the first one.
+    @property
+    def _place(self) -> str:
+        return f"{self._run}-{self._number}"
 
-        Args:
-            place: as handed out by ``state`` or with a message.
-            patience: how long to wait (s); nothing by then gives an empty list.
-
-        Returns:
-            None where messages in between are no longer kept, or the place is of another watcher.
-        """
-        run, _, known = place.rpartition("-")
-        if run != self.run or not (known.isascii() and known.isdigit() and len(known) < 16):
-            return None
-        position = int(known)
-        with self._changed:
-            self._changed.wait_for(lambda: self._number > position, patience)
-            missed = self._number - position
-            if missed > len(self._messages) or missed < 0:
-                return None
-            newest = list(self._messages)[len(self._messages) - missed :]
-        return [(f"{self.run}-{number}", message) for number, message in newest]
-
-    def _publish(self, messages: Sequence[Message]) -> None:
-        self._number += max(len(messages) - MOST_MESSAGES, 0)
-        for message in messages[-MOST_MESSAGES:]:
-            self._number += 1
-            self._messages.append((self._number, json.dumps(message, allow_nan=False, separators=(",", ":"))))
-        if messages:
-            self._changed.notify_all()
+    def _renew(self) -> None:
+        """There is something new for pages."""
+        self._number += 1
+        self._changed.notify_all()
 
     @staticmethod
     def _since(moment: float) -> float:
         """Seconds; none where clocks disagree."""
         return round(max(0.0, time.time() - moment), 1)
 
-    def _new_situation(self) -> list[Message]:
-        """What the first screen says, where that changed, and what became of the newest hour."""
-        with contextlib.suppress(OSError):
-            written = (self.folder.parent / MISSION).stat().st_mtime_ns
-            if written != self._truth_time:
-                self._truth, self._truth_time = truth_beside(self.folder), written
-        now = {"event": "situation", "situation": self.history.situation(str(self.folder), self._status)}
-        if now == self._situation:
-            return []
-        self._situation = now
-        over_time = self.history.over_time(self._truth)
-        newest = {key: over_time[key] for key in ("usual_mm", "limit_mm", "off", "checked")}
-        return [{**now, "over_time": {**newest, "rows": over_time["rows"][-1:]}}]
+    def _found_units(self) -> bool:
+        """Whether the calibration has units of parameters that no event gave."""
+        estimates, path = self.history.estimates, self.folder / CALIBRATION
+        if not estimates.without_unit or time.monotonic() < self._units_after or not path.exists():
+            return False
+        self._units_after = time.monotonic() + _RETRY
+        return estimates.add_units(units_of(path))
 
-    def _new_status(self) -> list[Message]:
+    def _read_truth(self) -> bool:
+        """Whether a simulated mission has another truth."""
+        try:
+            written = (self.folder.parent / MISSION).stat().st_mtime_ns
+        except OSError:
+            return False
+        if written == self._truth_time:
+            return False
+        self._truth, self._truth_time = truth_beside(self.folder), written
+        return True
+
+    def _read_status(self) -> bool:
+        """Whether there is another status."""
         path = self.folder / STATUS
         try:
             written = path.stat().st_mtime_ns
             if written == self._status_time:
-                return []
+                return False
             status = parsed(path.read_bytes()[:_LONGEST_STATUS])
         except OSError:
-            return []
+            return False
         self._status_time = written
         if status is None:
-            return []
+            return False
         self._status = {str(text(key)): value for key, raw in status.items() if (value := scalar(raw)) is not None}
         counts = numbers(status.get("counts"))
         if all(verdict in counts for verdict in VERDICTS):
             self._status["counts"] = {verdict: counts[verdict] for verdict in VERDICTS}
         if (good := named_record(status.get("last_good"))) is not None:
             self._status["last_good"] = good
-        return [{"event": "status", "status": self._status}]
+        return True
 
 
 def units_of(path: Path) -> Mapping[str, str]:

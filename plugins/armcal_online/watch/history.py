@@ -1,7 +1,7 @@
 """The state of a recalibration as its events give it, in bounded memory."""
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from armcal_online.watch.estimates import Estimates, Thinned
@@ -19,10 +19,14 @@ MOST_EVENTS = 400
 
 
 class History:
-    """What the events gave so far."""
+    """What the events gave so far.
+
+    Attributes:
+        step: a number, which whatever is taken now gets.
+    """
 
     def __init__(self) -> None:
-        self.unknown = self.unreadable = 0
+        self.unknown = self.unreadable = self.step = 0
         self._begin()
 
     def _begin(self) -> None:
@@ -45,9 +49,9 @@ class History:
         self.finished: Message | None = None
 
     def take(self, event: Mapping[str, Any] | None) -> list[Message]:
-        """Add an event (None: a line that could not be read); returns the messages to pages about it.
+        """Add an event (None: a line that could not be read); returns the messages about it.
 
-        A start that does not resume an earlier one makes everything before it void: pages get ``reset``.
+        A start that does not resume an earlier one makes everything before it void: the first message is ``reset``.
         """
         if event is None:
             self.unreadable += 1
@@ -58,7 +62,7 @@ class History:
         if kind == "started":
             return self._start(event)
         if kind == "estimate":
-            row = self.estimates.take(event)
+            row = self.estimates.take(event, self.step)
             return [row] if row else []
         message = message_of(event)
         if message is None:
@@ -76,7 +80,7 @@ class History:
         if message["event"] == "calibration":
             self.written = message
         else:
-            self._listed.append(message)
+            self._listed.append({**message, "step": self.step})
         return [message]
 
     def situation(self, folder: str, status: Mapping[str, Any]) -> dict[str, Any]:
@@ -85,13 +89,15 @@ class History:
         known = situation(level, self.trouble, tuple(self._newest), self._good or status.get("last_good"), folder)
         return {**known, "do": AFTER_THE_END} if level == "nominal" and status.get("finished") else known
 
-    def over_time(self, truth: Truth | None) -> dict[str, Any]:
-        """How far off, hour by hour."""
-        return over_time(self.hours, truth)
+    def over_time(self, truth: Truth | None, since: int = 0) -> dict[str, Any]:
+        """How far off, hour by hour; of the hours those after a step, and the truth with all of them."""
+        known = over_time(self.hours, truth)
+        return {**known, "rows": _newer(known["rows"], since), "truth": None if since else known["truth"]}
 
-    def state(self) -> dict[str, Any]:
-        """Everything, for a page that begins; numbers are SI unless their key says otherwise."""
-        records = sorted([*self._accepted, *self._others], key=lambda r: r.get("sequence") or 0)
+    def state(self, since: int = 0) -> dict[str, Any]:
+        """Everything, but for what was listed up to a step; numbers are SI unless their key says otherwise."""
+        records = sorted(_newer([*self._accepted, *self._others], since), key=lambda r: r.get("sequence") or 0)
+        estimates = self.estimates.state()
         return {
             "level": self.level,
             "level_sentence": self.level_sentence,
@@ -100,8 +106,8 @@ class History:
             "last": self.last,
             "gate_probability": self.gate,
             "records": [{k: v for k, v in r.items() if k != "event"} for r in records],
-            "estimates": self.estimates.state(),
-            "told": list(self._listed),
+            "estimates": {**estimates, "rows": _newer(estimates["rows"], since)},
+            "told": _newer(self._listed, since),
             "written": self.written,
             "finished": self.finished,
             "unknown": self.unknown,
@@ -119,11 +125,11 @@ class History:
         self.gate = number(gate.get("probability")) if isinstance(gate, Mapping) else self.gate
         first = whole(event.get("sequence"))
         self._sequence = self._sequence if first is None else first - 1
-        row = self.estimates.start(event)
+        row = self.estimates.start(event, self.step)
         self._set_level(text(event.get("level")), None)
         self.finished = None
         if message:
-            self._listed.append(message)
+            self._listed.append({**message, "step": self.step})
             messages.append(message)
         return [*messages, *([row] if row else [])]
 
@@ -134,7 +140,7 @@ class History:
             return []
         if record.setdefault("sequence", self._sequence + 1) <= self._sequence:
             return []  # written a second time
-        self._sequence = record["sequence"]
+        self._sequence, record["step"] = record["sequence"], self.step
         self._counts[record["verdict"]] += 1
         if self._first is None:
             self._first = record["sequence"]
@@ -143,11 +149,10 @@ class History:
         self.hours.take(record)
         if record["verdict"] == "accepted" and record.get("level") == "nominal":
             self._good = {key: record[key] for key in ("sequence", "id", "at") if key in record}
-        record = {key: value for key, value in record.items() if key != "inputs"}
-        (self._accepted if record["verdict"] == "accepted" else self._others).add(record)
+        kept = {key: value for key, value in record.items() if key != "inputs"}
+        (self._accepted if record["verdict"] == "accepted" else self._others).add(kept)
         self._set_level(record.get("level"), None)
-        standing = {"standing": self.level, "standing_sentence": self.level_sentence}
-        return [{**record, "counts": dict(self._counts), **standing}]
+        return [record]
 
     def _set_level(self, level: Any, sentence: str | None) -> None:
         if level not in LEVELS:
@@ -157,3 +162,8 @@ class History:
         elif level != self.level:
             self.level_sentence = "Nothing out of the ordinary." if level == "nominal" else ""
         self.level = level
+
+
+def _newer(items: Iterable[Message], since: int) -> list[Message]:
+    """What was taken after a step."""
+    return [item for item in items if item["step"] > since or not since]

@@ -28,17 +28,21 @@ _DAY_S = 86400.0
 
 @dataclass
 class Hour:
-    """An hour's judged readings: when it began, how far off the first of them were (mm), how many, the worst level."""
+    """An hour's judged readings: when it began, how far off the first of them were (mm), how many, the worst level.
+
+    ``step`` is that of the last reading.
+    """
 
     at: float
     sizes: list[float] = field(default_factory=list)
     count: int = 0
     level: int = 0
+    step: int = 0
     _median: float | None = None
 
-    def take(self, off_mm: float, level: int) -> None:
+    def take(self, off_mm: float, level: int, step: int) -> None:
         """A reading."""
-        self.count += 1
+        self.count, self.step = self.count + 1, step
         self.level = max(self.level, level)
         if len(self.sizes) < _MOST_SIZES:
             self.sizes.append(off_mm)
@@ -55,7 +59,8 @@ class Hour:
     @property
     def row(self) -> dict[str, Any]:
         """For pages."""
-        return {"at": self.at, "mm": rounded(self.median, 4), "count": self.count, "level": LEVELS[self.level]}
+        known = {"at": self.at, "mm": rounded(self.median, 4), "count": self.count, "level": LEVELS[self.level]}
+        return {**known, "step": self.step}
 
 
 @dataclass
@@ -74,7 +79,7 @@ class Hours:
             if self._hours:
                 self._hours[-1].close()
             self._hours.append(Hour(start))
-        self._hours[-1].take(off, LEVELS.index(level) if level in LEVELS else 0)
+        self._hours[-1].take(off, LEVELS.index(level) if level in LEVELS else 0, record.get("step", 0))
 
     @property
     def rows(self) -> list[dict[str, Any]]:

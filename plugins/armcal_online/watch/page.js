@@ -1,7 +1,8 @@
 "use strict";
 // What the page knows, how it is kept up to date, and when it is drawn again.
 
-const MOST_RECORDS = 6000, MOST_ROWS = 700, MOST_EVENTS = 400;
+const MOST_RECORDS = 8000, MOST_LISTED = 800; // more than the server keeps: then all is fetched anew
+const PAUSE_MS = 250, AGAIN_MS = 3000, LONGEST_MS = 30000;
 const token = new URLSearchParams(location.search).get("token");
 const address = (path, query = {}) => {
   const asked = new URLSearchParams(token === null ? query : { ...query, token });
@@ -9,7 +10,7 @@ const address = (path, query = {}) => {
 };
 
 const SILENT_S = 15;
-const Known = { state: null, heard: 0, status: 0, stream: null, due: new Set(), timer: null };
+const Known = { state: null, heard: 0, status: 0, due: new Set(), timer: null };
 
 function ask(...parts) {
   for (const part of parts) Known.due.add(part);
@@ -111,94 +112,40 @@ function eventItem(state, event, names, decided) {
     html("span", { class: "where" }, [entry, when(event.at)].filter(Boolean).join(", ")), ...lines);
 }
 
-function takeSituation(state, message) {
-  state.situation = message.situation;
-  const { rows, ...rest } = message.over_time, known = state.over_time.rows, newest = rows[rows.length - 1];
-  if (newest) {
-    if (known.length && known[known.length - 1].at === newest.at) known.pop();
-    known.push(newest);
+// A state, or what is new in it: of its lists that come after those that are known.
+function take(state) {
+  const known = Known.state, hours = state.over_time, { records, told } = state, { rows } = state.estimates;
+  if (state.whole || records.length) ask("innovations", "arm");
+  if (state.whole || told.length) ask("hours", "innovations", "events", "parameters");
+  if (state.whole || rows.length) ask("parameters");
+  if (state.whole || hours.rows.length) ask("hours");
+  if (state.arm && state.arm.sequence !== (known && known.arm || {}).sequence) ask("arm");
+  if (!state.whole) {
+    state.records = [...known.records, ...records];
+    state.told = [...known.told, ...told];
+    state.estimates.rows = [...known.estimates.rows, ...rows];
+    hours.rows = [...new Map([...known.over_time.rows, ...hours.rows].map((hour) => [hour.at, hour])).values()];
+    hours.truth = known.over_time.truth;
   }
-  Object.assign(state.over_time, rest);
-  ask("health", "hours");
+  Known.state = state;
+  Known.heard = performance.now() - 1000 * state.heard_s;
+  Known.status = performance.now() - 1000 * (state.status_s || 0);
 }
 
-function took(message) {
-  const state = Known.state;
-  if (!["status", "arm", "situation"].includes(message.event)) Known.heard = performance.now();
-  state.waiting = null;
-  if (message.event === "record") takeRecord(state, message);
-  else if (message.event === "estimate") takeEstimate(state, message);
-  else if (message.event === "arm") { state.arm = message; ask("arm"); }
-  else if (message.event === "status") {
-    state.status = message.status;
-    Known.status = performance.now();
-    age();
-  } else if (message.event === "calibration") { state.written = message; ask("health"); }
-  else if (message.event === "situation") takeSituation(state, message);
-  else if (message.event === "reset") begin();
-  else takeTold(state, message);
-}
-
-function takeRecord(state, record) {
-  state.counts = record.counts;
-  if (state.level !== record.standing) {
-    state.level = record.standing;
-    state.level_sentence = record.standing_sentence;
-  }
-  state.last = record;
-  if (!isNumber(state.first_sequence)) state.first_sequence = record.sequence;
-  state.records.push(record);
-  if (state.records.length > MOST_RECORDS) state.records.splice(0, MOST_RECORDS / 6);
-  ask("health", "innovations", "arm");
-}
-
-function takeEstimate(state, row) {
-  const rows = state.estimates.rows;
-  if (row.change.length > state.estimates.parameters.length) { begin(); return; }
-  rows.push(row);
-  if (rows.length > MOST_ROWS) state.estimates.rows = rows.filter((_, i) => i % 2 === 0 || i > MOST_ROWS / 2);
-  ask("parameters");
-}
-
-function takeTold(state, event) {
-  if (event.event === "level") { state.level = event.to; state.level_sentence = event.sentence; }
-  if (event.event === "started" || event.event === "finished") state.finished = event.event === "finished" ? event : null;
-  state.told.push(event);
-  if (state.told.length > MOST_EVENTS) state.told.shift();
-  ask("health", "innovations", "events", "parameters");
-}
-
-let beginning = false;
-async function begin() {
-  if (beginning) return;
-  beginning = true;
-  if (Known.stream) Known.stream.close();
-  Known.stream = null;
+async function follow() {
+  const known = Known.state;
+  const isMuch = known && (known.records.length > MOST_RECORDS || Math.max(known.told.length, known.estimates.rows.length) > MOST_LISTED);
   try {
-    const answer = await fetch(address("state"), { cache: "no-store" });
+    const place = known && !isMuch ? { after: known.place } : {};
+    const answer = await fetch(address("state", place), { cache: "no-store", signal: AbortSignal.timeout(LONGEST_MS) });
     if (!answer.ok) throw new Error(`the server answered ${answer.status}`);
-    Known.state = await answer.json();
-    Known.heard = performance.now() - 1000 * Known.state.heard_s;
-    Known.status = performance.now() - 1000 * (Known.state.status_s || 0);
-    listen(Known.state.after);
-    redrawAll();
+    take(await answer.json());
+    connection("live", "live");
+    setTimeout(follow, PAUSE_MS);
   } catch (fault) {
     connection("lost", "no connection; trying again");
-    setTimeout(begin, 3000);
+    setTimeout(follow, AGAIN_MS);
   }
-  beginning = false;
-}
-
-function listen(after) {
-  const stream = new EventSource(address("events", { after }));
-  Known.stream = stream;
-  stream.onopen = () => connection("live", "live");
-  stream.onmessage = (event) => { if (Known.stream === stream) took(JSON.parse(event.data)); };
-  stream.addEventListener("reset", () => begin());
-  stream.onerror = () => {
-    connection("lost", "no connection; trying again");
-    if (stream.readyState === EventSource.CLOSED && Known.stream === stream) setTimeout(begin, 3000);
-  };
 }
 
 function connection(state, text) {
@@ -272,4 +219,4 @@ byId("filter").addEventListener("input", () => ask("parameters"));
 addEventListener("resize", redrawAll);
 setInterval(age, 1000);
 turning();
-begin();
+follow();

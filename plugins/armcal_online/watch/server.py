@@ -1,4 +1,4 @@
-"""The page and its server: three addresses that are read, nothing that is written.
+"""The page and its server: two addresses that are read, nothing that is written.
 
 On this machine every request is answered that uses one of its own names; from elsewhere it needs the token.
 """
@@ -28,10 +28,10 @@ from armcal_online.watch.feed import Feed
 
 SCRIPTS = ("drawing.js", "hours.js", "innovations.js", "parameters.js", "arm.js", "page.js")
 """In this order: each uses what those before it define."""
-MOST_STREAMS = 32
-"""Pages that are open at once."""
-_MOST_CONNECTIONS = 64
-_HEARTBEAT = 5.0
+MOST_CONNECTIONS = 64
+"""Pages have one each."""
+_NEWS_S = 5.0
+"""How long a page waits for something new, before it asks again."""
 _PATIENCE = 10.0
 _OWN_NAMES = ("localhost", "127.0.0.1", "::1")
 _HOST_HEADER = re.compile(r"(?:\[(?P<ipv6>[^\]]+)\]|(?P<name>[^:\[]+))(?::[0-9]*)?")
@@ -107,7 +107,6 @@ class WatchServer(ThreadingHTTPServer):
         feed: what is shown.
         host: the address to listen on; further than this machine, every request needs ``token``.
         port: 0 for any free one.
-        heartbeat: how often an idle stream is written to (s).
         patience: how long a client may take to send a request or to take a part of an answer (s).
 
     Raises:
@@ -118,20 +117,11 @@ class WatchServer(ThreadingHTTPServer):
     block_on_close = False
     request_queue_size = 64
 
-    def __init__(
-        self,
-        feed: Feed,
-        host: str = "127.0.0.1",
-        port: int = 0,
-        heartbeat: float = _HEARTBEAT,
-        patience: float = _PATIENCE,
-    ) -> None:
-        self.feed, self.heartbeat, self.patience = feed, heartbeat, patience
+    def __init__(self, feed: Feed, host: str = "127.0.0.1", port: int = 0, patience: float = _PATIENCE) -> None:
+        self.feed, self.patience = feed, patience
         self.access = Access.of(host)
         self.page, self.policy = page()
-        self.streams = threading.BoundedSemaphore(MOST_STREAMS)
-        self.ending = threading.Event()
-        self._connections = threading.BoundedSemaphore(_MOST_CONNECTIONS)
+        self.connections = threading.BoundedSemaphore(MOST_CONNECTIONS)
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
             super().__init__((host, port), _Handler)
@@ -159,7 +149,7 @@ class WatchServer(ThreadingHTTPServer):
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """One thread a connection, as long as there are not too many."""
-        if not self._connections.acquire(blocking=False):
+        if not self.connections.acquire(blocking=False):
             self.shutdown_request(request)
             return
         super().process_request(request, client_address)
@@ -169,7 +159,7 @@ class WatchServer(ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._connections.release()
+            self.connections.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A client that went away is no fault."""
@@ -185,7 +175,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.connection.settimeout(self.server.patience)
 
     def do_GET(self) -> None:
-        """The page, the state, or the stream of events."""
+        """The page, or the state: all of it, or what is new ``after`` the place of an earlier one."""
         address = urlsplit(self.path)
         query = {key: values[-1] for key, values in parse_qs(address.query).items()}
         if not self.server.access.allows(self.headers.get("Host"), query.get("token")):
@@ -193,10 +183,9 @@ class _Handler(BaseHTTPRequestHandler):
         elif address.path == "/":
             self._answer(HTTPStatus.OK, self.server.page, "text/html")
         elif address.path == "/state":
-            state = json.dumps(self.server.feed.state(), allow_nan=False, separators=(",", ":"))
-            self._answer(HTTPStatus.OK, state.encode(), "application/json")
-        elif address.path == "/events":
-            self._stream(self.headers.get("Last-Event-ID") or query.get("after", ""))
+            state = self.server.feed.state(query.get("after", ""), _NEWS_S)
+            text = json.dumps(state, allow_nan=False, separators=(",", ":"))
+            self._answer(HTTPStatus.OK, text.encode(), "application/json")
         else:
             self._answer(HTTPStatus.NOT_FOUND, b"Not found.\n")
 
@@ -204,38 +193,14 @@ class _Handler(BaseHTTPRequestHandler):
         """Nothing: a token would be in it."""
 
     def _answer(self, status: HTTPStatus, body: bytes, kind: str = "text/plain") -> None:
-        self._head(status, f"{kind}; charset=utf-8")
+        self.send_response(status)
+        self.send_header("Content-Type", f"{kind}; charset=utf-8")
+        self.send_header("Content-Security-Policy", self.server.policy)
+        for name, value in _ALWAYS.items():
+            self.send_header(name, value)
         if "gzip" in self.headers.get("Accept-Encoding", "") and len(body) > 4096:
             body = gzip.compress(body, 5)
             self.send_header("Content-Encoding", "gzip")
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
         self.wfile.write(body)
-
-    def _head(self, status: HTTPStatus, kind: str) -> None:
-        self.send_response(status)
-        self.send_header("Content-Type", kind)
-        self.send_header("Content-Security-Policy", self.server.policy)
-        for name, value in _ALWAYS.items():
-            self.send_header(name, value)
-
-    def _stream(self, place: str) -> None:
-        if not self.server.streams.acquire(blocking=False):
-            self._answer(HTTPStatus.SERVICE_UNAVAILABLE, b"Too many pages are open.\n")
-            return
-        try:
-            self._head(HTTPStatus.OK, "text/event-stream")
-            self.end_headers()
-            self.wfile.write(b"retry: 2000\n\n")
-            while not self.server.ending.is_set():
-                messages = self.server.feed.after(place, self.server.heartbeat)
-                if messages is None:
-                    self.wfile.write(b"event: reset\ndata: {}\n\n")
-                    return
-                if messages:
-                    place = messages[-1][0]
-                    self.wfile.write("".join(f"id: {at}\ndata: {text}\n\n" for at, text in messages).encode())
-                else:
-                    self.wfile.write(b": still there\n\n")
-        finally:
-            self.server.streams.release()

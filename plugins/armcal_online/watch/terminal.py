@@ -36,9 +36,9 @@ def picture(state: Mapping[str, Any], width: int = 80) -> RenderableType:
 
 
 def line(message: Mapping[str, Any]) -> str | None:
-    """One message as a line of plain text; None for estimates, drawings and states, which have none."""
+    """One message as a line of plain text; None for estimates, which have none."""
     kind = message["event"]
-    if kind in ("estimate", "arm", "status", "situation"):
+    if kind == "estimate":
         return None
     if kind == "reset":
         return "A new recalibration begins."
