@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 VERSION = 1
 LATE = 128
@@ -100,35 +100,57 @@ class HelloReply:
 
 
 @dataclass(frozen=True)
-class Hello:
-    """The host's greeting, with its version of the protocol."""
+class _Fixed:
+    """A payload of so many numbers, in the order of the fields."""
 
-    version: int = VERSION
+    LAYOUT: ClassVar[struct.Struct]
 
     def pack(self) -> bytes:
-        """The payload."""
-        return bytes((self.version,))
+        """The payload; of a reply, what follows the head."""
+        return self.LAYOUT.pack(*vars(self).values())
 
-    @staticmethod
-    def read(payload: bytes) -> Hello:
-        """From the payload."""
-        return Hello(_exactly(payload, 1)[0])
+    @classmethod
+    def read(cls, payload: bytes) -> Self:
+        """From these bytes."""
+        if len(payload) != cls.LAYOUT.size:
+            raise ValueError(f"found {len(payload)} bytes, expected {cls.LAYOUT.size}")
+        return cls(*cls.LAYOUT.unpack(payload))
 
 
 @dataclass(frozen=True)
-class Take:
+class Hello(_Fixed):
+    """The host's greeting, with its version of the protocol."""
+
+    LAYOUT = struct.Struct("<B")
+    version: int = VERSION
+
+
+@dataclass(frozen=True)
+class Take(_Fixed):
     """The host takes over again from the board that has started so often."""
 
+    LAYOUT = struct.Struct("<I")
     boots: int
 
-    def pack(self) -> bytes:
-        """The payload."""
-        return self.boots.to_bytes(4, "little")
 
-    @staticmethod
-    def read(payload: bytes) -> Take:
-        """From the payload."""
-        return Take(int.from_bytes(_exactly(payload, 4), "little"))
+@dataclass(frozen=True)
+class Read(_Fixed):
+    """One I2C read of ``count`` bytes from a register."""
+
+    LAYOUT = struct.Struct("<BBB")
+    address: int
+    register: int
+    count: int
+
+
+@dataclass(frozen=True)
+class Refusal(_Fixed):
+    """Why a request was refused; ``detail`` is the index of what failed: a byte of WRITE, a target of SET."""
+
+    LAYOUT = struct.Struct("<BBB")
+    request: int
+    code: int
+    detail: int = 0
 
 
 @dataclass(frozen=True)
@@ -148,24 +170,6 @@ class Write:
         if not payload:
             raise ValueError("the write has no address")
         return Write(payload[0], payload[1:])
-
-
-@dataclass(frozen=True)
-class Read:
-    """One I2C read of ``count`` bytes from a register."""
-
-    address: int
-    register: int
-    count: int
-
-    def pack(self) -> bytes:
-        """The payload."""
-        return bytes((self.address, self.register, self.count))
-
-    @staticmethod
-    def read(payload: bytes) -> Read:
-        """From the payload."""
-        return Read(*_exactly(payload, 3))
 
 
 class ChannelTarget(NamedTuple):
@@ -230,27 +234,3 @@ class Guard:
         channels = tuple(GuardedChannel(*c) for c in _GUARD_CHANNEL.iter_unpack(payload[_GUARD_HEAD.size : at]))
         counts = struct.unpack(f"<{n * payload[at]}H", payload[at + 1 :])
         return Guard(after_ms, channels, tuple(counts[i * n : (i + 1) * n] for i in range(payload[at])))
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """Why a request was refused; ``detail`` is the index of what failed: a byte of WRITE, a target of SET."""
-
-    request: int
-    code: int
-    detail: int = 0
-
-    def pack(self) -> bytes:
-        """After the head."""
-        return bytes((self.request, self.code, self.detail))
-
-    @staticmethod
-    def read(payload: bytes) -> Refusal:
-        """From what follows the head."""
-        return Refusal(*_exactly(payload, 3))
-
-
-def _exactly(payload: bytes, count: int) -> bytes:
-    if len(payload) != count:
-        raise ValueError(f"found {len(payload)} bytes, expected {count}")
-    return payload
