@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from armcal.devices.device import DeviceIdentity, DeviceLostError, DeviceState
+from armcal_bench.acquisition.run_log import Progress
 from armcal_bench.settling import Settled
 
 COUNT_RAD = 0.0093
@@ -130,9 +131,11 @@ class FakeLog:
 
     entries: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
     dies_after: int | None = None
+    progress: Progress = field(default_factory=Progress)
 
     def record(self, kind: str, content: Mapping[str, Any]) -> None:
         self.entries.append((kind, dict(content)))
+        self.progress = self.progress.after(kind, content)
         if self.dies_after is not None and len(self.entries) >= self.dies_after:
             raise KilledError
 
@@ -141,6 +144,21 @@ class FakeLog:
 
     def kinds(self) -> list[str]:
         return [kind for kind, _ in self.entries]
+
+
+class NoEvidence:
+    """Finds nothing wrong."""
+
+    def __init__(self) -> None:
+        self.arrival, self.doubted = self, dict[int, Any]()
+
+    def doubt(self, *pose: Any) -> str:
+        return ""
+
+    def nothing(self, *anything: Any) -> None:
+        pass
+
+    stood = succeeded = failed = check_frame = nothing
 
 
 class KilledError(BaseException):

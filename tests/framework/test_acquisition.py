@@ -17,7 +17,7 @@ from armcal_bench.acquisition.schedule import Scheduler
 from armcal_bench.acquisition.settings import AcquisitionSettings, ServoHeatSettings
 from armcal_bench.acquisition.tracker_monitor import MotionGate
 
-from tests.bench_fakes import COUNT_RAD, FakeClock, FakeDevice, FakeLog, FakeTrackerMonitor, KilledError
+from tests.bench_fakes import COUNT_RAD, FakeClock, FakeDevice, FakeLog, FakeTrackerMonitor, KilledError, NoEvidence
 
 POSES = COUNT_RAD * np.round(np.random.default_rng(5).uniform(-1.5, 1.5, (8, 2)) / COUNT_RAD)
 IDS = tuple(f"p{i}" for i in range(len(POSES)))
@@ -39,7 +39,7 @@ class Run:
         self.device = device or FakeDevice(self.clock)
         self.settings = settings or AcquisitionSettings()
         self.monitor, self.log, self.asked = FakeTrackerMonitor(self.clock, self.device), FakeLog(), False
-        self.progress, self.poses = progress or Progress(), POSES
+        self.log.progress, self.poses = progress or Progress(), POSES
         self.model = HeatModel.of(self.device.joint_names, heat or {})
 
     def acquisition(self) -> AcquisitionRun:
@@ -51,12 +51,11 @@ class Run:
         )
         gate = MotionGate(self.monitor, clock, settings.lost, lambda: self.asked)
         identity = device.open(clock)
-        return AcquisitionRun(drive, identity, scheduler, gate, self.log, self.progress, lambda progress: None)
+        return AcquisitionRun(drive, identity, scheduler, gate, self.log, NoEvidence(), lambda progress: None)
 
     def run(self) -> str:
         self.made = self.acquisition()
         ending = self.made.run()
-        self.progress = self.made.progress
         assert ending.sentence
         assert self.log.entries[-1][0] == "ended"
         return ending.how
@@ -148,7 +147,7 @@ def test_someone_who_asks_for_the_end_gets_a_parked_arm() -> None:
     assert run.run() == "parked"
     assert 0 < len(run.measured()) < len(IDS)
     assert not run.device.running
-    again = Run(progress=run.progress)
+    again = Run(progress=run.log.progress)
     assert again.run() == "done"
     assert {*run.measured()} | {*again.measured()} == set(IDS) and not {*run.measured()} & {*again.measured()}
 
@@ -226,7 +225,7 @@ def test_a_pose_that_never_settles_is_tried_again_at_the_end_and_then_left_out()
     run.monitor.restless.add(tuple(round(a, 6) for a in POSES[2]))
     assert run.run() == "done"
     assert list(run.measured()) == [name for name in IDS if name != "p2"]
-    assert run.progress.left_out["p2"] == "still moving by 3 mm"
+    assert run.log.progress.left_out["p2"] == "still moving by 3 mm"
     assert "1 were left out" in run.log.entries[-1][1]["sentence"]
     goings = [content["pose"] for kind, content in run.log.entries if kind == "going"]
     assert goings.count("p2") == 2 and goings[-1] == "p2"
@@ -248,7 +247,7 @@ def test_where_parking_is_too_much_as_well_poses_are_left_out_and_none_is_lost()
     assert (parked_torque / 0.9) ** 2 > 0.5
     run = Run(heat=heat)
     assert run.run() == "done"
-    assert set(run.progress.left_out) | set(run.measured()) == set(IDS) and run.progress.left_out
+    assert set(run.log.progress.left_out) | set(run.measured()) == set(IDS) and run.log.progress.left_out
 
 
 @pytest.mark.parametrize("dies_after", range(1, 34))
@@ -300,7 +299,7 @@ def test_random_troubles_end_in_done_held_or_parked(seed: int) -> None:
         run.clock.at.append((float(time), partial(trouble, kind, float(lasts))))
     how = run.run()
     assert how in ("done", "held", "parked")
-    assert (how == "done") == (set(run.measured()) | set(run.progress.left_out) == set(IDS)) or how != "done"
+    assert (how == "done") == (set(run.measured()) | set(run.log.progress.left_out) == set(IDS)) or how != "done"
     assert run.fastest() <= RATE * 1.0001
     energised = [t for t, what, _ in run.device.log if what == "energise"]
     assert len(energised) < 2 or min(np.diff(energised)) >= 0.5 - 1e-9

@@ -9,13 +9,11 @@ from armcal.base.arrays import Array
 from armcal.devices.device import DeviceIdentity, DeviceUnwellError
 
 from armcal_bench.acquisition import run_log as entry
-from armcal_bench.acquisition.arrival import Arrival
 from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.evidence import Evidence, FrameRefused, JointGivesWay
 from armcal_bench.acquisition.heat import ThermalLimit
 from armcal_bench.acquisition.recovery import DeviceLost, Recovery
 from armcal_bench.acquisition.run_log import EndedHow, Progress, RunLog
-from armcal_bench.acquisition.sag import SagJudge
 from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler
 from armcal_bench.acquisition.tracker_monitor import MotionGate, StopRequested, TrackerLost, unguarded
 from armcal_bench.settling import Settled, pose_of
@@ -44,14 +42,8 @@ class AcquisitionRun:
         scheduler: decides what comes next.
         gate: asked between two steps of the arm.
         log: the journal, in which every step is written as it is made.
-        progress: of an earlier part of the run.
-        on_progress: called after each pose.
-        arrival: whether the arm stands where it was commanded to; None checks nothing.
-        sag: names a joint that gives way; None names none.
-
-    Attributes:
-        progress: where the run stands now.
         evidence: of what is wrong with the tracker's frame, or with a joint.
+        on_progress: called after each pose.
     """
 
     def __init__(
@@ -61,20 +53,16 @@ class AcquisitionRun:
         scheduler: Scheduler,
         gate: MotionGate,
         log: RunLog,
-        progress: Progress,
+        evidence: Evidence,
         on_progress: Callable[[Progress], None],
-        arrival: Arrival | None = None,
-        sag: SagJudge | None = None,
     ) -> None:
         self._drive, self._scheduler, self._gate = drive, scheduler, gate
         self._recovery = Recovery(drive.device, identity, gate, drive.settings.lost.park, self._notice)
-        self._log, self.progress, self._on_progress, self._arrival = log, progress, on_progress, arrival
+        self._log, self._evidence, self._on_progress = log, evidence, on_progress
         self._ids, self._settings = scheduler.ids, drive.settings
         self._tries: dict[int, int] = {}
         self._astray = 0
-        judges = arrival, sag, drive.settings.arrival.in_a_row
-        self.evidence = Evidence(scheduler.poses, *judges)
-        done = {*progress.measured, *progress.left_out}
+        done = {*log.progress.measured, *log.progress.left_out}
         self._left = [i for i, name in enumerate(self._ids) if name not in done]
 
     def run(self) -> Ending:
@@ -88,7 +76,7 @@ class AcquisitionRun:
                 self._persist(self._energise)
                 while self._left:
                     self._persist(self._step)
-                return self._park_and_end(*self.progress.at_the_end(len(self._ids)))
+                return self._park_and_end(*self._log.progress.at_the_end(len(self._ids)))
             except FrameRefused as refusal:
                 return self._park_and_end("refused", str(refusal))
             except JointGivesWay as fault:
@@ -104,7 +92,7 @@ class AcquisitionRun:
             raise
 
     def _energise(self) -> None:
-        self._drive.energise(self.progress.angles)
+        self._drive.energise(self._log.progress.angles)
 
     def _persist(self, action: Callable[[], T], afterwards: Callable[[], None] | None = None) -> T:
         """Do it; when the device fails, hold until it is back and energised (or ``afterwards``), and do it again."""
@@ -142,7 +130,7 @@ class AcquisitionRun:
 
     def _measure(self, step: Measure) -> None:
         drive, gate = self._drive, self._gate
-        self._record(entry.GOING, {"pose": self._ids[step.pose], **self._here()})
+        self._log.record(entry.GOING, {"pose": self._ids[step.pose], **self._here()})
         try:
             drive.go(step.path, gate.measuring)
             drive.preload_backlash(self._scheduler.approaches[step.pose], gate.measuring)
@@ -156,18 +144,18 @@ class AcquisitionRun:
                 raise
             settled = str(loss)
         assert gate.monitor is not None
-        self.evidence.stood(step.pose, gate.monitor.stand())
+        self._evidence.stood(step.pose, gate.monitor.stand())
         if isinstance(settled, str):
             self._try_later(step.pose, settled)
             self._check_frame()
-            self.evidence.failed(self.known)
+            self._evidence.failed(self.known)
         else:
             self._accept(step.pose, settled)
 
     @property
     def known(self) -> dict[int, Array]:
         """``base_T_target`` (4 x 4, m) of measured poses, by their index."""
-        measured = self.progress.measured
+        measured = self._log.progress.measured
         return {i: pose_of(measured[name]) for i, name in enumerate(self._ids) if name in measured}
 
     def _sees_again(self) -> bool:
@@ -203,18 +191,18 @@ class AcquisitionRun:
             **angles,
             "approach": dict(zip(drive.angles, drive.approach.tolist(), strict=True)),
         }
-        doubt = self._arrival.doubt(pose, settled.base_T_target, self.known) if self._arrival else ""
-        self.evidence.doubted[pose] = record
+        doubt = self._evidence.arrival.doubt(pose, settled.base_T_target, self.known)
+        self._evidence.doubted[pose] = record
         self._check_frame()
         if doubt:
             self._astray += 1
             self._try_later(pose, doubt)
-            self.evidence.failed(self.known)
+            self._evidence.failed(self.known)
             if self._astray >= self._settings.arrival.in_a_row:
                 raise StopRequested(f"{doubt}, {self._astray} times in a row; look at servos, gears and bodies")
             return
         self._astray = 0
-        self.evidence.succeeded(pose)
+        self._evidence.succeeded(pose)
         self._keep(pose, record)
 
     def _check_frame(self) -> None:
@@ -224,17 +212,17 @@ class AcquisitionRun:
             FrameRefused: they are others.
         """
         try:
-            self.evidence.check_frame(self.known)
+            self._evidence.check_frame(self.known)
         except FrameRefused:
-            for pose, record in self.evidence.doubted.items():
+            for pose, record in self._evidence.doubted.items():
                 if pose in self._left:
                     self._keep(pose, record)
             raise
 
     def _keep(self, pose: int, record: Mapping[str, Any]) -> None:
-        self._record(entry.MEASURED, record)
+        self._log.record(entry.MEASURED, record)
         self._left.remove(pose)
-        self._on_progress(self.progress)
+        self._on_progress(self._log.progress)
 
     def _here(self) -> dict[str, Any]:
         drive = self._drive
@@ -253,9 +241,9 @@ class AcquisitionRun:
         self._left.append(pose)
 
     def _leave_out(self, pose: int, why: str) -> None:
-        self._record(entry.LEFT_OUT, {"pose": self._ids[pose], "why": why})
+        self._log.record(entry.LEFT_OUT, {"pose": self._ids[pose], "why": why})
         self._left.remove(pose)
-        self._on_progress(self.progress)
+        self._on_progress(self._log.progress)
 
     def _park_and_end(self, how: EndedHow, why: str) -> Ending:
         """Park, and release the servos where the settings ask for it; the arm holds where no path home is found."""
@@ -278,12 +266,8 @@ class AcquisitionRun:
         return True
 
     def _end(self, ending: Ending) -> Ending:
-        self._record(entry.ENDED, {"how": ending.how, "sentence": ending.sentence, **self._here()})
+        self._log.record(entry.ENDED, {"how": ending.how, "sentence": ending.sentence, **self._here()})
         return ending
 
     def _notice(self, what: str, sentence: str) -> None:
-        self._record(entry.NOTICE, {"what": what, "sentence": sentence, "at": self._gate.clock.wall()})
-
-    def _record(self, kind: str, content: Mapping[str, Any]) -> None:
-        self._log.record(kind, content)
-        self.progress = self.progress.after(kind, content)
+        self._log.record(entry.NOTICE, {"what": what, "sentence": sentence, "at": self._gate.clock.wall()})

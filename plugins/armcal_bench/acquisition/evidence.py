@@ -25,17 +25,16 @@ class Evidence:
 
     Args:
         poses: commanded, by index (N x joints, rad).
-        arrival: compares poses with the model's; None compares nothing.
-        sag: names a joint that gives way; None names none.
-        in_a_row: so many poses that fail one after the other are no accident.
+        arrival: compares poses with the model's.
+        sag: names a joint that gives way.
 
     Attributes:
         doubted: what was recorded of poses that do not count as measured, by their index.
     """
 
-    def __init__(self, poses: Array, arrival: Arrival | None, sag: SagJudge | None, in_a_row: int) -> None:
+    def __init__(self, poses: Array, arrival: Arrival, sag: SagJudge) -> None:
         self.doubted: dict[int, Mapping[str, Any]] = {}
-        self._poses, self._arrival, self._sag, self._in_a_row = poses, arrival, sag, in_a_row
+        self.arrival, self._poses, self._sag = arrival, poses, sag
         self._stands: list[tuple[int, Stand]] = []
         self._failed = 0
 
@@ -59,14 +58,14 @@ class Evidence:
             JointGivesWay: that happened several times in a row, and a joint is the reason.
         """
         self._failed += 1
-        sag = self.gives_way(measured, self._failed) if self._failed >= self._in_a_row else None
+        sag = self.gives_way(measured, self._failed) if self._failed >= self.arrival.settings.in_a_row else None
         if sag is not None and sag.joints:
             raise JointGivesWay(f"{sag.sentence}. {sag.mend}".rstrip("."))
 
     def gives_way(self, measured: Mapping[int, Array], last: int = 0) -> Sag | None:
         """A joint that gives way, by the last so many stands, or all of them. See ``failed``."""
         stands = self._stands[-last:]
-        if self._sag is None or not stands:
+        if not stands:
             return None
         seen = np.array(list(measured.values())).reshape(-1, 4, 4)
         angles = self._poses[[pose for pose, _ in stands]]
@@ -80,7 +79,6 @@ class Evidence:
         """
         glimpsed = {pose: stand.base_T_target for pose, stand in self._stands}
         doubted = {pose: pose_of(record) for pose, record in self.doubted.items()}
-        mistake = self._arrival.mistake({**glimpsed, **measured, **doubted}) if self._arrival else None
-        if mistake is not None:
+        if (mistake := self.arrival.mistake({**glimpsed, **measured, **doubted})) is not None:
             kept = "The poses that were measured are kept as they came"
             raise FrameRefused(f"{mistake.sentence}. {mistake.mend} {kept}")

@@ -91,11 +91,16 @@ def progress_of(entries: tuple[Entry, ...]) -> Progress:
 
 
 class RunLog:
-    """An open journal and what it held."""
+    """An open journal.
+
+    Attributes:
+        progress: where the run stands by it, now.
+        identity: of the device that the run began with; None where it did not.
+    """
 
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
-        self.progress: Progress = progress_of(journal.recovered.entries)
+        self.progress = progress_of(journal.recovered.entries)
         started = [entry.content for entry in journal.recovered.entries if entry.kind == STARTED]
         self.identity = DeviceIdentity(started[-1]["name"], started[0]["device"]) if started else None
         self._failed = False
@@ -108,6 +113,7 @@ class RunLog:
         """
         with self._once():
             self._journal.record(kind, dict(content))
+        self.progress = self.progress.after(kind, content)
 
     def note_angles(self, angles: Mapping[str, float], thermal_state: Mapping[str, Any], wall: float) -> None:
         """Write the commanded angles (rad); a power loss may take the last of these. See ``record``."""

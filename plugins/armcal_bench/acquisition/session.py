@@ -4,7 +4,7 @@ import hashlib
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from armcal.errors import InputError, Location
 from armcal_bench.acquisition import run_log as entry
 from armcal_bench.acquisition.acquisition_run import AcquisitionRun, Ending
 from armcal_bench.acquisition.drive import Drive
+from armcal_bench.acquisition.evidence import Evidence
 from armcal_bench.acquisition.preparation import Prepared
 from armcal_bench.acquisition.run_log import OURS, Progress, RunLog, in_order, measured_by, write_outputs
 from armcal_bench.acquisition.sag import Sag
@@ -86,8 +87,9 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
         else:
             with _opened(prepared, options, clock, log) as (gate, identity):
                 log.record(entry.STARTED, {"at": clock.wall(), "device": identity.digest, "name": identity.name})
-                run = _prepared_run(prepared, options, log, gate, identity)
-                ending, progress, sag = run.run(), run.progress, run.evidence.gives_way(run.known)
+                evidence = Evidence(prepared.scheduler.poses, prepared.arrival, prepared.sag)
+                run = _prepared_run(prepared, options, log, gate, identity, evidence)
+                ending, progress, sag = run.run(), log.progress, evidence.gives_way(run.known)
         summary = {
             "how": ending.how,
             "why": ending.sentence,
@@ -160,7 +162,12 @@ def _opened(
 
 
 def _prepared_run(
-    prepared: Prepared, options: RunOptions, log: RunLog, gate: MotionGate, identity: DeviceIdentity
+    prepared: Prepared,
+    options: RunOptions,
+    log: RunLog,
+    gate: MotionGate,
+    identity: DeviceIdentity,
+    evidence: Evidence,
 ) -> AcquisitionRun:
     """A run that may energise the arm.
 
@@ -181,6 +188,4 @@ def _prepared_run(
     before = options.asked_to_end()
     if not options.may_energise(start) or (options.asked_to_end() and not before):
         raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
-    progress = replace(progress, ended="")
-    judges = prepared.arrival, prepared.sag
-    return AcquisitionRun(drive, identity, scheduler, gate, log, progress, options.on_progress, *judges)
+    return AcquisitionRun(drive, identity, scheduler, gate, log, evidence, options.on_progress)
