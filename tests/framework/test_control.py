@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 from armcal.cli.main import cli
 from armcal.errors import InputError
-from armcal_online.running.control import SOCKET, ControlServer, ask, joint_values
+from armcal.io.json_server import JsonServer
+from armcal_online.running.control import SOCKET, answer, ask, control_server, joint_values
 from click.testing import CliRunner
 from fake_recalibrator import request
 
@@ -22,13 +23,13 @@ from fake_recalibrator import request
 def echo(content: Mapping[str, Any]) -> Mapping[str, Any]:
     if content["command"] == "rollback":
         raise InputError("the journal does not reach there.", hint="Give a later one.")
-    return {"asked": dict(content)}
+    return {"ok": True, "asked": dict(content)}
 
 
 @contextmanager
-def serving(folder: Path, answer: Callable[[Mapping[str, Any]], Mapping[str, Any]] = echo) -> Iterator[ControlServer]:
+def serving(folder: Path, answer: Callable[[Mapping[str, Any]], Mapping[str, Any]] = echo) -> Iterator[JsonServer]:
     """A server in a thread of its own, as the loop would call it."""
-    server, ends = ControlServer(folder, answer), threading.Event()
+    server, ends = control_server(folder, answer), threading.Event()
 
     def loop() -> None:
         while not ends.is_set():
@@ -66,13 +67,19 @@ def test_a_request_is_answered_and_an_error_is_told(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "data",
-    [b"{\n", b"\xff\n", b"[]\n", b"7\n", b'{"command": "reboot"}\n', b'{"command": ["pause"]}\n', b"[" * 9000 + b"\n"],
+    [b"{\n", b"\xff\n", b"[]\n", b"7\n", b"\n", b"{}\n", b"[" * 9000 + b"\n"],
 )
 def test_what_is_not_understood_gets_an_error(tmp_path: Path, data: bytes) -> None:
     with serving(tmp_path):
         (told,) = raw(tmp_path, data)
         assert told["ok"] is False and told["error"]
         assert ask(tmp_path, {"command": "status"})["ok"]
+
+
+@pytest.mark.parametrize("command", ["reboot", ["pause"], None])
+def test_a_command_that_is_none_is_refused(command: Any) -> None:
+    with pytest.raises(InputError, match="expected one of status, pause"):
+        answer(None, None, {"command": command})  # type: ignore[arg-type]
 
 
 def test_several_requests_in_one_go_and_one_in_pieces(tmp_path: Path) -> None:
@@ -110,10 +117,10 @@ def test_a_stale_socket_is_replaced_a_live_one_and_a_file_are_not(tmp_path: Path
     with pytest.raises(InputError, match="no recalibration answers here"):
         ask(tmp_path, {"command": "status"})
     with serving(tmp_path), pytest.raises(InputError, match="is running here"):
-        ControlServer(tmp_path, echo)
+        control_server(tmp_path, echo)
     (tmp_path / SOCKET).write_text("mine")
     with pytest.raises(InputError, match="not a socket"):
-        ControlServer(tmp_path, echo)
+        control_server(tmp_path, echo)
     assert (tmp_path / SOCKET).read_text() == "mine"
 
 
@@ -124,14 +131,14 @@ def test_a_folder_with_a_long_name_is_served_too(tmp_path: Path) -> None:
     with serving(folder):
         assert ask(folder, {"command": "status"})["ok"]
         with pytest.raises(InputError, match="is running here"):
-            ControlServer(folder, echo)
+            control_server(folder, echo)
     assert len([*Path("/proc/self/fd").iterdir()]) == len(before)
 
 
 def test_nobody_there_and_nobody_answering(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"control\.sock: no recalibration answers here"):
         ask(tmp_path, {"command": "status"})
-    server = ControlServer(tmp_path, echo)
+    server = control_server(tmp_path, echo)
     with pytest.raises(InputError, match="no answer within"):
         ask(tmp_path, {"command": "status"}, 0.1)
     server.close()

@@ -22,9 +22,9 @@ from armcal.cli.main import cli
 from armcal.config.servo_file import load_servo_file
 from armcal.devices.framed.frames import Frame, FrameDecoder, encoded
 from armcal.devices.simulated import BenchRequest
+from armcal.io.json_server import JsonServer
 from armcal.run.experiment import Experiment
 from armcal.run.plan_clearance import clearance_check
-from armcal_simulation.bench.clock_server import ClockServer
 from armcal_simulation.bench.parts import ServoBenchSettings
 from armcal_simulation.bench.world import BenchWorld
 from armcal_simulation.boards.servo_bench import ServoBench, pulse_bench
@@ -515,7 +515,7 @@ class TestServer:
     @pytest.mark.parametrize("line", ["", "[]", "{", "{}", '{"advance": "x"}', "\xff", "[" * 20000, '{"fault": 3}'])
     def test_a_request_that_is_none_is_answered_by_an_error(self, path: Path, line: str) -> None:
         client = Client(path)
-        assert set(client.say(line)) == {"error"}
+        assert "error" in client.say(line)
         assert client.ask(advance=0.5)["now"] == 0.5
         client.close()
 
@@ -593,7 +593,7 @@ class TestCommand:
     def test_settings_that_do_not_fit_are_refused(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str, told: str
     ) -> None:
-        monkeypatch.setattr(ClockServer, "serve", lambda *given: None)
+        monkeypatch.setattr(JsonServer, "serve", lambda *given: None)
         arguments = ["simulated-bench", str(LRM / "bench.yaml"), "--dir", str(tmp_path / "bench"), "--set", change]
         result = CliRunner().invoke(cli, arguments)
         assert result.exit_code == 2 and told in result.stderr

@@ -42,7 +42,7 @@ def listening(path: Path, taken: str, hint: str, backlog: int) -> socket.socket:
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         with short_address(path) as address:
-            _clear(path, address, taken, hint)
+            vacate(path, taken, hint)
             mask = os.umask(0o177)
             try:
                 listener.bind(address)
@@ -62,8 +62,12 @@ def listening(path: Path, taken: str, hint: str, backlog: int) -> socket.socket:
     return listener
 
 
-def _clear(path: Path, address: str, taken: str, hint: str) -> None:
-    """Take away a socket that nobody serves any more."""
+def vacate(path: Path, taken: str, hint: str) -> None:
+    """Take away a socket that nobody serves any more; see ``listening``.
+
+    Raises:
+        InputError: somebody serves it, or something else is there.
+    """
     where = Location(str(path))
     try:
         kind = path.lstat().st_mode
@@ -71,7 +75,7 @@ def _clear(path: Path, address: str, taken: str, hint: str) -> None:
         return
     if not S_ISSOCK(kind):
         raise InputError("it is not a socket.", where=where, hint=f"Remove it, or {hint[:1].lower()}{hint[1:]}")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe, short_address(path) as address:
         probe.settimeout(1.0)
         try:
             probe.connect(address)

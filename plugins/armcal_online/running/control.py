@@ -1,19 +1,16 @@
 """The control socket of a running recalibration: requests and replies, a JSON object a line."""
 
-import contextlib
 import json
-import select
 import socket
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from armcal.base.config_text import as_line
 from armcal.base.units import from_unit
-from armcal.errors import ArmcalError, InputError, Location
+from armcal.errors import InputError, Location
 from armcal.io.journal.reader import read_entries
-from armcal.io.unix_socket import listening, short_address
+from armcal.io.json_server import Answer, JsonServer
+from armcal.io.unix_socket import short_address
 from armcal.measure.column_match import spellings
 from armcal.measure.reader import ReadRequest
 
@@ -26,119 +23,14 @@ GOOD = "good"
 """In place of a sequence number: that of the last good record."""
 COMMANDS = ("status", "pause", "resume", "rollback", "finish", "what_if")
 
-_LONGEST = 64 * 1024
-_CLIENTS = 8
-_PATIENCE_S = 10.0
-"""A client that neither asks nor reads for so long is dropped."""
 
-Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
-"""The reply to a request; an ArmcalError becomes an error reply."""
-
-
-class _Client:
-    def __init__(self, connection: socket.socket) -> None:
-        self.connection = connection
-        self.received = bytearray()
-        self.replies = bytearray()
-        self.ends = False
-        self.heard = time.monotonic()
-
-
-class ControlServer:
-    """Serves the socket in a folder, in the caller's thread: only while ``serve`` is called is anyone answered.
+def control_server(folder: Path, answer: Answer) -> JsonServer:
+    """What serves the socket in a folder.
 
     Raises:
         InputError: somebody else serves it, or it cannot be made.
     """
-
-    def __init__(self, folder: Path, answer: Answer) -> None:
-        self._path = folder / SOCKET
-        self._answer = answer
-        self._clients: list[_Client] = []
-        self._listener = listening(self._path, "a recalibration is running here.", "Give another --out.", _CLIENTS)
-
-    def serve(self) -> None:
-        """Answer the requests that have come; returns at once."""
-        open_now = [client.connection for client in self._clients]
-        writing = [client.connection for client in self._clients if client.replies]
-        try:
-            readable, writable, _ = select.select([self._listener, *open_now], writing, [], 0)
-        except (OSError, ValueError):
-            return
-        if self._listener in readable:
-            with contextlib.suppress(OSError):
-                connection, _ = self._listener.accept()
-                connection.setblocking(False)
-                self._clients.append(_Client(connection))
-                if len(self._clients) > _CLIENTS:
-                    self._drop(self._clients[0])
-        for client in [*self._clients]:
-            if client.connection in readable:
-                self._read(client)
-            if client.connection in writable or client.replies:
-                self._write(client)
-            if (client.ends and not client.replies) or time.monotonic() - client.heard > _PATIENCE_S:
-                self._drop(client)
-
-    def close(self) -> None:
-        """Send what is ready, and take the socket away."""
-        for client in [*self._clients]:
-            self._write(client)
-            self._drop(client)
-        self._listener.close()
-        with contextlib.suppress(OSError):
-            self._path.unlink()
-
-    def _read(self, client: _Client) -> None:
-        try:
-            data = client.connection.recv(_LONGEST)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b""
-        client.heard = time.monotonic()
-        client.ends |= not data
-        *lines, rest = bytes(client.received + data).split(b"\n")
-        client.received = bytearray(rest)
-        for line in lines:
-            if line.strip():
-                client.replies += as_line(self._reply(line)).encode() + b"\n"
-        if len(client.received) > _LONGEST:
-            client.replies += as_line(_refusal("The request has more than 64 KiB.")).encode() + b"\n"
-            client.received.clear()
-            client.ends = True
-
-    def _write(self, client: _Client) -> None:
-        try:
-            sent = client.connection.send(client.replies)
-        except BlockingIOError:
-            return
-        except OSError:
-            client.replies.clear()
-            client.ends = True
-            return
-        if sent:
-            client.heard = time.monotonic()
-        del client.replies[:sent]
-
-    def _drop(self, client: _Client) -> None:
-        client.connection.close()
-        if client in self._clients:
-            self._clients.remove(client)
-
-    def _reply(self, line: bytes) -> Mapping[str, Any]:
-        try:
-            request = json.loads(line.decode("utf-8"))
-        except (ValueError, RecursionError) as fault:
-            return _refusal(f"The request is not JSON ({fault}).")
-        if not isinstance(request, dict) or request.get("command") not in COMMANDS:
-            return _refusal(f"Expected an object with a command: {', '.join(COMMANDS)}.")
-        try:
-            return {"ok": True, **self._answer(request)}
-        except ArmcalError as fault:
-            return _refusal(str(fault))
-        except Exception as fault:  # whoever asks, and whatever, cannot end a recalibration
-            return _refusal(f"It failed ({type(fault).__name__}: {fault}).")
+    return JsonServer(folder / SOCKET, "a recalibration is running here.", "Give another --out.", answer)
 
 
 def is_running(folder: Path) -> bool:
@@ -175,17 +67,15 @@ def ask(folder: Path, request: Mapping[str, Any], timeout_s: float = 30.0) -> di
     return dict(reply)
 
 
-def _refusal(sentence: str) -> dict[str, Any]:
-    return {"ok": False, "error": sentence}
-
-
 def answer(recalibration: Recalibration, session: Recalibrator, request: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The reply to one of the known commands, which act at once.
+    """The reply to one of the known commands, which act at once: ``ok``, and what it says.
 
     Raises:
         ArmcalError: the request cannot be met.
     """
-    match request["command"]:
+    match request.get("command"):
+        case "status":
+            pass
         case "pause":
             recalibration.pause()
         case "resume":
@@ -193,10 +83,12 @@ def answer(recalibration: Recalibration, session: Recalibrator, request: Mapping
         case "finish":
             recalibration.finishing = "It was asked to finish."
         case "rollback":
-            return rolled_back(recalibration, session, request.get("to"))
+            return {"ok": True, **rolled_back(recalibration, session, request.get("to"))}
         case "what_if":
-            return session.what_if(joint_values(request.get("joints"), session.request))
-    return recalibration.status()
+            return {"ok": True, **session.what_if(joint_values(request.get("joints"), session.request))}
+        case other:
+            raise InputError(f"found the command {other!r}, expected one of {', '.join(COMMANDS)}.")
+    return {"ok": True, **recalibration.status()}
 
 
 def rolled_back(recalibration: Recalibration, session: Recalibrator, to: Any) -> Mapping[str, Any]:

@@ -15,9 +15,10 @@ from armcal.io.folder import check_folder
 from armcal.io.journal.files import REAL_FILES, FileLayer
 from armcal.io.journal.journal import Journal, JournalLimits
 from armcal.io.journal.reader import read_until, verify
+from armcal.io.json_server import JsonServer
 from armcal.io.lines import StandardOutput
 
-from armcal_online.running.control import SOCKET, ControlServer, answer
+from armcal_online.running.control import SOCKET, answer, control_server
 from armcal_online.running.loop import Pace, Recalibration
 from armcal_online.running.outputs import CALIBRATION, RESERVE, STATUS, Outputs
 from armcal_online.running.state_replayer import STARTED, StateReplayer
@@ -64,7 +65,7 @@ class Open:
     """An open recalibration, and the socket that it is controlled by."""
 
     recalibration: Recalibration
-    control: ControlServer
+    control: JsonServer
 
     def run(self) -> None:
         """Until it ends; see ``Recalibration.run``."""
@@ -117,7 +118,7 @@ def opened(setup: Setup, session: Recalibrator, source_of: SourceOf) -> Iterator
             outputs.alarm(f"{fault.message} {text}")
         left = len(journal.recovered.entries) if resumed else 0
         recalibration = Recalibration(source, journal, session, state_replayer, outputs, setup.pace, left)
-        control = ControlServer(setup.folder, partial(answer, recalibration, session))
+        control = control_server(setup.folder, partial(answer, recalibration, session))
         stack.callback(control.close)
         yield Open(recalibration, control)
 

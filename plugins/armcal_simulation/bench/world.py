@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
+import select
 from collections.abc import Callable, Mapping
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.devices.simulated import BOARD, CLOCK, LOG
+from armcal.io.json_server import JsonServer
 from armcal.io.signals import Signals
+from armcal.io.unix_socket import vacate
 
-from armcal_simulation.bench.clock_server import ClockServer
 from armcal_simulation.bench.dtrack_sender import DTrackSender
 from armcal_simulation.bench.elastic_pose import TrackedArm
 from armcal_simulation.bench.faults import FaultCalendar, FaultRequest
@@ -24,6 +28,9 @@ from armcal_simulation.bench.servo_model import JointServo
 WALL_AT_START = 1893456000.0
 """2030-01-01, 0:00 UTC: no bench is there at two times, and results are the same whenever they are made."""
 LONGEST_ADVANCE_S = 86400.0
+_TAKEN = "another simulated bench is running here.", "Stop it first, or give another folder."
+_LOOK_UP_S = 0.25
+"""How often it is looked whether the end was asked for."""
 
 
 class Firmware(Protocol):
@@ -213,14 +220,21 @@ def serve_world(world: BenchWorld, folder: Path) -> None:
     Raises:
         InputError: the folder cannot be used.
     """
-    try:
-        server = ClockServer(folder / CLOCK, world.answer)
-        try:
-            with Signals() as signals:
-                world.start(folder / BOARD)
-                server.listen()  # after the board: who finds the clock finds the board as well
-                server.serve(world.port, world.attend_line, lambda: world.stopped or signals.finish)
-        finally:
-            server.close()
-    finally:
-        world.close()
+    with closing(world), Signals() as signals:
+        vacate(folder / CLOCK, *_TAKEN)
+        world.start(folder / BOARD)
+        # After the board: who finds the clock finds the board as well.
+        with closing(JsonServer(folder / CLOCK, *_TAKEN, world.answer)) as server, select.epoll() as edges:
+            server.watch(edges.fileno(), partial(_attend, world, edges))
+            watched = None
+            while not (world.stopped or signals.finish):
+                if (port := world.port()) != watched and port is not None:
+                    # Edges only: a port that nobody has open is at its end all the time. A closed one left by itself.
+                    edges.register(port[0], select.EPOLLIN | select.EPOLLHUP | select.EPOLLET)
+                watched = port
+                server.serve(_LOOK_UP_S)
+
+
+def _attend(world: BenchWorld, edges: select.epoll) -> None:
+    edges.poll(0)
+    world.attend_line()
