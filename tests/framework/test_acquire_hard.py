@@ -507,7 +507,7 @@ class TestTracker:
         run.monitor.trouble = trouble  # type: ignore[method-assign]
         run.clock.at.append((5000.0, lambda: pytest.fail("it never ends")))
         assert run.run() == "done"
-        assert list(run.progress.left_out) == ["p3"] and "body lost" in run.progress.left_out["p3"]
+        assert list(run.log.progress.left_out) == ["p3"] and "body lost" in run.log.progress.left_out["p3"]
 
     @pytest.mark.parametrize("motion", ["still", "moving"])
     @pytest.mark.slow
@@ -529,7 +529,7 @@ class TestTracker:
         run.monitor.trouble = lambda: (0.6, "silent") if run.clock.now() % 1.2 < 0.6 else (0.0, "")  # type: ignore[method-assign]
         run.clock.at.append((5000.0, lambda: pytest.fail("it never ends")))
         assert run.run() == "failed"
-        assert len(run.progress.left_out) == len(run.poses)
+        assert len(run.log.progress.left_out) == len(run.poses)
 
     @pytest.mark.slow
     def test_frames_from_before_are_not_taken_for_frames_of_now(self, run: BenchRun) -> None:
