@@ -11,6 +11,7 @@ from armcal.base.dataset import Dataset
 from armcal.diagnose.held import Contradiction
 from armcal.diagnose.large_errors import LargeErrors
 from armcal.diagnose.residual_structure import ResidualStructure
+from armcal.diagnose.rounded import Rounding
 from armcal.diagnose.unseen import HiddenPayload
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.prediction import NewRecording
@@ -56,6 +57,7 @@ class Evidence:
     hidden_payload: HiddenPayload | None = None
     contradictions: tuple[Contradiction, ...] = ()
     name: str = "Tip"
+    rounding: Rounding | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json."""
@@ -67,6 +69,7 @@ class Evidence:
             and {"worst_mm": alone.worst_mm, "between_mm": alone.between_mm, "poses": alone.poses},
             "hidden_payload": self.hidden_payload and asdict(self.hidden_payload),
             "contradictions": [asdict(one) for one in self.contradictions],
+            "rounding": self.rounding and asdict(self.rounding),
         }
 
 

@@ -6,10 +6,12 @@ import numpy as np
 
 from armcal.base.arrays import Array
 from armcal.base.units import digits
+from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.gross import BEYOND, FAR_BEYOND, Displaced, Figure
 from armcal.diagnose.majority import Minority
 from armcal.diagnose.noise_findings import Finding, first_few
 from armcal.diagnose.residual_structure import ResidualStructure
+from armcal.diagnose.rounded import rounding_findings
 from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
 
 OF_REACH = 0.03
@@ -38,9 +40,8 @@ def gross_error(
     judged_mm: Array,
     figure: Figure,
     estimate: Estimate,
-    left: ResidualStructure | None,
+    evidence: Evidence,
     whitened: Array,
-    unit: str = "mm",
 ) -> list[Finding]:
     """Errors of records that did not train (N; nan where not judged) beside the reach and the noise.
 
@@ -50,7 +51,7 @@ def gross_error(
     Where nothing measured is a length, angles stand beside a radian (what the reach is at the distance of the reach),
     pixels beside a thousand. Forces and torques have no such size, and are not judged here.
     """
-    seen = judged_mm[np.isfinite(judged_mm)]
+    seen, left, unit = judged_mm[np.isfinite(judged_mm)], evidence.structure, evidence.unit
     reach = (figure.reach_mm, "the arm's reach")
     wholes = {"mm": reach, "mrad": (1000.0, "a radian"), "px": (1000.0, "a thousand px")}
     if not len(seen) or figure.reach_mm <= 0 or unit not in wholes:
@@ -66,13 +67,20 @@ def gross_error(
     typical = float(np.nanmedian(np.abs(whitened))) / _MEDIAN_OF_NOISE
     if share <= limit or min(scale, typical if limit == 0 else np.inf) <= TIMES_NOISE:
         return []
-    text = f"{error} and {scale:.0f} times the declared noise; what was found in the residuals does not explain it."
+    rounded = rounding_findings(evidence.rounding, unit)
+    why = (
+        "rounding of the recorded joints leaves as much"
+        if rounded
+        else "what was found in the residuals does not explain it"
+    )
+    text = f"{error} and {scale:.0f} times the declared noise; {why}."
     test = (
         f"limits {100 * limit:g} % and {TIMES_NOISE:g} times; one cause explains at most {100 * explained:.0f} % of "
         f"it, other poses predict {100 * predicted:.0f} %"
     )
     action = f"The cause is not known: is the stated noise the instrument's? {CHECK_THE_DATA}"
-    return [Finding("bad", text, test, _MOVED if _by_time(left) else action)]
+    action = _MOVED if _by_time(left) else action
+    return [Finding("bad", text, test, rounded[0].action if rounded else action)]
 
 
 def _by_time(left: ResidualStructure | None) -> bool:

@@ -28,6 +28,7 @@ from armcal.diagnose.noise_findings import (
     suspicious_in_short,
     suspicious_records,
 )
+from armcal.diagnose.rounded import rounding_findings
 from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
 from armcal.estimate.identifiability import POOR_CONDITION, bound_together, correlated_pairs
 from armcal.estimate.prediction import NewRecording
@@ -95,7 +96,7 @@ def judge(
     suspicious = suspicious_records(errors_mm[train], own, fitted)
     noise = component_findings(fitted.components) if fitted and fitted.components else [_size(estimate, seen)]
     findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
-    findings += [*shift_findings(estimate), *noise, *_freedom(estimate), *contradiction_findings(seen.contradictions)]
+    findings += [*shift_findings(estimate), *noise, *_freedom(estimate), *_causes(seen)]
     findings += structure_findings(seen.structure, seen.unit) if estimate.verdict.converged else []
     findings += neighbour_findings(seen.structure, estimate, seen.unit) or _neighbours(whitened, kept, estimate)
     findings += [*_correlated(estimate), *predicted, *large_error_findings(seen.large_errors, seen.unit)]
@@ -169,9 +170,14 @@ def _in_short(
     return sentences
 
 
+def _causes(seen: Evidence) -> list[Finding]:
+    """What is wrong with instruments and recorded joints."""
+    return [*contradiction_findings(seen.contradictions), *rounding_findings(seen.rounding, seen.unit)]
+
+
 def _left(seen: Evidence) -> list[str]:
     """What is left in the residuals; that nothing was found only where all that was looked at says so."""
-    left, sentences = seen.structure, [finding.text for finding in contradiction_findings(seen.contradictions)]
+    left, sentences = seen.structure, [finding.text for finding in _causes(seen)]
     if left is None:
         return sentences or ["Whether the model lacks anything is not known: the training records are too few."]
     if left.predictable is not None and left.is_predictable:
@@ -241,7 +247,9 @@ def _size(estimate: Estimate, seen: Evidence) -> Finding:
     total, test = ratio**2 * freedom, "chi-square, 5 %"
     if total > chdtri(freedom, LEVEL / 2):
         why = "the model's error or the instrument's, which this test cannot separate"
-        if seen.structure is not None or seen.contradictions:
+        if seen.rounding is not None:
+            why = "rounding of the recorded joints leaves as much, see below"
+        elif seen.structure is not None or seen.contradictions:
             known = "some of it is the model's: what residuals depend on is named below"
             left = seen.structure
             is_seen = seen.contradictions or (left is not None and (left.structures or left.is_predictable))

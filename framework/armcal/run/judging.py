@@ -19,6 +19,7 @@ from armcal.diagnose.majority import minority, moved_findings, moved_groups
 from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.outside import predicted_positions
 from armcal.diagnose.residual_structure import structure
+from armcal.diagnose.rounded import rounding
 from armcal.diagnose.unseen import hidden_payload, hidden_payload_findings, scale_deviation, scale_findings
 from armcal.diagnose.verdict import Verdict, judge
 from armcal.estimate.estimator import Estimate
@@ -140,8 +141,11 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     wider = freed(few, [parameter.name for one in held for parameter in one.parameters])
     left = structure(wider, acting, estimate, *own, modelled=frozenset(str(effect.get("type")) for effect in effects))
     hidden = hidden_payload(few, acting, estimate, own[0], own[1])
+    seen = left is not None and left.is_predictable and left.predictable
+    declared = few.weighted(few.subset(records, run.split.train), run.fitted.weights)
+    rounded = rounding(few, declared, estimate, own[0], own[1], seen.share if seen else 0.0)
     new = predictor(problem, run.fitted).new_recording(run.records, np.flatnonzero(np.isfinite(judged_mm)))
-    return Evidence(left, missed, alone, error_unit(problem), new, hidden, held, error_name(problem))
+    return Evidence(left, missed, alone, error_unit(problem), new, hidden, held, error_name(problem), rounded)
 
 
 def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array, evidence: Evidence) -> list[Finding]:
@@ -158,7 +162,7 @@ def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array
     position = recorded_position(run.dataset)[looked_at]
     read = predicted_positions(problem, estimate.values, acting, dataset)
     return [
-        *gross_error(judged_mm, figure, estimate, evidence.structure, _whitened(run), evidence.unit),
+        *gross_error(judged_mm, figure, estimate, evidence, _whitened(run)),
         *contradicting(minority(rows, estimate.noise_scale, position), dataset.ids),
         *size_findings(figure),
         *displacement_findings(figure),
