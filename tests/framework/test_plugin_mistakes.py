@@ -134,30 +134,32 @@ def armcal_register_readers(register):
 )
 TIP, MINE = "{type: tip_position, noise_mm: 0.1}", "{mine: {type: mine}}"
 MDH = "mdh, convention: standard, rows: [{a_mm: 300, alpha_deg: 90}, {a_mm: 200}, {a_mm: 150}]"
+WHOLE = 'Dataset(("a", "b", "c"), values)'
+
+
+def _beside(parts: str) -> str:
+    return WHOLE[:-1] + f", {parts})"
+
+
 READERS = {
     "none": ("return Dataset", "Dataset", "R.read returned None, expected a Dataset"),
-    "a mapping": (
-        'Dataset(("a", "b", "c"), values)',
-        "values",
-        "R.read returned an object of type dict, expected a Da",
-    ),
+    "a mapping": (WHOLE, "values", "R.read returned an object of type dict, expected a Da"),
     "lists": (": numbers for", ": list(numbers) for", "R.read returned the channel 'arm.q1' as list of the shape .3,."),
-    "few": (
-        "[: len(angles)]",
-        "[:2]",
-        r"R.read returned the channel 'm.x' as ndarray of the shape \(2,\), expected a nu",
-    ),
-    "NaN": (
-        "0.1, 0.2]",
-        "math.nan, 0.2]",
-        "row 2: found no number for m.x, m.y, m.z in the record b. A reader refuses",
-    ),
-    "a file": (
-        "        angles =",
-        "        open('no')\n        angles =",
-        "R.read raised FileNotFoundError: .* 'no'. To che",
-    ),
-}
+    "few": ("[: len(angles)]", "[:2]", r"R.read returned the channel 'm.x' as ndarray of the shape \(2,\), expect"),
+    "NaN": ("0.5, 0.1, 0.2]", "math.nan] * 3", "no usable record: all 3 were set aside, the first because m.x is emp"),
+    "a file": ("angles =", "open('no')\n        angles =", "R.read raised FileNotFoundError: .* 'no'. To che"),
+    "ids twice": ('"c")', '"a")', "row 3: the id 'a' was given to another record before, at row 1, with other values"),
+    "numbers": ('("a", "b", "c")', "(1, 2, 3)", "R.read returned the ids .1, 2, 3., expected a tuple of texts"),
+    "no joint": ("start=1)}", "start=1) if i < 3}", "R.read returned no channel 'arm.q3' among arm.q1, arm.q2, m.x, "),
+    "no z": ('in "xyz"', 'in "xy"', "R.read returned no channel 'm.z' among .*, expected every channel of the request"),
+    "degrees": ("np.radians", "np.array", "arm.q1: found -1718.87.* deg more than two turns. If the unit is wrong"),
+    "time": (WHOLE, "Dataset(tuple('abc'), {**values, 'time': np.array([1.0, 3, 2])})", "row 3, time: .* out of order"),
+    "channels": (WHOLE, "Dataset(tuple('abc'), list(values))", "R.read returned the channels .'arm.q1', .*, expected"),
+    "few rows": (WHOLE, _beside("rows=(1,)"), "R.read returned the rows .1,., expected a tuple of 3 ints, or an emp"),
+    "a column": (WHOLE, _beside("extra={'t': ('x',)}"), "R.read returned extra as .*, expected a mapp.* of 3 texts"),
+    "a source": (WHOLE, _beside("source=None"), "R.read returned the source None and sha256 '', expected texts"),
+    "left": (WHOLE, _beside("set_aside=['x']"), "R.read returned the warnings .. and set_aside ..x.., expected a tupl"),
+}  # fmt: skip
 MODEL = (
     IMPORTS
     + """
@@ -272,8 +274,8 @@ KINDS: dict[str, tuple[str, dict[str, tuple[str, str, str]], dict[str, str]]] = 
     "model": (MODEL, MODELS, {"model": "mine", "free": "arm.mine.a2"}),
     "registration": (EFFECT, REGISTRATIONS, {"effects": MINE, "free": "arm.mine.s2"}),
 }
-OF_NO_LINE = ("derivative", "the measurement", "row", "'mine'")
-"""Sentences about numbers, or a name, that no single line of a plugin gave."""
+OF_NO_LINE = ("derivative", "the measurement", "row", "no usable", "arm.q1", "'mine'")
+"""Sentences about numbers, records or a name that no single line of a plugin gave."""
 
 
 @pytest.mark.parametrize(("kind", "mistake"), [(kind, name) for kind, (_, table, _) in KINDS.items() for name in table])

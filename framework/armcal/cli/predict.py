@@ -22,6 +22,7 @@ from armcal.io.plain_files import input_file
 from armcal.measure.csv_writer import column_names, write_csv
 from armcal.measure.environment import noticed
 from armcal.measure.reader import ReadRequest, RequestedChannel, requested_channels
+from armcal.measure.returned import records_of
 from armcal.plugins import PluginRegistry
 from armcal.run.compensate import short_texts
 
@@ -143,7 +144,7 @@ def read_commands(registry: PluginRegistry, loaded: Calibration, poses: Path, co
             )
         named[name] = own
     reader = reader_class(reader_class.Settings(path=ConfigText(str(poses)), columns=named))
-    return noticed(reader.read(ReadRequest(arms, {}, requested, layout_hint=_LAYOUT)))
+    return noticed(records_of(reader, ReadRequest(arms, {}, requested, layout_hint=_LAYOUT)))
 
 
 def _known_columns(loaded: Calibration, poses: Path, requested: Sequence[RequestedChannel]) -> dict[str, str]:

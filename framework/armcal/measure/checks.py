@@ -1,7 +1,8 @@
 """Checks of records that hold for every source: what is refused, what is set aside, what a user is warned of.
 
 Each check takes a dataset (SI) and the layout that says which channel is what. It gives the dataset back, with
-records set aside or a warning added, or raises `DataError`. ``check_dataset`` runs them all.
+records set aside or a warning added, or raises `DataError`. ``check_dataset`` runs them all,
+``check_records`` those without which nothing works.
 """
 
 import math
@@ -22,6 +23,7 @@ from armcal.measure.reader import CYCLE, RequestedChannel
 __all__ = [
     "Layout",
     "check_dataset",
+    "check_records",
     "layout_of",
     "refuse_approaches",
     "refuse_conflicting_ids",
@@ -56,7 +58,20 @@ _VARIES_AT_REST = ("time", "temperature")
 
 
 def check_dataset(dataset: Dataset, layout: Layout) -> Dataset:
-    """All checks, in the order in which one relies on another.
+    """All checks: those that refuse or set aside, then warnings.
+
+    Raises:
+        DataError: the dataset is refused, or no record is left.
+    """
+    dataset = warn_kelvin(warn_small_degrees(check_records(dataset, layout), layout), layout)
+    return warn_repeated_poses(dataset, layout)
+
+
+def check_records(dataset: Dataset, layout: Layout) -> Dataset:
+    """What all that comes after readers relies on, in the order in which one check relies on another.
+
+    Records that passed it pass it again as they are: readers make it with the names and units of their source, and
+    ``records_of`` once more, for those that do not.
 
     Raises:
         DataError: the dataset is refused, or no record is left.
@@ -65,11 +80,10 @@ def check_dataset(dataset: Dataset, layout: Layout) -> Dataset:
     refuse_approaches(dataset, layout)
     refuse_joint_units(dataset, layout)
     refuse_impossible_surroundings(dataset, layout)
-    dataset = warn_kelvin(warn_small_degrees(dataset, layout), layout)
     refuse_conflicting_ids(dataset, layout)
     dataset = set_aside_backward_time(dataset, layout)
     dataset = set_aside_duplicates(set_aside_frozen(set_aside_zeros(dataset, layout), layout), layout)
-    return warn_repeated_poses(require_records(dataset), layout)
+    return require_records(dataset)
 
 
 def refuse_joint_count(names: Sequence[str], requested_channels: Sequence[RequestedChannel], where: Location) -> None:

@@ -2,34 +2,71 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from armcal.base.dataset import Dataset
+from armcal.base.dataset import Dataset, SetAside
 from armcal.base.se3 import Expression, column
 from armcal.base.units import DIMENSIONS, ERROR_UNITS
 from armcal.errors import ProblemError
+from armcal.measure.checks import check_records
+from armcal.measure.layout import layout_of
 from armcal.measure.measurement import Channel, Measurement, noise_channels, residual_dimensions
 from armcal.measure.reader import Reader, ReadRequest
 from armcal.plugin_faults import refuse
 
 
 def records_of(reader: Reader, request: ReadRequest) -> Dataset:
-    """The records of a reader.
+    """The records of a reader, checked whether or not it checked them; all that ask one for records ask here.
 
     Raises:
         DataError: the source is refused.
-        PluginError: it returned no dataset, or a channel is no array of a number each record.
+        PluginError: it returned no dataset, or one without a required channel, or parts of it are of other types.
     """
     dataset = reader.read(request)
+    if fault := _dataset_fault(dataset):
+        refuse(reader.read, *fault)
+    for requested in request.channels:
+        if requested.required and not requested.effects and not dataset.has(requested.channel):
+            given = f"no channel {requested.channel!r} among {', '.join(dataset.channels) or 'none'}"
+            refuse(reader.read, given, "every channel of the request that is required")
+    layout = layout_of(request.channels, dataset, {}, {}, by_line=False)
+    return check_records(dataset, replace(layout, units=dict.fromkeys(layout.revolute, "deg")))
+
+
+def _dataset_fault(dataset: Any) -> tuple[Any, str] | None:
+    """What is wrong with the parts of a dataset, and what was expected; None if nothing is."""
     if not isinstance(dataset, Dataset):
-        refuse(reader.read, dataset, "a Dataset")
+        return dataset, "a Dataset"
+    if not _is_texts(dataset.ids):
+        return f"the ids {dataset.ids!r:.60}", "a tuple of texts, one a record"
+    count = len(dataset)
+    if not isinstance(dataset.channels, Mapping) or not all(isinstance(name, str) for name in dataset.channels):
+        return f"the channels {dataset.channels!r:.60}", "a mapping of names to numpy arrays"
     for name, values in dataset.channels.items():
-        if np.shape(values) != (len(dataset),) or getattr(values, "dtype", None) != np.float64:
+        if np.shape(values) != (count,) or getattr(values, "dtype", None) != np.float64:
             given = f"the channel {name!r} as {type(values).__name__} of the shape {np.shape(values)}"
-            refuse(reader.read, given, f"a numpy array of {len(dataset)} numbers (float64), one a record")
-    return dataset
+            return given, f"a numpy array of {count} numbers (float64), one a record"
+    rows = dataset.rows
+    if not isinstance(rows, tuple) or len(rows) not in (0, count) or not all(isinstance(row, int) for row in rows):
+        return f"the rows {rows!r:.60}", f"a tuple of {count} ints, or an empty one"
+    for part, columns in (("extra", dataset.extra), ("files", dataset.files)):
+        whole = isinstance(columns, Mapping) and all(_is_texts(own) and len(own) == count for own in columns.values())
+        if not whole:
+            return f"{part} as {columns!r:.60}", f"a mapping of names to tuples of {count} texts"
+    if not (isinstance(dataset.source, str) and isinstance(dataset.sha256, str)):
+        return f"the source {dataset.source!r:.60} and sha256 {dataset.sha256!r:.60}", "texts"
+    left = dataset.set_aside
+    if not (_is_texts(dataset.warnings) and isinstance(left, tuple) and all(isinstance(own, SetAside) for own in left)):
+        given = f"the warnings {dataset.warnings!r:.60} and set_aside {left!r:.60}"
+        return given, "a tuple of texts and one of SetAside"
+    return None
+
+
+def _is_texts(value: Any) -> bool:
+    return isinstance(value, tuple) and all(isinstance(text, str) for text in value)
 
 
 def check_channels(measurement: Measurement) -> None:

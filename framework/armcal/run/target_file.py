@@ -18,6 +18,7 @@ from armcal.calibration.tool_expression import APPROACH, ToolExpression
 from armcal.errors import DataError, Location
 from armcal.measure.environment import noticed
 from armcal.measure.reader import ReadRequest, RequestedChannel, surroundings
+from armcal.measure.returned import records_of
 from armcal.plugins import PluginRegistry
 
 QUATERNION = ("qw", "qx", "qy", "qz")
@@ -102,7 +103,7 @@ def _read(path: Path, expression: ToolExpression, registry: PluginRegistry) -> D
         channels.append(RequestedChannel(f"{expression.name}.{APPROACH}{joint}", names, DIMENSIONLESS, False))
     reader_class = registry.find("reader", "csv").load()
     reader = reader_class(reader_class.Settings(path=ConfigText(str(path))))
-    dataset = noticed(reader.read(ReadRequest({}, {}, tuple(channels), layout_hint=_AS_DOCUMENTED)))
+    dataset = noticed(records_of(reader, ReadRequest({}, {}, tuple(channels), layout_hint=_AS_DOCUMENTED)))
     units = {name: split_suffix(name) for name in dataset.extra if not any(name in w for w in dataset.warnings)}
     # Commands that stand in the file already give way to those that are found.
     idle = [name for name, split in units.items() if split is not None and split[0] not in expression.joints]

@@ -15,6 +15,7 @@ from armcal.io.plain_files import input_file
 from armcal.measure.environment import noticed
 from armcal.measure.groups import pose_numbers
 from armcal.measure.reader import CYCLE, Reader, ReadRequest, RequestedChannel, requested_channels
+from armcal.measure.returned import records_of
 from armcal.plugins import PluginRegistry
 
 from armcal_capability.acceptance.subject import ArmToJudge
@@ -96,7 +97,7 @@ def read_visits(subject: ArmToJudge, registry: PluginRegistry, path: Path) -> Vi
         section["columns"] = {**known, **section.get("columns", {})}
     reader: Reader
     reader, _ = build_component(replace(source, data={**source.data, "data": section}), registry, "reader", ("data",))
-    dataset = noticed(reader.read(ReadRequest(arms, subject.system.measurements, channels)))
+    dataset = noticed(records_of(reader, ReadRequest(arms, subject.system.measurements, channels)))
     _require_whole(dataset, COMMANDED)
     _require_whole(dataset, COMMANDED_TURN)
     return visits_of(dataset, [f"{n}.{joint}" for n, arm in arms.items() for joint in arm.commanded], path, section)
