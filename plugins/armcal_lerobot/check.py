@@ -14,7 +14,6 @@ from armcal.arm.horn import teeth_text
 from armcal.base.arrays import Array
 from armcal.calibration.joint_zeros import Zero
 from armcal.cli.common import Console
-from armcal.cli.console import columned
 from armcal.errors import InputError, Location
 
 from armcal_lerobot.calibration_file import MotorFile, read_motors
@@ -80,15 +79,15 @@ def show_check(console: Console, content: Mapping[str, Any]) -> None:
     columns += ["mm per deg"] if has_mm else []
     columns += ["moved, deg"] if has_two else []
     columns += ["moved, mm"] if has_mm and has_two else []
-    table = columned("What zeros cost at the gripper" if has_mm else "Motors", columns)
+    rows = []
     for name, motor in motors.items():
         row = [name, f"{motor['range_deg']:.1f}"]
         row += [] if has_two else [str(motor["id"]), str(motor["homing_offset"])]
         row += [_pair(motor.get("mm_per_deg"))] if has_mm else []
         row += [f"{motor['zero_moved_deg']:+.2f}"] if has_two else []
         row += [_pair(motor.get("moved_mm"))] if has_mm and has_two else []
-        table.add_row(*row)
-    console.out.print(table)
+        rows.append(row)
+    console.table("What zeros cost at the gripper" if has_mm else "Motors", columns, rows)
     if has_mm:
         console.line(f"mm at the gripper: in a typical pose, and at most; poses {content['poses']}")
     for name, motor in motors.items():
@@ -206,16 +205,13 @@ def show_zeros(
     console: Console, file: MotorFile, changed: Mapping[str, Motor], wired: Mapping[str, tuple[Zero, int]]
 ) -> None:
     """A row a motor: its zero, and the numbers of the file before and after."""
-    table = columned(
-        "What changes in the file", ("motor", "zero, deg", "sd", "homing_offset", "range_min", "range_max")
-    )
+    fields = ("homing_offset", "range_min", "range_max")
+    rows = []
     for name, motor in changed.items():
         old, zero = file.motors[name], wired[name][0]
-        cells = [
-            f"{getattr(old, field)} -> {getattr(motor, field)}" for field in ("homing_offset", "range_min", "range_max")
-        ]
-        table.add_row(name, f"{zero.degrees:+.2f}", f"{zero.sd_deg:.2f}", *cells)
-    console.out.print(table)
+        cells = (f"{getattr(old, field)} -> {getattr(motor, field)}" for field in fields)
+        rows.append((name, f"{zero.degrees:+.2f}", f"{zero.sd_deg:.2f}", *cells))
+    console.table("What changes in the file", ("motor", "zero, deg", "sd", *fields), rows)
 
 
 def _unswept(file: MotorFile, gripper: Gripper | None) -> list[str]:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from armcal.cli.common import Console
-from armcal.cli.console import columned
 from armcal.report.page import rendered
 from armcal.version import __version__
 
@@ -61,10 +60,7 @@ def compare_content(motions: Sequence[Motion], gripper: Gripper | None) -> dict[
 def show_compare(console: Console, content: Mapping[str, Any]) -> None:
     """The tables, what was found, and what the data cannot say."""
     for caption, headings, rows in _tables(content):
-        table = columned(caption, headings)
-        for row in rows:
-            table.add_row(*row)
-        console.out.print(table)
+        console.table(caption, headings, rows)
     for text in _sentences(content):
         console.line(text)
 

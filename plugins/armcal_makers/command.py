@@ -13,7 +13,6 @@ from armcal.calibration.convert_poe_urdf import urdf_text
 from armcal.calibration.exporter import POSES
 from armcal.calibration.rigid_chain import turn_between
 from armcal.cli.common import FILE, Console, spare_inputs, speaking
-from armcal.cli.console import columned
 from armcal.errors import ConfigError, InputError
 from armcal.io.file_set import write_new, write_over
 from armcal.io.plain_files import check_output
@@ -136,10 +135,8 @@ def _show(console: Console, comparison: Comparison, out: Path | None) -> None:
         f"tool against {comparison.nominal} in {len(apart)} random poses: median {numbers['median_mm']:.3f} mm, "
         f"at most {numbers['largest_mm']:.3f} mm and {numbers['largest_deg']:.3f} deg"
     )
-    table = columned("Each joint, on the one before it", ["joint", "shift, mm", "turn, deg"])
-    for name, part in joints.items():
-        table.add_row(name, f"{part['shift_mm']:.3f}", f"{part['turn_deg']:.4f}")
-    console.out.print(table)
+    rows = ((name, f"{part['shift_mm']:.3f}", f"{part['turn_deg']:.4f}") for name, part in joints.items())
+    console.table("Each joint, on the one before it", ("joint", "shift, mm", "turn, deg"), rows)
     for warning in comparison.warnings:
         console.warn(warning)
     if out is not None:

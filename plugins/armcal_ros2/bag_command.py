@@ -6,7 +6,6 @@ from typing import Any
 import click
 import yaml
 from armcal.cli.common import FILE, Console, speaking
-from armcal.cli.console import columned
 
 from armcal_ros2.bag import Bag
 
@@ -26,11 +25,12 @@ def info(console: Console, path: Path) -> None:
     content = survey(Bag(path))
     data = content.data(path)
     console.result({**content.content(), "data": data})
-    table = columned("Topics", ("topic", "type", "messages", "from s", "to s"), left=("type",))
     begin = min((topic.first for topic in content.topics.values()), default=0.0)
-    for name, topic in content.topics.items():
-        table.add_row(name, topic.type, str(topic.count), f"{topic.first - begin:.1f}", f"{topic.last - begin:.1f}")
-    console.out.print(table)
+    rows = (
+        (name, topic.type, topic.count, f"{topic.first - begin:.1f}", f"{topic.last - begin:.1f}")
+        for name, topic in content.topics.items()
+    )
+    console.table("Topics", ("topic", "type", "messages", "from s", "to s"), rows, left=("type",))
     for name, log in content.joints.items():
         lengths = [rest.end - rest.begin for rest in log.rests]
         spans = f" of {min(lengths):.1f} to {max(lengths):.1f} s" if lengths else ""

@@ -8,7 +8,6 @@ from typing import Any
 
 import click
 from armcal.cli.common import Console
-from armcal.cli.console import columned
 from armcal.errors import EXIT_BAD_INPUT, InputError
 
 from armcal_servobus.checks import examined
@@ -45,12 +44,13 @@ def check_command(console: Console, config: Path, overrides: tuple[str, ...]) ->
     mistakes = [{"joint": m.joint, "what": m.what, "mend": m.mend} for m in examination.mistakes]
     across = [name for name, joint in joints.items() if joint.crosses_seam]
     console.result({"joints": rows, "mistakes": mistakes, "ranges_over_the_seam": across})
-    table = columned(str(config), ("joint", "id", "deg", "count", "offset", "V", "deg C", "state"), ("state",))
-    for row in rows:
-        cells = (row["joint"], row["id"], row["angle_deg"], row["count"], row["offset"], row["voltage_V"])
-        state = ", ".join(row["alarms"]) or ("holds" if row["torque"] else "well")
-        table.add_row(*map(str, (*cells, row["temperature_C"])), state)
-    console.out.print(table)
+    measured = ("joint", "id", "angle_deg", "count", "offset", "voltage_V", "temperature_C")
+    shown = (
+        (*(row[key] for key in measured), ", ".join(row["alarms"]) or ("holds" if row["torque"] else "well"))
+        for row in rows
+    )
+    headings = ("joint", "id", "deg", "count", "offset", "V", "deg C", "state")
+    console.table(str(config), headings, shown, left=("state",))
     for name in across:
         console.warn(
             f"the range of {name} crosses the end of its encoder's turn: it can be read there, and not driven."

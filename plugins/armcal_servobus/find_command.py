@@ -5,7 +5,6 @@ from typing import get_args
 
 import click
 from armcal.cli.common import Console, speaking
-from armcal.cli.console import columned
 from armcal.errors import InputError, Location
 
 from armcal_servobus.bus import Bus, BusSettings
@@ -31,13 +30,12 @@ def find_command(
     spoken, servos = _searched(console, place, (protocol,) if protocol else get_args(ProtocolName), baud, last_id)
     console.result({"port": place, "protocol": spoken, "servos": [servo.content for servo in servos]})
     headings = ("baud", "id", "model", "firmware", "count", "V", "deg C", "state")
-    table = columned(f"{place}, {spoken}", headings, ("state",))
+    rows = []
     for servo in servos:
         state = "two servos with this id?" if servo.is_doubled else ", ".join(servo.alarms) or "well"
         cells = (servo.baud, servo.id, servo.model_name, servo.firmware, servo.position)
-        measured = ("" if cell is None else str(cell) for cell in (*cells, servo.voltage, servo.temperature))
-        table.add_row(*measured, state)
-    console.out.print(table)
+        rows.append(["" if cell is None else cell for cell in (*cells, servo.voltage, servo.temperature, state)])
+    console.table(f"{place}, {spoken}", headings, rows, left=("state",))
     for number in sorted({servo.id for servo in servos if servo.is_doubled}):
         console.warn(f"two servos may have the id {number}: unplug all but one, and give it another id.")
 

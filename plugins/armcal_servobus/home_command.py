@@ -7,7 +7,6 @@ from pathlib import Path
 
 import click
 from armcal.cli.common import FILE, Console
-from armcal.cli.console import columned
 from armcal.errors import InputError
 
 from armcal_servobus.configured import on_config, opened
@@ -85,11 +84,8 @@ def _zeros(console: Console, calibration: Path, arm: str | None, joints: dict[st
 
 
 def _show_plans(console: Console, config: Path, plans: list[Homing]) -> None:
-    table = columned(str(config), ("joint", "id", "count", "offset", "new offset", "change deg"))
-    for plan in plans:
-        cells = (plan.joint.id, plan.position, plan.before, plan.after, f"{math.degrees(plan.change):+.2f}")
-        table.add_row(plan.joint.name, *map(str, cells))
-    console.out.print(table)
+    rows = ((p.joint.name, p.joint.id, p.position, p.before, p.after, f"{math.degrees(p.change):+.2f}") for p in plans)
+    console.table(str(config), ("joint", "id", "count", "offset", "new offset", "change deg"), rows)
     for plan in plans:
         if plan.finding:
             console.warn(f"{plan.joint.name}: the change is {plan.finding}")

@@ -1,17 +1,16 @@
 """``armcal check``."""
 
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
-from rich.table import Table
 
 from armcal.base.units import digits, to_unit
 from armcal.cli.common import FILE, Console, data, overrides, speaking
-from armcal.cli.console import columned
 from armcal.cli.outlet import say
 from armcal.errors import ProblemError
 from armcal.estimate.identifiability import Identifiability
@@ -55,7 +54,8 @@ def check(console: Console, config: Path, data: Path | None, overrides: tuple[st
         f"{len(records['set_aside'])} set aside), {content['equations']} equations for "
         f"{len(parameters['free'])} free of {len(parameters['all'])} parameters."
     )
-    out.print(_excitation(experiment, content["excitation_rad_or_m"]))
+    rows = _excitation(experiment, content["excitation_rad_or_m"])
+    console.table("Excitation of the joints", ("joint", "from", "to", "unit", "levels"), rows)
     for line in _alignment_lines(ready.start):
         out.print(line, soft_wrap=True)
     condition = parameters["scaled_condition"]
@@ -72,15 +72,13 @@ def check(console: Console, config: Path, data: Path | None, overrides: tuple[st
     console.out.print("Ready to run.", style="green")
 
 
-def _excitation(experiment: Experiment, excitation: dict[str, Any]) -> Table:
+def _excitation(experiment: Experiment, excitation: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
     """How far each joint moved, in degrees or mm."""
-    table = columned("Excitation of the joints", ("joint", "from", "to", "unit", "levels"))
     arms = experiment.system.arms
     units = {f"{a}.{j}": "deg" if kind == "angle" else "mm" for a in arms for j, kind in arms[a].commanded.items()}
     for joint, seen in excitation.items():
         low, high = (f"{to_unit(seen[end], units[joint]):.5g}" for end in ("min", "max"))
-        table.add_row(joint, low, high, units[joint], str(seen["levels"]))
-    return table
+        yield joint, low, high, units[joint], seen["levels"]
 
 
 def _content(experiment: Experiment, ready: Prepared, known: Identifiability) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 import shlex
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ import click
 
 from armcal.base.config_text import as_json
 from armcal.calibration.measured_point import MeasuredPoint, Point
-from armcal.cli.console import Screen
+from armcal.cli.console import Screen, columned
 from armcal.errors import CalibrationWarning, DataError, Location
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.io.parallel import parse_executor
@@ -60,6 +60,15 @@ class Console:
     def line(self, text: str, style: str = "") -> None:
         """One line of the result, which the terminal may wrap."""
         self.out.print(text, style=style, soft_wrap=True)
+
+    def table(
+        self, title: str, columns: Iterable[str], rows: Iterable[Iterable[object]], left: Sequence[str] = ()
+    ) -> None:
+        """A table of the result; numbers stand to the right but in the first column and those of ``left``."""
+        table = columned(title, columns, left)
+        for row in rows:
+            table.add_row(*map(str, row))
+        self.out.print(table)
 
     def registry(self) -> PluginRegistry:
         """The plugins; one warning for each broken one."""

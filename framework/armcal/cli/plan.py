@@ -11,7 +11,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from armcal.cli.common import FILE, Console, overrides, speaking
-from armcal.cli.console import columned
 from armcal.errors import ConfigError, InputError, Location
 from armcal.estimate.combination import Measure
 from armcal.measure.csv_writer import write_csv
@@ -152,7 +151,7 @@ def _content(experiment: Experiment, result: PlanResult) -> dict[str, Any]:
 
 
 def _show(console: Console, content: dict[str, Any]) -> None:
-    out, pool = console.out, content["candidates"]
+    pool = content["candidates"]
     left = f" ({counts_text(pool['left_out'])} left out)" if pool["left_out"] else ""
     given = f" after {content['given_records']} given records" if content["given_records"] else ""
     moved = f"; {pool['refined']} of the plan moved on from there" if pool["refined"] else ""
@@ -168,14 +167,14 @@ def _show(console: Console, content: dict[str, Any]) -> None:
     indices = "  ".join(f"{name.upper()} {value:.4g}" for name, value in content["observability"].items())
     console.line(f"observability: {indices}")
     parameters = content["parameters"]
-    columns = ("parameter", "before", "after", "unit")
-    table = columned("Predicted standard deviations, the largest first", columns, left=("unit",))
+    rows: list[tuple[str, ...]] = []
     worst = np.argsort([-p["sd_in_ordinary_sizes"] for p in parameters], kind="stable")[:_SHOWN]
     for p in (parameters[i] for i in worst):
         shown, measure = ("sd_before", "sd_after"), Measure(p["unit"], 1.0)
         texts = ["-" if p[key] is None else f"{measure.shown(p[key])[0]:.3g}" for key in shown]
-        table.add_row(p["name"], *texts, measure.shown(0.0)[1] or p["unit"])
-    out.print(table)
+        rows.append((p["name"], *texts, measure.shown(0.0)[1] or p["unit"]))
+    columns = ("parameter", "before", "after", "unit")
+    console.table("Predicted standard deviations, the largest first", columns, rows, left=("unit",))
     console.line(f"least determined: {content['weakest']}.")
     visit = content["visit"]
     hot = visit["peak_squared_torque"]
@@ -213,10 +212,8 @@ def show_iso_plan(
         f"{experiment.name}: cube of {cube['size_mm']:g} mm about ({x:.1f}, {y:.1f}, {z:.1f}) mm, "
         + (f"tool at roll, pitch, yaw {_three(turned)} deg." if turned else "the tool turns from pose to pose.")
     )
-    table = columned("Poses of the tool, mm, base frame", ("pose", "x", "y", "z"))
-    for name, place in content["poses"].items():
-        table.add_row(name, *(f"{coordinate:.1f}" for coordinate in place))
-    console.out.print(table)
+    rows = ((name, *(f"{coordinate:.1f}" for coordinate in place)) for name, place in content["poses"].items())
+    console.table("Poses of the tool, mm, base frame", ("pose", "x", "y", "z"), rows)
     console.line(
         f"{content['visits']} visits in {content['cycles']} cycles: {out}  ({time.perf_counter() - began:.1f} s)"
     )

@@ -5,7 +5,6 @@ from pathlib import Path
 import click
 
 from armcal.cli.common import FILE, Console, command_line, data, overrides, parallel, speaking
-from armcal.cli.console import columned
 from armcal.io.folder import reserved
 from armcal.io.parallel import Executor
 from armcal.report.study_page import conclusions, render_study, transfer_conclusions, transfer_table
@@ -51,10 +50,7 @@ def study(
     else:
         shown = transfer_table(result)
         words = [name for name, is_number in shown.headings if not is_number]
-        table = columned(f"{result.name}: {shown.caption}", [name for name, _ in shown.headings], left=words)
-        for row in shown.rows:
-            table.add_row(*row)
-        console.out.print(table)
+        console.table(f"{result.name}: {shown.caption}", [name for name, _ in shown.headings], shown.rows, left=words)
         for sentence in transfer_conclusions(result):
             console.line(sentence)
     console.line(f"page: {folder / 'study.html'}  ({watch.total():.1f} s)")
@@ -66,7 +62,7 @@ def _show_study(console: Console, result: StudyResult) -> None:
     title = f"{result.name}: mean error, {result.unit}; cross-validated (cv): {records}"
     turned = any(v.turns for v in result.variants)
     columns = ("variant", "free", "train", "cv", "cv 95 %", "change", "± se", "helps", *(["cv, deg"] if turned else []))
-    table = columned(title, columns)
+    rows: list[tuple[object, ...]] = []
     for v in result.variants:
         moved = ["", "", ""]
         if v.change:
@@ -75,8 +71,8 @@ def _show_study(console: Console, result: StudyResult) -> None:
         if v.failed_folds:  # over fewer records than the others
             figures[1:] = [f"({x})" for x in figures[1:]]
         turns = [f"{v.turns.crossed.mean:.3f}" if v.turns.crossed.mean is not None else "-"] if v.turns else []
-        table.add_row(v.name, str(v.free), *figures, *moved, *turns)
+        rows.append((v.name, v.free, *figures, *moved, *turns))
         console.detail(f"{v.name}: {v.fit_seconds:.2f} s for the fit on all records, {v.seconds:.2f} s for all fits")
-    console.out.print(table)
+    console.table(title, columns, rows)
     for text in conclusions(result):
         console.line(text)

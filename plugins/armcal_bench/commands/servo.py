@@ -16,7 +16,6 @@ from armcal.devices.device import DeviceError
 from armcal.devices.wiring import WiringRecord, servo_file_of
 from armcal.errors import EXIT_FAULT, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
 from armcal.io.signals import Signals
-from rich.table import Table
 
 from armcal_bench.acquisition.preparation import Prepared
 from armcal_bench.acquisition.tracker_monitor import StopRequested
@@ -158,24 +157,17 @@ def _stoppable(console: Console) -> Iterator[None]:
 
 
 def _show(console: Console, outcome: Outcome, content: Mapping[str, Any]) -> None:
-    table = Table(title="Pulses at angles, and what changed", title_justify="left")
-    for column in ("servo", "deg", "us", "sd", "before", "change, us", "change, deg", "backlash, deg"):
-        table.add_column(column, justify="left" if column == "servo" else "right")
+    rows: list[tuple[str, ...]] = []
     for joint, servo in content["servos"].items():
         half_width = servo["backlash_deg"]
         backlash = "-" if half_width is None else f"{half_width:.2f} +- {servo['backlash_sd_deg'] or 0:.2f}"
         for i, knot in enumerate(servo["knots"]):
-            table.add_row(
-                joint if i == 0 else "",
-                f"{knot['angle_deg']:g}",
-                f"{knot['pulse_us']:.1f}",
-                "-" if knot["sd_us"] is None else f"{knot['sd_us']:.1f}",
-                f"{knot['before_us']:.1f}",
-                f"{knot['change_us']:+.1f}",
-                f"{knot['change_deg']:+.2f}",
-                backlash if i == 0 else "",
-            )
-    console.out.print(table)
+            sd = "-" if knot["sd_us"] is None else f"{knot['sd_us']:.1f}"
+            pulses = f"{knot['angle_deg']:g}", f"{knot['pulse_us']:.1f}", sd, f"{knot['before_us']:.1f}"
+            changes = f"{knot['change_us']:+.1f}", f"{knot['change_deg']:+.2f}"
+            rows.append(("" if i else joint, *pulses, *changes, "" if i else backlash))
+    columns = ("servo", "deg", "us", "sd", "before", "change, us", "change, deg", "backlash, deg")
+    console.table("Pulses at angles, and what changed", columns, rows)
     for name, board in content["boards"].items():
         if board["oscillator_sd_hz"] is not None:
             text = f"{name}: oscillator {board['oscillator_hz'] / 1e6:.4f} +- {board['oscillator_sd_hz'] / 1e6:.4f} MHz"

@@ -11,12 +11,10 @@ from typing import Any
 import click
 from armcal.calibration.calibration import Calibration
 from armcal.cli.common import Console, overrides, speaking
-from armcal.cli.console import columned
 from armcal.io.folder import reserved
 from armcal.io.lines import StandardOutput
 from armcal.plugins import PluginRegistry
 from armcal.run.prepare import Stopwatch
-from rich.table import Table
 
 from armcal_online.commands.recalibrate import setup_of
 from armcal_online.mission.files import SURPRISE, figures, write_files
@@ -67,7 +65,7 @@ def mission(console: Console, config: Path, out: Path, seed: int | None, overrid
     content = {**figures(plan.experiment.name, result.mission, result.log, result.judgement), "seconds": watch.seconds}
     write_files(out, plan, result, content)
     console.result({**content, "folder": str(out)})
-    console.out.print(_error_table(content, plan.settings.refit.records))
+    _show_errors(console, content, plan.settings.refit.records)
     for line in _lines(content):
         console.line(line)
     for stage, seconds in watch.seconds.items():
@@ -75,7 +73,7 @@ def mission(console: Console, config: Path, out: Path, seed: int | None, overrid
     console.line(f"figure: {out / 'mission.png'}  ({watch.total():.1f} s)")
 
 
-def _error_table(content: Mapping[str, Any], records: int) -> Table:
+def _show_errors(console: Console, content: Mapping[str, Any], records: int) -> None:
     names = {
         "frozen": "frozen at launch",
         "refit": "robust refit of all",
@@ -85,11 +83,11 @@ def _error_table(content: Mapping[str, Any], records: int) -> Table:
     columns = {"mean": "mean", "median": "median", "p95": "95 %", "max": "max", "last": "last"}
     within = f"within {content['limit_mm']:g} mm"
     title = f"Mean tip error over {content['days']:g} days, mm"
-    table = columned(title, ("calibration", *columns.values(), within))
+    rows = []
     for name, summary in content["error_mm"].items():
         share = f"{content['within_limit'][name]:.1%}"
-        table.add_row(names[name], *(f"{summary[column]:.3f}" for column in columns), share)
-    return table
+        rows.append((names[name], *(f"{summary[column]:.3f}" for column in columns), share))
+    console.table(title, ("calibration", *columns.values(), within), rows)
 
 
 def _lines(content: Mapping[str, Any]) -> Iterator[str]:
