@@ -34,6 +34,22 @@ q5,-90,0,0,116,-120,120
 q6,0,0,0,92,-170,170
 """
 """Six joints as of a large industrial arm, 1.4 m of reach."""
+THREE_JOINTS = """
+name: three joints
+arms:
+  arm:
+    model: {type: mdh, convention: standard, rows: [{d_mm: 200, alpha_deg: 90}, {a_mm: 400}, {a_mm: 300}]}
+measurements: {tracker: {type: tip_position, noise_mm: 0.1}}
+parameters: {free: ["arm.mdh.theta*", "arm.mdh.a[0-9]", "arm.mdh.alpha1"], priors: {"*theta*": 2 deg, "*alpha1": 2 deg}}
+data: {type: csv, path: data.csv}
+simulation:
+  type: elastic_arm
+  truth: truth.yaml
+  seed: 1
+  poses: {kind: random, count: 100, levels_deg: {q1: [-170, 170], q2: [-90, 20], q3: [-120, 120]}}
+validation: {holdout: 0.25, seed: 1}
+evaluator: interpreted
+"""
 
 
 @dataclass(frozen=True)
@@ -146,6 +162,13 @@ def industrial_arm(folder: Path) -> PlantedArm:
     (folder / "industrial.csv").write_text(INDUSTRIAL)
     config = _new(folder, "industrial", "--convention", "standard", "--dh", str(folder / "industrial.csv"))
     return PlantedArm("industrial", config, "arm.mdh.base_*", 1.4)
+
+
+def three_joint_arm(folder: Path) -> PlantedArm:
+    """Rigid, on its base, its calibration and its recordings in a fraction of a second."""
+    (folder / "truth.yaml").write_text("arm.mdh.theta2: 0.4 deg\narm.mdh.a3: 301 mm\n")
+    (folder / "three.yaml").write_text(THREE_JOINTS)
+    return PlantedArm("three", folder / "three.yaml", "arm.mdh.base_*", 0.7)
 
 
 def _new(folder: Path, name: str, *flags: str) -> Path:

@@ -13,8 +13,10 @@ import pytest
 from armcal.cli.main import cli
 from armcal.diagnose.gross_findings import overfitted
 from armcal.planning.suggestion import Suggestion, is_worth_measuring
+from armcal.run.experiment import Experiment
+from armcal.run.pipeline import calibrate
 from click.testing import CliRunner
-from planted_mistakes import outcome
+from planted_mistakes import outcome, three_joint_arm, tips, with_tips
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 QUICK = ("validation.folds=0", "evaluator=interpreted")
@@ -121,6 +123,20 @@ def test_poses_are_suggested_only_where_they_are_worth_it(tmp_path: Path) -> Non
     assert "Measure these poses next" in verdict["paragraph"]
     assert "Measure these poses next" not in many["paragraph"]
     assert not any(f["action"].startswith("Measure next") for f in many["findings"])
+
+
+@pytest.mark.parametrize("drift_um", [0.0, 20.0])
+def test_an_instrument_of_micrometres_has_no_errors_of_nothing(tmp_path: Path, drift_um: float) -> None:
+    """Neither without noise nor where what is left of it is small and named."""
+    noise = ("simulation.noise_mm=0.002", "measurements.tracker.noise_mm=0.002") if drift_um else ()
+    arm = replace(three_joint_arm(tmp_path), overrides=noise or ("simulation.noise_mm=0",))
+    data = arm.recording(1)
+    drifting = 1e-6 * drift_um * np.linspace(0, 1, len(data)) * np.array([[1.0], [0.0], [0.0]])
+    path = arm.write(with_tips(data, tips(data) + drifting), tmp_path / "data.csv")
+    verdict = calibrate(Experiment.load(arm.config, arm.overrides, path)).verdict
+    texts = " ".join([verdict.headline, verdict.paragraph, *(finding.whole for finding in verdict.findings)])
+    assert ("would fall by 0.00" in texts) == bool(drift_um)
+    assert not re.findall(r"\b0\.0+ (mm|%|times)|0\.0+ to 0\.0+ times", texts)
 
 
 @pytest.mark.slow

@@ -10,32 +10,12 @@ from armcal.base.dataset import Dataset
 from armcal.estimate.simulation import SimulationRequest
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
-from planted_mistakes import PlantedArm, outcome, tips, with_columns, with_tips
-
-CONFIG = """
-name: three joints
-arms:
-  arm:
-    model: {type: mdh, convention: standard, rows: [{d_mm: 200, alpha_deg: 90}, {a_mm: 400}, {a_mm: 300}]}
-measurements: {tracker: {type: tip_position, noise_mm: 0.1}}
-parameters: {free: ["arm.mdh.theta*", "arm.mdh.a[0-9]", "arm.mdh.alpha1"], priors: {"*theta*": 2 deg, "*alpha1": 2 deg}}
-data: {type: csv, path: data.csv}
-simulation:
-  type: elastic_arm
-  truth: truth.yaml
-  seed: 1
-  poses: {kind: random, count: 100, levels_deg: {q1: [-170, 170], q2: [-90, 20], q3: [-120, 120]}}
-validation: {holdout: 0.25, seed: 1}
-evaluator: interpreted
-"""
+from planted_mistakes import PlantedArm, outcome, three_joint_arm, tips, with_columns, with_tips
 
 
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory: pytest.TempPathFactory) -> PlantedArm:
-    folder = tmp_path_factory.mktemp("arm")
-    (folder / "truth.yaml").write_text("arm.mdh.theta2: 0.4 deg\narm.mdh.a3: 301 mm\n")
-    (folder / "arm.yaml").write_text(CONFIG)
-    return PlantedArm("three", folder / "arm.yaml", "arm.mdh.base_*", 0.7)
+    return three_joint_arm(tmp_path_factory.mktemp("arm"))
 
 
 def rounded(arm: PlantedArm, step: float) -> Dataset:

@@ -15,6 +15,7 @@ from armcal.base.units import (
     display_unit,
     from_unit,
     parse_quantity,
+    readable,
     si_unit,
     split_suffix,
     to_unit,
@@ -59,6 +60,11 @@ def test_millimetres_and_metres_make_the_same_float_where_a_multiplication_would
 def test_significant_digits_are_written_without_an_exponent(value: float, count: int, text: str) -> None:
     assert digits(value, count) == text
     assert digits(math.inf) == "inf" and digits(-12.34) == "-12.3" and digits(0.0) == "0"
+
+
+def test_no_error_is_shown_as_nothing() -> None:
+    shown = [readable(size) for size in (12.345, 0.1, 0.0949, 0.0042, 3e-5, 0.0)]
+    assert shown == ["12.35", "0.10", "0.095", "0.0042", "0.0001", "0.0001"]
 
 
 def test_arrays_are_converted_like_numbers() -> None:

@@ -115,6 +115,8 @@ _WRITTEN: Mapping[str, str] = MappingProxyType(
 )
 """Units whose names, made for keys of a file, are not how people write them: their first spelling."""
 _NEAR_UNIT = 0.1
+SMALLEST_SHOWN = 0.0001
+"""Of sizes in mm, px and other thousandths: no instrument reads less."""
 _LONGEST_FIRST = tuple(sorted((n for n in UNITS if n != "1"), key=len, reverse=True))
 _QUANTITY = re.compile(r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*(\S.*?)?\s*", re.DOTALL)
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?[0-9]+,[0-9]+")
@@ -245,6 +247,11 @@ def to_unit(si_value: Any, unit_name: str) -> Any:
     """The value in the named unit of an SI number or array; ValueError for an unknown unit."""
     known = unit(unit_name)
     return si_value * known.denominator / known.numerator
+
+
+def readable(value: float) -> str:
+    """A size with two decimals, or with two significant digits where two decimals would be too few of them."""
+    return f"{value:.2f}" if value >= 0.095 else digits(max(value, SMALLEST_SHOWN), 2)
 
 
 def digits(value: float, count: int = 3) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
 from armcal.base.quaternions import quaternion_of
-from armcal.base.units import DIMENSIONLESS, split_suffix, to_unit
+from armcal.base.units import DIMENSIONLESS, readable, split_suffix, to_unit
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.intervals import PlusMinus
 from armcal.calibration.recorded_range import beyond_records
@@ -111,7 +111,8 @@ def _show(
     text = ", ".join(named[:_MOST_NAMED]) + (f" and {len(named) - _MOST_NAMED} more" if named[_MOST_NAMED:] else "")
     if typical:  # of a position; else of every column
         text = (
-            f"{typical['half_width_90_mm']:.2f} mm a coordinate (90 %), {typical['radius_95_mm']:.2f} mm in all (95 %)"
+            f"{readable(typical['half_width_90_mm'])} mm a coordinate (90 %), "
+            f"{readable(typical['radius_95_mm'])} mm in all (95 %)"
         )
         text += f", {typical['turn_90_deg']:.2g} deg (90 %)" if "turn_90_deg" in typical else ""
     elif text:

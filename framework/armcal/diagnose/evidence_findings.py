@@ -8,6 +8,7 @@ from scipy.special import stdtrit
 from armcal.base.arrays import Array
 from armcal.base.domains import Semidefinite, symmetric
 from armcal.base.parameters import ParameterBlock
+from armcal.base.units import digits, readable
 from armcal.diagnose.evidence import PriorsAlone
 from armcal.diagnose.large_errors import MEDIANS, LargeErrors
 from armcal.diagnose.noise_findings import Finding, Grade, first_few
@@ -24,6 +25,8 @@ _LIKELY = 0.05
 """A cause with less of the odds is not named first."""
 NEGLIGIBLE_SHARE = 0.1
 """Of the typical error: what moves the tip by less than this does not matter to it."""
+_NO_NOISE = 0.01
+"""Of the declared noise: residuals below it are a simulation's without noise, and how they vary means nothing."""
 NOTICEABLE_SD = 0.3
 """A shift by less than so many standard deviations is not reported."""
 _MM = "mm"
@@ -96,7 +99,7 @@ def worse_than_nominal(judged_mm: Array, nominal_mm: Array, unit: str = _MM) -> 
     after, before = float(np.mean(judged_mm[seen])), float(np.mean(nominal_mm[seen]))
     if after <= before:
         return []
-    which = f"on records that did not train it: {after:.2f} {unit} on average, {before:.2f} before."
+    which = f"on records that did not train it: {readable(after)} {unit} on average, {readable(before)} before."
     more = judged_mm[seen] - nominal_mm[seen]
     test = "paired differences, one-sided, 5 %"
     if len(more) > 1 and after - before <= stdtrit(len(more) - 1, 0.95) * np.std(more, ddof=1) / np.sqrt(len(more)):
@@ -181,7 +184,8 @@ def percent(share: float) -> str:
 
 def _structure_finding(s: Structure, structure: ResidualStructure, unit: str, test: str) -> Finding:
     """One cause if it is clearly the likeliest, else all that it does not beat."""
-    falls = f"the mean training residual of {structure.mean_mm:.2f} {unit} would fall by {s.falls_mm:.2f} {unit}"
+    falls = f"would fall by {readable(s.falls_mm)} {unit}"
+    falls = f"the mean training residual of {readable(structure.mean_mm)} {unit} {falls}"
     what = s.words + (f" ({s.size})" if s.size else "")
     test = f"p {_p(s.p_value)}, {test}; odds among all of them and what is none of them"
     if not s.alternatives:
@@ -204,11 +208,11 @@ def _share(odds: float) -> str:
 def _scatter(structure: ResidualStructure) -> list[Finding]:
     """What the size of residuals depends on."""
     noise = structure.noise
-    if noise is None:
+    if noise is None or noise.high < _NO_NOISE:
         return []
     text = f"The spread of the residuals depends on {'; or on '.join([noise.words, *noise.alternatives[:MOST_TOLD]])}:"
-    text += f" from {noise.low:.1f} to {noise.high:.1f} times the declared noise, in the thirds of the records with the"
-    text += " least and the most of it. Either the noise varies, or the model errs more there."
+    text += f" from {digits(noise.low, 2)} to {digits(noise.high, 2)} times the declared noise, in the thirds of the"
+    text += " records with the least and the most of it. Either the noise varies, or the model errs more there."
     test = f"regression of squared residuals, p {_p(noise.p_value)} over everything looked at"
     action = (
         "Repeat a pose at both ends of it: if repeats spread equally, the model is the cause; else state noise by "
@@ -234,8 +238,8 @@ def neighbour_findings(structure: ResidualStructure | None, estimate: Estimate, 
         return [Finding("warning", text, test, _TELL_APART["open"])]
     text += (
         f" {_WHY[alike.cause]}predicted from the other records, a smooth function of time has an error of "
-        f"{alike.time_mm:.2f} {unit} and one of the pose {alike.pose_mm:.2f} {unit} (log odds against noise "
-        f"{alike.time:.0f} and {alike.pose:.0f})"
+        f"{readable(alike.time_mm)} {unit} and one of the pose {readable(alike.pose_mm)} {unit} (log odds against "
+        f"noise {alike.time:.0f} and {alike.pose:.0f})"
     )
     if max(alike.time_imitated, alike.pose_imitated) > IMITATED:
         shares = f"the pose predicts {_share(alike.time_imitated)} of the first, time {_share(alike.pose_imitated)} of "
@@ -274,14 +278,14 @@ def large_error_findings(large_errors: LargeErrors | None, unit: str = _MM) -> l
     limit = "validation.limit_mm" if large_errors.configured else f"{MEDIANS:g} times the median"
     test = f"errors of {large_errors.judged} records by fits that did not see them, limit {limit}"
     if not large_errors.beyond:
-        return [Finding("good", f"No judged record has an error above {large_errors.limit_mm:.2f} {unit}.", test)]
+        return [Finding("good", f"No judged record has an error above {readable(large_errors.limit_mm)} {unit}.", test)]
     listed = "; ".join(
-        f"{miss.record_id} ({miss.error_mm:.2f} {unit}: {', '.join(miss.reasons)})"
+        f"{miss.record_id} ({readable(miss.error_mm)} {unit}: {', '.join(miss.reasons)})"
         for miss in large_errors.explained[:MOST_TOLD]
     )
     more = f"; and {large_errors.beyond - MOST_TOLD} more, in the report" if large_errors.beyond > MOST_TOLD else ""
     records = _plural(large_errors.beyond, "record has", "records have")
-    text = f"{records} an error above {large_errors.limit_mm:.2f} {unit}: "
+    text = f"{records} an error above {readable(large_errors.limit_mm)} {unit}: "
     advice = "; or ".join(dict.fromkeys(miss.advice for miss in large_errors.explained[:MOST_TOLD]))
     return [Finding("warning", f"{text}{listed}{more}.", test, f"{advice.capitalize()}.")]
 

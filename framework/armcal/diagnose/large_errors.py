@@ -8,7 +8,7 @@ from scipy.special import betainc
 
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.units import display_unit, to_unit
+from armcal.base.units import digits, display_unit, to_unit
 from armcal.estimate.estimator import Estimate
 from armcal.problem.motion import Motion
 from armcal.problem.problem import FactorRecords, Problem
@@ -182,4 +182,4 @@ def _along(record: int, problem: Problem, motion: Motion, judged: Judged) -> str
     unit = display_unit(arm.commanded[joint])
     off = abs(float(own @ slopes[:, best] / (slopes[:, best] @ slopes[:, best])))
     shown = joint if len(problem.blueprint.arms) == 1 else motion.channels[best]
-    return f"its error lies along {shown}'s own motion, as if {to_unit(off, unit.name):.1f} {unit.name} off"
+    return f"its error lies along {shown}'s own motion, as if {digits(to_unit(off, unit.name), 2)} {unit.name} off"

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armcal.base.arrays import Array, Indices
+from armcal.base.units import digits
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.noise_findings import Finding
 from armcal.measure.groups import group_key
@@ -144,7 +145,7 @@ def moved_findings(moved: Sequence[Moved]) -> list[Finding]:
     return [
         Finding(
             "warning",
-            f"{group.key}: its first {group.before} records lie {group.distance * _MM:.1f} mm from the other "
+            f"{group.key}: its first {group.before} records lie {digits(group.distance * _MM)} mm from the other "
             f"{group.after}, {group.distance / group.scatter:.0f} times their spread. Did it move, or the base?",
             f"the best split in recorded order, limit {APART:g} standard deviations",
             "Give the records before the move a label of their own, or leave them out.",

@@ -14,6 +14,7 @@ import numpy as np
 
 from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.dataset import Dataset
+from armcal.base.units import SMALLEST_SHOWN
 from armcal.diagnose.dependences import Dependence, Records, dependences
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.noise_trend import NoiseTrend, noise_trend
@@ -111,8 +112,9 @@ class ResidualStructure:
 
     @property
     def worthwhile(self) -> tuple[Structure, ...]:
-        """Those that would lower the mean error by a hundredth of it."""
-        return tuple(s for s in self.structures if s.falls_mm >= WORTHWHILE * self.mean_mm)
+        """Those that would lower the mean error by a hundredth of it, and by what an instrument may read."""
+        least = max(WORTHWHILE * self.mean_mm, SMALLEST_SHOWN)
+        return tuple(s for s in self.structures if s.falls_mm >= least)
 
 
 def structure(

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.special import bdtr, chdtri, ndtri
 
 from armcal.base.arrays import Array, Indices
+from armcal.base.units import digits, readable
 from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.evidence_findings import (
     MOST_TOLD,
@@ -116,8 +117,8 @@ def _errors_text(judged_mm: Array, judged_on: str, seen: Evidence) -> str:
     errors, unit = summarise(judged_mm), seen.unit
     most = "all of them" if errors.p95 is None else "95 % of poses"
     return (
-        f"{seen.name} error {errors.mean:.2f} {unit} on average, {most} below "
-        f"{errors.max if errors.p95 is None else errors.p95:.2f} {unit}, judged on {judged_on}."
+        f"{seen.name} error {readable(errors.mean)} {unit} on average, {most} below "
+        f"{readable(errors.max if errors.p95 is None else errors.p95)} {unit}, judged on {judged_on}."
     )
 
 
@@ -133,13 +134,16 @@ def _good_for(judged_mm: Array, judged_on: str, unit: str = "mm", new: NewRecord
     enough = np.flatnonzero(bdtr(below, len(judged_mm), SHARE) >= 1 - LEVEL)
     if not len(enough):
         largest = float(np.max(judged_mm))
-        return f"The largest error on {judged_on} is {largest:.2f} {unit}; {len(judged_mm)} are too few to say more."
+        return (
+            f"The largest error on {judged_on} is {readable(largest)} {unit}; {len(judged_mm)} are too few to say more."
+        )
     limit = float(np.sort(judged_mm if new is None else judged_mm * new.ratio)[enough[0]])
     if new is not None:
         correlated, independent = (freedom / chdtri(freedom, 1 - LEVEL) for freedom in (new.freedom, new.independent))
         limit *= float(np.sqrt(correlated / independent))
     return (
-        f"Good for +- {limit:.2f} {unit} on unseen poses like these: 95 % of them, with 95 % confidence ({judged_on})."
+        f"Good for +- {readable(limit)} {unit} on unseen poses like these: 95 % of them, with 95 % confidence "
+        f"({judged_on})."
     )
 
 
@@ -162,7 +166,7 @@ def _in_short(
         ids = ", ".join(miss.record_id for miss in missed.explained[:MOST_TOLD])
         more = f" and {missed.beyond - MOST_TOLD} more" if missed.beyond > MOST_TOLD else ""
         named = "the record" if missed.beyond == 1 else f"{missed.beyond} records"
-        sentences.append(f"Error above {missed.limit_mm:.2f} {seen.unit} in {named}, by id: {ids}{more}.")
+        sentences.append(f"Error above {readable(missed.limit_mm)} {seen.unit} in {named}, by id: {ids}{more}.")
     sentences.append(suspicious)
     sentences += _left(seen)
     if is_worth_measuring(suggestions):
@@ -184,7 +188,7 @@ def _left(seen: Evidence) -> list[str]:
         sentences.append(predicted_in_short(left.predictable))
     if left.worthwhile:
         listed = "; ".join(
-            f"{s.words}{', or on another cause' if s.alternatives else ''} ({s.falls_mm:.2f} {seen.unit})"
+            f"{s.words}{', or on another cause' if s.alternatives else ''} ({readable(s.falls_mm)} {seen.unit})"
             for s in left.worthwhile
         )
         sentences.append(f"Residuals still depend on {listed}.")
@@ -260,7 +264,7 @@ def _size(estimate: Estimate, seen: Evidence) -> Finding:
         )
         return Finding("warning", text, test, action)
     if ratio < 0.5 and total < chdtri(freedom, 1 - LEVEL / 2):
-        text = f"Residuals are only {ratio:.2f} times the declared noise: was it stated too large?"
+        text = f"Residuals are only {readable(ratio)} times the declared noise: was it stated too large?"
         return Finding("note", text, f"ratio below 0.5, {test}", "State the noise as the instrument's data sheet does.")
     explained = not seen.contradictions and (seen.structure is None or not seen.structure.is_predictable)
     text = f"Residuals are as large as the declared noise{': the model explains the data' if explained else ''}."
@@ -312,8 +316,8 @@ def _next(estimate: Estimate, suggestions: Sequence[Suggestion]) -> list[Finding
     text = f"Least certain, in its typical scale: {estimate.names[int(np.argmax(relative))]}."
     if not suggestions:
         return [Finding("note", text)]
-    shrink = 100 * (1 - suggestions[-1].shrink)
-    text += f" {len(suggestions)} poses more would shrink standard deviations by {shrink:.1f} % on average."
+    shrink = digits(100 * (1 - suggestions[-1].shrink), 2)
+    text += f" {len(suggestions)} poses more would shrink standard deviations by {shrink} % on average."
     test = f"determinant of the information, {CANDIDATES} poses like the recorded ones; clearance was not checked"
     poses = "; ".join(suggestion.text for suggestion in suggestions)
     return [Finding("note", text, test, f"Measure next: {poses}." if is_worth_measuring(suggestions) else "")]

@@ -8,6 +8,7 @@ import numpy as np
 
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
+from armcal.base.units import readable
 from armcal.diagnose.coverage import (
     Coverage,
     PredictedFit,
@@ -77,10 +78,10 @@ class IntervalResult:
         half, radius = self.half_width_mm, self.radius_mm
         first: Recording = "new" if "new" in half else "same"
         text = "In the median pose, of poses like the recorded ones, a prediction is good to "
-        text += f"+- {half[first]:.2f} mm a coordinate (90 %), "
-        text += f"{radius[first]:.2f} mm in all (95 %)"
+        text += f"+- {readable(half[first])} mm a coordinate (90 %), "
+        text += f"{readable(radius[first])} mm in all (95 %)"
         if first == "new":
-            text += f"; within this recording to +- {half['same']:.2f} mm and {radius['same']:.2f} mm"
+            text += f"; within this recording to +- {readable(half['same'])} mm and {readable(radius['same'])} mm"
         text += ", the measurement's noise included."
         if self.levels:
             text += f" Each joint stood at {self.levels} angles at most: what it is off between them is not included."
