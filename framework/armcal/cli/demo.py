@@ -7,6 +7,7 @@ import click
 from armcal.cli.common import FILE, Console, speaking, unwritten
 from armcal.errors import InputError, Location
 from armcal.io.file_set import write_new
+from armcal.io.plain_files import writing
 from armcal.version import SOURCES
 
 _CONFIG = "demo.yaml"
@@ -35,16 +36,13 @@ def demo(ctx: click.Context, console: Console, name: str, out: Path | None) -> N
     folder = out or Path(f"armcal-demo-{name}")
     source = demos[name]
     files = {folder / path.relative_to(source): path.read_bytes() for path in source.rglob("*") if path.is_file()}
-    try:
+    with writing(folder, "Give --out a place that can be written."):
         missing = unwritten(files)
         if changed := next((path for path in missing if path.exists()), None):
             hint = "Give another --out, or run it with armcal run."
             raise InputError("it is there and was changed.", where=Location(str(changed)), hint=hint)
         folder.mkdir(parents=True, exist_ok=True)
         write_new(missing)
-    except OSError as fault:
-        hint = "Give --out a place that can be written."
-        raise InputError(f"it cannot be written ({fault.strerror}).", where=Location(str(folder)), hint=hint) from fault
     results = folder / "results"
     console.line(f"the files of {name} are in {folder}; armcal run {folder / _CONFIG} --out {results}")
     from armcal.cli.run import run  # all of the solver

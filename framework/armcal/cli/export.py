@@ -27,7 +27,7 @@ from armcal.config.yaml_source import Reader, as_source
 from armcal.config.yaml_tree import assignment, set_at
 from armcal.errors import ConfigError, InputError, Location, PluginError
 from armcal.io.file_set import require_new, write_new, write_over
-from armcal.io.plain_files import check_output
+from armcal.io.plain_files import check_output, writing
 
 S = TypeVar("S", bound=Settings)
 
@@ -100,17 +100,15 @@ def export(
             raise PluginError(fault.message, hint=f"{fault.hint} The formats are {known}.") from fault
         raise
     exporter: Exporter = made(settings_from(made.Settings, options, "--option"))
-    where = Location(str(out))
-    try:
+    with writing(out, "Give --out a place that can be written."):
         if out.is_dir() or not out.name:
-            raise InputError("it is a directory, expected a file.", where=where, hint="Name the file in it.")
+            raise InputError(
+                "it is a directory, expected a file.", where=Location(str(out)), hint="Name the file in it."
+            )
         spare_inputs(out, calibration)
         check_output(out, InputError)
         if not force:
             require_new([out])
-    except OSError as fault:
-        hint = "Give --out a place that can be written."
-        raise InputError(f"it cannot be written ({fault.strerror}).", where=where, hint=hint) from fault
     loaded = Calibration.load(calibration, registry, accept)
     request = request_of(loaded, arm, out.name)
     exported = exporter.export(request)

@@ -1,6 +1,8 @@
 """Regular files alone: of a stated size where they are read, and never a link or a device where one is written."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from stat import S_ISDIR, S_ISLNK, S_ISREG
 from typing import BinaryIO, NoReturn
@@ -86,6 +88,20 @@ def text_of(content: bytes, path: Path, hint: str) -> str:
     if at >= 0:
         refuse(path, f"found {fault}.", hint, content.count(b"\n", 0, at) + 1)
     return text
+
+
+@contextmanager
+def writing(place: Path, hint: str, refusal: type[InputError] = InputError) -> Iterator[None]:
+    """What is done within writes a file or a folder.
+
+    Raises:
+        InputError: of the kind ``refusal``: the operating system refused it.
+    """
+    try:
+        yield
+    except OSError as fault:
+        message = f"it cannot be written ({fault.strerror or fault})."
+        raise refusal(message, where=Location(str(place)), hint=hint) from fault
 
 
 def check_output(path: Path, refusal: type[InputError] = DataError) -> None:

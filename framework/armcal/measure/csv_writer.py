@@ -13,7 +13,7 @@ from typing import TextIO
 from armcal.base.dataset import Dataset
 from armcal.base.units import DIMENSIONLESS, display_unit, to_unit, units_of
 from armcal.errors import DataError, Location
-from armcal.io.plain_files import check_output
+from armcal.io.plain_files import check_output, writing
 from armcal.measure.reader import RequestedChannel
 
 ID_COLUMN = "pose_id"
@@ -110,16 +110,11 @@ def _replacing(path: Path) -> Iterator[TextIO]:
     check_output(path)
     beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
-        with beside.open("x", encoding="utf-8", newline="") as stream:
-            yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
-        beside.replace(path)
-    except OSError as fault:
-        raise DataError(
-            f"it cannot be written ({fault.strerror or fault}).",
-            where=Location(str(path)),
-            hint="Check that its folder is there and may be written to.",
-        ) from fault
+        with writing(path, "Check that its folder is there and may be written to.", DataError):
+            with beside.open("x", encoding="utf-8", newline="") as stream:
+                yield stream
+                stream.flush()
+                os.fsync(stream.fileno())
+            beside.replace(path)
     finally:
         beside.unlink(missing_ok=True)

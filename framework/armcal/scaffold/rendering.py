@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from armcal.errors import InputError, Location
+from armcal.io.plain_files import writing
 
 TEMPLATES = Path(__file__).with_name("templates")
 SUFFIX = ".j2"
@@ -62,22 +63,18 @@ def staged(folder: Path) -> Iterator[Path]:
     Raises:
         InputError: something is there already, or the place cannot be written.
     """
-    where = Location(str(folder))
     if folder.exists() or folder.is_symlink():
-        raise InputError("it is there already.", where=where, hint="Give another --out, or move it away.")
-    try:
+        hint = "Give another --out, or move it away."
+        raise InputError("it is there already.", where=Location(str(folder)), hint=hint)
+    with writing(folder, "Give --out a place that can be written."):
         folder.parent.mkdir(parents=True, exist_ok=True)
         place = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    except OSError as fault:
-        raise _unwritable(folder, fault) from fault
-    try:
-        yield place
-        place.chmod(0o755)
-        place.rename(folder)
-    except OSError as fault:
-        raise _unwritable(folder, fault) from fault
-    finally:
-        shutil.rmtree(place, ignore_errors=True)
+        try:
+            yield place
+            place.chmod(0o755)
+            place.rename(folder)
+        finally:
+            shutil.rmtree(place, ignore_errors=True)
 
 
 def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
@@ -86,11 +83,3 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8", newline="\n")
-
-
-def _unwritable(folder: Path, fault: OSError) -> InputError:
-    return InputError(
-        f"it cannot be written ({fault.strerror or fault}).",
-        where=Location(str(folder)),
-        hint="Give --out a place that can be written.",
-    )

@@ -12,8 +12,9 @@ from armcal.arm.servo import PulseTable
 from armcal.base.config_text import finite
 from armcal.config.servo_file import BoardSettings, ServoFile, ServoSettings, load_servo_file, servo_file_text
 from armcal.config.servo_file_edit import edited_text
-from armcal.errors import ConfigError, InputError, Location
+from armcal.errors import ConfigError
 from armcal.io.journal.files import REAL_FILES, write_whole
+from armcal.io.plain_files import writing
 
 from armcal_bench.servo.findings import findings, is_usable
 from armcal_bench.servo.fit import FittedServo
@@ -90,8 +91,8 @@ def write_servo_file(path: Path, file: ServoFile) -> Path | None:
     Raises:
         InputError: it cannot be written; the one before is as it was.
     """
-    try:
-        path = path.resolve()  # of a link, what it leads to
+    path = path.resolve()  # of a link, what it leads to
+    with writing(path, "Make it writable and give the command again: nothing measured is lost."):
         before = path.read_bytes()
         if not path.stat().st_mode & 0o222:
             raise PermissionError(errno.EACCES, "it is read-only")
@@ -101,9 +102,6 @@ def write_servo_file(path: Path, file: ServoFile) -> Path | None:
         kept = next_name(path)
         write_whole(REAL_FILES, kept, before)
         write_whole(REAL_FILES, path, text)
-    except OSError as fault:
-        hint = "Make it writable and give the command again: nothing measured is lost."
-        raise InputError(f"it cannot be written ({fault.strerror}).", where=Location(str(path)), hint=hint) from fault
     return kept
 
 
@@ -171,12 +169,8 @@ def write_results(folder: Path, summary: Mapping[str, Any]) -> None:
     Raises:
         InputError: the folder cannot be written.
     """
-    try:
+    with writing(folder, "Give another --out."):
         write_whole(REAL_FILES, folder / RESULTS, (json.dumps(summary, indent=2, allow_nan=False) + "\n").encode())
-    except OSError as fault:
-        raise InputError(
-            f"it cannot be written ({fault.strerror}).", where=Location(str(folder)), hint="Give another --out."
-        ) from fault
 
 
 def _servo(servo: FittedServo, outcome: Outcome, changed: ServoFile) -> dict[str, Any]:

@@ -15,12 +15,14 @@ from armcal.arm.servo import COUNTS, PulseClock, PulseTable
 from armcal.devices.device import DeviceIdentity
 from armcal.errors import DataError, InputError, Location
 from armcal.io.journal.files import REAL_FILES, opened
+from armcal.io.plain_files import writing
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from armcal_bench.servo.problem import KnownBoard, KnownServo
 from armcal_bench.servo.setup import Setup
 
 NAME = "observations.jsonl"
+_HINT = "Give --out a writable folder."
 BEGUN, POSE, ANGLE, LEFT_OUT = "begun", "pose", "angle", "left_out"
 """Kinds of lines."""
 
@@ -113,7 +115,7 @@ class Record:
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / NAME
-        try:
+        with writing(folder, _HINT):
             REAL_FILES.make_folder(folder)
             whole = self.path.read_bytes() if self.path.exists() else b""
             kept = whole[: whole.rfind(b"\n") + 1]
@@ -121,8 +123,6 @@ class Record:
                 with opened(REAL_FILES, self.path) as descriptor:
                     REAL_FILES.truncate(descriptor, len(kept))
                     REAL_FILES.sync(descriptor)
-        except OSError as fault:
-            raise _unwritable(folder, fault) from fault
         self._entries: list[Mapping[str, Any]] = []
         for number, line in enumerate(kept.splitlines(), start=1):
             damage = ""
@@ -161,10 +161,8 @@ class Record:
             InputError: it cannot be renamed.
         """
         kept = next_name(self.path)
-        try:
+        with writing(self.path, _HINT):
             REAL_FILES.rename(self.path, kept)
-        except OSError as fault:
-            raise _unwritable(self.path, fault) from fault
         self._entries = []
         return kept
 
@@ -176,14 +174,12 @@ class Record:
         """
         entry = {"kind": kind, **values}
         is_first = not self.path.exists()
-        try:
+        with writing(self.path, _HINT):
             with opened(REAL_FILES, self.path) as descriptor:
                 REAL_FILES.write(descriptor, json.dumps(entry, allow_nan=False).encode() + b"\n")
                 REAL_FILES.sync(descriptor)
             if is_first:
                 REAL_FILES.sync_folder(self.path.parent)
-        except OSError as fault:
-            raise _unwritable(self.path, fault) from fault
         self._entries.append(entry)
 
 
@@ -193,12 +189,6 @@ def next_name(path: Path) -> Path:
     while (kept := path.with_name(f"{path.name}.before-{number}")).exists():
         number += 1
     return kept
-
-
-def _unwritable(path: Path, fault: OSError) -> InputError:
-    return InputError(
-        f"it cannot be written ({fault.strerror}).", where=Location(str(path)), hint="Give --out a writable folder."
-    )
 
 
 def begin(setup: Setup, record: Record, device: DeviceIdentity | None, say: Callable[[str], None]) -> None:

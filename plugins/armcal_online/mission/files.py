@@ -14,9 +14,9 @@ from armcal.base.arrays import Array
 from armcal.base.config_text import as_json
 from armcal.base.parameters import Parameters
 from armcal.base.units import to_unit
-from armcal.errors import InputError, Location
+from armcal.errors import InputError
 from armcal.estimate.simulation import DAY_S, Mission
-from armcal.io.plain_files import check_output
+from armcal.io.plain_files import check_output, writing
 
 from armcal_online.mission.decisions import Verdict
 from armcal_online.mission.figure import mission_figure
@@ -47,13 +47,10 @@ def write_files(folder: Path, plan: MissionPlan, result: MissionResult, content:
         texts[SURPRISE] = surprise_text(plan)
     files = {name: text.encode() for name, text in texts.items()}
     files["mission.png"] = mission_figure(result.mission, result.judgement, name, plan.settings.refit.records)
-    try:
+    with writing(folder, "Check the room on the disk."):
         for name, data in files.items():
             check_output(folder / name, InputError)
             (folder / name).write_bytes(data)
-    except OSError as fault:
-        text = f"it cannot be written ({fault.strerror or fault})."
-        raise InputError(text, where=Location(str(folder)), hint="Check the room on the disk.") from fault
 
 
 def surprise_text(plan: MissionPlan) -> str:
