@@ -114,11 +114,11 @@ def judge(
 def _errors_text(judged_mm: Array, judged_on: str, seen: Evidence) -> str:
     if not len(judged_mm):
         return "No record was held out: how good the model is on new poses is not known."
-    errors, unit = summarise(judged_mm), seen.unit
-    most = "all of them" if errors.p95 is None else "95 % of poses"
+    mean, p95, unit = float(np.mean(judged_mm)), summarise(judged_mm).p95, seen.unit
+    most, below = ("all of them", float(np.max(judged_mm))) if p95 is None else ("95 % of poses", p95)
     return (
-        f"{seen.name} error {readable(errors.mean)} {unit} on average, {most} below "
-        f"{readable(errors.max if errors.p95 is None else errors.p95)} {unit}, judged on {judged_on}."
+        f"{seen.name} error {readable(mean)} {unit} on average, {most} below {readable(below)} {unit}, judged on "
+        f"{judged_on}."
     )
 
 
