@@ -1,4 +1,4 @@
-"""A fit as the rows of one linear least-squares problem: data, priors, and the innovations of a drift."""
+"""A fit as the rows of one linear least-squares problem: data, ties of groups, priors, innovations of a drift."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,10 @@ from armcal.problem.problem import FactorRecords, Problem
 
 @dataclass(frozen=True)
 class FitRows:
-    """A fit as rows: whitened data factor by factor, then priors, then innovations of a drift.
+    """A fit as rows: whitened data factor by factor, then ties of groups, priors, and innovations of a drift.
+
+    Without the ties, known distances of sockets, an arm could change its size: that moves residuals of a contact in
+    proportion to themselves, and would take up all of them.
 
     Attributes:
         slopes: by coordinates, and by innovations (rows x n).
@@ -58,11 +61,13 @@ class FitRows:
         below = np.zeros((len(held) + len(drift), kept + len(drift)))
         below[np.arange(len(held)), held] = (prior * scales)[held]
         below[len(held) :, kept:] = np.eye(len(drift))
+        tied = problem.tie_rows(values)
+        ties = np.hstack([tied.jacobian @ chain, np.zeros((len(tied.residual), len(drift)))])
         sizes = [len(residual) for residual in weighted]
         numbers = np.arange(sum(sizes) * count).reshape(sum(sizes), count)
         return cls(
-            np.vstack([*slopes, below]),
-            np.concatenate([*data, moved[held], drift]),
+            np.vstack([*slopes, ties, below]),
+            np.concatenate([*data, tied.residual, moved[held], drift]),
             np.tile(np.arange(count), sum(sizes)),
             numbers.T,
             tuple(_whitening(k.factor.noise, record) for k, record in zip(problem.kernels, records, strict=True)),

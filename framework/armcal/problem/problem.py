@@ -260,11 +260,15 @@ class Problem:
 
     def _extra(self, values: Array, records: Sequence[FactorRecords]) -> ExtraRows:
         """The rows that belong to no single record."""
-        places = self._places
-        rows = [tie.rows(values, places, len(places)) for tie in self.ties]
+        rows = [self.tie_rows(values)]
         for grouped, record in zip(self.grouped, records, strict=True):
             rows += [ExtraRows(residual, jacobian) for jacobian, residual in grouped.linearised_means(values, record)]
-        return stacked(rows, len(places))
+        return stacked(rows, len(self._places))
+
+    def tie_rows(self, values: Array) -> ExtraRows:
+        """What is known between groups, whitened."""
+        places = self._places
+        return stacked([tie.rows(values, places, len(places)) for tie in self.ties], len(places))
 
     @property
     def _places(self) -> dict[int, int]:
