@@ -11,7 +11,8 @@ from typing import Any
 
 from armcal.io.journal.files import FileLayer
 from armcal.io.journal.reader import read_entries, read_until
-from armcal_online.running.session import Open, opened
+from armcal_online.running.loop import Recalibration
+from armcal_online.running.session import opened
 from armcal_online.running.state_replayer import StateReplayer
 from armcal_online.sources.source import Incoming
 from fake_recalibrator import HEADER, FakeRecalibrator, row, setup
@@ -92,15 +93,15 @@ def kinds(folder: Path) -> list[str]:
 
 
 @contextmanager
-def stepping(folder: Path, source: Any) -> Iterator[tuple[Open, FakeRecalibrator]]:
+def stepping(folder: Path, source: Any) -> Iterator[tuple[Recalibration, FakeRecalibrator]]:
     fake = FakeRecalibrator()
     with opened(setup(folder), fake, lambda rows: source) as going:
         yield going, fake
 
 
-def steps(going: Open, count: int) -> None:
+def steps(going: Recalibration, count: int) -> None:
     for _ in range(count):
-        going.recalibration.step(0.0)
+        going.step(0.0)
 
 
 class FullFiles(FileLayer):

@@ -79,7 +79,7 @@ def test_what_is_not_understood_gets_an_error(tmp_path: Path, data: bytes) -> No
 @pytest.mark.parametrize("command", ["reboot", ["pause"], None])
 def test_a_command_that_is_none_is_refused(command: Any) -> None:
     with pytest.raises(InputError, match="expected one of status, pause"):
-        answer(None, None, {"command": command})  # type: ignore[arg-type]
+        answer(None, {"command": command})  # type: ignore[arg-type]
 
 
 def test_several_requests_in_one_go_and_one_in_pieces(tmp_path: Path) -> None:

@@ -112,7 +112,7 @@ def test_an_update_of_armcal_goes_on_where_it_was_though_the_last_bits_differ(
     assert run(folder, Listed(made(1, 30))).count == 29
     assert any("Another evaluator" in event.get("sentence", "") for event in events(folder))
     with stepping(copy, Listed([])) as (going, fake):
-        going.recalibration.roll_back(next(e for e in read_entries(folder / "journal") if e.kind == "record").sequence)
+        going.roll_back(next(e for e in read_entries(folder / "journal") if e.kind == "record").sequence)
         assert fake.count == 1
 
 
@@ -178,17 +178,17 @@ def test_a_record_of_a_stream_that_is_sent_again_counts_once(tmp_path: Path) -> 
 def test_while_paused_files_keep_their_records_and_those_of_streams_are_passed_over(tmp_path: Path) -> None:
     with stepping(tmp_path / "file", Listed(made(1, 9))) as (going, fake):
         steps(going, 3)
-        going.recalibration.pause()
+        going.pause()
         steps(going, 3)
         assert fake.count == 3
-        going.recalibration.resume()
+        going.resume()
         steps(going, 9)
         assert fake.count == 8
     with stepping(tmp_path / "stream", Listed(made(1, 9, key=""), keeps_records=False)) as (going, fake):
         steps(going, 2)
-        going.recalibration.pause()
+        going.pause()
         steps(going, 3)
-        going.recalibration.resume()
+        going.resume()
         steps(going, 3)
         assert fake.count == 5
     assert len(taken(tmp_path / "stream")) == 8
@@ -200,9 +200,9 @@ def test_while_paused_files_keep_their_records_and_those_of_streams_are_passed_o
 def test_a_pause_outlasts_a_restart(tmp_path: Path) -> None:
     with stepping(tmp_path / "out", Listed(made(1, 9))) as (going, _):
         steps(going, 3)
-        going.recalibration.pause()
+        going.pause()
     with stepping(tmp_path / "out", Listed(made(1, 9))) as (going, fake):
-        assert going.recalibration.paused
+        assert going.paused
         steps(going, 3)
         assert fake.count == 3
 
@@ -210,7 +210,7 @@ def test_a_pause_outlasts_a_restart(tmp_path: Path) -> None:
 def test_a_rollback_restores_every_bit_and_a_replay_does_the_same(tmp_path: Path) -> None:
     folder, states = tmp_path / "out", {}
     with stepping(folder, Listed(made(1, 120), cut=True)) as (going, fake):
-        loop = going.recalibration
+        loop = going
         for _ in range(90):
             loop.step(0.0)
             states[loop.sequence] = fake.digest()
@@ -237,11 +237,11 @@ def test_a_rollback_that_no_checkpoint_followed_is_made_again_after_a_restart(
     monkeypatch.setattr(Recalibration, "_checkpoint", lambda self: None)
     with stepping(tmp_path / "out", Listed(made(1, 50))) as (going, fake):
         steps(going, 10)
-        target = going.recalibration.sequence
+        target = going.sequence
         digest = fake.digest()
         steps(going, 20)
-        going.recalibration.roll_back(target)
-        going.recalibration.roll_back(going.recalibration.sequence)
+        going.roll_back(target)
+        going.roll_back(going.sequence)
     with stepping(tmp_path / "out", Listed(made(1, 50))) as (going, again):
         assert again.digest() == digest
         steps(going, 1)
@@ -256,16 +256,16 @@ def test_records_wait_unacknowledged_while_the_journal_is_full(tmp_path: Path, m
         files.full = {"journal-"}
         steps(going, 5)
         assert fake.count == 3 and len(source.acknowledged) == 3 and len(source.records) == 4
-        assert going.recalibration.status()["journal"] == "full"
+        assert going.status()["journal"] == "full"
         with pytest.raises(JournalFullError):
-            going.recalibration.pause()
+            going.pause()
         digest = fake.digest()
         with pytest.raises(JournalFullError):
-            going.recalibration.roll_back(going.recalibration.sequence - 1)
+            going.roll_back(going.sequence - 1)
         assert fake.digest() == digest
         files.full = set()
         steps(going, 5)
-        assert fake.count == 8 and going.recalibration.status()["journal"] == "good"
+        assert fake.count == 8 and going.status()["journal"] == "good"
     told = [json.loads(line).get("sentence", "") for line in out.getvalue().splitlines()]
     assert sum("The journal is full, and records wait" in s for s in told) == 1
     assert sum("has room again" in s for s in told) == 1
@@ -292,5 +292,5 @@ def test_the_real_source_in_the_real_loop(tmp_path: Path) -> None:
     ) as going:
         ends = time.monotonic() + 10
         while len(taken(tmp_path / "out")) < 10 and time.monotonic() < ends:
-            going.recalibration.step(0.1)
+            going.step(0.1)
     assert taken(tmp_path / "out") == [f"p{i}" for i in range(1, 11)]

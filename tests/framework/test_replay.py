@@ -26,9 +26,9 @@ from armcal.run.experiment import Experiment
 from armcal_online.commands.recalibrate import setup_of
 from armcal_online.replaying.kept_journal import kept_calibration, kept_journal
 from armcal_online.replaying.replay import replay
-from armcal_online.replaying.replay_verifier import BOUND, Comparer, DiffersError, ReplayVerifier, distance
-from armcal_online.running.loop import Pace
-from armcal_online.running.session import Open, opened
+from armcal_online.replaying.replay_verifier import BOUND, DiffersError, ReplayVerifier, distance
+from armcal_online.running.loop import Pace, Recalibration
+from armcal_online.running.session import opened
 from armcal_online.sources.source import Incoming
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import RecalibrateSettings
@@ -84,15 +84,15 @@ def sequence_of(folder: Path, name: str) -> int:
     return next(e.sequence for e in read_entries(folder / "journal") if e.kind == "record" and e.content["id"] == name)
 
 
-def wandered(open_: Open, folder: Path, names: Sequence[str]) -> None:
+def wandered(open_: Recalibration, folder: Path, names: Sequence[str]) -> None:
     """A rollback, a pause, and a rollback across a rollback."""
     steps(open_, 40)
-    open_.recalibration.roll_back(sequence_of(folder, names[24]))
+    open_.roll_back(sequence_of(folder, names[24]))
     steps(open_, 10)
-    open_.recalibration.pause()
-    open_.recalibration.resume()
+    open_.pause()
+    open_.resume()
     steps(open_, 8)
-    open_.recalibration.roll_back(sequence_of(folder, names[44]))
+    open_.roll_back(sequence_of(folder, names[44]))
 
 
 def last_segment(folder: Path) -> Path:
@@ -208,14 +208,13 @@ def test_a_state_or_a_decision_that_differs_is_told(whole: Path, calibration: Pa
     mean[0] += 1e-9
     moved = replace(belief, gaussian=replace(belief.gaussian, mean=mean))
     nudged.state = State(moved, moved)
-    done = replay(journal, nudged, Comparer(header["evaluator"]), None, no_progress)
+    done = replay(journal, nudged, ReplayVerifier(header["evaluator"]), None, no_progress)
     assert done.difference is not None and done.entries < 10
+    drift = {"event": "decision", "kind": "drift", "sequence": 7, "sentence": "A drift."}
     with pytest.raises(DiffersError, match="noted was"):
-        Comparer({}).compare_events(
-            7, [{"event": "decision", "kind": "drift", "sequence": 7, "sentence": "A drift."}], []
-        )
+        ReplayVerifier({}).compare_events(7, [drift], [])
     with pytest.raises(DiffersError, match="noted was nothing"):
-        Comparer({}).unnoted_events(7, [{"event": "decision", "kind": "drift", "sequence": 7, "sentence": "A drift."}])
+        ReplayVerifier({}).unnoted_events(7, [drift])
 
 
 def test_what_cannot_be_replayed_ends_with_2(whole: Path, tmp_path: Path) -> None:
@@ -251,9 +250,10 @@ def test_distance_is_measured_in_standard_deviations(calibration: Path) -> None:
     assert distance(space, state, state).is_small
 
 
-def replayed(folder: Path, verifier: Any = None) -> tuple[Any, FakeRecalibrator]:
+def replayed(folder: Path, compares: bool = True) -> tuple[Any, FakeRecalibrator]:
     fake: Any = FakeRecalibrator()
-    done = replay(kept_journal(folder / "journal"), fake, verifier or Comparer(fake.evaluator), None, no_progress)
+    verifier = ReplayVerifier(fake.evaluator) if compares else None
+    done = replay(kept_journal(folder / "journal"), fake, verifier, None, no_progress)
     return done, fake
 
 
@@ -261,7 +261,7 @@ def test_a_journal_that_dropped_its_beginning_goes_on_from_what_it_keeps(tmp_pat
     folder = tmp_path / "out"
     with stepping(folder, Listed(made(1, 40))) as (open_, _):
         steps(open_, 39)
-        open_.recalibration.roll_back(sequence_of(folder, "p8"))
+        open_.roll_back(sequence_of(folder, "p8"))
         steps(open_, 1)
     limits = JournalLimits(segment_bytes=3000, total_bytes=12000)
     left = run(folder, Listed(made(1, 90)), limits=limits)
@@ -275,9 +275,9 @@ def test_a_rollback_to_what_is_no_longer_kept_goes_on_at_the_checkpoint_after_it
     folder = tmp_path / "out"
     with stepping(folder, Listed(made(1, 60))) as (open_, _):
         steps(open_, 58)
-        open_.recalibration.roll_back(sequence_of(folder, "p8"))
+        open_.roll_back(sequence_of(folder, "p8"))
         steps(open_, 10)
-        end = open_.recalibration.status()["digest"]
+        end = open_.status()["digest"]
     segments = sorted((folder / "journal").glob("journal-*.log"))
     for path in segments[:2]:
         path.unlink()
@@ -287,7 +287,7 @@ def test_a_rollback_to_what_is_no_longer_kept_goes_on_at_the_checkpoint_after_it
         sequence_of_first(done)
     ]
     with pytest.raises(DataError, match="no longer holds"):
-        replayed(folder, ReplayVerifier())
+        replayed(folder, compares=False)
 
 
 def sequence_of_first(done: Any) -> int:

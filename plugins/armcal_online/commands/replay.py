@@ -29,7 +29,7 @@ from armcal_online.replaying.replay import (
     replay,
     side_by_side,
 )
-from armcal_online.replaying.replay_verifier import Comparer, ReplayVerifier
+from armcal_online.replaying.replay_verifier import ReplayVerifier
 from armcal_online.running.session import OURS
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import RecalibrateSettings, load_settings
@@ -72,19 +72,19 @@ def replay_command(
     with kept_in(folder):
         begun_from = kept_calibration(header, folder, registry)
         session = Recalibrator.begin(begun_from, _evaluated(kept_settings(header), evaluator), registry)
-    comparer = Comparer(session.evaluator)
+    verifier = ReplayVerifier(session.evaluator)
     with console.progress() as progress:
-        done = replay(held, session, comparer, until, progress)
+        done = replay(held, session, verifier, until, progress)
         other = None
         if other_settings is not None:
             others = Recalibrator.begin(begun_from, _evaluated(other_settings, evaluator), registry)
-            other = compared(done, replay(held, others, ReplayVerifier(), until, progress, "with other settings"))
+            other = compared(done, replay(held, others, None, until, progress, "with other settings"))
     chosen = other.replayer if other else done
     written = calibration if calibration and not done.difference else None
     if written:
         write_whole(REAL_FILES, written, chosen.session.calibration_text().encode())
-    console.result(_as_json(held, done, comparer, other, written))
-    _show(console, held, done, comparer, other)
+    console.result(_as_json(held, done, verifier, other, written))
+    _show(console, held, done, verifier, other)
     if written:
         console.line(f"the calibration after entry {chosen.last}: {written}")
     _leave(held, done)
@@ -118,25 +118,25 @@ def _leave(held: KeptJournal, done: JournalReplayer) -> None:
 
 
 def _show(
-    console: Console, held: KeptJournal, done: JournalReplayer, comparer: Comparer, other: Comparison | None
+    console: Console, held: KeptJournal, done: JournalReplayer, verifier: ReplayVerifier, other: Comparison | None
 ) -> None:
     header = held.first.header
     console.line(f"{held.folder}: begun from {header['path']}, replayed from entry {done.first} to {done.last}")
-    same = "as the journal was written" if not comparer.others else f"another than the journal's: {comparer.others[0]}"
+    same = "as the journal was written" if not verifier.others else f"another than the journal's: {verifier.others[0]}"
     console.line(f"evaluator: {done.session.evaluator['backend']}, {same}")
-    for text in comparer.others[1:]:
+    for text in verifier.others[1:]:
         console.detail(f"  {text}")
-    counts = f"{done.entries} entries, {comparer.states} states compared"
+    counts = f"{done.entries} entries, {verifier.states} states compared"
     if done.difference is not None:
         console.line(f"{counts}; after entry {done.difference.sequence} they differ. {done.difference.sentence}")
-    elif comparer.equal == comparer.states:
+    elif verifier.equal == verifier.states:
         console.line(f"{counts}, all the same to the last bit")
     else:
-        counts = f"{counts}, {comparer.equal} the same to the last bit"
-        if comparer.measured:
-            widest = f"{comparer.widest.values:.1e} sd ({comparer.widest.covariance:.1e} in the covariance)"
-            counts += f"; {comparer.measured} of the others were noted in full and differ by at most {widest}"
-        console.line(f"{counts}; all {comparer.decisions} decisions and levels are the same")
+        counts = f"{counts}, {verifier.equal} the same to the last bit"
+        if verifier.measured:
+            widest = f"{verifier.widest.values:.1e} sd ({verifier.widest.covariance:.1e} in the covariance)"
+            counts += f"; {verifier.measured} of the others were noted in full and differ by at most {widest}"
+        console.line(f"{counts}; all {verifier.decisions} decisions and levels are the same")
     if other is not None:
         console.out.print(_table(done, other))
     else:
@@ -166,7 +166,7 @@ def _table(done: JournalReplayer, other: Comparison) -> Table:
 
 
 def _as_json(
-    held: KeptJournal, done: JournalReplayer, comparer: Comparer, other: Comparison | None, written: Path | None
+    held: KeptJournal, done: JournalReplayer, verifier: ReplayVerifier, other: Comparison | None, written: Path | None
 ) -> Mapping[str, Any]:
     difference = done.difference
     content: dict[str, Any] = {
@@ -174,10 +174,10 @@ def _as_json(
         "entries": done.entries,
         "first": done.first,
         "last": done.last,
-        "states": {"compared": comparer.states, "same_to_the_last_bit": comparer.equal, "measured": comparer.measured},
-        "largest_difference_sd": {"values": comparer.widest.values, "covariance": comparer.widest.covariance},
+        "states": {"compared": verifier.states, "same_to_the_last_bit": verifier.equal, "measured": verifier.measured},
+        "largest_difference_sd": {"values": verifier.widest.values, "covariance": verifier.widest.covariance},
         "evaluator": done.session.evaluator,
-        "other_evaluator": list(comparer.others),
+        "other_evaluator": list(verifier.others),
         "difference": {"after": difference.sequence, "sentence": difference.sentence} if difference else None,
         "damage": str(held.damage) if held.damage else None,
         "cut": held.cut.sentence if held.cut else None,

@@ -42,7 +42,7 @@ class JournalReplayer:
     """
 
     def __init__(
-        self, session: Recalibrator, targets: Iterable[int], verifier: ReplayVerifier, until: int | None
+        self, session: Recalibrator, targets: Iterable[int], verifier: ReplayVerifier | None, until: int | None
     ) -> None:
         self.session = session
         self._targets, self._verifier, self._until = sorted(set(targets)), verifier, until
@@ -63,7 +63,8 @@ class JournalReplayer:
 
     def segment(self, segment: Segment) -> None:
         """Go through a segment."""
-        self._verifier.begin_segment(segment)
+        if self._verifier:
+            self._verifier.begin_segment(segment)
         checkpoint = segment.checkpoint
         if self._is_beyond(checkpoint.sequence):
             return
@@ -73,7 +74,8 @@ class JournalReplayer:
             self._state_replayer.restore(checkpoint.content, checkpoint.sequence)
         else:
             self._hold_before(checkpoint.sequence)
-            self._verifier.compare_checkpoint(checkpoint, self.session)
+            if self._verifier:
+                self._verifier.compare_checkpoint(checkpoint, self.session)
         self.last = checkpoint.sequence
         for entry in segment.entries:
             if self._is_beyond(entry.sequence):
@@ -103,7 +105,7 @@ class JournalReplayer:
                 self._held[target] = Entry(target, CHECKPOINT, self._state_replayer.checkpoint(), 0, 0)
 
     def _apply(self, entry: Entry, content: Mapping[str, Any]) -> None:
-        if self._pending and entry.kind == RECORD:
+        if self._verifier and self._pending and entry.kind == RECORD:
             # A note is written right after its record, unless the writer was stopped between the two.
             self._verifier.unnoted_events(self._pending_after, self._pending)
         self._pending = []
@@ -113,7 +115,7 @@ class JournalReplayer:
                 to = int(content["to"])
             if to in self._held:
                 self._state_replayer.apply(sequence, ROLLBACK, {"to": to})
-            elif self._verifier.resumes:
+            elif self._verifier:
                 # The state that it went back to is no longer kept; the checkpoint that follows a rollback has it.
                 self._is_lost = True
             else:
@@ -123,7 +125,7 @@ class JournalReplayer:
                     hint=f"Replay up to there only: --until {sequence - 1}.",
                 )
             self.decisions.append(self.session.rolled_back_event(sequence, to))
-            if content.get("digest") and not self._is_lost:
+            if self._verifier and content.get("digest") and not self._is_lost:
                 self._verifier.compare_digest(sequence, content["digest"], self.session)
         elif not self._is_lost:
             undigested = {key: value for key, value in content.items() if key != "digest"}
@@ -146,14 +148,15 @@ class JournalReplayer:
             after, events, digest = int(content["after"]), [dict(e) for e in content["events"]], str(content["digest"])
         replayed = self._pending if after == self._pending_after else []
         self._pending = []
-        self._verifier.compare_events(after, events, replayed)
-        self._verifier.compare_digest(sequence, digest, self.session)
+        if self._verifier:
+            self._verifier.compare_events(after, events, replayed)
+            self._verifier.compare_digest(sequence, digest, self.session)
 
 
 def replay(
     journal: KeptJournal,
     session: Recalibrator,
-    verifier: ReplayVerifier,
+    verifier: ReplayVerifier | None,
     until: int | None,
     progress: Progress,
     what: str = "replay",
@@ -163,7 +166,7 @@ def replay(
     Args:
         journal: see ``kept_journal``.
         session: at its beginning.
-        verifier: compares.
+        verifier: of what was noted; None for a session with other settings than the journal's.
         until: the last entry, which the journal holds; None for all.
         progress: is given ``what``, and the share of the journal that is done.
         what: the name of this replay.

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from armcal.io.journal.segment import Entry, Segment
-from typing_extensions import override
 
 from armcal_online.running.state_replayer import Event, parsing
 from armcal_online.tracking.evaluator import differences
@@ -71,31 +70,6 @@ class DiffersError(Exception):
 
 
 class ReplayVerifier:
-    """Compares nothing: for a session with other settings than the journal's.
-
-    Attributes:
-        resumes: whether the session may go on from a checkpoint's state where its own is lost.
-    """
-
-    resumes: ClassVar[bool] = False
-
-    def begin_segment(self, segment: Segment) -> None:
-        """A segment, whose checkpoint comes next."""
-
-    def compare_checkpoint(self, checkpoint: Entry, session: Recalibrator) -> None:
-        """A full state that was noted where the session is now."""
-
-    def compare_digest(self, sequence: int, noted: str, session: Recalibrator) -> None:
-        """The digest of a state that was noted where the session is now."""
-
-    def compare_events(self, sequence: int, noted: list[Event], replayed: list[Event]) -> None:
-        """The events of a record that were noted, and those of the replay."""
-
-    def unnoted_events(self, sequence: int, replayed: list[Event]) -> None:
-        """Events of a record in the replay, where none was noted though the writer went on."""
-
-
-class Comparer(ReplayVerifier):
     """Compares states and decisions; mutable.
 
     Attributes:
@@ -106,8 +80,6 @@ class Comparer(ReplayVerifier):
         others: in what the journal's evaluators differ from this one's.
     """
 
-    resumes = True
-
     def __init__(self, evaluator: Mapping[str, Any]) -> None:
         self._evaluator = dict(evaluator)
         self._writer: Any = None
@@ -116,8 +88,8 @@ class Comparer(ReplayVerifier):
         self.widest = Distance()
         self.others: tuple[str, ...] = ()
 
-    @override
     def begin_segment(self, segment: Segment) -> None:
+        """A segment, whose checkpoint comes next."""
         writer = segment.header.get("evaluator")
         self._is_new = self._writer is not None and writer != self._writer
         self._writer = writer
@@ -125,8 +97,8 @@ class Comparer(ReplayVerifier):
         self._is_ours = not texts
         self.others = tuple(dict.fromkeys([*self.others, *texts]))
 
-    @override
     def compare_checkpoint(self, checkpoint: Entry, session: Recalibrator) -> None:
+        """A full state that was noted where the session is now."""
         is_new, self._is_new = self._is_new, False
         self.states += 1
         with parsing(checkpoint.sequence):
@@ -150,23 +122,23 @@ class Comparer(ReplayVerifier):
             # Where the journal's evaluator changes, the session goes on from its state.
             session.restore(noted["state"])
 
-    @override
     def compare_digest(self, sequence: int, noted: str, session: Recalibrator) -> None:
+        """The digest of a state that was noted where the session is now."""
         digest = session.digest()
         self.states += 1
         self.equal += digest == noted
         if self._is_ours and digest != noted:
             raise DiffersError(sequence, f"The state is {digest}, {noted} was noted.")
 
-    @override
     def compare_events(self, sequence: int, noted: list[Event], replayed: list[Event]) -> None:
+        """The events of a record that were noted, and those of the replay."""
         self.decisions += len(noted)
         compared = (noted, replayed) if self._is_ours else (_without_digits(noted), _without_digits(replayed))
         if compared[0] != compared[1]:
             raise DiffersError(sequence, f"Found {_listed(replayed)}; noted was {_listed(noted)}.")
 
-    @override
     def unnoted_events(self, sequence: int, replayed: list[Event]) -> None:
+        """Events of a record in the replay, where none was noted though the writer went on."""
         # A full disk takes notes too; where all bits are the same, the states are compared anyway.
         if not self._is_ours:
             raise DiffersError(sequence, f"Found {_listed(replayed)}; noted was nothing.")

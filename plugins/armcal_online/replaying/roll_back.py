@@ -62,7 +62,7 @@ def roll_back_ended(folder: Path, to: int | str, registry: PluginRegistry) -> Ma
         begun_from=str(header["text"]).encode(),
     )
     with opened(setup, session, lambda rows: NoRecords()) as loop:
-        reply = rolled_back(loop.recalibration, session, to)
-        loop.recalibration.finishing = "The estimate was set back after the end."
+        reply = rolled_back(loop, to)
+        loop.finishing = "The estimate was set back after the end."
         loop.run()
     return reply

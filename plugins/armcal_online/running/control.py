@@ -16,7 +16,6 @@ from armcal.measure.reader import ReadRequest
 
 from armcal_online.running.loop import Recalibration
 from armcal_online.running.state_replayer import RECORD
-from armcal_online.tracking.recalibrator import Recalibrator
 
 SOCKET = "control.sock"
 GOOD = "good"
@@ -67,7 +66,7 @@ def ask(folder: Path, request: Mapping[str, Any], timeout_s: float = 30.0) -> di
     return dict(reply)
 
 
-def answer(recalibration: Recalibration, session: Recalibrator, request: Mapping[str, Any]) -> Mapping[str, Any]:
+def answer(recalibration: Recalibration, request: Mapping[str, Any]) -> Mapping[str, Any]:
     """The reply to one of the known commands, which act at once: ``ok``, and what it says.
 
     Raises:
@@ -83,15 +82,16 @@ def answer(recalibration: Recalibration, session: Recalibrator, request: Mapping
         case "finish":
             recalibration.finishing = "It was asked to finish."
         case "rollback":
-            return {"ok": True, **rolled_back(recalibration, session, request.get("to"))}
+            return {"ok": True, **rolled_back(recalibration, request.get("to"))}
         case "what_if":
+            session = recalibration.session
             return {"ok": True, **session.what_if(joint_values(request.get("joints"), session.request))}
         case other:
             raise InputError(f"found the command {other!r}, expected one of {', '.join(COMMANDS)}.")
     return {"ok": True, **recalibration.status()}
 
 
-def rolled_back(recalibration: Recalibration, session: Recalibrator, to: Any) -> Mapping[str, Any]:
+def rolled_back(recalibration: Recalibration, to: Any) -> Mapping[str, Any]:
     """The reply after a roll-back, to the state after an entry (its number), a record (its name) or the last good one.
 
     Raises:
@@ -100,7 +100,7 @@ def rolled_back(recalibration: Recalibration, session: Recalibrator, to: Any) ->
     """
     before = recalibration.sequence
     if to == GOOD:
-        good = session.status()["last_good"]
+        good = recalibration.session.status()["last_good"]
         if good is None:
             hint = "Begin a new --out from the calibration that this one began from."
             raise InputError("no record was good yet.", where=Location("rollback"), hint=hint)

@@ -2,13 +2,13 @@
 
 import os
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from armcal.base.config_text import finite
 from armcal.io.journal.journal import Journal, JournalFullError
+from armcal.io.json_server import JsonServer
 from armcal.io.signals import Signals
 
 from armcal_online.running.outputs import Outputs
@@ -42,6 +42,7 @@ class Recalibration:
     """A source, a journal, an estimate and its outputs, moved on record by record.
 
     Attributes:
+        session: the estimate.
         sequence: of the last entry that changed anything.
         finishing: why it is about to end; empty while it is not.
     """
@@ -53,11 +54,12 @@ class Recalibration:
         session: Recalibrator,
         state_replayer: StateReplayer,
         outputs: Outputs,
+        control: JsonServer,
         pace: Pace,
         since_checkpoint: int = 0,
     ) -> None:
-        self._source, self._journal, self._session = source, journal, session
-        self._state_replayer, self._outputs, self._pace = state_replayer, outputs, pace
+        self._source, self._journal, self.session = source, journal, session
+        self._state_replayer, self._outputs, self._control, self._pace = state_replayer, outputs, control, pace
         self._held: Incoming | None = None
         self._held_until = 0.0
         self._is_full = False
@@ -78,8 +80,8 @@ class Recalibration:
         """Whether records are passed over, or left where they are."""
         return self._state_replayer.progress.paused
 
-    def run(self, serve: Callable[[], None]) -> None:
-        """Until the source ends, a signal comes, or a request to finish; ``serve`` answers requests that have come.
+    def run(self) -> None:
+        """Until the source ends, a signal comes, or a request to finish.
 
         Raises:
             JournalFailedError: the disk fails; what was acknowledged is safe.
@@ -87,7 +89,7 @@ class Recalibration:
         with Signals() as signals:
             self.write_calibration()
             while not self.finishing:
-                serve()
+                self._control.serve()
                 if signals.finish:
                     self.finishing = "It was asked to finish by a signal."
                 if signals.rotate:
@@ -107,7 +109,7 @@ class Recalibration:
             event = {"event": "finished", "sequence": self.sequence, "at": time.time(), "sentence": sentence}
             self._outputs.event(event)
             self._outputs.status({**self.status(), "finished": True})
-            serve()
+            self._control.serve()
 
     def step(self, wait_s: float) -> None:
         """Take one record, if there is one within the wait, and write what is due."""
@@ -153,14 +155,14 @@ class Recalibration:
             DataError, InputError: the journal does not reach there; nothing is changed.
             JournalFullError: there is no room to note it; nothing is changed.
         """
-        before = self._session.snapshot()
+        before = self.session.snapshot()
         self._state_replayer.go_back(sequence)
         try:
-            self.sequence = self._journal.record(ROLLBACK, {"to": sequence, "digest": self._session.digest()})
+            self.sequence = self._journal.record(ROLLBACK, {"to": sequence, "digest": self.session.digest()})
         except BaseException:
-            self._session.restore(before)
+            self.session.restore(before)
             raise
-        event = {**self._session.rolled_back_event(self.sequence, sequence), "at": time.time()}
+        event = {**self.session.rolled_back_event(self.sequence, sequence), "at": time.time()}
         self._outputs.event(event)
         self._checkpoint()
         self.write_calibration()
@@ -169,7 +171,7 @@ class Recalibration:
     def status(self) -> dict[str, Any]:
         """Of session, journal and source now, as JSON."""
         return {
-            **self._session.status(),
+            **self.session.status(),
             "sequence": self.sequence,
             "records": self._state_replayer.progress.records,
             "paused": self.paused,
@@ -182,7 +184,7 @@ class Recalibration:
         """Replace the updated calibration."""
         self._since_calibration = 0
         self._calibrated = time.monotonic()
-        self._is_written = self._outputs.calibration(self._session.calibration_text())
+        self._is_written = self._outputs.calibration(self.session.calibration_text())
         if self._is_written:
             path = str(self._outputs.calibration_path)
             self._outputs.event({"event": "calibration", "sequence": self.sequence, "at": time.time(), "path": path})
@@ -215,7 +217,7 @@ class Recalibration:
         noted = [finite(event) for event in events if event["event"] in NOTED]
         if noted or self._since_digest >= self._pace.digest_records:
             self._since_digest = 0
-            note = {"after": self.sequence, "digest": self._session.digest(), "events": noted}
+            note = {"after": self.sequence, "digest": self.session.digest(), "events": noted}
             try:
                 self._journal.note(DECISION, note)
             except JournalFullError as fault:

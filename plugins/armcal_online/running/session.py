@@ -15,7 +15,6 @@ from armcal.io.folder import check_folder
 from armcal.io.journal.files import REAL_FILES, FileLayer
 from armcal.io.journal.journal import Journal, JournalLimits
 from armcal.io.journal.reader import read_until, verify
-from armcal.io.json_server import JsonServer
 from armcal.io.lines import StandardOutput
 
 from armcal_online.running.control import SOCKET, answer, control_server
@@ -60,23 +59,11 @@ class Setup:
     begun_from: bytes | None = None
 
 
-@dataclass(frozen=True)
-class Open:
-    """An open recalibration, and the socket that it is controlled by."""
-
-    recalibration: Recalibration
-    control: JsonServer
-
-    def run(self) -> None:
-        """Until it ends; see ``Recalibration.run``."""
-        self.recalibration.run(self.control.serve)
-
-
 SourceOf = Callable[[RowParser], Source]
 
 
 @contextmanager
-def opened(setup: Setup, session: Recalibrator, source_of: SourceOf) -> Iterator[Open]:
+def opened(setup: Setup, session: Recalibrator, source_of: SourceOf) -> Iterator[Recalibration]:
     """Begin in a new folder, or go on in one: its newest checkpoint, the entries after it, the source after these.
 
     Raises:
@@ -117,10 +104,10 @@ def opened(setup: Setup, session: Recalibrator, source_of: SourceOf) -> Iterator
             text = "The estimate is not touched by it: only what lies before is out of reach."
             outputs.alarm(f"{fault.message} {text}")
         left = len(journal.recovered.entries) if resumed else 0
-        recalibration = Recalibration(source, journal, session, state_replayer, outputs, setup.pace, left)
-        control = control_server(setup.folder, partial(answer, recalibration, session))
+        control = control_server(setup.folder, lambda request: answer(recalibration, request))
         stack.callback(control.close)
-        yield Open(recalibration, control)
+        recalibration = Recalibration(source, journal, session, state_replayer, outputs, control, setup.pace, left)
+        yield recalibration
 
 
 def _calibration_text(setup: Setup) -> bytes:
