@@ -9,7 +9,6 @@ import random
 import socket
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,7 @@ from armcal_online.sources.streams import Lines, Udp
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
 from fake_recalibrator import HEADER, request, row
 
-PLACE = Place(0.0, "", 1)
+PLACE = Place("", 1, 0.0)
 
 
 def rows(**columns: str) -> RowParser:
@@ -208,7 +207,7 @@ def test_bytes_at_random_never_raise(tmp_path: Path) -> None:
 def test_a_growing_file_is_followed_and_half_a_line_waited_for(tmp_path: Path, simulated: SimulatedTime) -> None:
     path = tmp_path / "poses.csv"
     path.write_text(HEADER[:10])
-    source = CsvFile(path, rows(), "wait", simulated.time)
+    source = CsvFile(path, rows(), "wait")
     assert everything(source, 0.06) == []
     with path.open("a") as file:
         file.write(f"{HEADER[10:]}\n{row(1)}\n{row(2)[:-1]}")
@@ -225,7 +224,7 @@ def test_a_file_that_takes_the_place_of_another_is_read_from_its_beginning(
 ) -> None:
     path = tmp_path / "poses.csv"
     path.write_text(table(5))
-    source = CsvFile(path, rows(), "wait", simulated.time)
+    source = CsvFile(path, rows(), "wait")
     first = everything(source, 0.06)
     (tmp_path / "new").write_text(table(3, first=10))
     os.replace(tmp_path / "new", path)
@@ -234,7 +233,7 @@ def test_a_file_that_takes_the_place_of_another_is_read_from_its_beginning(
     third = everything(source, 0.12)
     assert ids(first + second + third) == ["p1", "p2", "p3", "p4", "p5", "p10", "p11", "p12", "p20", "p21"]
     assert len({r.source_key for r in first + second + third}) == 3
-    again = CsvFile(path, rows(), "wait", simulated.time)
+    again = CsvFile(path, rows(), "wait")
     again.resume({first[0].source_key: 6})  # of another file of that name
     assert ids(everything(again, 0.06)) == ["p20", "p21"]
 
@@ -268,8 +267,8 @@ def test_a_file_that_cannot_be_used_is_refused_at_once(tmp_path: Path) -> None:
     assert isinstance(open_source(str(tmp_path), rows()), Folder)
 
 
-def folder(path: Path, clock: Callable[[], float] = time.time) -> Folder:
-    return Folder(path, rows(), clock, settled_s=0.15)
+def folder(path: Path) -> Folder:
+    return Folder(path, rows(), settled_s=0.15)
 
 
 def test_files_of_a_folder_come_in_the_order_of_their_names_and_new_ones_at_any_time(
@@ -281,7 +280,7 @@ def test_files_of_a_folder_come_in_the_order_of_their_names_and_new_ones_at_any_
     (tmp_path / ".d.csv.part").write_text(table(2))
     (tmp_path / "notes.txt").write_text("nothing")
     (tmp_path / "d.csv").mkdir()
-    source = folder(tmp_path, simulated.time)
+    source = folder(tmp_path)
     assert ids(everything(source, 0.5)) == ["p1", "p2", "p3", "p4", "p5", "3"]
     (tmp_path / "new").write_text(json.dumps([{**WHOLE, "id": "p6"}, 7, {**WHOLE, "id": "p7"}]))
     os.replace(tmp_path / "new", tmp_path / "aa.json")
@@ -293,7 +292,7 @@ def test_files_of_a_folder_come_in_the_order_of_their_names_and_new_ones_at_any_
 
 
 def test_a_file_that_is_being_written_holds_up_those_after_it(tmp_path: Path, simulated: SimulatedTime) -> None:
-    source = folder(tmp_path, simulated.time)
+    source = folder(tmp_path)
     with (tmp_path / "a.csv").open("w") as file:
         (tmp_path / "b.csv").write_text(table(1, first=50))
         for piece in (HEADER, f"\n{row(1)}\n{row(2)[:5]}", f"{row(2)[5:]}\n"):
@@ -306,7 +305,7 @@ def test_a_file_that_is_being_written_holds_up_those_after_it(tmp_path: Path, si
 def test_a_json_file_that_is_cut_short_is_read_when_it_is_whole(tmp_path: Path, simulated: SimulatedTime) -> None:
     path, text = tmp_path / "a.json", json.dumps([WHOLE, WHOLE])
     path.write_text(text[:-20])
-    source = folder(tmp_path, simulated.time)
+    source = folder(tmp_path)
     assert everything(source, 0.4) == []
     path.write_text(text)
     assert len(everything(source, 0.5)) == 2
@@ -318,12 +317,12 @@ def test_a_folder_is_gone_on_with_and_a_bad_header_costs_its_file_one_fault(
     (tmp_path / "a.csv").write_text(table(3))
     (tmp_path / "b.csv").write_text("no,header\n1,2\n3,4\n")
     (tmp_path / "c.csv").write_text(table(3, first=4))
-    progress, first = Progress(), folder(tmp_path, simulated.time)
+    progress, first = Progress(), folder(tmp_path)
     taken = [first.incoming(0.5) for _ in range(5)]
     for sequence, incoming in enumerate(taken):
         assert incoming is not None
         progress.take(incoming, sequence)
-    second = folder(tmp_path, simulated.time)
+    second = folder(tmp_path)
     second.resume(progress.positions)
     assert ids([r for r in taken if r]) == ["p1", "p2", "p3", "1", "p4"]
     assert ids(everything(second, 0.5)) == ["p5", "p6"]
@@ -337,7 +336,7 @@ def test_what_is_remembered_of_files_does_not_grow(tmp_path: Path, simulated: Si
     assert len(positions) == MAX_FILES + 1
     for i in (0, 2 * MAX_FILES - 1, 2 * MAX_FILES, 3 * MAX_FILES - 1, 3 * MAX_FILES):
         (tmp_path / f"{i:06d}.csv").write_text("\n" + table(5, first=i))
-    source = folder(tmp_path, simulated.time)
+    source = folder(tmp_path)
     source.resume(positions)
     last = 3 * MAX_FILES
     assert ids(everything(source, 0.5)) == [f"p{n}" for i in (last - MAX_FILES, last - 1) for n in (i + 3, i + 4)] + [
@@ -348,7 +347,7 @@ def test_what_is_remembered_of_files_does_not_grow(tmp_path: Path, simulated: Si
 def test_a_file_that_becomes_shorter_is_told_once(tmp_path: Path, simulated: SimulatedTime) -> None:
     path = tmp_path / "a.csv"
     path.write_text(table(5))
-    source = folder(tmp_path, simulated.time)
+    source = folder(tmp_path)
     assert len(everything(source, 0.4)) == 5
     path.write_text(table(1))
     (fault,) = everything(source, 0.4)

@@ -1,7 +1,6 @@
 """``armcal recalibrate``."""
 
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from armcal_online.running.session import Setup, opened
 from armcal_online.sources.csv_file import CsvFile
 from armcal_online.sources.folder import Folder
 from armcal_online.sources.row_parser import RowParser
-from armcal_online.sources.source import AtEnd, Clock, Source
+from armcal_online.sources.source import AtEnd, Source
 from armcal_online.sources.streams import Lines, Udp
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import RecalibrateSettings, load_settings
@@ -81,7 +80,7 @@ def setup_of(settings: RecalibrateSettings, calibration: Path, out: Path, stream
     )
 
 
-def open_source(text: str, rows: RowParser, at_end: AtEnd = "stop", clock: Clock = time.time) -> Source:
+def open_source(text: str, rows: RowParser, at_end: AtEnd = "stop") -> Source:
     """A source by its name: ``-``, ``udp:PORT``, ``udp:HOST:PORT?from=SENDER``, a directory, or a CSV file.
 
     Raises:
@@ -89,16 +88,16 @@ def open_source(text: str, rows: RowParser, at_end: AtEnd = "stop", clock: Clock
         DataError: the header of a file cannot be used.
     """
     if text == "-":
-        return Lines(sys.stdin.fileno(), rows, clock)
+        return Lines(sys.stdin.fileno(), rows)
     if text.startswith("udp:"):
         address = parsed(text)
         if address is None:
             raise InputError("it is no address.", where=Location(text), hint=f"Give {KINDS}.")
         host, port, senders = address
-        return Udp(host, port, rows, clock, senders)
+        return Udp(host, port, rows, senders)
     path = Path(text)
     if path.is_dir():
-        return Folder(path, rows, clock)
+        return Folder(path, rows)
     if not path.exists():
         raise InputError("there is no such file or directory.", where=Location(text), hint=f"Give {KINDS}.")
-    return CsvFile(path, rows, at_end, clock)
+    return CsvFile(path, rows, at_end)

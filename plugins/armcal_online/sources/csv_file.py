@@ -17,7 +17,7 @@ from typing_extensions import override
 
 from armcal_online.sources.reading import LineReading
 from armcal_online.sources.row_parser import KINDS, Kind, LineParser, RowParser
-from armcal_online.sources.source import AtEnd, Clock, Incoming, Source, key_of, wait_until
+from armcal_online.sources.source import AtEnd, Incoming, Source, key_of, wait_until
 
 _IDENTIFYING: Mapping[Kind, int] = {"csv": 2, "json": 1}
 """So many lines that are not blank identify a file: a header alone does not."""
@@ -35,9 +35,9 @@ class CsvFile(Source):
 
     keeps_records, ended = True, False
 
-    def __init__(self, path: Path, rows: RowParser, at_end: AtEnd, clock: Clock = time.time) -> None:
+    def __init__(self, path: Path, rows: RowParser, at_end: AtEnd) -> None:
         self._path, self._kind = path, KINDS.get(path.suffix, "csv")
-        self._rows, self._at_end, self._clock = rows, at_end, clock
+        self._rows, self._at_end = rows, at_end
         self._positions: Mapping[str, int] = {}
         self._reading: LineReading | None = None
         self._file: BinaryIO | None = None
@@ -109,4 +109,4 @@ class CsvFile(Source):
         key = f"{key_of(self._path.name)}#{checksum:08x}"
         parser = LineParser(self._rows, self._kind, str(self._path))
         self._file = file
-        self._reading = LineReading(file.read, parser, self._clock, key, self._positions.get(key, 0))
+        self._reading = LineReading(file.read, parser, key, self._positions.get(key, 0))

@@ -14,7 +14,7 @@ from typing_extensions import override
 
 from armcal_online.sources.reading import LineReading, WholeReading
 from armcal_online.sources.row_parser import KINDS, LineParser, RowParser, faulty
-from armcal_online.sources.source import THROUGH, Clock, Incoming, Place, Source, key_of, wait_until
+from armcal_online.sources.source import THROUGH, Incoming, Place, Source, key_of, wait_until
 
 SETTLED_S = 1.0
 """A file whose size has not changed for so long is read; one that never stops growing after ``IMPATIENT_S``."""
@@ -60,8 +60,8 @@ class Folder(Source):
 
     keeps_records, ended = True, False
 
-    def __init__(self, path: Path, rows: RowParser, clock: Clock = time.time, settled_s: float = SETTLED_S) -> None:
-        self._path, self._rows, self._clock, self._settled_s = path, rows, clock, settled_s
+    def __init__(self, path: Path, rows: RowParser, settled_s: float = SETTLED_S) -> None:
+        self._path, self._rows, self._settled_s = path, rows, settled_s
         self._positions: dict[str, int] = {}
         self._through = ""
         self._pending: list[str] = []
@@ -134,7 +134,7 @@ class Folder(Source):
         now = time.monotonic()
         return (
             now - watched.changed >= self._settled_s
-            or self._clock() - watched.modified >= self._settled_s
+            or time.time() - watched.modified >= self._settled_s
             or now - watched.seen >= IMPATIENT_S
         )
 
@@ -150,15 +150,15 @@ class Folder(Source):
         except InputError as fault:
             if isinstance(fault.__cause__, FileNotFoundError) or not isinstance(fault.__cause__, OSError):
                 return None  # it is gone, or a pipe or device took its place: those are not waited for
-            return faulty(Place(self._clock(), key, 0), f"{key} cannot be read ({fault.__cause__.strerror}).")
+            return faulty(Place(key), f"{key} cannot be read ({fault.__cause__.strerror}).")
         try:
             if path.suffix == _WHOLE:
-                watched.reading = WholeReading(file, self._rows, self._clock, key, through)
+                watched.reading = WholeReading(file, self._rows, key, through)
             else:
                 parser = LineParser(self._rows, KINDS[path.suffix], str(path))
-                watched.reading, watched.file = LineReading(file.read, parser, self._clock, key, through), file
+                watched.reading, watched.file = LineReading(file.read, parser, key, through), file
         except OSError as fault:
-            return faulty(Place(self._clock(), key, 0), f"{key} cannot be read ({fault.strerror}).")
+            return faulty(Place(key), f"{key} cannot be read ({fault.strerror}).")
         return None
 
     def _advance(self, name: str, watched: _Watched) -> Incoming | None:
@@ -175,7 +175,7 @@ class Folder(Source):
         elif _GONE < watched.size < watched.reading.offset and not watched.shorter:
             watched.shorter = True
             mend = "give what is new a name of its own"
-            return faulty(Place(self._clock(), key_of(name), 0), f"{name} became shorter after it was read; {mend}.")
+            return faulty(Place(key_of(name)), f"{name} became shorter after it was read; {mend}.")
         quiet = time.monotonic() - watched.changed >= IMPATIENT_S
         return watched.reading.last() if watched.reading.begun and quiet else None
 

@@ -9,7 +9,7 @@ from typing import Any, BinaryIO
 from armcal.io.lines import LineCutter
 
 from armcal_online.sources.row_parser import LineParser, RowParser, faulty
-from armcal_online.sources.source import Clock, Incoming, Place
+from armcal_online.sources.source import Incoming, Place
 
 MAX_JSON_BYTES = 4 * 1024**2
 
@@ -22,7 +22,6 @@ class LineReading:
     Args:
         read: at most so many bytes; none if there are none now.
         parser: of lines.
-        clock: for the arrival of records.
         key: of the file in its source.
         through: the last row that was taken before.
 
@@ -31,10 +30,9 @@ class LineReading:
     """
 
     def __init__(
-        self, read: Callable[[int], bytes | None], parser: LineParser, clock: Clock, key: str = "", through: int = 0
+        self, read: Callable[[int], bytes | None], parser: LineParser, key: str = "", through: int = 0
     ) -> None:
-        self._read, self._parser, self._clock = read, parser, clock
-        self._key, self._through = key, through
+        self._read, self._parser, self._key, self._through = read, parser, key, through
         self._cutter = LineCutter()
         self._lines: deque[bytes | None] = deque()
         self._row = self.offset = 0
@@ -77,7 +75,7 @@ class LineReading:
         return incoming if self._row > self._through else None
 
     def _place(self) -> Place:
-        return Place(self._clock(), self._key, self._row)
+        return Place(self._key, self._row)
 
 
 class WholeReading:
@@ -88,8 +86,8 @@ class WholeReading:
         row: how many objects were taken.
     """
 
-    def __init__(self, file: BinaryIO, rows: RowParser, clock: Clock, key: str, through: int) -> None:
-        self._rows, self._clock, self._key = rows, clock, key
+    def __init__(self, file: BinaryIO, rows: RowParser, key: str, through: int) -> None:
+        self._rows, self._key = rows, key
         self._objects: deque[Any] = deque()
         self._fault = ""
         self.row = 0
@@ -118,9 +116,9 @@ class WholeReading:
         if not self._objects:
             return None
         self.row += 1
-        return self._rows.object(self._objects.popleft(), Place(self._clock(), self._key, self.row))
+        return self._rows.object(self._objects.popleft(), Place(self._key, self.row))
 
     def last(self) -> Incoming | None:
         """Why it cannot be read, now that it does not change any more."""
         fault, self._fault = self._fault, ""
-        return faulty(Place(self._clock(), self._key, 0), fault) if fault else None
+        return faulty(Place(self._key), fault) if fault else None

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
-Clock = Callable[[], float]
-"""Unix seconds."""
 AtEnd = Literal["stop", "wait"]
 """What a file's end means: there is no more, or more may come."""
 POLL_S = 0.05
@@ -20,11 +18,11 @@ THROUGH = "/"
 
 @dataclass(frozen=True)
 class Place:
-    """Where a record came from: when it arrived (unix seconds, our clock), the file in its source, the row in that."""
+    """Where a record came from: the file in its source, the row in that, and when (unix seconds, our clock)."""
 
-    arrived: float
     source_key: str = ""
     row: int = 0
+    arrived: float = field(default_factory=lambda: time.time())
 
 
 @dataclass(frozen=True)

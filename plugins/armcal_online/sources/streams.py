@@ -15,7 +15,7 @@ from typing_extensions import override
 
 from armcal_online.sources.reading import LineReading
 from armcal_online.sources.row_parser import LineParser, RowParser, faulty
-from armcal_online.sources.source import Clock, Incoming, Place, Source
+from armcal_online.sources.source import Incoming, Place, Source
 
 _WAITING = 64
 """So many senders are remembered until their records are acknowledged; there is one unless a disk is full."""
@@ -26,9 +26,9 @@ class Lines(Source):
 
     keeps_records, ended = False, False
 
-    def __init__(self, descriptor: int, rows: RowParser, clock: Clock = time.time) -> None:
+    def __init__(self, descriptor: int, rows: RowParser) -> None:
         self._descriptor = descriptor
-        self._reading = LineReading(self._read, LineParser(rows, "either", "standard input"), clock)
+        self._reading = LineReading(self._read, LineParser(rows, "either", "standard input"))
         self._is_at_end = False
 
     @override
@@ -73,10 +73,8 @@ class Udp(Source):
 
     keeps_records, ended = False, False
 
-    def __init__(
-        self, host: str, port: int, rows: RowParser, clock: Clock = time.time, senders: Sequence[str] = ()
-    ) -> None:
-        self._rows, self._clock, self._row = rows, clock, 0
+    def __init__(self, host: str, port: int, rows: RowParser, senders: Sequence[str] = ()) -> None:
+        self._rows, self._row = rows, 0
         self._senders: OrderedDict[int, Any] = OrderedDict()
         self._socket, self._is_ours = listening(host, port, senders)
         self._stranger_reported = False
@@ -101,12 +99,12 @@ class Udp(Source):
             self._stranger_reported = True
             self._row += 1
             text = f"A datagram came from {sender[0]}, which is not named as a sender. Further ones are passed over."
-            return faulty(Place(self._clock(), "", self._row), text)
+            return faulty(Place("", self._row), text)
         self._row += 1
         self._senders[self._row] = sender
         while len(self._senders) > _WAITING:
             self._senders.popitem(last=False)
-        place = Place(self._clock(), "", self._row)
+        place = Place("", self._row)
         if flags & socket.MSG_TRUNC or len(data) > MAX_DATAGRAM_BYTES:
             return faulty(place, f"The datagram has more than {MAX_DATAGRAM_BYTES // 1024} KiB.")
         try:
