@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # the watcher reads this table, and has no need of numpy
     from armcal_online.tracking.health import Level
+    from armcal_online.tracking.sizes import Size
 
 
 @dataclass(frozen=True)
@@ -226,8 +227,7 @@ class Decision:
         since: the number of the first record that it affects.
         subject: a joint's channel, a measurement, or that of a cause.
         candidates: what these records cannot distinguish, the likeliest first.
-        size: of a step (rad, m or kg).
-        dimension: of that.
+        size: of a step.
     """
 
     kind: str
@@ -237,8 +237,7 @@ class Decision:
     since: int
     subject: str = ""
     candidates: tuple[str, ...] = ()
-    size: float | None = None
-    dimension: str = ""
+    size: Size | None = None
 
     @property
     def level(self) -> Level:

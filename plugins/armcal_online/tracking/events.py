@@ -14,18 +14,11 @@ from armcal_online.tracking.directions import CAUSES, LINK, Steps, spoken
 from armcal_online.tracking.health import LEVELS, Health
 from armcal_online.tracking.hypotheses import Recent
 from armcal_online.tracking.settings import RecalibrateSettings
-from armcal_online.tracking.sizes import TipError
+from armcal_online.tracking.sizes import SHOWN, TipError
 from armcal_online.tracking.start import FilterSetup
 from armcal_online.tracking.state import Arrival, State
 
 _MOST_LOG_ODDS = 700.0
-_SIZES = {
-    "angle": ("size_deg", math.degrees(1.0)),
-    "length": ("size_mm", 1000.0),
-    "mass": ("size_g", 1000.0),
-    "angle a day": ("rate_deg_per_day", math.degrees(1.0)),
-    "length a day": ("rate_mm_per_day", 1000.0),
-}
 _FIRST_DATE, _LAST_DATE = 1e8, 1e11
 """Unix seconds (1973 to 5138); other times are of a clock that began elsewhere."""
 
@@ -41,7 +34,7 @@ def started(
 ) -> dict[str, Any]:
     """At the beginning; ``slowest``: the rates (rad or m a day) of gradual changes that a week of records names."""
     slides = {joint.joint for joint in steps.joints if joint.dimension == "length"} | set(steps.sensors)
-    rates = {name: _SIZES["length a day" if name in slides else "angle a day"] for name in slowest}
+    rates = {name: SHOWN["length a day" if name in slides else "angle a day"] for name in slowest}
     blocks = {name: block.entry_unit for block in setup.space.parameters.free for name in block.entry_names}
     return {
         **_event("started", state),
@@ -55,7 +48,7 @@ def started(
         "joint_steps_not_followed": list(steps.unfollowed),
         "other_changes": [spoken(cause.subject) for cause in steps.causes],
         "sensor_motions": {name: list(which) for name, (_, which) in steps.sensors.items()},
-        "slowest_named_in_a_week": {name: {unit: factor * slowest[name]} for name, (unit, factor) in rates.items()},
+        "slowest_named_in_a_week": {name: {key: factor * slowest[name]} for name, (key, _, factor) in rates.items()},
     }
 
 
@@ -130,9 +123,9 @@ def decided(state: State, decision: Decision, tip: TipError | None, calm: int) -
         event["joint" if decision.kind.startswith("joint") else "measurement"] = decision.subject
     if len(decision.candidates) > 1:
         event["candidates"] = list(decision.candidates)
-    if decision.size is not None and decision.dimension:
-        name, factor = _SIZES[decision.dimension]
-        event[name] = factor * decision.size
+    if decision.size and decision.size.dimension:
+        key, _, factor = SHOWN[decision.size.dimension]
+        event[key] = factor * decision.size.value
     return event
 
 

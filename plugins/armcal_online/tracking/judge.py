@@ -201,11 +201,8 @@ class Judge:
             if change.subject in subjects and change.subject and change.scale == 1.0
         )
         suspects = suspects if len(suspects) > 1 else ()
-        after = replace(
-            state,
-            belief=belief,
-            anchor=belief,
-            held=(),
+        after = state.following(
+            belief,
             recent=(),
             nis_window=(),
             drifted=0,
@@ -217,7 +214,7 @@ class Judge:
         sizes = [self._size(since[0].before, belief, change) for change in best.hypothesis.singles]
         if best.hypothesis.parts:
             return after, sentences.together(state, self._steps, alike, others, sizes)
-        decision = sentences.change(state, self._steps, alike, others, sizes[0])
+        decision = sentences.change(state, alike, others, sizes[0])
         if best.hypothesis.kind == "general_change":
             late = tuple(s for s in state.changes if state.sequence - s < 10 * self._settings.gate.window)
             after = replace(after, changes=(*late, state.sequence)[-_UNEXPLAINED:])
@@ -246,14 +243,12 @@ class Judge:
         if not others and change.kind != "joint_replaced":
             return settled, ()
         left = tuple(candidate for candidate in followed if candidate not in others) if others else ()
-        after = replace(settled, belief=best.belief, anchor=best.belief, held=(), recent=(), wary=False)
+        after = settled.following(best.belief, recent=(), wary=False)
         if len(left) > 1:
             after = replace(after, suspects=left, before_change=state.before_change)
         size = self._size(state.before_change or best.belief, best.belief, change)
-        if others:
-            names = tuple(dict.fromkeys(self._changes[other.place].subject for other in others))
-            return after, (sentences.named(state, change, names, margin, size),)
-        return after, (sentences.replaced(state, change, margin, size),)
+        names = tuple(dict.fromkeys(self._changes[other.place].subject for other in others))
+        return after, (sentences.named(state, change, names, margin, size),)
 
     def _detect_drift(self, state: State) -> tuple[State, tuple[Decision, ...]]:
         """Whether the NIS as a whole is too large, though no record's is."""
@@ -274,7 +269,7 @@ class Judge:
         factor = min(math.sqrt(ratio), _MOST_WIDENING)
         belief = state.belief.widened(len(self._space.scales), factor)
         decision = sentences.drift(state, count, ratio, by_chance, factor)
-        return replace(state, belief=belief, anchor=belief, held=()), (decision,)
+        return state.following(belief), (decision,)
 
     def _detect_slow(self, state: State) -> tuple[State, tuple[Decision, ...]]:
         """Whether many records together speak for a change that none of them shows."""
@@ -291,7 +286,7 @@ class Judge:
         if len(near) > 1:
             belief = state.belief.widened(len(self._space.scales), _UNNAMED)
             decision = sentences.slow_unnamed([one.change.subject for one in near], *about, _UNNAMED)
-            return replace(state, belief=belief, anchor=belief), (decision,)
+            return state.following(belief), (decision,)
         slow, belief = self._slow.followed(state.slow, best, state.belief)
         is_gradual = best.change.kind in GRADUAL
         size = (
@@ -300,7 +295,7 @@ class Judge:
             else self._size(state.belief, belief, best.change)
         )
         decision = sentences.slow(best.change, size, *about, weighings[1].change.subject if len(weighings) > 1 else "")
-        return replace(state, belief=belief, anchor=belief, recent=(), nis_window=(), slow=slow), (decision,)
+        return state.following(belief, recent=(), nis_window=(), slow=slow), (decision,)
 
     def _size(self, before: Belief, after: Belief, change: Hypothesis) -> Size:
         return size_of(self._space, self._steps, before, after, change)

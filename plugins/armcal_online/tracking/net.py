@@ -6,7 +6,7 @@ chance makes in a long mission, the belief becomes that window's. Everything is 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from armcal.base.arrays import Array
@@ -38,27 +38,6 @@ _LOOKED_AT = 10
 _NUMBERS = 3
 """Predictions of all measurements are compared by the loss of so many numbers."""
 _FARTHEST = 1e9
-
-
-@dataclass(frozen=True)
-class TakeOver:
-    """A window that predicts better than the filter.
-
-    Attributes:
-        belief: of its refit.
-        window: how many records it holds.
-        since: the first record that it predicted better.
-        records: how many predictions were compared.
-        log_odds: of them.
-        distances: the filter's median distance from what was measured, and the window's (m).
-    """
-
-    belief: Belief
-    window: int
-    since: int
-    records: int
-    log_odds: float
-    distances: tuple[float, float]
 
 
 class Net:
@@ -96,39 +75,22 @@ class Net:
         if corrected:
             net = replace(net, predictions=())
         net = self._taken(net, record, passed.get("time", 0.0), state.belief)
-        over = self._take_over(net)
+        over = self._take_over(net, state.belief)
         if over is None:
             return replace(state, net=net), ()
-        net = replace(net, predictions=())
-        after = replace(
-            state,
-            belief=over.belief,
-            anchor=over.belief,
-            held=(),
+        belief, decision = over
+        after = state.following(
+            belief,
             recent=(),
             nis_window=(),
             wary=False,
             suspects=(),
             before_change=None,
             drifted=0,
-            net=net,
+            net=replace(net, predictions=()),
             slow=replace(state.slow, tracks=()),
         )
-        return after, (self._decision(state.belief, over),)
-
-    def _decision(self, before: Belief, over: TakeOver) -> Decision:
-        filtered, refitted = (1000 * distance for distance in over.distances)
-        space = self._setup.space
-        n = len(space.scales)
-        moved = space.between(before.values(space), over.belief.values(space))
-        deviations = np.sqrt(np.diag(over.belief.gaussian.covariance)[:n])
-        most = int(np.argmax(np.abs(moved) / deviations))
-        what = f"A robust refit of the last {over.window} records took over from the filter"
-        why = (
-            f"it predicted the last {over.records} records {refitted:.2f} mm off in the median, the filter "
-            f"{filtered:.2f} mm; {space.names[most]} moved most"
-        )
-        return Decision("refit_took_over", what, why, over.log_odds, over.since)
+        return after, (decision,)
 
     def _predicted(self, state: NetState, record: NetRecord, filtered: Belief) -> NetState:
         """With a record predicted by all, before any of them has used it; the filter knows what neighbours share."""
@@ -169,22 +131,29 @@ class Net:
             refits[place] = self._refitter.refitted(refits[place], prior, window, _ROUNDS)
         return replace(state, refits=tuple(refits))
 
-    def _take_over(self, state: NetState) -> TakeOver | None:
-        """The window that predicts better than the filter beyond chance, the likeliest if several do."""
+    def _take_over(self, state: NetState, filtered: Belief) -> tuple[Belief, Decision] | None:
+        """The belief of the window that predicts better than the filter beyond chance, the likeliest if several do."""
         gains = [self._gain(state.predictions, place) for place in range(len(state.refits))]
         place = max(range(len(gains)), key=lambda i: gains[i][0], default=None)
         if place is None or gains[place][0] <= _ODDS:
             return None
         log_odds, count = gains[place]
-        compared = state.predictions[-count:]
-        window = state.records[-WINDOWS[place] :]
-        prior = self._prior(state.seconds)
+        compared, window = state.predictions[-count:], state.records[-WINDOWS[place] :]
         try:
-            belief = self._refitter.belief(state.refits[place], prior, window, self._beside)
+            belief = self._refitter.belief(state.refits[place], self._prior(state.seconds), window, self._beside)
         except (ArmcalError, np.linalg.LinAlgError):
             return None
-        filtered, refitted = (float(np.median([p.distance[i] for p in compared])) for i in (0, place + 1))
-        return TakeOver(belief, WINDOWS[place], compared[0].sequence, count, log_odds, (filtered, refitted))
+        before, after = (1000 * float(np.median([p.distance[i] for p in compared])) for i in (0, place + 1))
+        space = self._setup.space
+        moved = space.between(filtered.values(space), belief.values(space))
+        deviations = np.sqrt(np.diag(belief.gaussian.covariance)[: len(space.scales)])
+        most = space.names[int(np.argmax(np.abs(moved) / deviations))]
+        what = f"A robust refit of the last {WINDOWS[place]} records took over from the filter"
+        why = (
+            f"it predicted the last {count} records {after:.2f} mm off in the median, the filter {before:.2f} mm; "
+            f"{most} moved most"
+        )
+        return belief, Decision("refit_took_over", what, why, log_odds, compared[0].sequence)
 
     def _gain(self, predictions: Sequence[Prediction], place: int) -> tuple[float, int]:
         """Log odds of a window against the filter over the last predictions, as many as speak for it most."""

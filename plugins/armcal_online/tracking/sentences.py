@@ -11,13 +11,7 @@ from armcal_online.tracking.sizes import Size
 from armcal_online.tracking.state import State
 
 
-def change(
-    state: State,
-    steps: Steps,
-    alike: Sequence[Explanation],
-    others: Sequence[Explanation],
-    size: Size,
-) -> Decision:
+def change(state: State, alike: Sequence[Explanation], others: Sequence[Explanation], size: Size) -> Decision:
     """A change that is followed from now on."""
     best = alike[0]
     hypothesis, kind, subject = best.hypothesis, best.hypothesis.kind, best.hypothesis.subject
@@ -43,7 +37,7 @@ def change(
         why += "; records since do not distinguish them, and all of them are open until one does"
         return Decision("one_of_several", what, why, log_odds, onset, "", names)
     what = _happened(hypothesis, size)
-    return Decision(kind, what, why, log_odds, onset, subject, names, size.value, size.dimension)
+    return Decision(kind, what, why, log_odds, onset, subject, names, size)
 
 
 def together(
@@ -70,8 +64,7 @@ def together(
     decisions = []
     for part, other, size in zip(parts, reversed(parts), sizes, strict=True):
         what, names = f"{_happened(part, size)}; {_named(other)} changed at the same time", (part.subject,)
-        kind, value = part.kind, size.value
-        decisions.append(Decision(kind, what, why, log_odds, onset, part.subject, names, value, size.dimension))
+        decisions.append(Decision(part.kind, what, why, log_odds, onset, part.subject, names, size))
     return tuple(decisions)
 
 
@@ -79,8 +72,7 @@ def slow(change: Hypothesis, size: Size, since: int, records: int, log_odds: flo
     """A small or slow change that many records speak for."""
     why = f"no single one of the {records} records since shows it, but all of them together do"
     why += f"; the next likeliest is {spoken(next_likeliest)}" if next_likeliest else ""
-    numbers = (change.subject, (change.subject,), size.value, size.dimension)
-    return Decision(change.kind, _happened(change, size), why, log_odds, since, *numbers)
+    return Decision(change.kind, _happened(change, size), why, log_odds, since, change.subject, (change.subject,), size)
 
 
 def slow_unnamed(candidates: Sequence[str], since: int, records: int, log_odds: float, factor: float) -> Decision:
@@ -94,21 +86,13 @@ def slow_unnamed(candidates: Sequence[str], since: int, records: int, log_odds: 
 
 
 def named(state: State, change: Hypothesis, others: Sequence[str], margin: float, size: Size) -> Decision:
-    """Which of several it was."""
-    subject, numbers = change.subject, (size.value, size.dimension)
-    if change.kind.startswith("joint"):
-        what = f"It was joint {subject} that stepped, by {size.shown}"
+    """Which of several it was; without others, that a joint which stepped acts like a new servo."""
+    about = (margin, state.suspected, change.subject, (change.subject,), size)
+    if others and change.kind.startswith("joint"):
         why = f"the records since do not fit a change of {_or(others)} as well, which is as before"
-        return Decision("joint_named", what, why, margin, state.suspected, subject, (subject,), *numbers)
-    why = f"the records since fit this better than a change of {_or(others)}, which is as before"
-    return Decision(change.kind, _happened(change, size), why, margin, state.suspected, subject, (subject,), *numbers)
-
-
-def replaced(state: State, change: Hypothesis, margin: float, size: Size) -> Decision:
-    """A joint that stepped acts like a new servo."""
-    why, joint = "the records since fit this better than a slip alone", change.subject
-    what, numbers = _happened(change, size), (size.value, size.dimension)
-    return Decision(change.kind, what, why, margin, state.suspected, joint, (joint,), *numbers)
+        return Decision("joint_named", f"It was joint {change.subject} that stepped, by {size.shown}", why, *about)
+    better = f"a change of {_or(others)}, which is as before" if others else "a slip alone"
+    return Decision(change.kind, _happened(change, size), f"the records since fit this better than {better}", *about)
 
 
 def drift(state: State, count: int, ratio: float, by_chance: float, factor: float) -> Decision:

@@ -15,13 +15,14 @@ from armcal_online.tracking.hypotheses import Hypothesis, Recent
 from armcal_online.tracking.observer import Observer
 from armcal_online.tracking.state_space import StateSpace
 
-_UNITS = {
-    "angle": ("deg", math.degrees(1.0)),
-    "length": ("mm", 1000.0),
-    "mass": ("g", 1000.0),
-    "angle a day": ("deg a day", math.degrees(1.0)),
-    "length a day": ("mm a day", 1000.0),
+SHOWN = {
+    "angle": ("size_deg", "deg", math.degrees(1.0)),
+    "length": ("size_mm", "mm", 1000.0),
+    "mass": ("size_g", "g", 1000.0),
+    "angle a day": ("rate_deg_per_day", "deg a day", math.degrees(1.0)),
+    "length a day": ("rate_mm_per_day", "mm a day", 1000.0),
 }
+"""By dimension: the key in an event, the unit, and how many of it make one in SI."""
 _DIMENSIONS = {"rad": "angle", "m": "length"}
 _CLEAR = 3.0
 """So many standard deviations from zero a number is worth saying."""
@@ -29,12 +30,12 @@ _CLEAR = 3.0
 
 @dataclass(frozen=True)
 class Size:
-    """Of a change, and its standard deviation (rad, m or kg by ``dimension``); in words."""
+    """Of a change, and its standard deviation (rad, m or kg by ``dimension``, empty where it has none); in words."""
 
-    value: float
-    deviation: float
-    dimension: str
-    shown: str
+    value: float = 0.0
+    deviation: float = 0.0
+    dimension: str = ""
+    shown: str = ""
 
 
 def size_of(space: StateSpace, steps: Steps, before: Belief, after: Belief, change: Hypothesis) -> Size:
@@ -51,12 +52,12 @@ def size_of(space: StateSpace, steps: Steps, before: Belief, after: Belief, chan
         along[at] = turn / max(float(np.linalg.norm(turn)), 1e-12) * space.scales[at]
         return _sized(*_along(along, moved, covariance), "angle")
     if not change.step.any():
-        return Size(0.0, 0.0, "", "")
+        return Size()
     along = change.step / float(change.step @ change.step)
     dimension = next((joint.dimension for joint in steps.joints if joint.joint == change.subject), "")
     if change.kind == "payload_changed":
         return _with_centre(space, moved, covariance, _sized(*_along(along, moved, covariance), "mass"))
-    return _sized(*_along(along, moved, covariance), dimension) if dimension else Size(0.0, 0.0, "", "")
+    return _sized(*_along(along, moved, covariance), dimension) if dimension else Size()
 
 
 def rate_of(steps: Steps, change: Hypothesis, size: Array, covariance: Array) -> Size:
@@ -104,7 +105,7 @@ def _along(along: Array, moved: Array, covariance: Array) -> tuple[float, float]
 
 
 def _sized(value: float, deviation: float, dimension: str) -> Size:
-    unit, factor = _UNITS[dimension]
+    _, unit, factor = SHOWN[dimension]
     digits = 0 if dimension == "mass" else 2
     shown = f"{factor * value:+.{digits}f} {unit} (sd {factor * deviation:.{digits}f} {unit})"
     return Size(value, deviation, dimension, shown)

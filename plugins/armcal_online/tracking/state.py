@@ -150,6 +150,10 @@ class State:
     net: NetState = field(default_factory=NetState)
     slow: SlowState = field(default_factory=SlowState)
 
+    def following(self, belief: Belief, **changes: Any) -> State:
+        """With another belief in place of what the records made, and of those that the estimator holds."""
+        return replace(self, belief=belief, anchor=belief, held=(), **changes)
+
     def known(self, sequence: int) -> Arrival | None:
         """The record of a number, if it is remembered."""
         return next((arrival for arrival in reversed(self.ids) if arrival.sequence == sequence), None)
