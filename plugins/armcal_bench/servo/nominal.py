@@ -13,9 +13,9 @@ from armcal.arm.assembly import Arm, ArmState, scoped
 from armcal.arm.environment import Environment
 from armcal.arm.model import forward
 from armcal.base.arrays import Array
-from armcal.base.parameters import ParameterBlock, Parameters
+from armcal.base.parameters import Parameters
 from armcal.base.se3 import Expression
-from armcal.measure.measurement import Channel, Measurement
+from armcal.measure.contact import ArmsAlone
 from armcal.problem.backend import Interpreter
 from armcal.problem.factor import build_factor
 from armcal.problem.kernel import AS_IT_STANDS, Kernel
@@ -32,37 +32,17 @@ _COMPLIANCE_UNIT = "rad_per_Nm"
 _ENTRIES = 12
 
 
-@dataclass(frozen=True)
-class _ToolFrame(Measurement):
+class _ToolFrame(ArmsAlone):
     """``base_T_tool`` without its last row, column by column, as a residual that nothing is taken from."""
-
-    arm: str
-
-    @property
-    @override
-    def arms(self) -> tuple[str, ...]:
-        return (self.arm,)
-
-    @override
-    def parameters(self) -> Sequence[ParameterBlock]:
-        return ()
-
-    @override
-    def channels(self) -> Sequence[Channel]:
-        return ()
-
-    @override
-    def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> Mapping[str, Expression]:
-        return {}
 
     @override
     def residual(
         self, arms: Mapping[str, ArmState], measured: Mapping[str, Expression], values: Mapping[str, Expression]
     ) -> Expression:
-        return ca.vec(arms[self.arm].base_T_tool.matrix()[:3, :])
+        return ca.vec(arms[self.arms[0]].base_T_tool.matrix()[:3, :])
 
     @override
-    def noise(self) -> Sequence[float]:
+    def noise(self) -> tuple[float, ...]:
         return (1.0,) * _ENTRIES
 
 
@@ -90,7 +70,7 @@ class NominalArm:
         arm = replace(arm, effects=springy, residual=None)
         parameters = parameters.with_free(block.name for block in arm.parameters())
         conditions = frozenset(arm.conditions)
-        factor = build_factor("tool", _ToolFrame(arm.name), {arm.name: arm}, parameters, environment, conditions)
+        factor = build_factor("tool", _ToolFrame((arm.name,)), {arm.name: arm}, parameters, environment, conditions)
         return cls(arm, parameters, Kernel(factor, Interpreter(factor)))
 
     def with_values(self, values: Mapping[str, tuple[float, ...]], zeros: Mapping[str, float]) -> NominalArm:
