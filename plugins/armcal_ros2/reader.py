@@ -9,7 +9,7 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.settings import InputPath, Settings
-from armcal.calibration.rigid_chain import tool_poses
+from armcal.calibration.rigid_chain import nominal_tools
 from armcal.io.plain_files import refuse
 from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.layout import warned
@@ -292,7 +292,7 @@ def _tool_of(request: ReadRequest, name: str) -> Callable[[Array], Array]:
     own = request.measurements[name].arms[0]
     arm, channels = request.arms[own], _joint_channels(request)
     columns = [channels.index(f"{own}.{joint}") for joint in arm.commanded]
-    return lambda joints: tool_poses(arm.nominal_chain, np.stack(arm.joint_commands([*joints[:, columns].T]), axis=1))
+    return lambda joints: nominal_tools(arm, joints[:, columns])
 
 
 def _follows_nominal(request: ReadRequest, name: str, dataset: Dataset) -> bool:

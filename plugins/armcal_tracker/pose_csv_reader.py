@@ -4,13 +4,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, NoReturn, Self
 
-import casadi as ca
 import numpy as np
 from armcal.arm.assembly import Arm
-from armcal.arm.model import forward
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.units import DIMENSIONLESS
+from armcal.calibration.rigid_chain import nominal_tools
 from armcal.errors import DataError, Location
 from armcal.measure.checks import Layout, require_records
 from armcal.measure.layout import set_aside, warned
@@ -183,13 +182,8 @@ class PoseCsvReader:
 
 def nominal_rotations(arm: Arm, dataset: Dataset) -> Rotation:
     """base_T_tool's rotation of the nominal arm in each record, without its effects."""
-    commands = ca.SX.sym("commands", len(arm.commanded))
-    joint_commands = arm.joint_commands([commands[i] for i in range(commands.numel())])
-    displacements = [joint.offset + joint_commands[i] for i, joint in enumerate(arm.nominal_chain.joints)]
-    rotation = forward(arm.nominal_chain, displacements, {}).base_T_tool.rotation
-    function = ca.Function("rotation", [commands], [ca.densify(ca.vec(rotation.T))])
-    rows = np.asarray(function(dataset.stacked([f"{arm.name}.{joint}" for joint in arm.commanded])))
-    return Rotation.from_matrix(rows.T.reshape(-1, 3, 3))
+    commands = dataset.stacked([f"{arm.name}.{joint}" for joint in arm.commanded])
+    return Rotation.from_matrix(nominal_tools(arm, commands.T)[:, :3, :3])
 
 
 def misfit(measured: Rotation, nominal: Rotation) -> float:

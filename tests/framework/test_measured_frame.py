@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from armcal.base.arrays import Array
 from armcal.base.units import length_mistake
-from armcal.calibration.rigid_chain import tool_poses
+from armcal.calibration.rigid_chain import nominal_tools
 from armcal.diagnose.measured_frame import frame_mistake, frame_of
 from armcal.run.experiment import Experiment
 from scipy.spatial.transform import Rotation
@@ -20,11 +21,7 @@ LIMITS = np.deg2rad([100, 50, 80, 80, 80, 50])
 @pytest.fixture(scope="module")
 def tools() -> object:
     arm = next(iter(Experiment.load(CONFIG).system.arms.values()))
-
-    def poses(angles: Array) -> Array:
-        return tool_poses(arm.nominal_chain, np.stack(arm.joint_commands(list(angles.T)), axis=1))
-
-    return poses
+    return partial(nominal_tools, arm)
 
 
 def measured(tools, seed: int, count: int, rotations: bool = True) -> tuple[Array, Array, Array]:  # type: ignore[no-untyped-def]

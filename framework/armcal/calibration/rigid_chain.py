@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from armcal.arm.assembly import Arm
 from armcal.arm.model import ArmModel, Chain, Joint, Mimic, forward
 from armcal.base.arrays import Array
 from armcal.base.se3 import Transform, evaluated
@@ -126,6 +127,11 @@ def tool_poses(chain: Chain, commands: Array) -> Array:
     shown = ca.densify(forward(chain, moved, {}).base_T_tool.matrix())
     function = ca.Function("tool", [symbols], [ca.vec(shown.T)], {"cse": True})
     return np.asarray(function.map(len(commands))(commands.T).full()).T.reshape(-1, 4, 4)
+
+
+def nominal_tools(arm: Arm, commands: Array) -> Array:
+    """base_T_tool (N x 4 x 4) of an arm at nominal parameters, without effects, at commands (N x joints)."""
+    return tool_poses(arm.nominal_chain, np.stack(arm.joint_commands([*commands.T]), axis=1))
 
 
 def largest_difference(one: Array, two: Array) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from armcal.arm.clearance import ClearanceCheck
 from armcal.arm.joints import joint_limits, unknown_joint
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
-from armcal.calibration.rigid_chain import tool_poses
+from armcal.calibration.rigid_chain import nominal_tools
 from armcal.devices.device import DeviceRefusedError, JointDevice, MeasuringDevice
 from armcal.errors import ConfigError, DataError, Location
 from armcal.run.experiment import Experiment
@@ -96,8 +96,8 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
         order=settings.order,
     )
     judge = HazardJudge(device.joint_names, device.joint_names, limits, torques, park)
-    arrival = Arrival(_rigid_poses(arm, poses), settings.arrival)
-    sag = SagJudge(device.joint_names, partial(_rigid_poses, arm), torques)
+    arrival = Arrival(nominal_tools(arm, poses), settings.arrival)
+    sag = SagJudge(device.joint_names, partial(nominal_tools, arm), torques)
     return Prepared(bench, device, commands, scheduler, arrival, sag, judge)
 
 
@@ -120,11 +120,6 @@ def _approaches(commands: Dataset, space: JointSpace) -> Array:
     """From which side each joint is to come (N x joints); 0 where the plan does not say."""
     columns = [commands.column(c) if commands.has(c) else np.zeros(len(commands)) for c in approach_channels(space)]
     return np.nan_to_num(np.array(columns).T.reshape(len(commands), -1))
-
-
-def _rigid_poses(arm: Arm, angles: Array) -> Array:
-    """``base_T_tool`` (N x 4 x 4, m) of the nominal, rigid arm at joint angles (N x joints, rad)."""
-    return tool_poses(arm.nominal_chain, np.stack(arm.joint_commands(list(angles.T)), axis=1))
 
 
 def run_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> Array:
