@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from html import escape
 from pathlib import Path
@@ -20,6 +21,7 @@ from armcal.run import outputs
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from click.testing import CliRunner
+from planted_mistakes import three_joint_arm
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 DEMO = str(CONFIGS / "demo.yaml")
@@ -257,6 +259,19 @@ def test_suggested_poses_tell_more_than_random_ones() -> None:
     rng = np.random.default_rng(5)
     others = [information([[rng.choice(level) for level in levels] for _ in range(3)]) for _ in range(60)]
     assert best > max(others)
+
+
+@pytest.mark.parametrize("limits", [True, False])
+def test_poses_to_measure_next_move_a_joint_that_stood_still(tmp_path: Path, limits: bool) -> None:
+    """Between its limits; where none are known, the sentence says that it must be moved."""
+    few = ("simulation.poses.levels_deg.q3=[40, 40]", "simulation.poses.count=12", "parameters.free=[arm.mdh.theta*]")
+    arm = replace(three_joint_arm(tmp_path), overrides=few)
+    path = arm.write(arm.recording(1), tmp_path / "data.csv")
+    plan = ("plan.limits={q3: [60 deg, 80 deg]}",) if limits else ()
+    paragraph = calibrate(Experiment.load(arm.config, (*few, *plan), path)).verdict.paragraph
+    poses = re.findall(r"\(-?\d+, -?\d+, (-?\d+)\) deg", paragraph.partition("next: ")[2])
+    assert len(poses) == 3 and all(60 <= float(q3) <= 80 if limits else float(q3) == 40 for q3 in poses)
+    assert paragraph.endswith(", each with q3 moved as well, which stood still.") != limits
 
 
 @pytest.mark.parametrize("free", ["[]", "[arm.spring.k1]"])

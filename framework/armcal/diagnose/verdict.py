@@ -35,7 +35,7 @@ from armcal.estimate.identifiability import POOR_CONDITION, bound_together, corr
 from armcal.estimate.prediction import NewRecording
 from armcal.estimate.validation import summarise
 from armcal.estimate.weighing import WeighedFit
-from armcal.planning.suggestion import CANDIDATES, Suggestion, is_worth_measuring
+from armcal.planning.suggestion import CANDIDATES, Suggestion, in_words, is_worth_measuring
 
 LEVEL = 0.05
 SHARE = 0.95
@@ -170,7 +170,7 @@ def _in_short(
     sentences.append(suspicious)
     sentences += _left(seen)
     if is_worth_measuring(suggestions):
-        sentences.append(f"Measure these poses next: {'; '.join(suggestion.text for suggestion in suggestions)}.")
+        sentences.append(f"Measure these poses next: {in_words(suggestions)}.")
     return sentences
 
 
@@ -319,5 +319,5 @@ def _next(estimate: Estimate, suggestions: Sequence[Suggestion]) -> list[Finding
     shrink = digits(100 * (1 - suggestions[-1].shrink), 2)
     text += f" {len(suggestions)} poses more would shrink standard deviations by {shrink} % on average."
     test = f"determinant of the information, {CANDIDATES} poses like the recorded ones; clearance was not checked"
-    poses = "; ".join(suggestion.text for suggestion in suggestions)
-    return [Finding("note", text, test, f"Measure next: {poses}." if is_worth_measuring(suggestions) else "")]
+    action = f"Measure next: {in_words(suggestions)}." if is_worth_measuring(suggestions) else ""
+    return [Finding("note", text, test, action)]

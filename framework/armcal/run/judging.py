@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from armcal.arm.joints import Limits, joint_limits
 from armcal.base.arrays import Array
 from armcal.config.system import System
 from armcal.diagnose.coverage import predictor
@@ -34,14 +35,19 @@ from armcal.problem.motion import Motion, recorded_position
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.run.errors import FittedRecords, RecordErrors
 from armcal.run.intervals import IntervalResult
-from armcal.run.prepare import gravity_findings, same_pose_findings, still_findings
+from armcal.run.prepare import gravity_findings, same_pose_findings, still_findings, still_joints
+from armcal.run.settings import ExperimentSettings, PlanSettings
 
 _MM = 1000.0
 _AT_REST = ", as in a new recording (its drift not known)"
 
 
 def verdict_of(
-    run: FittedRecords, errors: RecordErrors, intervals: IntervalResult, system: System, limit: float | None
+    run: FittedRecords,
+    errors: RecordErrors,
+    intervals: IntervalResult,
+    system: System,
+    settings: ExperimentSettings,
 ) -> tuple[Verdict, Evidence]:
     """The verdict on a fit, and what it rests on.
 
@@ -49,21 +55,17 @@ def verdict_of(
         run: the fit and its records, with what was found before.
         errors, intervals: of every record; whether prediction intervals cover their share.
         system: the arms.
-        limit: above which the error of a judged record is explained (m); None for the default.
+        settings: from what error on a record is explained, and limits of joints that a plan keeps.
     """
     problem, fitted, train, held = run.problem, run.fitted, run.split.train, len(run.split.holdout)
     estimate, acting = fitted.estimate, run.problem.weighted(fitted.records, fitted.weights)
     judged = _judged(run, errors)
-    evidence = gather(run, judged, system, limit)
+    evidence = gather(run, judged, system, settings.validation.limit)
     drifts = _AT_REST if any(block.drift is not None for block in problem.parameters.free) else ""
-    gross, moved, suggestions = list[Finding](), _accuracies(run), tuple[Suggestion, ...]()
+    gross, moved = list[Finding](), _accuracies(run)
     if estimate.verdict.converged:
         gross = _gross(run, acting, judged, evidence)
         moved += moved_findings(moved_groups(problem, estimate.values, acting))
-        # In a contact no pose can be chosen that does not touch.
-        if estimate.names and all(kernel.factor.output_channels for kernel in problem.kernels):
-            joints = {f"{name}.{j}": kind for name, arm in system.arms.items() for j, kind in arm.commanded.items()}
-            suggestions = suggest(problem, run.dataset.subset(train), estimate, joints)
     worse = _worse(run, errors, judged)
     verdict = judge(
         estimate,
@@ -73,12 +75,31 @@ def verdict_of(
         judged[np.isfinite(judged)],
         (f"{held} held-out records" if held else "cross-validation") + drifts,
         run.dataset.ids,
-        suggestions,
+        _suggestions(run, system, settings.plan),
         fitted,
         [*run.findings, *gross, *worse, *intervals.findings(), *moved, *_of_records(system, run)],
         evidence,
     )
     return verdict, evidence
+
+
+def _suggestions(run: FittedRecords, system: System, plan: PlanSettings | None) -> tuple[Suggestion, ...]:
+    """Poses to measure next, joints that stood still elsewhere; none after a fit that did not converge."""
+    problem, estimate, dataset = run.problem, run.fitted.estimate, run.dataset.subset(run.split.train)
+    # In a contact no pose can be chosen that does not touch.
+    chosen = all(kernel.factor.output_channels for kernel in problem.kernels)
+    if not (estimate.verdict.converged and estimate.names and chosen):
+        return ()
+    joints, limits = dict[str, str](), dict[str, Limits | None]()
+    stated = {} if plan is None else {**plan.limits, **plan.travel_limits}
+    for name, arm in system.arms.items():
+        own = joint_limits(arm.nominal_chain)
+        for joint, kind in arm.commanded.items():
+            channel = f"{name}.{joint}"
+            joints[channel] = kind
+            limits[channel] = stated.get(joint if len(system.arms) == 1 else channel, own[joint])
+    still = {channel: limits[channel] for channel in still_joints(system, dataset)}
+    return suggest(problem, dataset, estimate, joints, still=still)
 
 
 def _of_records(system: System, run: FittedRecords) -> list[Finding]:

@@ -78,7 +78,7 @@ def _judged(
         system = outcome.system(system)
     with context.watch.stage("judge"):
         context.progress("judging", 0.0)
-        verdict, evidence = verdict_of(run, errors, intervals, system, validation.limit)
+        verdict, evidence = verdict_of(run, errors, intervals, system, experiment.settings)
         context.progress("judging", 1.0)
     return RunResult(
         name=experiment.name,

@@ -268,21 +268,27 @@ def check_permuted_axes(
     raise DataError(text, where=Location(dataset.source), hint=hint)
 
 
-def still_findings(system: System, dataset: Dataset) -> list[Finding]:
-    """A warning of joints that stood still in all records that trained."""
-    still = []
+def still_joints(system: System, dataset: Dataset) -> dict[str, str]:
+    """Channels of joints that stood still in all records, and where, as people read it."""
+    still = {}
     for name, arm in system.arms.items():
         for joint, kind in arm.commanded.items():
             channel, (unit, least) = f"{name}.{joint}", _STILL[kind]
             values = dataset.column(channel) if dataset.has(channel) else np.array([])
             known = to_unit(values[np.isfinite(values)], unit)
             if known.size and np.ptp(known) < least:
-                at = f"{np.mean(known):.4g} {unit}"
-                still.append(f"{joint if len(system.arms) == 1 else f'{name}.{joint}'} at {at}")
+                still[channel] = f"{np.mean(known):.4g} {unit}"
+    return still
+
+
+def still_findings(system: System, dataset: Dataset) -> list[Finding]:
+    """A warning of joints that stood still in all records that trained."""
+    still = still_joints(system, dataset)
     if not still:
         return []
+    listed = [f"{c.partition('.')[2] if len(system.arms) == 1 else c} at {where}" for c, where in still.items()]
     text = (
-        f"Hardly moved in the training records: {first_few(still)}. Predictions elsewhere rest on nominal values and "
+        f"Hardly moved in the training records: {first_few(listed)}. Predictions elsewhere rest on nominal values and "
         "priors, and no record judges them."
     )
     test = "range, limits " + " and ".join(f"{least:g} {unit}" for unit, least in _STILL.values())
