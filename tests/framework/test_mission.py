@@ -45,13 +45,14 @@ EVENTS, EARLY = (
     yaml.safe_dump(events, default_flow_style=True, width=10_000).strip()
     for events in ([SLIP, SWAP, BUMP], [{**SLIP, "day": 0.3}])
 )
+REFIT = "{records: 60, every: 100}"
 SHORT = (
     "simulation.days=3",
     "simulation.records.every_min=20",
     f"simulation.events={EVENTS}",
     "simulation.power_cuts=[0.7, 1.55]",
     "mission.poses=20",
-    "mission.refit={records: 60, every: 100}",
+    f"mission.refit={REFIT}",
 )
 ONE_DAY = (
     *SHORT,
@@ -396,7 +397,7 @@ def test_the_recalibration_goes_on_after_power_cuts_and_sees_every_record(
 def test_power_cuts_change_nothing(short: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     """To the last digit of every error at every moment: the journal is all that a restart needs."""
     folder, _ = short
-    calibration = f"mission={{calibration: {folder / 'calibration.yaml'}, poses: 20}}"
+    calibration = f"mission={{calibration: {folder / 'calibration.yaml'}, poses: 20, refit: {REFIT}}}"
     again, told = flown(tmp_path / "out", *SHORT, "simulation.power_cuts=[]", calibration)
     assert told["resumed"] == 0
     assert (again / "mission.csv").read_bytes() == (folder / "mission.csv").read_bytes()
