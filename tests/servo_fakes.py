@@ -25,6 +25,7 @@ class FakeServos:
 
     def __init__(self, servo_file: Path) -> None:
         self.file = load_servo_file(servo_file)
+        self.joint_names = tuple(self.file.servos)
         self.counts: dict[str, int] = {}
         self.log: list[tuple[str, int, float]] = []
         self.lost_at: set[int] = set()

@@ -8,13 +8,13 @@ import sys
 import traceback
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn, ParamSpec, TypeVar
 
 from armcal.errors import ArmcalError, Location, PluginError
 from armcal.plugins import PluginInfo, discover
 from armcal.registration import said
 
-T = TypeVar("T")
+P = ParamSpec("P")
 R = TypeVar("R")
 
 _OWN = "armcal"
@@ -64,14 +64,14 @@ def _wrong_arguments(fault: BaseException, packages: tuple[str, ...]) -> PluginE
     return None
 
 
-def blaming(work: Callable[[T], R]) -> Callable[[T], R]:
-    """``work`` for another process: a fault in a plugin's code is placed there, as its traceback does not travel."""
+def blaming(work: Callable[P, R]) -> Callable[P, R]:
+    """``work`` in which a fault of a plugin's code is placed: a traceback does not reach another process, for one."""
     return partial(_blamed, work)
 
 
-def _blamed(work: Callable[[T], R], task: T) -> R:
+def _blamed(work: Callable[P, R], *given: P.args, **named: P.kwargs) -> R:
     try:
-        return work(task)
+        return work(*given, **named)
     except ArmcalError:
         raise
     except (Exception, SystemExit) as fault:
@@ -86,6 +86,7 @@ def refuse(method: Callable[..., Any], returned: Any, expected: str) -> NoReturn
     Raises:
         PluginError: with the method, its file and line, what it returned and what was expected.
     """
+    method = getattr(method, "fget", method)  # of a property
     function = inspect.unwrap(getattr(method, "__func__", method))
     code = getattr(function, "__code__", None)
     where = Location(code.co_filename, line=code.co_firstlineno) if code else None

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal, Self
+from typing import Any, Literal, Protocol, Self
 
 from armcal.arm.assembly import Arm, only_arm
 from armcal.base.settings import InputPath, Settings
@@ -48,6 +48,30 @@ class BenchSettings(Settings):
     recording: RecordingSettings = Field(default_factory=RecordingSettings)
     servo: dict[str, Any] | None = None
     simulator: dict[str, Any] | None = None
+
+
+class Closable(Protocol):
+    """A part of a bench that was opened."""
+
+    def close(self) -> None:
+        """Let go of it."""
+
+
+@contextmanager
+def closing(*parts: Closable) -> Iterator[None]:
+    """Parts of a bench, each closed at the end whatever another raises; the first fault of all passes."""
+    faults = list[BaseException]()
+    try:
+        yield
+    except BaseException as fault:
+        faults.append(fault)
+    for part in parts:
+        try:
+            part.close()
+        except (Exception, SystemExit) as fault:
+            faults.append(fault)
+    if faults:
+        raise faults[0]
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import numpy as np
 from armcal.arm.horn import TOOTH_DEG, teeth_text
 from armcal.base.arrays import Array
 from armcal.devices.device import MeasuringDevice
+from armcal.devices.returned import measured_angles, open_device
 from armcal.devices.wiring import WiringRecord
 from armcal.errors import ConfigError
 from armcal.io.journal.journal import Journal
@@ -23,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from armcal_bench.acquisition.preparation import Prepared, prepare, run_limits
 from armcal_bench.acquisition.run_log import measured_by, progress_of
-from armcal_bench.bench import SECTION, Bench
+from armcal_bench.bench import SECTION, Bench, closing
 from armcal_bench.servo.nominal import NominalArm
 from armcal_bench.servo.trial import Move, Verdict, judged, noted
 from armcal_bench.settling import pose_of
@@ -162,12 +163,8 @@ def _measured(experiment: Experiment) -> tuple[dict[str, float], dict[str, Any]]
         text = "found a device whose servos do not know where they stand, and no servo file."
         hint = "Name the servo file in bench.device.servos."
         raise ConfigError(text, where=experiment.source.where((SECTION, "device")), hint=hint)
-    with bench.clock() as clock:
-        try:
-            adapter = device.open(clock).adapter
-            here = device.measured()
-        finally:
-            device.close()
+    with bench.clock() as clock, closing(device):
+        adapter, here = open_device(device, clock).adapter, measured_angles(device)
         seen = {"adapter": adapter, "by": "tracker", "at": clock.wall()}
     limits = run_limits(experiment, bench.settings.acquisition, bench.arm)
     ends = dict(zip(bench.arm.commanded, limits.tolist(), strict=True))

@@ -9,6 +9,7 @@ from armcal.arm.servo import COUNTS
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceError, DeviceRefusedError, DeviceResetError
 from armcal.devices.link import Link
+from armcal.devices.returned import bytes_from
 from armcal.errors import Location
 
 MODE1, MODE2, LED0, ALL_LED, PRE_SCALE = 0x00, 0x01, 0x06, 0xFA, 0xFE
@@ -152,7 +153,7 @@ class Chip:
         register, data = channel_register(channel), pulse.pack()
         for _ in range(2):
             self._link.write(self._address, bytes((register,)) + data)
-            read_back = self._link.read(self._address, register, CHANNEL_BYTES)
+            read_back = self._read(register, CHANNEL_BYTES)
             if read_back == data:
                 return
         text = f"found {read_back.hex(' ')} in channel {channel}, expected {data.hex(' ')}, which was written twice."
@@ -195,7 +196,7 @@ class Chip:
             raise DeviceError(text, where=self.where, hint=hint)
 
     def _read(self, register: int, count: int) -> bytes:
-        return self._link.read(self._address, register, count)
+        return bytes_from(self._link, self._address, register, count)
 
     def _write(self, register: int, value: int) -> None:
         self._link.write(self._address, bytes((register, value)))

@@ -20,6 +20,7 @@ from armcal.devices.device import (
     PulseDevice,
 )
 from armcal.devices.link import GuardedLink, Link
+from armcal.devices.returned import open_link
 from armcal.errors import Location
 from typing_extensions import override
 
@@ -140,7 +141,7 @@ class Pca9685Device(JointDevice, PulseDevice):
 
     @override
     def open(self, clock: Clock) -> DeviceIdentity:
-        identity = self._link.open(clock)
+        identity = open_link(self._link, clock)
         try:
             for name in {self._file.servos[joint].board for joint in self._servos}:
                 board_id = self._file.boards[name].id

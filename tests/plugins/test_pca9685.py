@@ -16,7 +16,7 @@ from armcal.devices.device import (
     JointDevice,
     PulseDevice,
 )
-from armcal.errors import ConfigError
+from armcal.errors import ConfigError, PluginError
 from armcal_pca9685.device import Pca9685Device
 from board_bench import JOINTS, LRM_PULSES_US, Clock, ModelLink, servo_file, written
 
@@ -28,6 +28,20 @@ def opened(folder, oscillators=(25e6,), rate_hz=50.0, true=None, **settings):
     device = Pca9685Device(Pca9685Device.Settings(servos=file, **settings), JOINTS, link)
     device.open(clock)
     return device, link, clock
+
+
+@pytest.mark.parametrize(
+    ("method", "returned", "sentence"),
+    [
+        ("read", None, "returned None, expected bytes, 1 of them"),
+        ("read", b"", "returned 0 bytes, expected bytes, 1 of them"),
+        ("open", "/dev/ttyACM0", "returned /dev/ttyACM0, expected a LinkIdentity"),
+    ],
+)
+def test_a_link_that_returns_something_else_is_named(tmp_path, monkeypatch, method, returned, sentence):
+    monkeypatch.setattr(ModelLink, method, lambda self, *given: returned)
+    with pytest.raises(PluginError, match=rf"test_pca9685.py:\d+: .*{sentence}"):
+        opened(tmp_path)
 
 
 def test_it_is_what_it_says(tmp_path):

@@ -196,7 +196,7 @@ def build_component(
     if not is_protocol(contract) and not isinstance(built, contract):
         raise _broken(registered, f"it does not derive from armcal.{contract.__name__}")
     members = sorted(get_protocol_members(contract)) if is_protocol(contract) else []
-    if lacking := [name for name in members if not hasattr(built, name)]:
+    if lacking := [name for name in members if not (hasattr(type(built), name) or hasattr(built, name))]:
         raise _broken(registered, f"it has no {', '.join(lacking)}; the contract is printed by armcal plugins hooks")
     return built, {"type": name, **settings.to_config()}
 

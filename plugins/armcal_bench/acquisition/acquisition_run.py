@@ -87,8 +87,7 @@ class AcquisitionRun:
                 return self._end(Ending("held", f"{loss}; {_AS_IT_IS}"))
         except Exception as fault:
             # Nothing is known of what went wrong here, but an arm that is left standing heats up.
-            with suppress(Exception):
-                self._park_and_end("parked", str(fault))
+            self._park_after(fault)
             raise
 
     def _energise(self) -> None:
@@ -255,6 +254,14 @@ class AcquisitionRun:
         except (DeviceLost, DeviceUnwellError) as loss:
             return self._end(Ending("held", f"{why}; then {loss}; {_AS_IT_IS}"))
         return self._end(Ending(how, why))
+
+    def _park_after(self, fault: Exception) -> None:
+        """Park, as far as what went wrong still lets it; else the arm holds."""
+        try:
+            self._park_and_end("parked", str(fault))
+        except Exception as again:
+            with suppress(Exception):
+                self._end(Ending("held", f"{fault}; then {again}; {_AS_IT_IS}"))
 
     def _park(self) -> bool:
         """Whether a clear path to where the arm parks was found, and gone."""

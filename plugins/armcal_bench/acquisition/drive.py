@@ -8,7 +8,8 @@ from itertools import pairwise
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.devices.clock import Clock
-from armcal.devices.device import DeviceError, DeviceRefusedError, JointDevice, MeasuringDevice
+from armcal.devices.device import DeviceError, DeviceRefusedError, JointDevice
+from armcal.devices.returned import measured_angles, standing_at, state_of
 
 from armcal_bench.acquisition.heat import HeatModel, ThermalState, Torques
 from armcal_bench.acquisition.path_planner import JointPath, PathPlanner
@@ -138,12 +139,12 @@ class Drive(Motion):
                 joints get the angle at which they park. What the device measures goes before both.
         """
         last = self.angles if self._is_energised else {**self.angles, **known}
-        self.take_over({**last, **self.measured(), **self.device.state().angles})
+        self.take_over({**last, **self.measured(), **state_of(self.device).angles})
         self._is_energised = True
         # Should the host fall silent from now on: stay, for joints that hang free make every path unknown.
         self.device.guard([self.angles], self._rate, self.settings.silence)
         for i, (joint, angle) in enumerate(self.angles.items()):
-            if joint not in self.device.state().angles:
+            if joint not in state_of(self.device).angles:
                 self._log.record(ENERGISED, {"joint": joint, "angle": angle, "at": self.clock.wall()})
                 self.device.energise(joint, angle)
                 self.approach[i] = self._one_way[i] = 0.0  # it may have jumped from either side
@@ -156,7 +157,7 @@ class Drive(Motion):
         Raises:
             DeviceError: they are not those that were commanded.
         """
-        commanded, angles = self.device.standing(self.angles), self.device.state().angles
+        commanded, angles = standing_at(self.device, self.angles), state_of(self.device).angles
         for joint, angle in commanded.items():
             if joint not in angles or abs(angles[joint] - angle) > _SAME_RAD:
                 stands = f"{math.degrees(angles[joint]):.2f} deg" if joint in angles else "no pulses"
@@ -166,7 +167,7 @@ class Drive(Motion):
 
     def measured(self) -> dict[str, float]:
         """Where the joints stand (rad), by servos that know; empty for others."""
-        return self.device.measured() if isinstance(self.device, MeasuringDevice) else {}
+        return measured_angles(self.device)
 
     def go(self, path: Sequence[Array], may_move: MayMove) -> None:
         """Along a path that begins where the arm is: straight lines in joint space, all joints in proportion.
@@ -179,7 +180,7 @@ class Drive(Motion):
             self._guard(start)
             difference, gone, before = goal - start, 0.0, self.clock.now()
             length = float(np.max(np.abs(difference)))
-            commanded = self.device.standing(self.angles)
+            commanded = standing_at(self.device, self.angles)
             # On which side of their play joints come to lie.
             turned, signs = np.abs(difference) > _SAME_RAD, np.sign(difference)
             further = difference + np.where(self._one_way * signs > 0, self._one_way, 0.0)
@@ -196,7 +197,7 @@ class Drive(Motion):
                     continue
                 gone = min(gone + step, length)
                 self.at = start + (gone / length) * difference if gone < length else goal.copy()
-                standing = self.device.standing(self.angles)
+                standing = standing_at(self.device, self.angles)
                 if standing != commanded:
                     self.device.command(standing)
                     commanded = standing

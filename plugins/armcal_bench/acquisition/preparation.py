@@ -12,6 +12,7 @@ from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.calibration.rigid_chain import nominal_tools
 from armcal.devices.device import DeviceRefusedError, JointDevice, MeasuringDevice
+from armcal.devices.returned import standing_at
 from armcal.errors import ConfigError, DataError, Location
 from armcal.run.experiment import Experiment
 from armcal.run.plan_approaches import approach_channels
@@ -176,7 +177,7 @@ def _check_park(
 
 def _nearest_settable(device: JointDevice, pose: Array) -> Array:
     """The angles (joints, rad) that the device can set nearest to a pose."""
-    standing = device.standing(dict(zip(device.joint_names, pose.tolist(), strict=True)))
+    standing = standing_at(device, dict(zip(device.joint_names, pose.tolist(), strict=True)))
     return np.array([standing[joint] for joint in device.joint_names])
 
 

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from armcal.devices.device import DeviceError, DeviceIdentity, DeviceRefusedError, DeviceUnwellError, JointDevice
+from armcal.devices.returned import open_device
+from armcal.plugin_faults import blaming
 
 from armcal_bench.acquisition.tracker_monitor import MotionGate
 
@@ -53,7 +55,7 @@ class Recovery:
         """
         while True:
             try:
-                return action()
+                return blaming(action)()
             except DeviceUnwellError:
                 raise
             except DeviceError as fault:
@@ -74,9 +76,9 @@ class Recovery:
                 raise DeviceLost(f"it was asked to stop while the device was lost ({fault})", None)
             clock.sleep(AGAIN_EVERY_S)
             try:
-                opened, begun = self._device.open(clock), self._identity
-                if (opened.digest, opened.name) != (begun.digest, begun.name):
-                    text = f"found {opened.name}, expected {begun.name}, with which the run began."
+                reopened, begun = open_device(self._device, clock), self._identity
+                if (reopened.digest, reopened.name) != (begun.digest, begun.name):
+                    text = f"found {reopened.name}, expected {begun.name}, with which the run began."
                     raise DeviceRefusedError(text, hint="Connect the board that the run began with.")
                 restore()
                 waits.over("device", clock.now())

@@ -192,13 +192,18 @@ def in_order(progress: Progress) -> bool:
     return all(before < after for before, after in pairwise(times))
 
 
+def write_measured(folder: Path, experiment: Experiment, progress: Progress, digests: Mapping[str, str]) -> None:
+    """Replace the dataset, where a pose is measured; see ``write_outputs``."""
+    if progress.measured:
+        dataset = dataset_of(experiment, progress, digests)
+        write_csv(folder / DATASET, dataset, experiment.request(measured=True).channels)
+
+
 def write_outputs(folder: Path, experiment: Experiment, progress: Progress, summary: Mapping[str, Any]) -> None:
     """Replace dataset and summary, each whole.
 
     Raises:
         DataError: they cannot be written.
     """
-    if progress.measured:
-        dataset = dataset_of(experiment, progress, summary["digests"])
-        write_csv(folder / DATASET, dataset, experiment.request(measured=True).channels)
+    write_measured(folder, experiment, progress, summary["digests"])
     write_whole(REAL_FILES, folder / SUMMARY, (json.dumps(summary, indent=2) + "\n").encode())

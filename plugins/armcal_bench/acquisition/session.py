@@ -2,8 +2,8 @@
 
 import hashlib
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from armcal.base.config_text import plain
 from armcal.calibration.calibration_file import identity_of
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceIdentity
+from armcal.devices.returned import open_device, state_of
 from armcal.devices.wiring import wiring_of
 from armcal.errors import InputError, Location
 
@@ -21,9 +22,18 @@ from armcal_bench.acquisition.acquisition_run import AcquisitionRun, Ending
 from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.evidence import Evidence
 from armcal_bench.acquisition.preparation import Prepared
-from armcal_bench.acquisition.run_log import OURS, Progress, RunLog, in_order, measured_by, write_outputs
+from armcal_bench.acquisition.run_log import (
+    OURS,
+    Progress,
+    RunLog,
+    in_order,
+    measured_by,
+    write_measured,
+    write_outputs,
+)
 from armcal_bench.acquisition.sag import Sag
 from armcal_bench.acquisition.tracker_monitor import MotionGate, TrackerMonitor, Waits
+from armcal_bench.bench import closing
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.journal_folder import Start, opened_journal
 from armcal_bench.settling import pose_of
@@ -85,11 +95,17 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
             how, why = progress.at_the_end(len(prepared.scheduler.ids))  # nothing needs to be there
             ending = Ending(how, "it was done before" if how == "done" else why)
         else:
-            with _opened(prepared, options, clock, log) as (gate, identity):
-                log.record(entry.STARTED, {"at": clock.wall(), "device": identity.digest, "name": identity.name})
-                evidence = Evidence(prepared.scheduler.poses, prepared.arrival, prepared.sag)
-                run = _prepared_run(prepared, options, log, gate, identity, evidence)
-                ending, progress, sag = run.run(), log.progress, evidence.gives_way(run.known)
+            try:
+                with _opened(prepared, options, clock, log) as (gate, identity):
+                    log.record(entry.STARTED, {"at": clock.wall(), "device": identity.digest, "name": identity.name})
+                    evidence = Evidence(prepared.scheduler.poses, prepared.arrival, prepared.sag)
+                    run = _prepared_run(prepared, options, log, gate, identity, evidence)
+                    ending, progress, sag = run.run(), log.progress, evidence.gives_way(run.known)
+            except (Exception, SystemExit):
+                if identity is not None:
+                    with suppress(Exception):  # the journal holds it, whatever else is broken
+                        write_measured(options.folder, experiment, log.progress, _digests(identity, header))
+                raise
         summary = {
             "how": ending.how,
             "why": ending.sentence,
@@ -100,10 +116,15 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
             "set_aside": {set_aside.record_id: set_aside.reason for set_aside in prepared.plan.set_aside},
             "times": "written" if in_order(progress) else "left out: the clock was set back during the run",
             "board": identity.name,
-            "digests": {"board": identity.digest[:16], "config": header["config"][:16]},
+            "digests": _digests(identity, header),
         }
         write_outputs(options.folder, experiment, progress, summary)
         return Outcome(ending, summary)
+
+
+def _digests(identity: DeviceIdentity, header: Mapping[str, Any]) -> dict[str, str]:
+    """Of the board and the configuration, short, as the data has them."""
+    return {"board": identity.digest[:16], "config": header["config"][:16]}
 
 
 def _check_frame(prepared: Prepared, progress: Progress, folder: Path) -> None:
@@ -142,8 +163,8 @@ def _opened(
         clock.sleep(prepared.settings.period)
         device.keep_alive()
 
-    try:
-        identity = device.open(clock)
+    with closing(monitor, device):
+        identity = open_device(device, clock)
         if log.identity is not None and log.identity.digest != identity.digest:
             raise InputError(
                 f"the run was begun with another board, or another calibration of it, than {identity.name}.",
@@ -156,9 +177,6 @@ def _opened(
         hint = "Start it, check its address and the names of its bodies, and let it see them."
         monitor.await_first_frame(pause, hint)
         yield MotionGate(monitor, clock, prepared.settings.lost, options.asked_to_end, options.waits), identity
-    finally:
-        monitor.close()
-        device.close()
 
 
 def _prepared_run(
@@ -180,7 +198,7 @@ def _prepared_run(
     scheduler.planner.meanwhile = drive.keep_alive  # the board would take a host that plans for one that died
     if progress.thermal_state:  # the warmth that an earlier part of the run has left
         drive.thermal_state.go_on(progress.thermal_state, progress.angles, clock.wall() - progress.at)
-    angles = device.state().angles
+    angles = state_of(device).angles
     releases, measured = settings.at_end == "release", drive.measured()
     start = prepared.judge.first_motion(angles, progress.angles, releases=releases, measured=measured)
     if angles:  # no signs of life reach the board while somebody thinks: joints that hold are to stay where they are

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceRefusedError
 from armcal.devices.live import REPEATED, TrackerFrame
+from armcal.devices.returned import frames_of, refused_by
 
 from armcal_bench.acquisition.settings import LostSettings
 from armcal_bench.bench import Bench
@@ -132,9 +133,9 @@ class TrackerMonitor:
 
     def look(self) -> None:
         """Take in the frames that came."""
-        frames = self._tracker.frames()
+        frames, refused = frames_of(self._tracker), refused_by(self._tracker)
         for health in (self._health, self._with_base):
-            health.feed(frames, self._tracker.refused)
+            health.feed(frames, refused)
         self._settling.feed(frames)
 
     def trouble(self) -> tuple[float, str]:

@@ -10,6 +10,7 @@ import numpy as np
 from armcal.devices.clock import Clock
 from armcal.devices.line_source import refused_lines_text
 from armcal.devices.live import JointSample, JointStream, LiveCamera, Shot
+from armcal.devices.returned import refused_by, shot_of, shots_of
 from armcal.errors import InputError
 from armcal.io.file_set import write_over
 from armcal.measure.environment import warn_beyond_limits
@@ -185,7 +186,7 @@ class Recorder:
         """Postures of images that came by themselves; one waits until enough readings are there."""
         if self._camera is None or not self._camera.gives_shots:
             return []
-        self._waiting += [(shot, self._clock.now()) for shot in self._camera.shots()]
+        self._waiting += [(shot, self._clock.now()) for shot in shots_of(self._camera)]
         messages: list[Message] = []
         while self._waiting:
             shot, came = self._waiting[0]
@@ -256,7 +257,7 @@ class Recorder:
         """What an image would add, which is not kept."""
         if self._camera is None:
             return [_refused("there is no camera to look by: give --camera.")]
-        shot = self._camera.shoot()
+        shot = shot_of(self._camera)
         if shot.fault:
             return [_refused(shot.fault)]
         posture = self._log.next_posture(mean, self.labels.present, shot.values)
@@ -270,7 +271,7 @@ class Recorder:
             return [_refused(fault)]
         messages: list[Message] = []
         if self._camera is not None:
-            shot = shot or self._camera.shoot()
+            shot = shot or shot_of(self._camera)
             if shot.fault:
                 return [self._without_board(mean, shot)]
             messages.append(Message("seen", f"{shot.seen}.", {"kept": True}))
@@ -309,7 +310,7 @@ class Recorder:
         lines += [f"posture {name} disagrees by {offset}." for name, offset in doubts.items()]
         lines += [f"the next one touches {self.labels.shown}."] if self.labels.columns else []
         lines += [f"digits: {self.labels.known_labels_text()}."] if self.labels.known else []
-        refused = refused_lines_text(self._stream.refused)
+        refused = refused_lines_text(refused_by(self._stream))
         lines += [f"{refused}."] if refused else []
         missing = self._assessor.explained(postures)
         content = {"postures": len(postures), "groups": by_place, "name": self.labels.shown}
@@ -355,7 +356,7 @@ class Recorder:
     def _silent(self) -> str:
         if self._fault and self._clock.now() - self._fault_at <= self._settings.stale:
             return self._fault
-        refused = refused_lines_text(self._stream.refused)
+        refused = refused_lines_text(refused_by(self._stream))
         reason = f" ({refused})" if refused else ": is the sender running?"
         return f"no joint readings came for {self._silence():.1f} s{reason}"
 

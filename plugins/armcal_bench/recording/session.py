@@ -6,9 +6,10 @@ from pathlib import Path
 
 from armcal.devices.clock import Clock
 from armcal.devices.live import JointStream, LiveCamera, RestStream
+from armcal.devices.returned import samples_of
 from armcal.errors import ConfigError
 
-from armcal_bench.bench import SECTION, Bench
+from armcal_bench.bench import SECTION, Bench, closing
 from armcal_bench.journal_folder import Start, opened_journal
 from armcal_bench.keys import END, Keys
 from armcal_bench.recording.agreement import contacts_of
@@ -50,23 +51,18 @@ def record(
     header = {"joints": list(channels), "labels": list(columns)}
     stream = bench.joints()
     capture = _capture(bench, capture, stream, camera)
-    with bench.clock() as clock:
-        try:
+    with bench.clock() as clock, closing(stream, *(() if camera is None else (camera,))):
+        if camera is not None:
+            camera.open(clock, bench.experiment.system.measurements)
+        contacts_of(bench.experiment, camera)
+        stream.open(clock, channels)
+        with opened_journal(*to, OURS, header, "recording", _SAME) as journal:
             if camera is not None:
-                camera.open(clock, bench.experiment.system.measurements)
-            contacts_of(bench.experiment, camera)
-            stream.open(clock, channels)
-            with opened_journal(*to, OURS, header, "recording", _SAME) as journal:
-                if camera is not None:
-                    (to[0] / IMAGES).mkdir(exist_ok=True)
-                recorder = Recorder(bench, stream, capture, to[0], RecordingLog(journal), clock, camera)
-                for message in _messages(recorder, stream, keys, asked_to_end, clock):
-                    show(message)
-                return recorder.finished()
-        finally:
-            stream.close()
-            if camera is not None:
-                camera.close()
+                (to[0] / IMAGES).mkdir(exist_ok=True)
+            recorder = Recorder(bench, stream, capture, to[0], RecordingLog(journal), clock, camera)
+            for message in _messages(recorder, stream, keys, asked_to_end, clock):
+                show(message)
+            return recorder.finished()
 
 
 def _capture(bench: Bench, chosen: Capture, stream: JointStream, camera: LiveCamera | None) -> Capture:
@@ -92,7 +88,7 @@ def _messages(
     typed: deque[str] = deque()
     while True:
         has_ended = stream.ended  # before its last samples are taken
-        yield from recorder.take(stream.samples())
+        yield from recorder.take(samples_of(stream))
         typed.extend(keys.commands())
         if typed:  # one a round, so that each finds fresh readings
             command = typed.popleft()
@@ -104,4 +100,4 @@ def _messages(
             break
         clock.sleep(_PERIOD_S)
     if isinstance(stream, RestStream) and stream.gives_rests:
-        yield from recorder.take(stream.lasting())
+        yield from recorder.take(samples_of(stream, "lasting"))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -124,6 +124,7 @@ class Automatic:
             mover.guard({})
         except (TrackerLost, Restless, InputError) as stop:
             # Nobody may be there for hours, and it could hold a heavy pose.
+            mover.gate = replace(mover.gate, monitor=None)  # it may be what failed
             mover.persist(mover.to_base)
             if isinstance(stop, StopRequested):
                 stop.arm = "the arm is commanded to hold its base pose"

@@ -7,6 +7,7 @@ from typing import Protocol, TypeVar
 
 from armcal.arm.servo import PulseClock, PulseTable
 from armcal.devices.device import DeviceError, DeviceIdentity, DeviceRefusedError, JointDevice, PulseDevice
+from armcal.devices.returned import open_device, state_of
 from armcal.errors import InputError
 
 from armcal_bench.acquisition.drive import Motion
@@ -57,7 +58,7 @@ class Mover(Motion):
             raise DeviceRefusedError(
                 "this device cannot set pulses by their length.", hint="Calibrate servos with a device like pca9685."
             )
-        identity = self.device.open(self.clock)
+        identity = open_device(self.device, self.clock)
         self._recovery = Recovery(self.device, identity, self.gate, _LONGEST_LOSS_S)
         # A path home of another run must not be gone now.
         self.device.guard([], self._rate, self.setup.settings.silence)
@@ -188,7 +189,7 @@ class Mover(Motion):
 
     def _running(self) -> dict[str, int]:
         """The counts of the joints that get pulses."""
-        angles = self.device.state().angles
+        angles = state_of(self.device).angles
         moved = {joint: angle for joint, angle in angles.items() if joint in self.setup.base}
         return {joint: _counts(*self.setup.table_of(joint), angle) for joint, angle in moved.items()}
 

@@ -14,6 +14,7 @@ from armcal.errors import InputError, Location
 
 from armcal_bench.acquisition.recovery import DeviceLost
 from armcal_bench.acquisition.tracker_monitor import MotionGate, StopRequested, TrackerMonitor, Waits
+from armcal_bench.bench import closing
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.keys import Wishes
 from armcal_bench.servo.automatic import Automatic, FrameWatch, ReportProgress
@@ -139,7 +140,7 @@ def _opened(
         servos = {servo.joint: (servo.table, servos[servo.joint][1]) for servo in stated}
     lost = setup.bench.settings.acquisition.lost
     mover = Mover(setup, device, servos, MotionGate(None, clock, lost, talk.asked_to_stop, talk.waits))
-    try:
+    with closing(device), _held(mover):
         identity = mover.open()
         if record is not None and record.is_measured:
             check_same(setup, record, identity)
@@ -147,6 +148,13 @@ def _opened(
         if (start.free or start.hazards) and not talk.may_energise(start):
             raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
         yield mover, identity
+
+
+@contextmanager
+def _held(mover: Mover) -> Iterator[None]:
+    """Where it is stopped the arm holds, as far as the board is there."""
+    try:
+        yield
     except StopRequested as stop:
         if not mover.hold():
             raise StopRequested(f"{stop}, while the board was lost", _AS_IT_IS) from stop
@@ -155,23 +163,21 @@ def _opened(
         if loss.fault is None:
             raise StopRequested(str(loss), _AS_IT_IS) from loss
         raise loss.fault from loss
-    finally:
-        device.close()
 
 
 @contextmanager
 def _monitored(mover: Mover) -> Iterator[None]:
     """With the tracker, once it gives frames that can be used."""
     gate, monitor = mover.gate, TrackerMonitor(mover.setup.bench, mover.clock)
-    try:
+    with closing(monitor):
         monitor.open()
         mover.gate = replace(gate, monitor=monitor)
         hint = "Start it, check its address and the names of its bodies; or calibrate with --guided."
-        monitor.await_first_frame(lambda: mover.tick(mover.gate.resting), hint)
-        yield
-    finally:
-        mover.gate = gate
-        monitor.close()
+        try:
+            monitor.await_first_frame(lambda: mover.tick(mover.gate.resting), hint)
+            yield
+        finally:
+            mover.gate = gate
 
 
 def _go_on_warm(mover: Mover, record: Record) -> None:
