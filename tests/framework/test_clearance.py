@@ -8,14 +8,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from armcal.arm import clearance as shapes
 from armcal.arm.clearance import (
-    Box,
     Capsule,
     Clearance,
     ClearanceCheck,
-    HalfSpace,
-    Point,
-    Rule,
     distance,
     joints_of_frames,
     segment_to_box,
@@ -27,6 +24,24 @@ from armcal.run.plan_clearance import ClearanceSettings, clearance_check, enclos
 from scipy.optimize import minimize
 
 RANDOM = np.random.default_rng(0)
+
+
+def Point(frame, at=(0, 0, 0)) -> shapes.Point:  # noqa: N802
+    return shapes.Point.si(frame=frame, at=_floats(at))
+
+
+def HalfSpace(point, normal) -> shapes.HalfSpace:  # noqa: N802
+    return shapes.HalfSpace.si(type="half_space", point=_floats(point), normal=_floats(normal))
+
+
+def Rule(between, at_least, besides=()) -> shapes.Rule:  # noqa: N802
+    return shapes.Rule.si(between=between, at_least=float(at_least), besides=besides)
+
+
+def _floats(numbers) -> tuple[float, ...]:
+    return tuple(map(float, numbers))
+
+
 EDGE_CASES = [
     ((0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)),  # parallel
     ((0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0)),  # in one line
@@ -78,10 +93,10 @@ def test_box_distances_of_points_and_of_segments_along_its_sides() -> None:
 def test_capsules_agree_with_coal() -> None:
     coal = pytest.importorskip("coal")
     for _ in range(30):
-        shapes, bodies = [], []
+        capsules, bodies = [], []
         for _ in range(2):
             ends, radius = RANDOM.normal(size=(2, 3)), RANDOM.uniform(0.01, 0.2)
-            shapes.append(Capsule(Point("base", tuple(ends[0])), Point("base", tuple(ends[1])), radius))
+            capsules.append(Capsule(Point("base", tuple(ends[0])), Point("base", tuple(ends[1])), radius))
             axis = ends[1] - ends[0]
             length = np.linalg.norm(axis)
             rotation = np.linalg.svd(np.column_stack([axis, np.eye(3)]))[0][:, [1, 2, 0]]
@@ -91,7 +106,7 @@ def test_capsules_agree_with_coal() -> None:
         result = coal.DistanceResult()
         (a, at_a), (b, at_b) = bodies
         expected = coal.distance(a, at_a, b, at_b, coal.DistanceRequest(), result)
-        assert distance(*shapes, {})[0] == pytest.approx(expected, abs=1e-5)
+        assert distance(*capsules, {})[0] == pytest.approx(expected, abs=1e-5)
 
 
 def test_a_half_space_counts_height_along_its_normal_whatever_its_length() -> None:
@@ -163,7 +178,7 @@ def test_the_tool_stays_out_of_forbidden_boxes_and_balls(arm) -> None:
     near = ~nothing(q).allowed
     region = ClearanceCheck(arm, Clearance({}, (), ball("base", 0.3)))
     assert 0 < near.sum() < 6000 and np.array_equal(near, ~region(q).allowed)
-    box = Box((0.2, -0.1, 0.0), (0.5, 0.1, 0.3))
+    box = shapes.Box.si(type="box", low=(0.2, -0.1, 0.0), high=(0.5, 0.1, 0.3))
     axes = [
         ClearanceCheck(
             arm,

@@ -8,26 +8,28 @@ nominal parameters and rigid: what springs give is to be left in the margins.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from typing import Literal, Self
 
 import casadi as ca
 import numpy as np
+from pydantic import model_validator
 
 from armcal.arm.assembly import Arm
-from armcal.arm.model import Vector3, forward
+from armcal.arm.model import forward
 from armcal.arm.statics import BASE_FRAME, MOUNT_FRAME, TOOL_FRAME, frame_names
 from armcal.base.arrays import Array, Mask
+from armcal.base.settings import Length, Length3, Settings
 
 EVERYTHING = "everything"
 _AT_ONCE = 4096
 _NO_LENGTH = 1e-18
 
 
-@dataclass(frozen=True)
-class Point:
-    """A point fixed in a frame (m): ``base``, ``mount``, ``tool`` or a named frame of the arm."""
+class Point(Settings):
+    """A point ``at`` coordinates of a frame: ``base``, ``mount``, ``tool`` or a named frame of the arm."""
 
-    frame: str
-    at: Vector3 = (0.0, 0.0, 0.0)
+    frame: str = BASE_FRAME
+    at: Length3 = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -44,12 +46,18 @@ class Capsule:
         return (self.start.frame, self.end.frame)
 
 
-@dataclass(frozen=True)
-class Box:
-    """A box along the axes of the base frame, between two corners (m)."""
+class Box(Settings):
+    """A box along the axes of the base frame, between two corners."""
 
-    low: Vector3
-    high: Vector3
+    type: Literal["box"]
+    low: Length3
+    high: Length3
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if any(low > high for low, high in zip(self.low, self.high, strict=True)):
+            raise ValueError("low lies beyond high on an axis: give the smaller coordinates as low")
+        return self
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -57,12 +65,18 @@ class Box:
         return (BASE_FRAME,)
 
 
-@dataclass(frozen=True)
-class HalfSpace:
-    """Everything behind a plane of the base frame, such as a table: ``normal`` points out of it."""
+class HalfSpace(Settings):
+    """Everything behind a plane of the base frame, such as a table; ``normal`` points out of it."""
 
-    point: Vector3
-    normal: Vector3
+    type: Literal["half_space"]
+    point: Length3
+    normal: tuple[float, float, float]
+
+    @model_validator(mode="after")
+    def _has_direction(self) -> Self:
+        if not any(self.normal):
+            raise ValueError("normal is zero: give the direction out of the plane, such as [0, 0, 1]")
+        return self
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -71,17 +85,17 @@ class HalfSpace:
 
 
 Shape = Capsule | Box | HalfSpace
+_TOOL = Point(frame=TOOL_FRAME)
 
 
-@dataclass(frozen=True)
-class Rule:
-    """Parts that match ``between`` (globs, or ``everything``) keep at least ``at_least`` (m) apart.
+class Rule(Settings):
+    """Parts that match ``between`` (globs, or ``everything``) keep at least ``at_least`` apart.
 
     Parts that one joint or none lies between do not count, nor pairs with a part that matches ``besides``.
     """
 
     between: tuple[str, str]
-    at_least: float
+    at_least: Length
     besides: tuple[str, ...] = ()
 
 
@@ -136,7 +150,7 @@ class ClearanceCheck:
         self._pairs = [clearance.pairs(rule, moved_by) for rule in clearance.rules]
         capsules = [shape for shapes in clearance.parts.values() for shape in shapes if isinstance(shape, Capsule)]
         points = {point for capsule in capsules for point in (capsule.start, capsule.end)}
-        self._points = [Point(TOOL_FRAME), *sorted(points, key=repr)]
+        self._points = [_TOOL, *sorted(points, key=repr)]
         self._function = _point_function(arm, self._points)
 
     @property
@@ -171,9 +185,9 @@ class ClearanceCheck:
                 if pair not in known:
                     known[pair] = self._apart(pair, where, count)
                 margins[row] = np.minimum(margins[row], known[pair] - rule.at_least)
-        tool = where[Point(TOOL_FRAME)]
+        tool = where[_TOOL]
         for region in self._clearance.forbidden:
-            margins[-1] = np.minimum(margins[-1], distance(Capsule(*(Point(TOOL_FRAME),) * 2, 0.0), region, where))
+            margins[-1] = np.minimum(margins[-1], distance(Capsule(_TOOL, _TOOL, 0.0), region, where))
             if isinstance(region, Box):
                 inside = np.all((tool >= region.low) & (tool <= region.high), axis=1)
             else:

@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from fnmatch import filter as matching
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Literal, Self, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from armcal.arm.assembly import Arm, only_arm
 from armcal.arm.clearance import (
@@ -23,26 +23,19 @@ from armcal.arm.clearance import (
     joints_of_frames,
 )
 from armcal.base.arrays import Array
-from armcal.base.settings import InputPath, Length, Length3, Settings
+from armcal.base.settings import InputPath, Length, Settings
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ConfigError, DataError, Location, PluginError
 
 _AT = ("plan", "clearance")
 
 
-class PointSettings(Settings):
-    """A point ``at`` coordinates of a frame: ``base``, ``mount``, ``tool`` or a named frame of the arm."""
-
-    frame: str = "base"
-    at: Length3 = (0.0, 0.0, 0.0)
-
-
 class CapsuleSettings(Settings):
     """All that lies within ``radius`` of the segment from ``start`` to ``end``."""
 
     type: Literal["capsule"]
-    start: PointSettings
-    end: PointSettings
+    start: Point
+    end: Point
     radius: Length
 
 
@@ -50,36 +43,8 @@ class BallSettings(Settings):
     """A ball."""
 
     type: Literal["ball"]
-    centre: PointSettings
+    centre: Point
     radius: Length
-
-
-class BoxSettings(Settings):
-    """A box along the axes of the base frame, between two corners."""
-
-    type: Literal["box"]
-    low: Length3
-    high: Length3
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if any(low > high for low, high in zip(self.low, self.high, strict=True)):
-            raise ValueError("low lies beyond high on an axis: give the smaller coordinates as low")
-        return self
-
-
-class HalfSpaceSettings(Settings):
-    """Everything behind a plane of the base frame, such as a table; ``normal`` points out of it."""
-
-    type: Literal["half_space"]
-    point: Length3
-    normal: tuple[float, float, float]
-
-    @model_validator(mode="after")
-    def _has_direction(self) -> Self:
-        if not any(self.normal):
-            raise ValueError("normal is zero: give the direction out of the plane, such as [0, 0, 1]")
-        return self
 
 
 class MeshSettings(Settings):
@@ -92,16 +57,8 @@ class MeshSettings(Settings):
 
 
 ShapeSettings: TypeAlias = Annotated[
-    CapsuleSettings | BallSettings | BoxSettings | HalfSpaceSettings | MeshSettings, Field(discriminator="type")
+    CapsuleSettings | BallSettings | Box | HalfSpace | MeshSettings, Field(discriminator="type")
 ]
-
-
-class RuleSettings(Settings):
-    """Parts that match the two globs (or ``everything``) keep ``at_least`` apart; ``besides`` names exceptions."""
-
-    between: tuple[str, str]
-    at_least: Length
-    besides: tuple[str, ...] = ()
 
 
 class ClearanceSettings(Settings):
@@ -111,8 +68,8 @@ class ClearanceSettings(Settings):
     """
 
     parts: dict[str, tuple[ShapeSettings, ...]] = Field(default_factory=dict)
-    rules: tuple[RuleSettings, ...] = ()
-    forbidden: tuple[Annotated[BoxSettings | BallSettings, Field(discriminator="type")], ...] = ()
+    rules: tuple[Rule, ...] = ()
+    forbidden: tuple[Annotated[Box | BallSettings, Field(discriminator="type")], ...] = ()
 
 
 def clearance_check(settings: ClearanceSettings, arms: Mapping[str, Arm], source: ConfigSource) -> ClearanceCheck:
@@ -129,7 +86,6 @@ def clearance_check(settings: ClearanceSettings, arms: Mapping[str, Arm], source
         name: tuple(_shape(shape, frames, source, ("parts", name, index)) for index, shape in enumerate(shapes))
         for name, shapes in settings.parts.items()
     }
-    forbidden = []
     for index, region in enumerate(settings.forbidden):
         if isinstance(region, BallSettings) and region.centre.frame != "base":
             raise ConfigError(
@@ -137,10 +93,9 @@ def clearance_check(settings: ClearanceSettings, arms: Mapping[str, Arm], source
                 where=source.where((*_AT, "forbidden", index, "centre")),
                 hint="Give the centre in the base frame.",
             )
-        forbidden.append(_region(region))
-    rules = tuple(Rule(rule.between, rule.at_least, rule.besides) for rule in settings.rules)
-    check = ClearanceCheck(arm, Clearance(parts, rules, tuple(forbidden)))
-    for index, (rule, pairs) in enumerate(zip(rules, check.pairs, strict=True)):
+    forbidden = tuple(region if isinstance(region, Box) else _ball(region) for region in settings.forbidden)
+    check = ClearanceCheck(arm, Clearance(parts, settings.rules, forbidden))
+    for index, (rule, pairs) in enumerate(zip(settings.rules, check.pairs, strict=True)):
         where, globs = source.where((*_AT, "rules", index)), (*rule.between, *rule.besides)
         if unknown := [glob for glob in globs if glob != EVERYTHING and not matching(parts, glob)]:
             hint = f"The parts are {', '.join(parts) or 'none'}."
@@ -168,7 +123,7 @@ def enclosing_capsule(points: Array, frame: str) -> Capsule:
         low = high = (low + high) / 2
         radius = float(np.max(np.linalg.norm(points - middle - low * axis, axis=1)))
     ends = [(float(x), float(y), float(z)) for x, y, z in (middle + low * axis, middle + high * axis)]
-    return Capsule(Point(frame, ends[0]), Point(frame, ends[1]), radius)
+    return Capsule(*(Point.si(frame=frame, at=end) for end in ends), radius)
 
 
 def _shape(
@@ -176,15 +131,12 @@ def _shape(
 ) -> Shape:
     """A part's shape, whose frames are known and whose radius is no less than zero."""
     shape: Shape
-    if isinstance(settings, HalfSpaceSettings):
-        shape = HalfSpace(settings.point, settings.normal)
-    elif isinstance(settings, MeshSettings):
+    if isinstance(settings, MeshSettings):
         shape = enclosing_capsule(_vertices(Path(settings.path)) * settings.unit, settings.frame)
     elif isinstance(settings, CapsuleSettings):
-        start, end = (Point(point.frame, point.at) for point in (settings.start, settings.end))
-        shape = Capsule(start, end, settings.radius)
+        shape = Capsule(settings.start, settings.end, settings.radius)
     else:
-        shape = _region(settings)
+        shape = _ball(settings) if isinstance(settings, BallSettings) else settings
     where = source.where((*_AT, *at))
     for frame in shape.frames:
         if frame not in frames:
@@ -196,11 +148,8 @@ def _shape(
     return shape
 
 
-def _region(settings: BoxSettings | BallSettings) -> Box | Capsule:
-    if isinstance(settings, BoxSettings):
-        return Box(settings.low, settings.high)
-    centre = Point(settings.centre.frame, settings.centre.at)
-    return Capsule(centre, centre, settings.radius)
+def _ball(settings: BallSettings) -> Capsule:
+    return Capsule(settings.centre, settings.centre, settings.radius)
 
 
 def _vertices(path: Path) -> Array:
