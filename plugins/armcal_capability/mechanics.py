@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
-from armcal.arm.loading import LOAD_CHANNELS
+from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.arrays import Array, Mask
 from armcal.calibration.compensation.step import force_compliance, slopes, twists
 from armcal.calibration.tool_expression import Equilibrium, ToolExpression

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 from typing import Any, ClassVar
 
-from armcal.arm.loading import LOAD_CHANNELS
+from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.settings import Settings
 from armcal.calibration.exporter import Exported, ExportRequest, changed_numbers
 from armcal.calibration.tool_expression import ToolExpression

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NoReturn
 
 import numpy as np
-from armcal.arm.loading import LOAD_CHANNELS
+from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.arrays import Array
 from armcal.base.units import from_unit, split_suffix, to_unit
 from armcal.calibration.compensation.compensator import Compensator

@@ -5,9 +5,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from armcal.arm.assembly import MassSpec
 from armcal.arm.model import Mimic
-from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME
+from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME, MassSpec
 from armcal.base.arrays import Array
 from scipy.spatial.transform import Rotation
 

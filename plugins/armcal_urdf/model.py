@@ -6,8 +6,8 @@ from functools import cached_property
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
-from armcal.arm.assembly import MassSpec
 from armcal.arm.model import Attachment, Chain, Joint, Vector3
+from armcal.arm.statics import MassSpec
 from armcal.base import se3
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.quaternions import rpy_matrices, rpy_of

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import oracle
 import pytest
-from armcal.arm.assembly import Arm, MassSpec, prefixed
+from armcal.arm.assembly import Arm, prefixed
 from armcal.arm.environment import Environment
+from armcal.arm.statics import MassSpec
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.estimate.structure import explain, identify

@@ -9,7 +9,8 @@ from functools import lru_cache
 import numpy as np
 import oracle
 import pytest
-from armcal.arm.loading import LOAD_CHANNELS, holding_efforts, site_loads
+from armcal.arm.loading import holding_efforts, site_loads
+from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.dataset import Dataset
 from armcal.diagnose.evidence import priors_alone, unseen_poses
 from armcal.diagnose.evidence_findings import determined_finding

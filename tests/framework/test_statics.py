@@ -8,11 +8,11 @@ import casadi as ca
 import numpy as np
 import oracle
 import pytest
-from armcal.arm.assembly import Arm, MassSpec
+from armcal.arm.assembly import Arm
 from armcal.arm.effects import JointEffect, Spring
 from armcal.arm.environment import Environment
 from armcal.arm.model import forward
-from armcal.arm.statics import Load, Mass, wrenches
+from armcal.arm.statics import Load, MassSpec, wrenches
 from armcal.base.parameters import Parameters, scalar
 from armcal.problem.problem import Problem
 from armcal_joints.springs import TorsionalSprings, TorsionalSpringSettings
@@ -31,7 +31,7 @@ def wrench_function(arm):
     sizes = (len(chain.joints), 3, 1, 3, 3, 3)
     symbols = [ca.SX.sym(f"s{i}", size) for i, size in enumerate(sizes)]
     frames = forward(chain, [joint.offset + symbols[0][i] for i, joint in enumerate(chain.joints)], {})
-    masses = [Mass(m.name, m.mass, ca.SX(list(m.com)), m.frame, m.loads_up_to) for m in arm.masses]
+    masses = [MassSpec(m.name, m.mass, ca.SX(list(m.com)), m.frame, m.loads_up_to) for m in arm.masses]
     acting = wrenches(chain, frames, masses, Load(*symbols[1:]))
     stacked = ca.horzcat(*[ca.vertcat(w.moment, w.force) for w in acting])
     axes = ca.horzcat(*[ca.mtimes(s.rotation, ca.SX([0, 0, 1])) for s in frames.sites])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from armcal.arm.loading import LOAD_CHANNELS
+from armcal.arm.statics import LOAD_CHANNELS
 from armcal.calibration.compensation.compensator import Compensator
 from armcal.calibration.compensation.request import Options
 from armcal.calibration.compensation.step import slope_function

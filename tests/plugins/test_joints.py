@@ -13,9 +13,9 @@ import numpy as np
 import oracle
 import pytest
 import yaml
-from armcal.arm.assembly import Arm, ArmInputs, MassSpec, prefixed
+from armcal.arm.assembly import Arm, ArmInputs, prefixed
 from armcal.arm.environment import Environment
-from armcal.arm.statics import Load
+from armcal.arm.statics import Load, MassSpec
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.cli.main import cli

@@ -9,10 +9,10 @@ import casadi as ca
 import frida
 import numpy as np
 import pytest
-from armcal.arm.assembly import Arm, ArmInputs, MassSpec
+from armcal.arm.assembly import Arm, ArmInputs
 from armcal.arm.effects import JointEffect, Spring
 from armcal.arm.model import Joint, forward
-from armcal.arm.statics import Load, Mass, effort, wrenches
+from armcal.arm.statics import Load, MassSpec, effort, wrenches
 from armcal.base import se3
 from armcal.base.domains import Direction
 from armcal.base.parameters import Parameters
@@ -250,8 +250,8 @@ def test_what_twists_and_offsets_leave_open_is_one_shift_of_joints_one_and_three
 def weights(chain, frames, force):
     """A mass on the tool and one on the second joint, with a force at the tool."""
     masses = [
-        Mass("tip", ca.SX(0.7), ca.SX([0.1, 0.0, 0.05]), "tool"),
-        Mass("mid", ca.SX(1.1), ca.SX([0, 0.2, 0.1]), "joint2"),
+        MassSpec("tip", ca.SX(0.7), ca.SX([0.1, 0.0, 0.05]), "tool"),
+        MassSpec("mid", ca.SX(1.1), ca.SX([0, 0.2, 0.1]), "joint2"),
     ]
     load = Load(ca.SX([1.0, 2.0, -9.0]), ca.SX(0), ca.SX(3, 1), ca.SX(list(force)), ca.SX(3, 1))
     carried = wrenches(chain, frames, masses, load)

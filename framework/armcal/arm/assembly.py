@@ -14,7 +14,7 @@ from armcal.arm.elastic import deflections, elastic_sites, split_deflection
 from armcal.arm.environment import Environment
 from armcal.arm.model import ArmModel, Chain, chain_fault, forward
 from armcal.arm.pose_residual import OF_TOOL, SURROUNDINGS, PoseResidual, Postures, corrected, correction_names
-from armcal.arm.statics import Load, Mass, joint_efforts, wrenches
+from armcal.arm.statics import Load, MassSpec, joint_efforts, wrenches
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock, declared, scalar
@@ -25,17 +25,6 @@ from armcal.plugin_faults import refuse
 
 PLACEMENT = "placement"
 """What the blocks of an arm's placement are called."""
-
-
-@dataclass(frozen=True)
-class MassSpec:
-    """A mass as stated: kg, centre in m in a named frame, and the last joint it loads (None: the physical one)."""
-
-    name: str
-    mass: float
-    com: tuple[float, float, float]
-    frame: str
-    loads_up_to: int | None = None
 
 
 @runtime_checkable
@@ -283,12 +272,12 @@ class Arm:
             total += column(effect.displacement, added, 1, "one number or expression (rad or m)")
         return command.commanded + total
 
-    def _masses(self, values: Mapping[str, Expression]) -> Sequence[Mass]:
+    def _masses(self, values: Mapping[str, Expression]) -> list[MassSpec]:
         result = []
         for mass in self.masses:
             local = scoped(values, self._scope(f"links.{mass.name}"))
             com = ca.sparsify(ca.vertcat(*[local[f"com_{axis}"] for axis in "xyz"]))
-            result.append(Mass(mass.name, local["mass"], com, mass.frame, mass.loads_up_to))
+            result.append(replace(mass, mass=local["mass"], com=com))
         return result
 
     def _scope(self, component: str) -> str:

@@ -27,11 +27,14 @@ class Environment:
     torque: Vector3 = _ZERO
 
     @property
+    def acting(self) -> tuple[float, ...]:
+        """All of it, in the order of ``LOAD_CHANNELS``."""
+        return (*self.gravity, self.payload_mass, *self.payload_com, *self.force, *self.torque)
+
+    @property
     def load(self) -> Load:
         """As constant expressions."""
-        vectors = (self.gravity, self.payload_com, self.force, self.torque)
-        gravity, com, force, torque = (ca.SX(list(vector)) for vector in vectors)
-        return Load(gravity, ca.SX(self.payload_mass), com, force, torque)
+        return Load.of([ca.SX(number) for number in self.acting])
 
 
 def gravity_tilt() -> tuple[ParameterBlock, ...]:

@@ -1,7 +1,7 @@
 """Statics of the rigid arm: what its sites carry and its joints hold, and how a turn of a site moves the tip."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -9,18 +9,9 @@ import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.arm.environment import Environment
 from armcal.arm.model import Chain, Frames, Vector3, forward
-from armcal.arm.statics import Load, Mass, SiteWrench, joint_efforts, wrenches
+from armcal.arm.statics import LOAD_CHANNELS, Load, SiteWrench, joint_efforts, wrenches
 from armcal.base.arrays import Array
 from armcal.base.se3 import Expression
-
-LOAD_CHANNELS = (
-    *(f"gravity_{axis}" for axis in "xyz"),
-    "payload",
-    *(f"payload_{axis}" for axis in "xyz"),
-    *(f"force_{axis}" for axis in "xyz"),
-    *(f"torque_{axis}" for axis in "xyz"),
-)
-"""What acts on an arm in a record: m/s^2, kg, m, N, N m."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +37,7 @@ def site_loads(arm: Arm, values: Mapping[str, Array], commands: Array, acting: A
     """
     chain = arm.chain({name: ca.SX(list(value)) for name, value in values.items()})
     joints, what = ca.SX.sym("commands", len(chain.joints)), ca.SX.sym("acting", len(LOAD_CHANNELS))
-    load = Load(what[0:3], what[3], what[4:7], what[7:10], what[10:13])
-    frames, wrenches_of = _rigid_statics(arm, chain, ca.vertsplit(joints), load)
+    frames, wrenches_of = _rigid_statics(arm, chain, ca.vertsplit(joints), Load.of(ca.vertsplit(what)))
     moments, levers = [], []
     for site, wrench in zip(frames.sites, wrenches_of, strict=True):
         moments.append(ca.mtimes(site.rotation.T, wrench.moment))
@@ -89,5 +79,5 @@ def _rigid_statics(
 ) -> tuple[Frames, tuple[SiteWrench, ...]]:
     """Frames and wrenches without effects, with the stated masses; ``commands`` are of all joints of the chain."""
     frames = forward(chain, [joint.offset + commands[i] for i, joint in enumerate(chain.joints)], {})
-    masses = [Mass(m.name, ca.SX(m.mass), ca.SX(list(m.com)), m.frame, m.loads_up_to) for m in arm.masses]
+    masses = [replace(mass, mass=ca.SX(mass.mass), com=ca.SX(list(mass.com))) for mass in arm.masses]
     return frames, wrenches(chain, frames, masses, load)

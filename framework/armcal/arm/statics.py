@@ -7,6 +7,7 @@ cost does not grow with the number of masses. [Conenna2024]
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import casadi as ca
 
@@ -17,15 +18,25 @@ from armcal.base.se3 import Expression
 BASE_FRAME, MOUNT_FRAME, TOOL_FRAME = "base", "mount", "tool"
 
 
+LOAD_CHANNELS = (
+    *(f"gravity_{axis}" for axis in "xyz"),
+    "payload",
+    *(f"payload_{axis}" for axis in "xyz"),
+    *(f"force_{axis}" for axis in "xyz"),
+    *(f"torque_{axis}" for axis in "xyz"),
+)
+"""What acts on an arm in a record: m/s^2, kg, m, N, N m."""
+
+
 @dataclass(frozen=True)
-class Mass:
-    """A mass of the arm.
+class MassSpec:
+    """A mass in a named frame of the chain, ``mount`` or ``tool``: numbers as stated, or expressions of parameters.
 
     Attributes:
         name: what it is.
         mass: kg.
-        com: centre of mass in its frame (3x1, m).
-        frame: a named frame of the chain, ``mount`` or ``tool``.
+        com: centre of mass in its frame (3, or 3x1; m).
+        frame: that frame.
         loads_up_to: the last joint it loads (from 1); None for the physical one, the joint that moves it.
     """
 
@@ -56,6 +67,12 @@ class Load:
     torque: Expression
     beyond: tuple[Expression, Expression] | None = None
 
+    @classmethod
+    def of(cls, acting: Sequence[Expression]) -> Self:
+        """From numbers in the order of ``LOAD_CHANNELS``."""
+        gravity, com, force, torque = (ca.sparsify(ca.vertcat(*acting[i : i + 3])) for i in (0, 4, 7, 10))
+        return cls(gravity, acting[3], com, force, torque)
+
 
 @dataclass(frozen=True)
 class SiteWrench:
@@ -65,7 +82,7 @@ class SiteWrench:
     force: Expression
 
 
-def wrenches(chain: Chain, frames: Frames, masses: Sequence[Mass], load: Load) -> tuple[SiteWrench, ...]:
+def wrenches(chain: Chain, frames: Frames, masses: Sequence[MassSpec], load: Load) -> tuple[SiteWrench, ...]:
     """The wrench that everything beyond it puts on each site (0 the mount, i joint i)."""
     last = len(chain.joints)
     weight_at: dict[int, Expression] = defaultdict(lambda: ca.SX(0))

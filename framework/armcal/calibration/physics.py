@@ -15,6 +15,7 @@ import numpy as np
 from armcal import plugin_files
 from armcal.arm import assembly
 from armcal.arm.environment import Environment
+from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
@@ -36,7 +37,6 @@ SHARE = 0.05
 UNSTATED_M = 1e-5
 """The same where no accuracy of the tool is stated: below what any tracker can resolve."""
 CHECK_POSES = 8
-_PAYLOAD = ("payload", "payload_x", "payload_y", "payload_z")
 
 
 class ComponentRecord(Settings):
@@ -214,8 +214,8 @@ def check_record(system: System, parameters: Parameters, commands: Dataset, stat
 
 def under_load(kept: CheckRecord, environment: Environment) -> CheckRecord:
     """The same, its commands with the payload that they were predicted with: it may be stated otherwise from now on."""
-    stated = dict(zip(_PAYLOAD, (environment.payload_mass, *environment.payload_com), strict=True))
-    silent = {channel: value for channel, value in stated.items() if channel not in kept.channels}
+    stated = zip(LOAD_CHANNELS, environment.acting, strict=True)
+    silent = {c: value for c, value in stated if c.startswith("payload") and c not in kept.channels}
     records = tuple((*record, *silent.values()) for record in kept.records)
     return kept.model_copy(update={"channels": (*kept.channels, *silent), "records": records})
 

@@ -16,9 +16,8 @@ from typing_extensions import override
 from armcal.arm.assembly import Arm, ArmInputs, scoped
 from armcal.arm.environment import STATICS, Environment, tilted
 from armcal.arm.evaluator import ElasticPass, Evaluator
-from armcal.arm.loading import LOAD_CHANNELS
 from armcal.arm.servo import PulseClock, PulseTable, SteppedEffect
-from armcal.arm.statics import Load
+from armcal.arm.statics import LOAD_CHANNELS, Load
 from armcal.base import se3
 from armcal.base.arrays import Array, Mask
 from armcal.base.parameters import Parameters
@@ -26,7 +25,6 @@ from armcal.base.se3 import Expression, Transform
 from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
 APPROACH = "approach."
-_VECTORS = ("gravity", "payload", "force", "torque")
 
 
 @dataclass(frozen=True)
@@ -114,17 +112,17 @@ def arm_expression(
     inputs = ArmInputs(
         ca.vertcat(*smooth.joint_commands([said[joint] for joint in joints])),
         ca.vertcat(*smooth.joint_approaches([said[APPROACH + joint] for joint in joints])),
-        tilted(_load(said), scoped(values, f"{STATICS}.")),
+        tilted(Load.of([said[channel] for channel in LOAD_CHANNELS]), scoped(values, f"{STATICS}.")),
         deflection,
         {name: said[name] for name in conditions},
     )
-    arm_state = smooth.state(values, inputs)
+    arm_state, stated = smooth.state(values, inputs), dict(zip(LOAD_CHANNELS, environment.acting, strict=True))
     return ToolExpression(
         name=arm.name,
         arm=smooth,
         joints=joints,
         channels=channels,
-        defaults=_defaults(channels, environment),
+        defaults=np.array([stated.get(channel, 0.0) for channel in channels]),
         record=record,
         state=deflection,
         next_state=ca.densify(arm_state.next_deflection),
@@ -136,26 +134,11 @@ def arm_expression(
     )
 
 
-def _load(said: Mapping[str, Expression]) -> Load:
-    vectors = {name: ca.vertcat(*[said[f"{name}_{axis}"] for axis in "xyz"]) for name in _VECTORS}
-    return Load(vectors["gravity"], said["payload"], vectors["payload"], vectors["force"], vectors["torque"])
-
-
 def _without_steps(arm: Arm) -> tuple[Arm, dict[str, tuple[PulseTable, PulseClock]]]:
     stepped = {name: effect for name, effect in arm.effects.items() if isinstance(effect, SteppedEffect)}
     servos = {arm.joint_names[i]: servo for effect in stepped.values() for i, servo in effect.servos().items()}
     kept = {name: effect for name, effect in arm.effects.items() if name not in stepped}
     return replace(arm, effects=kept), servos
-
-
-def _defaults(channels: Sequence[str], environment: Environment) -> Array:
-    stated = (environment.gravity, environment.payload_com, environment.force, environment.torque)
-    said = {
-        f"{name}_{axis}": value
-        for name, vector in zip(_VECTORS, stated, strict=True)
-        for axis, value in zip("xyz", vector, strict=True)
-    }
-    return np.array([{**said, "payload": environment.payload_mass}.get(channel, 0.0) for channel in channels])
 
 
 def sample_inputs(expression: ToolExpression) -> list[Array]:

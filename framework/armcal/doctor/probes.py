@@ -190,7 +190,8 @@ def _evaluated(choice: Any) -> _Evaluated:
     """All records linearised by one backend; the shortest of a few times."""
     import numpy as np
 
-    from armcal.arm.assembly import Arm, MassSpec
+    from armcal.arm.assembly import Arm
+    from armcal.arm.statics import MassSpec
     from armcal.problem.problem import Problem
     from armcal.testing import planar
 

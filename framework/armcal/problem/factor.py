@@ -23,9 +23,8 @@ from typing_extensions import override
 from armcal.arm.assembly import Arm, ArmInputs, ArmState, LocalValues, scoped
 from armcal.arm.environment import STATICS, Environment, tilted
 from armcal.arm.evaluator import ElasticPass
-from armcal.arm.model import Vector3
 from armcal.arm.pose_residual import SURROUNDINGS, correction_names
-from armcal.arm.statics import Load
+from armcal.arm.statics import LOAD_CHANNELS, Load
 from armcal.base.arrays import Array
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.se3 import Expression
@@ -198,11 +197,6 @@ class _Records:
         """The symbols that an expression depends on, or a pose residual."""
         return {n: own for n, own in self.symbols.items() if n in self.kept or ca.depends_on(expression, own)}
 
-    def vector(self, channel: str, defaults: Vector3) -> Expression:
-        """Three channels ``channel_x`` to ``channel_z``."""
-        parts = [self.optional(f"{channel}_{axis}", d) for axis, d in zip("xyz", defaults, strict=True)]
-        return ca.sparsify(ca.vertcat(*parts))
-
 
 def build_factor(
     name: str,
@@ -348,14 +342,8 @@ def _arm_states(
 ) -> tuple[_Records, dict[str, ArmState], list[Expression]]:
     """Each arm in a record under its load, ``@other`` ones in the record's partner; and their deflections' symbols."""
     records = _Records(available)
-    load = Load(
-        gravity=records.vector("gravity", environment.gravity),
-        payload_mass=records.optional("payload", environment.payload_mass),
-        payload_com=records.vector("payload", environment.payload_com),
-        force=records.vector("force", environment.force),
-        torque=records.vector("torque", environment.torque),
-    )
-    load = tilted(load, scoped(values, f"{STATICS}."))
+    acting = [records.optional(*pair) for pair in zip(LOAD_CHANNELS, environment.acting, strict=True)]
+    load = tilted(Load.of(acting), scoped(values, f"{STATICS}."))
     states, deflections = {}, []
     for name in measurement.arms:
         arm = arms[name.removesuffix(OTHER)]

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armcal.arm.loading import LOAD_CHANNELS, SiteLoads, site_loads
+from armcal.arm.loading import SiteLoads, site_loads
+from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.problem.kernel import Kernel
@@ -82,11 +83,9 @@ def recorded_position(dataset: Dataset) -> Indices:
 
 def _acting(problem: Problem, dataset: Dataset) -> dict[str, Array]:
     """The loads of each record (N each), those of the environment where a record says nothing."""
-    e = problem.blueprint.environment
-    stated = (*e.gravity, e.payload_mass, *e.payload_com, *e.force, *e.torque)
     return {
         channel: dataset.column(channel) if dataset.has(channel) else np.full(len(dataset), default)
-        for channel, default in zip(LOAD_CHANNELS, stated, strict=True)
+        for channel, default in zip(LOAD_CHANNELS, problem.blueprint.environment.acting, strict=True)
     }
 
 

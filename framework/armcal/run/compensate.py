@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from armcal.arm.loading import LOAD_CHANNELS
+from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.quaternions import quaternion_of

@@ -123,7 +123,8 @@ def enclosing_capsule(points: Array, frame: str) -> Capsule:
         low = high = (low + high) / 2
         radius = float(np.max(np.linalg.norm(points - middle - low * axis, axis=1)))
     ends = [(float(x), float(y), float(z)) for x, y, z in (middle + low * axis, middle + high * axis)]
-    return Capsule(*(Point.si(frame=frame, at=end) for end in ends), radius)
+    start, end = (Point.si(frame=frame, at=place) for place in ends)
+    return Capsule(start, end, radius)
 
 
 def _shape(

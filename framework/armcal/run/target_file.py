@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from armcal.arm.loading import LOAD_CHANNELS
+from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.arrays import Array
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from armcal.arm.assembly import Arm, MassiveModel, MassSpec
+from armcal.arm.assembly import Arm, MassiveModel
 from armcal.arm.environment import Environment
 from armcal.arm.model import ArmModel, Chain, forward
-from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME, frame_names
+from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME, MassSpec, frame_names
 from armcal.base.arrays import Array
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression, Transform

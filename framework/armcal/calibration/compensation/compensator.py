@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from armcal.arm.loading import LOAD_CHANNELS
+from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.arrays import Array, Mask
 from armcal.base.parameters import Parameters
 from armcal.calibration.compensation.counts import Rounding, ServoCounts
