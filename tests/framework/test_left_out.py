@@ -33,8 +33,8 @@ def without_priors():
 def test_it_is_the_posterior_without_the_record() -> None:
     """Values and drift together, each record in turn taken out of the information."""
     problem, fitted, joint, known = without_priors()
-    (spread,) = predictor(problem, fitted).left_out_of_recording(fitted.records)
-    (own,) = predictor(problem, fitted).in_recording(fitted.records)
+    (spread,) = predictor(problem, fitted).left_out(fitted.records, "same")
+    (own,) = predictor(problem, fitted).spreads(fitted.records, "same")
     information = joint.T @ joint + known
     scale = (fitted.estimate.noise_scale * NOISE) ** 2
     for i in range(len(joint) // 3):
@@ -48,10 +48,10 @@ def test_it_is_the_posterior_without_the_record() -> None:
 def test_a_record_that_weighed_less_is_missed_less() -> None:
     problem, fitted, *_ = without_priors()
     by = predictor(problem, fitted)
-    (whole,), (own,) = by.left_out_of_recording(fitted.records), by.in_recording(fitted.records)
+    (whole,), (own,) = by.left_out(fitted.records, "same"), by.spreads(fitted.records, "same")
     weight = fitted.records[0].weight.copy()
     weight[0], weight[1] = 0.0, 0.5
-    (spread,) = by.left_out_of_recording([replace(fitted.records[0], weight=weight)])
+    (spread,) = by.left_out([replace(fitted.records[0], weight=weight)], "same")
     assert np.allclose(spread.covariance[0], own.covariance[0], rtol=1e-10)
     assert (spread.deviations[:, 1] < whole.deviations[:, 1]).all()
     assert (spread.deviations[:, 1] > own.deviations[:, 1]).all()
@@ -64,7 +64,7 @@ def test_where_nothing_drifts_both_recordings_are_the_same() -> None:
     problem = problem_of(loaded, dataset)
     fitted = fit(problem, problem.records(dataset), loaded.estimator, loaded.parameters.nominal())
     by = predictor(problem, fitted)
-    (same,), (new,) = by.left_out_of_recording(fitted.records), by.left_out_of_new_recording(fitted.records)
+    (same,), (new,) = by.left_out(fitted.records, "same"), by.left_out(fitted.records, "new")
     assert np.array_equal(same.covariance, new.covariance)
     # What records hold of what is known of themselves sums to the number of values.
     noise = (fitted.estimate.noise_scale * NOISE) ** 2
@@ -80,16 +80,16 @@ def test_a_record_alone_in_telling_something_is_not_predicted_without_it() -> No
     problem = problem_of(loaded, dataset)
     records = problem.records(dataset)
     fitted = fit(problem, records, loaded.estimator, loaded.parameters.nominal())
-    (spread,) = predictor(problem, fitted).left_out_of_recording(fitted.records)
-    (own,) = predictor(problem, fitted).in_recording(fitted.records)
+    (spread,) = predictor(problem, fitted).left_out(fitted.records, "same")
+    (own,) = predictor(problem, fitted).spreads(fitted.records, "same")
     assert np.isfinite(spread.covariance).all()
     assert (spread.deviations > 3 * own.deviations).any(axis=0).all()
 
 
-@pytest.mark.parametrize("way", ["left_out_of_recording", "left_out_of_new_recording"])
-def test_the_order_of_records_does_not_matter(way: str) -> None:
+@pytest.mark.parametrize("recording", ["same", "new"])
+def test_the_order_of_records_does_not_matter(recording: str) -> None:
     *_, problem, _, _, _, fitted = drifting_problem()
     by, count = predictor(problem, fitted), fitted.records[0].count
     turned = problem.subset(fitted.records, np.arange(count)[::-1])
-    (forth,), (back,) = getattr(by, way)(fitted.records), getattr(by, way)(turned)
+    (forth,), (back,) = by.left_out(fitted.records, recording), by.left_out(turned, recording)
     assert np.allclose(forth.covariance, back.covariance[::-1], rtol=1e-10)

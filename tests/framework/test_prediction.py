@@ -82,7 +82,7 @@ def test_covariances_are_those_of_dense_gaussian_conditioning(drifting) -> None:
     h = slopes[rows["h"]] - drift[rows["h"]] @ message_of @ a.T @ j
     g = drift[rows["h"]]
     whole = h @ found.covariance @ h.T + s**2 * (g @ message_of @ g.T + noise**2 * np.eye(len(g)))
-    (spread,) = by.in_recording(problem.subset(records, held))
+    (spread,) = by.spreads(problem.subset(records, held), "same")
     for i in range(len(held)):
         block = whole[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
         assert np.allclose(spread.covariance[i], block, rtol=2e-4, atol=1e-4 * np.trace(block))
@@ -106,7 +106,7 @@ def test_without_priors_it_is_the_joint_posterior(drifting) -> None:
     posterior = scale[:, None] * np.linalg.inv(scaled.T @ scaled + known) * scale
     new = joint[rows_h]
     whole = fitted.estimate.noise_scale**2 * (new @ posterior @ new.T + 5e-4**2 * np.eye(len(new)))
-    (spread,) = predictor(problem, fitted).in_recording(problem.subset(records, held))
+    (spread,) = predictor(problem, fitted).spreads(problem.subset(records, held), "same")
     assert np.allclose(spread.deviations.T.ravel(), np.sqrt(np.diag(whole)), rtol=2e-2)
 
 
@@ -122,9 +122,9 @@ def test_nothing_told_of_the_drift_counts_all_of_it(drifting) -> None:
     variance[free.index("arm.mdh.theta1")] = np.deg2rad(0.3) ** 2
     s2 = found.noise_scale**2
     whole = slopes @ (found.covariance + s2 * np.diag(variance)) @ slopes.T + s2 * 25e-8 * np.eye(len(slopes))
-    (spread,) = by.in_new_recording(new)
+    (spread,) = by.spreads(new, "new")
     assert np.allclose(spread.deviations.T.ravel(), np.sqrt(np.diag(whole)), rtol=1e-4)
-    (known,) = by.in_recording(new)
+    (known,) = by.spreads(new, "same")
     assert (known.deviations < spread.deviations * (1 + 1e-9)).all()
     assert known.deviations[0].mean() < 0.8 * spread.deviations[0].mean()
 
@@ -132,8 +132,8 @@ def test_nothing_told_of_the_drift_counts_all_of_it(drifting) -> None:
 def test_the_order_of_new_records_does_not_matter(drifting) -> None:
     *_, problem, records, _, held, fitted = drifting
     by, turned = predictor(problem, fitted), held[::-1]
-    for way in (by.in_recording, by.in_new_recording):
-        (forth,), (back,) = way(problem.subset(records, held)), way(problem.subset(records, turned))
+    for recording in ("same", "new"):
+        (forth,), (back,) = (by.spreads(problem.subset(records, own), recording) for own in (held, turned))
         assert np.allclose(forth.covariance, back.covariance[::-1], rtol=1e-10)
 
 
@@ -145,7 +145,7 @@ def test_a_record_counts_its_own_noise() -> None:
     problem = problem_of(loaded, dataset)
     records = problem.records(dataset)
     fitted = fit(problem, records, loaded.estimator, loaded.parameters.nominal())
-    (spread,) = predictor(problem, fitted).in_recording(records)
+    (spread,) = predictor(problem, fitted).spreads(records, "same")
     deviations = spread.deviations / (fitted.estimate.noise_scale * noise)
     assert (deviations > 1).all() and (deviations < 1.5).all()
 
@@ -402,7 +402,7 @@ def test_what_is_kept_predicts_as_the_fit_itself(extra: tuple[str, ...], tmp_pat
     fitted = replace(fitted, estimate=widened(problem, acting, fitted.estimate, position))
     by = predictor(problem, fitted)
     alike = whitened_like(problem, fitted, records, loaded.estimator)
-    for recording, spreads in (("same", by.in_recording(alike)), ("new", by.in_new_recording(alike))):
+    for recording, spreads in ((name, by.spreads(alike, name)) for name in ("same", "new")):
         found = kept.plus_minus(dataset, recording)
         deviations = np.array([found.deviations[f"tracker.{axis}"] for axis in "xyz"])
         assert np.allclose(deviations, spreads[0].deviations, rtol=1e-6)

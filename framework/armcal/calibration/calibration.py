@@ -32,8 +32,8 @@ from armcal.calibration.tool_expression import ToolExpression, arm_expression
 from armcal.config.system import System, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource
-from armcal.diagnose.coverage import Recording
 from armcal.errors import ArmcalError, CalibrationWarning, ConfigError, DataError, Location
+from armcal.estimate.prediction import Recording
 from armcal.estimate.variance import Component
 from armcal.measure.measurement import Measurement
 from armcal.plugins import PluginRegistry, discover

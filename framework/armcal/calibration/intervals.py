@@ -18,9 +18,19 @@ from armcal.base.dataset import Dataset
 from armcal.base.parameters import Drift, Parameters
 from armcal.base.settings import Settings
 from armcal.config.system import System
-from armcal.diagnose.coverage import Recording, Stretch, level_name
+from armcal.diagnose.coverage import Stretch, level_name
 from armcal.errors import DataError
-from armcal.estimate.prediction import LEVELS, POSITION, STATED, TURN, KnownDrift, Predictor, Spread, is_position
+from armcal.estimate.prediction import (
+    LEVELS,
+    POSITION,
+    STATED,
+    TURN,
+    KnownDrift,
+    Predictor,
+    Recording,
+    Spread,
+    is_position,
+)
 from armcal.estimate.variance import Axes, Component, VarianceComponents, apply_components
 from armcal.problem.drift import Chain, chain, with_drift
 from armcal.problem.problem import FactorRecords, Problem
@@ -194,7 +204,7 @@ class Uncertainty:
             axes: Axes = "together" if instruments <= set(self.system.measurements) else "apart"
             estimated = VarianceComponents(self.components, (), (), 0.0)
             whitened = apply_components(problem, self.values, records, estimated, axes)
-        spreads = self._predictor(problem, None).in_new_recording(whitened)
+        spreads = self._predictor(problem, None).spreads(whitened, "new")
         recording: Recording = "same" if self.record.recording is None else "new"
         still = tuple(np.zeros_like(spread.deviations) for spread in spreads)
         return _Part(places, recording, still, spreads, reading_slopes(problem, self.values, records))
@@ -204,7 +214,7 @@ class Uncertainty:
     ) -> _Part:
         """In the recording, which tells of a drift."""
         records = self._drifted(problem, commands, along, self.noise_scale)
-        spreads = self._predictor(problem, drift).in_recording(records)
+        spreads = self._predictor(problem, drift).spreads(records, "same")
         moved = [record.correlation.shift(i, drift.states) for i, record in enumerate(records) if record.correlation]
         off = tuple(m[:, : len(places), 0] for m in moved)
         return _Part(places, "same", off, spreads, reading_slopes(problem, self.values, records))

@@ -12,7 +12,6 @@ scores of the other folds give (cross-conformal [Vovk2015]).
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from scipy.special import ndtri
@@ -29,6 +28,7 @@ from armcal.estimate.prediction import (
     STATED,
     KnownDrift,
     Predictor,
+    Recording,
     Spread,
     is_position,
     quantile,
@@ -38,8 +38,6 @@ from armcal.estimate.variance import apply_components
 from armcal.estimate.weighing import WeighedFit, Weighing, fit
 from armcal.problem.problem import FactorRecords, Problem
 
-Recording = Literal["same", "new"]
-"""Whether what is predicted lies within the recording of the fit, whose drift is known, or in another one."""
 Residuals = tuple[Array, ...]
 """Raw residuals, one (n_r x N) a factor."""
 FEWEST = 40
@@ -171,8 +169,7 @@ def missed(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, Resi
 
 def score(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, Scores]:
     """Residuals of records that a fit did not see, in units of what it predicts for them."""
-    spreads = {"same": by.in_recording, "new": by.in_new_recording}
-    return {name: scored(by.problem, residuals, spreads[name](held)) for name, residuals in missed(by, held).items()}
+    return {name: scored(by.problem, own, by.spreads(held, name)) for name, own in missed(by, held).items()}
 
 
 def scored(problem: Problem, residuals: Residuals, spreads: Sequence[Spread]) -> Scores:

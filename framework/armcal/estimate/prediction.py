@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from scipy.special import fdtri, stdtrit
@@ -24,6 +25,8 @@ from armcal.problem.factor_records import noise_roots
 from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem
 
+Recording = Literal["same", "new"]
+"""Whether what is predicted lies within the recording of the fit, whose drift is known, or in another one."""
 LEVELS = (0.5, 0.9, 0.95)
 """Of the intervals that are stated and judged."""
 STATED = 0.9
@@ -146,51 +149,31 @@ class Predictor:
         return any(block.drift is not None for block in self.problem.parameters.free)
 
     def residuals(self, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
-        """Raw residuals less the known drift, one (n_r x N) a factor; records as ``in_recording`` takes them."""
+        """Raw residuals less the known drift, one (n_r x N) a factor; records on the chain of those of the fit."""
         raw, here = self.problem.residuals(self.values, records), records[0].correlation
-        if here is None or self.drift is None:
-            return raw
-        states = self.drift.states
-        return tuple(r - here.shift(i, states)[:, : r.shape[1], 0] for i, r in enumerate(raw))
+        return raw if here is None or self.drift is None else here.taken_off(raw, self.drift.states)
 
-    def in_new_recording(self, records: Sequence[FactorRecords]) -> tuple[Spread, ...]:
-        """Spread about predictions without drift, where nothing is known of it; one a factor."""
-        parts = self._parts_in_new_recording(records)
+    def spreads(self, records: Sequence[FactorRecords], recording: Recording) -> tuple[Spread, ...]:
+        """Spread about predictions, one a factor: with the drift of the ``same`` recording, without in a ``new`` one.
+
+        In the same recording the records must be on the chain of those of the fit.
+        """
+        parts = self._parts(records, recording)
         return tuple(Spread(noise + values + drift, self.freedom) for noise, values, drift in parts)
 
-    def in_recording(self, records: Sequence[FactorRecords]) -> tuple[Spread, ...]:
-        """Spread about predictions with the drift of the recording of the fit; one a factor.
-
-        The records must be on the same chain as those of the fit.
-        """
-        parts = self._parts_in_recording(records)
-        return tuple(Spread(noise + values + drift, self.freedom) for noise, values, drift in parts)
-
-    def left_out_of_recording(
-        self, fitted: Sequence[FactorRecords], unknown: Sequence[Array] | None = None
+    def left_out(
+        self, fitted: Sequence[FactorRecords], recording: Recording, unknown: Sequence[Array] | None = None
     ) -> tuple[Spread, ...]:
-        """As ``in_recording`` of the fit's own records, each as if the fit had done without it.
+        """As ``spreads`` of the fit's own records, each as if the fit had done without it.
 
-        ``unknown`` is what pose residuals that did not see them do not know (see ``unexplained``).
+        For a new recording as if each record were evidence of the values alone, though neighbours share their drift: a
+        little too narrow. ``unknown`` is what pose residuals that did not see them do not know (see ``unexplained``).
         """
-        parts = zip(fitted, self._parts_in_recording(fitted, unknown), strict=True)
-        return tuple(
-            Spread(_without_itself(noise, values + drift, factor_records), self.freedom)
-            for factor_records, (noise, values, drift) in parts
-        )
-
-    def left_out_of_new_recording(
-        self, fitted: Sequence[FactorRecords], unknown: Sequence[Array] | None = None
-    ) -> tuple[Spread, ...]:
-        """As ``in_new_recording`` of the fit's own records, each as if the fit had done without it.
-
-        As if each record were evidence of the values alone, though neighbours share their drift: a little too narrow.
-        """
-        parts = zip(fitted, self._parts_in_new_recording(fitted, unknown), strict=True)
-        return tuple(
-            Spread(_without_itself(noise + drift, values, factor_records), self.freedom)
-            for factor_records, (noise, values, drift) in parts
-        )
+        spreads = []
+        for record, (noise, values, drift) in zip(fitted, self._parts(fitted, recording, unknown), strict=True):
+            own = (noise, values + drift) if recording == "same" else (noise + drift, values)
+            spreads.append(Spread(_without_itself(*own, record), self.freedom))
+        return tuple(spreads)
 
     def new_recording(self, records: Sequence[FactorRecords], judged: Indices) -> NewRecording | None:
         """What the errors of judged records, held out of this recording, say of a new one.
@@ -207,7 +190,7 @@ class Predictor:
         counted, whole, common = error_dimension(self.problem), 0.0, 0.0
         noises: list[Array] = []
         roots: list[Array] = []
-        parts = zip(self.problem.kernels, self._slopes(records), self._parts_in_new_recording(records), strict=True)
+        parts = zip(self.problem.kernels, self._slopes(records), self._parts(records, "new"), strict=True)
         for i, (kernel, slope, (noise, values, drift)) in enumerate(parts):
             rows = np.flatnonzero([dimension == counted for dimension in kernel.factor.dimensions])
             taken_up = np.moveaxis(here.shift(i, there.slopes)[:, : slope.shape[2]], 1, 2)
@@ -222,52 +205,28 @@ class Predictor:
         part = len(judged) / len(near)
         return NewRecording(ratio[judged], part * freedom, part * independent)
 
-    def _parts_in_new_recording(
-        self, records: Sequence[FactorRecords], unknown: Sequence[Array] | None = None
-    ) -> list[_Parts]:
-        """Covariances in a recording whose drift is not known."""
-        slopes = self._slopes(records)
-        blocks = self.problem.parameters.free
-        drifting = np.array([0.0 if b.drift is None else b.drift.sd**2 for b in blocks for _ in range(b.size)])
-        variance = self.noise_scale**2 * drifting
-        drift = [np.einsum("rvn,v,svn->nrs", slope, variance, slope, optimize=True) for slope in slopes]
-        return self._parts(records, slopes, drift, unknown)
-
-    def _parts_in_recording(
-        self, records: Sequence[FactorRecords], unknown: Sequence[Array] | None = None
-    ) -> list[_Parts]:
-        """Covariances in the recording of the fit, whose records determine its drift."""
-        here, there = records[0].correlation, self.drift
-        if here is None or there is None:
-            return self._parts_in_new_recording(records, unknown)
-        slopes, spreads = [], []
-        for i, slope in enumerate(self._slopes(records)):
-            count = slope.shape[2]
-            slopes.append(slope - np.moveaxis(here.shift(i, there.slopes)[:, :count], 1, 2))
-            by_state, left = here.raw[i][:, :count], there.covariance[here.node[:count]]
-            spread = np.einsum("rnd,nde,sne->nrs", by_state, left, by_state, optimize=True)
-            spreads.append(self.noise_scale**2 * spread)
-        return self._parts(records, slopes, spreads, unknown)
-
     def _parts(
-        self,
-        records: Sequence[FactorRecords],
-        slopes: Sequence[Array],
-        drift: Sequence[Array],
-        unknown: Sequence[Array] | None,
+        self, records: Sequence[FactorRecords], recording: Recording, unknown: Sequence[Array] | None = None
     ) -> list[_Parts]:
         """Covariances by noise, by values and by drift (N x n_r x n_r each), one of each a factor.
 
         What pose residuals do not know counts as noise: it is the same whether or not a record was learned from.
         """
-        parts = []
+        here, there, parts = records[0].correlation, self.drift if recording == "same" else None, []
+        blocks, variance = self.problem.parameters.free, self.noise_scale**2
+        drifting = np.array([0.0 if b.drift is None else b.drift.sd**2 for b in blocks for _ in range(b.size)])
         unknown = unexplained(self.problem, self.values, records) if unknown is None else unknown
-        for kernel, record, slope, moved, own in zip(
-            self.problem.kernels, records, slopes, drift, unknown, strict=True
-        ):
+        rows = zip(self.problem.kernels, records, self._slopes(records), unknown, strict=True)
+        for i, (kernel, record, slope, own) in enumerate(rows):
+            if here is None or there is None:
+                drift = np.einsum("rvn,v,svn->nrs", slope, variance * drifting, slope, optimize=True)
+            else:  # the records of the fit determine it
+                by_state, left = here.raw[i][:, : record.count], there.covariance[here.node[: record.count]]
+                drift = variance * np.einsum("rnd,nde,sne->nrs", by_state, left, by_state, optimize=True)
+                slope = slope - np.moveaxis(here.shift(i, there.slopes)[:, : record.count], 1, 2)
             values = np.einsum("rvn,vw,swn->nrs", slope, self.covariance, slope, optimize=True)
             roots = noise_roots(kernel.factor, record)
-            parts.append((self.noise_scale**2 * (roots @ roots.transpose(0, 2, 1)) + own, values, moved))
+            parts.append((variance * (roots @ roots.transpose(0, 2, 1)) + own, values, drift))
         return parts
 
     def _slopes(self, records: Sequence[FactorRecords]) -> list[Array]:

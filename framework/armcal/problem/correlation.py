@@ -109,6 +109,10 @@ class Correlation:
         """What states (n_k x n_s x k) make of a factor's raw residuals (n_r x width x k)."""
         return np.asarray(np.einsum("rns,nsk->rnk", self.raw[factor], states[self.node], optimize=True))
 
+    def taken_off(self, raw: Sequence[Array], states: Array) -> tuple[Array, ...]:
+        """Raw residuals (n_r x N a factor) less what states (n_k x n_s x 1) make of them."""
+        return tuple(r - self.shift(i, states)[:, : r.shape[1], 0] for i, r in enumerate(raw))
+
     def shared(self) -> tuple[Array, ...]:
         """B with B B' = A K A', one (n_r x width x n_z) a factor, of as few columns as the covariance needs."""
         stacked = self._stacked(self.slopes)

@@ -121,4 +121,4 @@ def residuals(
     if here is None or there is None:
         return raw
     states = there.states([r[:, :, None] for r in problem.weighted_residuals(values, training)])
-    return tuple(r - here.shift(i, states)[:, : r.shape[1], 0] for i, r in enumerate(raw))
+    return here.taken_off(raw, states)

@@ -12,7 +12,6 @@ from armcal.base.units import readable
 from armcal.diagnose.coverage import (
     Coverage,
     PredictedFit,
-    Recording,
     Scores,
     Stretch,
     besides,
@@ -28,7 +27,7 @@ from armcal.diagnose.coverage import (
 from armcal.diagnose.dependences import MOST_LEVELS
 from armcal.diagnose.noise_findings import Finding
 from armcal.estimate.estimator import Estimator
-from armcal.estimate.prediction import LEVELS, POSITION, STATED, Predictor, Spread, is_position
+from armcal.estimate.prediction import LEVELS, POSITION, STATED, Predictor, Recording, Spread, is_position
 from armcal.estimate.validation import CrossValidation, Split
 from armcal.estimate.weighing import WeighedFit
 from armcal.problem.problem import FactorRecords, Problem
@@ -126,9 +125,9 @@ def interval_result(
             if shares_held is not None:
                 holdout[name] = shares_held
             scores = {**scores, name: _filled(scores.get(name), own, split.holdout, records[0].count)}
-    spreads: dict[Recording, Sequence[Spread]] = {"same": by.in_recording(alike)}
+    spreads: dict[Recording, Sequence[Spread]] = {"same": by.spreads(alike, "same")}
     if by.drifts:
-        spreads["new"] = by.in_new_recording(alike)
+        spreads["new"] = by.spreads(alike, "new")
     places = [i for i, kernel in enumerate(problem.kernels) if is_position(kernel)]
     typical = {
         name: _typical([spread[i].of(POSITION) for i in places], stretches.get(name))
@@ -167,7 +166,6 @@ def _crossed(
     judged, splits = crossed
     fits = [fit if isinstance(fit, PredictedFit) else None for fit in judged.fits]
     held_residuals = collected(splits, [fit.held_residuals if fit else {} for fit in fits], len(split.train))
-    ways = {"same": by.left_out_of_recording, "new": by.left_out_of_new_recording}
     # What the pose residuals of folds did not know of the records that they did not see; None without any.
     unknown: list[Array] | None = None
     for fit, fold in zip(fits, splits, strict=True):
@@ -178,7 +176,8 @@ def _crossed(
         for whole, block in zip(unknown, fit.unknown, strict=True):
             whole[fold.holdout] = block
     scores = {
-        name: scored(by.problem, own, ways[name](fitted.records, unknown)) for name, own in held_residuals.items()
+        name: scored(by.problem, own, by.left_out(fitted.records, name, unknown))
+        for name, own in held_residuals.items()
     }
     shares: dict[Recording, Coverage] = {}
     for name, own in scores.items():
