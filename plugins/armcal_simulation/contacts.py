@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
+from armcal.arm.assembly import command_channels
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
@@ -65,7 +66,7 @@ class ContactsSimulator:
         """
         settings, measurements = self._settings, request.measurements
         random = np.random.default_rng(settings.seed)
-        channels = [f"{arm.name}.{joint}" for arm in request.arms.values() for joint in arm.commanded]
+        channels = [*command_channels(request.arms)]
         problems = self._problems(request)
         parts: list[dict[str, Array]] = []
         contacts: list[tuple[str, str, str]] = []
@@ -111,7 +112,7 @@ class ContactsSimulator:
         source = load_config(self._settings.truth)
         parameters = with_values(Parameters((*request.parameters.blocks, *blocks)), source.data, source, ())
         fixed, environment = parameters.with_free(()), request.environment
-        names = [f"{arm.name}.{joint}" for arm in request.arms.values() for joint in arm.commanded]
+        names = [*command_channels(request.arms)]
         shape = Dataset(("1",), {name: np.zeros(1) for name in names})
         return {
             name: Problem.build(

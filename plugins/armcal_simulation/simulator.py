@@ -104,7 +104,7 @@ class ElasticArmSimulator:
         """
         settings, random = self._settings, np.random.default_rng(self._settings.seed)
         arm = next(iter(request.arms.values()))
-        named = [f"{arm.name}.{joint}" for joint in arm.commanded]
+        named = [*arm.command_channels]
         given, true = request.poses, at_truth(request, settings.truth)
         commands = _in_view(true, settings.poses, arm, random) if given is None else given.stacked(named)
         reached = self._reached(arm, commands)
@@ -126,7 +126,7 @@ class ElasticArmSimulator:
     def stood(self, request: SimulationRequest, dataset: Dataset) -> tuple[SimulationRequest, Dataset]:
         """The truth, and where the arm stood for the commands of records that this simulator made."""
         arm = next(iter(request.arms.values()))
-        named = [f"{arm.name}.{joint}" for joint in arm.commanded]
+        named = [*arm.command_channels]
         reached = dict(zip(named, self._reached(arm, dataset.stacked(named)), strict=True))
         return at_truth(request, self._settings.truth), with_channels(dataset, reached)
 

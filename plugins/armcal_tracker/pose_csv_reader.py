@@ -182,7 +182,7 @@ class PoseCsvReader:
 
 def nominal_rotations(arm: Arm, dataset: Dataset) -> Rotation:
     """base_T_tool's rotation of the nominal arm in each record, without its effects."""
-    commands = dataset.stacked([f"{arm.name}.{joint}" for joint in arm.commanded])
+    commands = dataset.stacked([*arm.command_channels])
     return Rotation.from_matrix(nominal_tools(arm, commands.T)[:, :3, :3])
 
 

@@ -10,7 +10,7 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.calibration.recorded_range import beyond_records, recorded_ranges
 
-ARMS: Any = {"arm": SimpleNamespace(commanded={"q1": "angle", "rail": "length"})}
+ARMS: Any = {"arm": SimpleNamespace(command_channels={"arm.q1": "angle", "arm.rail": "length"})}
 
 
 def dataset(**channels: list[float]) -> Dataset:

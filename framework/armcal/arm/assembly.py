@@ -1,7 +1,7 @@
 """An arm: a model, its effects and its masses, put together under one instance name."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
@@ -123,6 +123,11 @@ class Arm:
             for joint in self.nominal_chain.joints
         ]
 
+    @cached_property
+    def command_channels(self) -> Mapping[str, str]:
+        """Channels of records that carry the commands of the ``commanded`` joints, with ``angle`` or ``length``."""
+        return {f"{self.name}.{joint}": dimension for joint, dimension in self.commanded.items()}
+
     @property
     def correction_channels(self) -> tuple[str, ...]:
         """Channels of records that carry corrections of its tool and joints (see ``pose_residual``)."""
@@ -136,7 +141,7 @@ class Arm:
             default = np.full(len(dataset), stated.get(channel, 0.0))
             return np.nan_to_num(dataset.column(channel)) if dataset.has(channel) else default
 
-        commands = [recorded(f"{self.name}.{joint}") for joint in self.commanded]
+        commands = [recorded(channel) for channel in self.command_channels]
         approaches = [recorded(f"{self.name}.approach.{joint}") for joint in self.commanded]
         around = {name: recorded(name) for name in SURROUNDINGS if name in stated or dataset.has(name)}
         return Postures(np.array(self.joint_commands(commands)), np.array(self.joint_approaches(approaches)), around)
@@ -299,6 +304,16 @@ class LocalValues(dict[str, Expression]):
 def scoped(values: Mapping[str, Expression], scope: str) -> LocalValues:
     """The values below a scope, under their local names."""
     return LocalValues({name.removeprefix(scope): value for name, value in values.items() if name.startswith(scope)})
+
+
+def command_channels(arms: Mapping[str, Arm]) -> dict[str, str]:
+    """The ``command_channels`` of all arms."""
+    return {channel: dimension for arm in arms.values() for channel, dimension in arm.command_channels.items()}
+
+
+def shown_joint(channel: str, arms: Collection[str]) -> str:
+    """A joint, by the channel of its commands, as people call it: ``q1``, or ``left.q1`` of several arms."""
+    return channel.partition(".")[2] if len(arms) == 1 else channel
 
 
 def only_arm(arms: Mapping[str, Arm], purpose: str, hint: str, where: Location | None = None) -> Arm:

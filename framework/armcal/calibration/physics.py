@@ -14,6 +14,7 @@ import numpy as np
 
 from armcal import plugin_files
 from armcal.arm import assembly
+from armcal.arm.assembly import command_channels
 from armcal.arm.environment import Environment
 from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.arrays import Array, Indices
@@ -175,10 +176,10 @@ def check_poses(system: System, dataset: Dataset, candidates: Indices) -> Datase
     names = {requested.channel for requested in requested_channels(system.arms, {}, measured=False)} & set(
         dataset.channels
     )
-    joints = [f"{arm.name}.{joint}" for arm in system.arms.values() for joint in arm.commanded]
+    joints = tuple(command_channels(system.arms))
     if not set(joints) <= names:
         return None
-    known = np.asarray(np.isfinite(dataset.stacked(tuple(joints))).all(axis=0))
+    known = np.asarray(np.isfinite(dataset.stacked(joints)).all(axis=0))
     rows = np.array([row for row in candidates if known[row]], dtype=np.intp)
     if not len(rows):
         return None

@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from armcal.arm.assembly import Arm
+from armcal.arm.assembly import Arm, command_channels
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.units import display_unit, to_unit
@@ -22,9 +22,8 @@ Ranges = Mapping[str, tuple[float, float]]
 
 def recorded_ranges(dataset: Dataset, arms: Mapping[str, Arm], payload: float | None) -> dict[str, tuple[float, float]]:
     """Of the records; ``payload`` (kg) is the configured one, which counts where they state none."""
-    joints = [f"{name}.{joint}" for name, arm in arms.items() for joint in arm.commanded]
     ranges = {} if payload is None else {PAYLOAD: (payload, payload)}
-    for channel in filter(dataset.has, (*joints, PAYLOAD)):
+    for channel in filter(dataset.has, (*command_channels(arms), PAYLOAD)):
         values = dataset.column(channel)
         known = values[np.isfinite(values)]
         if known.size:
@@ -51,9 +50,9 @@ class RecordedRange:
     @classmethod
     def of(cls, ranges: Ranges, channels: Sequence[str], arms: Mapping[str, Arm]) -> Self:
         """Of some channels: joints of these arms, and the payload."""
-        kinds = {f"{name}.{joint}": kind for name, arm in arms.items() for joint, kind in arm.commanded.items()}
+        dimensions = command_channels(arms)
         names = tuple(channel.rpartition(".")[2] if len(arms) == 1 else channel for channel in channels)
-        units = tuple(display_unit(kinds.get(channel, "mass")).name for channel in channels)
+        units = tuple(display_unit(dimensions.get(channel, "mass")).name for channel in channels)
         low, high = ends = np.array([ranges.get(channel, (-inf, inf)) for channel in channels]).reshape(-1, 2).T
         is_payload = np.array([channel == PAYLOAD for channel in channels], dtype=bool)
         margin = np.where(is_payload, _MARGIN * high, np.maximum(_MARGIN * (high - low), _LEAST))

@@ -9,6 +9,7 @@ from typing import Any
 import click
 import numpy as np
 
+from armcal.arm.assembly import command_channels
 from armcal.base.units import digits, to_unit
 from armcal.cli.common import FILE, Console, data, overrides, speaking
 from armcal.cli.outlet import say
@@ -82,7 +83,7 @@ def _excitation(experiment: Experiment, excitation: dict[str, Any]) -> Iterator[
 
 
 def _content(experiment: Experiment, ready: Prepared, known: Identifiability) -> dict[str, Any]:
-    channels = [f"{name}.{joint}" for name, arm in experiment.system.arms.items() for joint in arm.commanded]
+    channels = [*command_channels(experiment.system.arms)]
     angles = {channel: ready.dataset.column(channel)[ready.split.train] for channel in channels}
     every = ready.problem.parameters.with_free(ready.problem.parameters.names)
     return {

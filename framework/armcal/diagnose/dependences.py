@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import legendre
 
-from armcal.arm.assembly import Arm
+from armcal.arm.assembly import Arm, shown_joint
 from armcal.arm.effects import joint_rate
 from armcal.arm.loading import SiteLoads
 from armcal.base.arrays import Array
@@ -107,7 +107,7 @@ def dependences(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[
         loads = motion.loads[name]
         for joint, dimension in arm.commanded.items():
             index = arm.joint_names.index(joint)
-            shown = joint if len(arms) == 1 else f"{name}.{joint}"
+            shown = shown_joint(f"{name}.{joint}", arms)
             angle = dimension == "angle"
             yield from _of_level(here, name, f"{name}.{joint}", shown, dimension)
             yield from _of_approach(here, name, joint, shown, "rad" if angle else "m")

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import betainc
 
+from armcal.arm.assembly import shown_joint
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.units import digits, display_unit, to_unit
@@ -158,7 +159,7 @@ def _heaviest(record: int, problem: Problem, motion: Motion, efforts: Mapping[st
         joint = int(np.argmax(efforts[name][:, record]))
         effort = float(motion.loads[name].efforts[joint, record])
         if efforts[name][joint, record] > UNUSUAL and abs(effort) > 1e-9:
-            shown = arm.joint_names[joint] if len(arms) == 1 else f"{name}.{arm.joint_names[joint]}"
+            shown = shown_joint(f"{name}.{arm.joint_names[joint]}", arms)
             unit = "N m" if arm.joint_dimensions[joint] == "angle" else "N"
             return f"{shown} holds {abs(effort):.2g} {unit}, among the top 5 %"
     return ""
@@ -181,5 +182,5 @@ def _along(record: int, problem: Problem, motion: Motion, judged: Judged) -> str
     arm = problem.blueprint.arms[name]
     unit = display_unit(arm.commanded[joint])
     off = abs(float(own @ slopes[:, best] / (slopes[:, best] @ slopes[:, best])))
-    shown = joint if len(problem.blueprint.arms) == 1 else motion.channels[best]
+    shown = shown_joint(motion.channels[best], problem.blueprint.arms)
     return f"its error lies along {shown}'s own motion, as if {digits(to_unit(off, unit.name), 2)} {unit.name} off"

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from armcal.arm.assembly import shown_joint
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock
@@ -106,7 +107,7 @@ def _of_steps(here: Records, problem: Problem) -> Iterator[Dependence]:
         yield Dependence("step", "", "", words, effect, _STEP_MEASURE, here.axes(after))
     for channel in here.motion.channels:
         arm, _, joint = channel.partition(".")
-        shown = joint if len(problem.blueprint.arms) == 1 else channel
+        shown = shown_joint(channel, problem.blueprint.arms)
         si = "rad" if problem.blueprint.arms[arm].commanded[joint] == "angle" else "m"
         for place in _places(len(rank), _MOST_SLIPS):
             along = here.along(channel, (rank >= place).astype(float)[:, None])

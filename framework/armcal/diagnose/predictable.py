@@ -19,6 +19,7 @@ import numpy as np
 from scipy.linalg import LinAlgError
 from scipy.linalg.lapack import dposv
 
+from armcal.arm.assembly import shown_joint
 from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.dataset import Dataset
 from armcal.diagnose.fit_rows import FitRows
@@ -177,7 +178,7 @@ def _inputs(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[_Inp
     arms = problem.blueprint.arms
     for channel in motion.channels:
         arm, _, joint = channel.partition(".")
-        shown, command = joint if len(arms) == 1 else channel, dataset.column(channel)
+        shown, command = shown_joint(channel, arms), dataset.column(channel)
         if np.nanmax(command) > np.nanmin(command):
             yield _Input("joint", shown, channel, on_circle(command, arms[arm].commanded[joint] == "angle"))
         side = f"{arm}.approach.{joint}"

@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
+from armcal.arm.assembly import command_channels
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.problem.problem import Problem
@@ -81,12 +82,11 @@ def pose_kernels(problem: Problem, dataset: Dataset) -> Kernels:
     Of all joints at several lengths; and sums of functions of one joint, of two, and of three [Duvenaud2011].
     """
     squares = []
-    for name, arm in problem.blueprint.arms.items():
-        for joint, dimension in arm.commanded.items():
-            command = np.nan_to_num(dataset.column(f"{name}.{joint}"))
-            apart = command[:, None] - command
-            travel = 2 * apart / max(float(np.ptp(command)), 1e-12)
-            squares.append((2 * np.sin(apart / 2) if dimension == "angle" else travel) ** 2)
+    for channel, dimension in command_channels(problem.blueprint.arms).items():
+        command = np.nan_to_num(dataset.column(channel))
+        apart = command[:, None] - command
+        travel = 2 * apart / max(float(np.ptp(command)), 1e-12)
+        squares.append((2 * np.sin(apart / 2) if dimension == "angle" else travel) ** 2)
     whole = np.sum(squares, axis=0)
     powers = [np.sum([np.exp(-i * square / 2) for square in squares], axis=0) for i in (1, 2, 3)]
     sums = [powers[0], powers[0] ** 2 - powers[1], powers[0] ** 3 - 3 * powers[0] * powers[1] + 2 * powers[2]]

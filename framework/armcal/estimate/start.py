@@ -267,7 +267,7 @@ def _frame(problem: Problem, values: Array, dataset: Dataset, of: str, name: str
     joint_commands = [JointCommand(i, q, ca.SX(0)) for i, q in enumerate(arm.joint_commands(ca.vertsplit(symbols)))]
     moved = [joint.offset + arm.displacement(stated, q) for joint, q in zip(chain.joints, joint_commands, strict=True)]
     pose = ca.densify(forward(chain, moved, {}).named[name].matrix())
-    commands = dataset.stacked([f"{arm.name}.{joint}" for joint in arm.commanded])
+    commands = dataset.stacked([*arm.command_channels])
     shown = ca.Function("carrier", [symbols], [pose]).map(len(dataset))(commands).full()
     return np.asarray(shown.reshape(4, -1, 4).transpose(1, 0, 2))
 

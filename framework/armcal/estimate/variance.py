@@ -15,7 +15,9 @@ from typing import Literal
 import numpy as np
 from scipy.special import ndtri
 
+from armcal.arm.assembly import command_channels
 from armcal.base.arrays import Array
+from armcal.base.units import si_unit
 from armcal.errors import ProblemError
 from armcal.estimate.estimator import CONFIDENCE, degrees_of_freedom
 from armcal.estimate.identifiability import correlated_pairs
@@ -169,17 +171,14 @@ def _sources(problem: Problem, values: Array, records: Sequence[FactorRecords], 
             own = np.repeat(np.diag(diagonal)[:, :, None], record.count, axis=2)
             bases = [own if i == place else none for i, none in enumerate(nothing)]
             sources.append(_Source(label, "instrument", "1", bases))
-    joints = {
-        f"{arm.name}.{joint}": "rad" if dimension == "angle" else "m"
-        for arm in problem.blueprint.arms.values()
-        for joint, dimension in arm.commanded.items()
-    }
+    joints = command_channels(problem.blueprint.arms)
     slopes = problem.channel_slopes(values, records, list(joints))
     whitened = [
         transformed(whitening_of(kernel.factor, record)[:, :, : record.count], slope)
         for (kernel, record), slope in zip(pairs, slopes, strict=True)
     ]
-    for number, (joint, unit) in enumerate(joints.items()):
+    for number, (joint, dimension) in enumerate(joints.items()):
+        unit = si_unit(dimension).name
         sources.append(_Source(joint, "joint", unit, [w[:, None, number] * w[None, :, number] for w in whitened]))
     return sources
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from armcal.arm.assembly import Arm
+from armcal.arm.assembly import Arm, shown_joint
 from armcal.base.dataset import Dataset
 from armcal.base.units import display_unit, split_suffix, to_unit
 from armcal.errors import DataError, Location
@@ -72,10 +72,9 @@ def warn_beyond_limits(dataset: Dataset, arms: Mapping[str, Arm]) -> Dataset:
     """The dataset, with a warning for all joints that were commanded beyond their limits."""
     texts = []
     for name, arm in arms.items():
-        channels = [f"{name}.{joint}" for joint in arm.commanded]
-        if not len(dataset) or not all(map(dataset.has, channels)):
+        if not len(dataset) or not all(map(dataset.has, arm.command_channels)):
             continue
-        commands = arm.joint_commands([dataset.column(channel) for channel in channels])
+        commands = arm.joint_commands([dataset.column(channel) for channel in arm.command_channels])
         for joint, dimension, angles in zip(arm.nominal_chain.joints, arm.joint_dimensions, commands, strict=True):
             if joint.limits is None:
                 continue
@@ -84,7 +83,7 @@ def warn_beyond_limits(dataset: Dataset, arms: Mapping[str, Arm]) -> Dataset:
             count, unit = int(np.sum(over > TOLERANCE[dimension])), display_unit(dimension).name
             if count:
                 low, high, worst = (to_unit(x, unit) for x in (*joint.limits, float(angles[int(np.argmax(over))])))
-                shown = joint.name if len(arms) == 1 else f"{name}.{joint.name}"
+                shown = shown_joint(f"{name}.{joint.name}", arms)
                 beyond = f"{shown} is beyond its limits {low:.4g} to {high:.4g} {unit}"
                 texts.append(f"{beyond} in {count} of {len(dataset)} records, at worst {worst:.4g}")
     if not texts:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from armcal.arm.assembly import command_channels
 from armcal.arm.loading import SiteLoads, site_loads
 from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.arrays import Array, Indices
@@ -41,11 +42,11 @@ class Motion:
     def of(cls, problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset) -> Motion:
         """At the values that a fit found."""
         arms = problem.blueprint.arms
-        channels = tuple(f"{name}.{joint}" for name, arm in arms.items() for joint in arm.commanded)
+        channels = tuple(command_channels(arms))
         blocks = {b.name: values[problem.parameters.entries_of(b.name)] for b in problem.parameters.blocks}
         acting, loads = np.array(list(_acting(problem, dataset).values())), {}
         for name, arm in arms.items():
-            commands = arm.joint_commands([dataset.column(f"{arm.name}.{joint}") for joint in arm.commanded])
+            commands = arm.joint_commands([dataset.column(channel) for channel in arm.command_channels])
             loads[name] = site_loads(arm, blocks, np.array(commands), acting)
         slopes = problem.channel_slopes(values, records, channels)
         elastic = any(len(record.state) for record in records)

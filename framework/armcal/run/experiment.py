@@ -10,6 +10,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from armcal.arm.assembly import command_channels
 from armcal.base.arrays import Array, Indices
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
@@ -163,8 +164,7 @@ class Experiment:
 
     def poses(self, dataset: Dataset) -> Indices:
         """Which records are of one pose, by number (N): all arms near the same joint positions, under the same load."""
-        arms = self.system.arms.items()
-        return pose_numbers(dataset, [f"{name}.{joint}" for name, arm in arms for joint in arm.commanded])
+        return pose_numbers(dataset, [*command_channels(self.system.arms)])
 
     def request(self, *, measured: bool) -> ReadRequest:
         """What a reader should look for; with ``measured`` the measured values are required."""

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from armcal.arm.assembly import command_channels
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.units import readable
@@ -146,11 +147,11 @@ def interval_result(
 
 def _levels(problem: Problem, dataset: Dataset) -> int:
     """The most angles at which any turning joint stood; 0 where they are many, or an arm states its joints' noise."""
-    arms = problem.blueprint.arms.values()
-    channels = [f"{arm.name}.{joint}" for arm in arms for joint, kind in arm.commanded.items() if kind == "angle"]
+    arms = problem.blueprint.arms
+    channels = [channel for channel, dimension in command_channels(arms).items() if dimension == "angle"]
     counts = [len(np.unique(np.round(dataset.column(channel), 9))) for channel in channels]
     most = max(counts, default=0)
-    return most if most <= MOST_LEVELS and not any(arm.joint_noise for arm in arms) else 0
+    return most if most <= MOST_LEVELS and not any(arm.joint_noise for arm in arms.values()) else 0
 
 
 def _crossed(

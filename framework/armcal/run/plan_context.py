@@ -150,8 +150,8 @@ def in_order_of_visit(
     speeds = [given.get(n, np.array([_SPEEDS[d]])) for n, d in zip(space.names, space.dimensions, strict=True)]
     load = environment.gravity, environment.payload_mass, environment.payload_com
     efforts = [
-        holding_efforts(arm, chosen.stacked([f"{name}.{joint}" for joint in arm.commanded]), *load)
-        for name, arm in context.experiment.system.arms.items()
+        holding_efforts(arm, chosen.stacked([*arm.command_channels]), *load)
+        for arm in context.experiment.system.arms.values()
     ]
     times, heats = travel_times(angles, np.concatenate(speeds)), heat(np.concatenate(efforts))
     if settings.order == "travel":

@@ -9,6 +9,7 @@ from typing import Self
 
 import numpy as np
 
+from armcal.arm.assembly import command_channels, shown_joint
 from armcal.arm.clearance import ClearanceCheck
 from armcal.arm.joints import by_dimension
 from armcal.base.arrays import Array, Mask
@@ -49,9 +50,8 @@ class JointSpace:
     def of(cls, experiment: Experiment) -> Self:
         """That of an experiment's arms."""
         arms = experiment.system.arms
-        channels = tuple(f"{name}.{joint}" for name, arm in arms.items() for joint in arm.commanded)
-        names = tuple(c.partition(".")[2] for c in channels) if len(arms) == 1 else channels
-        return cls(channels, names, tuple(d for arm in arms.values() for d in arm.commanded.values()))
+        commands = command_channels(arms)
+        return cls(tuple(commands), tuple(shown_joint(c, arms) for c in commands), tuple(commands.values()))
 
     def by_joint(
         self, turning: Mapping[str, Sequence[float]], sliding: Mapping[str, Sequence[float]], keys: tuple[str, str]

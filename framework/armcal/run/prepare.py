@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from armcal.arm.assembly import command_channels, shown_joint
 from armcal.base.dataset import Dataset
 from armcal.base.units import digits, to_unit
 from armcal.config.system import System
@@ -271,13 +272,12 @@ def check_permuted_axes(
 def still_joints(system: System, dataset: Dataset) -> dict[str, str]:
     """Channels of joints that stood still in all records, and where, as people read it."""
     still = {}
-    for name, arm in system.arms.items():
-        for joint, kind in arm.commanded.items():
-            channel, (unit, least) = f"{name}.{joint}", _STILL[kind]
-            values = dataset.column(channel) if dataset.has(channel) else np.array([])
-            known = to_unit(values[np.isfinite(values)], unit)
-            if known.size and np.ptp(known) < least:
-                still[channel] = f"{np.mean(known):.4g} {unit}"
+    for channel, dimension in command_channels(system.arms).items():
+        unit, least = _STILL[dimension]
+        values = dataset.column(channel) if dataset.has(channel) else np.array([])
+        known = to_unit(values[np.isfinite(values)], unit)
+        if known.size and np.ptp(known) < least:
+            still[channel] = f"{np.mean(known):.4g} {unit}"
     return still
 
 
@@ -286,7 +286,7 @@ def still_findings(system: System, dataset: Dataset) -> list[Finding]:
     still = still_joints(system, dataset)
     if not still:
         return []
-    listed = [f"{c.partition('.')[2] if len(system.arms) == 1 else c} at {where}" for c, where in still.items()]
+    listed = [f"{shown_joint(c, system.arms)} at {where}" for c, where in still.items()]
     text = (
         f"Hardly moved in the training records: {first_few(listed)}. Predictions elsewhere rest on nominal values and "
         "priors, and no record judges them."
@@ -299,8 +299,7 @@ def still_findings(system: System, dataset: Dataset) -> list[Finding]:
 
 def same_pose_findings(system: System, dataset: Dataset, split: Split) -> list[Finding]:
     """A warning of held-out records at poses that trained, as a stated split may have them."""
-    channels = [f"{name}.{joint}" for name, arm in system.arms.items() for joint in arm.commanded]
-    pose = first_of_pose(dataset, [channel for channel in channels if dataset.has(channel)])
+    pose = first_of_pose(dataset, [*filter(dataset.has, command_channels(system.arms))])
     count, held = int(np.isin(pose[split.holdout], pose[split.train]).sum()), len(split.holdout)
     if not count:
         return []

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated, Self
 
 import numpy as np
-from armcal.arm.assembly import Arm
+from armcal.arm.assembly import Arm, command_channels
 from armcal.base.settings import Angle, Duration, Length, Settings
 from armcal.base.units import display_unit, to_unit
 from armcal.devices.live import JointSample
@@ -34,7 +34,7 @@ class JointKinds:
     @classmethod
     def of(cls, arms: Mapping[str, Arm]) -> Self:
         """Those of arms by name."""
-        dimensions = {f"{name}.{joint}": kind for name, arm in arms.items() for joint, kind in arm.commanded.items()}
+        dimensions = command_channels(arms)
         endless = {f"{name}.{j.name}" for name, arm in arms.items() for j in arm.nominal_chain.joints if j.endless}
         return cls(dimensions, frozenset(endless & set(dimensions)))
 

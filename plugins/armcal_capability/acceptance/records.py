@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from armcal.arm.assembly import command_channels
 from armcal.base.arrays import Indices
 from armcal.base.dataset import Dataset
 from armcal.base.units import DIMENSIONLESS
@@ -100,7 +101,7 @@ def read_visits(subject: ArmToJudge, registry: PluginRegistry, path: Path) -> Vi
     dataset = noticed(records_of(reader, ReadRequest(arms, subject.system.measurements, channels)))
     _require_whole(dataset, COMMANDED)
     _require_whole(dataset, COMMANDED_TURN)
-    return visits_of(dataset, [f"{n}.{joint}" for n, arm in arms.items() for joint in arm.commanded], path, section)
+    return visits_of(dataset, [*command_channels(arms)], path, section)
 
 
 def visits_of(dataset: Dataset, joints: Sequence[str], path: Path, section: Mapping[str, object]) -> Visits:

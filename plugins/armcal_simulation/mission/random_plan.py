@@ -52,7 +52,7 @@ def befallen(request: SimulationRequest, poses: Dataset) -> tuple[Joint, ...]:
     order = np.argsort(~calibrated, kind="stable")
     names = [free_names[i] for i in order]
     slopes = _columns(problem.jacobians(values, records), [kernel.factor.noise for kernel in problem.kernels])[:, order]
-    channels = [f"{arm.name}.{joint}" for joint in arm.commanded]
+    channels = [*arm.command_channels]
     motions = _columns(problem.channel_slopes(values, records, channels), None)
     rows = len(motions) // len(poses)
     approaches = [np.tile(poses.column(f"{arm.name}.approach.{joint}"), rows) for joint in arm.commanded]
