@@ -67,11 +67,7 @@ def thinned(chosen: Indices, most: int) -> Indices:
 
 
 def figure_of(problem: Problem, estimate: Estimate, records: Sequence[FactorRecords]) -> Figure:
-    """Of the first tool of all, at random poses about the recorded ones: what touches a socket hardly moves in them.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium.
-    """
+    """Of the first tool of all, at random poses about the recorded ones: what touches a socket hardly moves in them."""
     poses = problem.subset(random_records(problem, records), np.arange(_POSES, dtype=np.intp))
     try:
         nominal, calibrated = _both(problem, estimate, poses)

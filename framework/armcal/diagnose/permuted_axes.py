@@ -274,11 +274,7 @@ def _positions(problem: Problem, seen: _Seen, read_as: Wires, values: Array) -> 
 
 
 def _left(problem: Problem, seen: _Seen, read_as: Wires, measured: Array, enough: float) -> float:
-    """What a reading leaves where base and target are found anew: roughly, if that is far more than enough (m).
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium.
-    """
+    """What a reading leaves where base and target are found anew: roughly, if that is far more than enough (m)."""
     # As configured: where records that are mixed up put base and target says nothing of another reading of them.
     placing, number, nominal = seen.placing, seen.sighting.kernel, problem.blueprint.parameters.nominal()
     if placing is None:

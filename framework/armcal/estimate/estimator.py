@@ -318,9 +318,6 @@ def degrees_of_freedom(problem: Problem, values: Array, records: Sequence[Factor
 
     A parameter that its prior holds takes up nothing, so that it is not counted as spent. ``slope`` is that of an
     influence.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium there.
     """
     triangle = np.sqrt(slope) * factor_at_zero(problem, values, records)
     return problem.equations(records) - InverseInformation.of(triangle, problem.parameters).spent

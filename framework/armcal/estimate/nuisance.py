@@ -17,11 +17,7 @@ _DAMPING = 1e-9
 
 
 def started(problem: Problem, records: Sequence[FactorRecords]) -> Problem:
-    """The problem with the free parameters of each group starting from what a middling record gives for them.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium at the nominal values.
-    """
+    """The problem with the free parameters of each group starting from what a middling record gives for them."""
     if not problem.parameters.nuisances:
         return problem
     nominal, plan, done = problem.parameters.nominal(), problem.blueprint, set[tuple[str, str]]()
@@ -74,9 +70,6 @@ def settled(problem: Problem, values: Array, records: Sequence[FactorRecords]) -
         problem: as it was fitted; the groups it holds although they were compiled as free are those not seen.
         values: of the fit.
         records: that judge; with weights of zero where they are not to count.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium.
     """
     fitted = {block.name for block in problem.parameters.free}
     open_names = {block.name for block in problem.blueprint.parameters.free if block.nuisance} - fitted

@@ -119,11 +119,7 @@ class Placing:
 
 
 def placings(problem: Problem, records: Sequence[FactorRecords], sighting: Sighting) -> tuple[Placing, Placing]:
-    """Of the free parameters without a prior, and of all free ones.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium at the nominal values.
-    """
+    """Of the free parameters without a prior, and of all free ones."""
     poses = problem.subset(records, sighting.thinned(_POSES).chosen)[sighting.kernel]
     nominal = problem.parameters.nominal()
     here = tools_of(problem, nominal, poses, sighting.kernel)

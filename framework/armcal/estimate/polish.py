@@ -74,9 +74,6 @@ def descended(posed: PosedProblem, x: Array, most_steps: int, damping: float, en
     """Damped Gauss-Newton steps [Nocedal2006] within the bounds, until nothing moves or no step lowers the cost.
 
     A step that lowers the cost by less than ``enough`` of it, or of one, is the last.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium at ``x`` itself.
     """
     (lower, upper), model = posed.bounds(), posed.model(x)
     for _ in range(most_steps):

@@ -170,7 +170,6 @@ def with_proposals(start: Start, records: Sequence[FactorRecords], dataset: Data
     A parameter with a prior keeps its nominal value, and starts where it was proposed.
 
     Raises:
-        NotConvergedError: a record has no elastic equilibrium at the nominal values.
         ProblemError: the records leave free parameters open that nothing else holds.
     """
     measurements = [start.problem.blueprint.measurements[kernel.factor.name] for kernel in start.problem.kernels]

@@ -61,11 +61,7 @@ class Undetermined:
 
 
 def identify(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Identifiability:
-    """What records determine at a value vector, judged at zero residual.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium at these values.
-    """
+    """What records determine at a value vector, judged at zero residual."""
     return identify_from(factor_at_zero(problem, values, records), problem.parameters)
 
 
@@ -168,9 +164,6 @@ def scale_is_unseen(problem: Problem, values: Array, records: Sequence[FactorRec
     Contacts fit a smaller arm in a smaller world just as well. The tools decide, not the parameters: which numbers
     take part in a growth differs from model to model. A growth may go along with a motion of everything, and with
     another point of a tool being the one that is meant.
-
-    Raises:
-        NotConvergedError: a pose has no elastic equilibrium.
     """
     if not len(known.null):
         return False

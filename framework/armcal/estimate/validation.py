@@ -262,11 +262,7 @@ def judged_fit(
     held: Sequence[FactorRecords],
     began: float,
 ) -> JudgedFit:
-    """Errors of the other records by a solution on the training records.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium there.
-    """
+    """Errors of the other records by a solution on the training records."""
     judged, turns = errors_and_turns(task.problem, solution.values, held, train)
     at_rest = record_errors(task.problem, solution.values, held)
     if not solution.verdict.converged:

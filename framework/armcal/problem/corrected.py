@@ -38,11 +38,7 @@ class Moved:
 
 
 def moved_by(problem: Problem, values: Array, records: Sequence[FactorRecords], arm: Arm) -> Moved:
-    """What the pose residual of an arm does in records that carry its corrections.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium.
-    """
+    """What the pose residual of an arm does in records that carry its corrections."""
     place = next(i for i, k in enumerate(problem.kernels) if arm.name in _arms_of(problem, k.factor.name))
     own, channels = records[place], problem.kernels[place].factor.channels
     size, known = len(arm.correction_channels), dict(zip(channels, own.record[:, : own.count], strict=True))

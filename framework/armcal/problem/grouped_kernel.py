@@ -65,11 +65,7 @@ class GroupedKernel:
         return np.ascontiguousarray(values[entries])
 
     def residuals(self, values: Array, records: FactorRecords) -> Array:
-        """Raw residuals (n_r x width).
-
-        Raises:
-            NotConvergedError: a record has no elastic equilibrium.
-        """
+        """Raw residuals (n_r x width)."""
         residual = np.empty((self.kernel.factor.rows, records.record.shape[1]))
         self._evaluate(self.kernel.residuals, values, records, residual)
         return residual if records.present is None else np.where(records.present, residual, 0.0)

@@ -84,27 +84,15 @@ class Kernel:
         return self._by_channels[channels]
 
     def residuals(self, values: Array, record: Array, state: Array, residual: Array) -> None:
-        """Residuals in equilibrium.
-
-        Raises:
-            NotConvergedError: a record has none.
-        """
+        """Residuals in equilibrium."""
         self._over_points(self._residuals, values, record, state, residual)
 
     def linearise(self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array) -> None:
-        """Residuals and Jacobian in equilibrium.
-
-        Raises:
-            NotConvergedError: a record has none.
-        """
+        """Residuals and Jacobian in equilibrium."""
         self._over_points(self._linearise, values, record, state, residual, jacobian)
 
     def predict(self, values: Array, record: Array, state: Array, shown: Array) -> None:
-        """Outputs and tool poses in equilibrium (n_o + 12 an arm x records).
-
-        Raises:
-            NotConvergedError: a record has no equilibrium.
-        """
+        """Outputs and tool poses in equilibrium (n_o + 12 an arm x records)."""
         points = self.points
         if points is None:
             shown[:] = self.evaluator(values, record, state)

@@ -56,11 +56,7 @@ def _thinned(factor: Factor, record: FactorRecords) -> tuple[Factor, FactorRecor
 
 
 def as_seen(problem: Problem, values: Array, dataset: Dataset) -> tuple[Dataset, Mask]:
-    """The dataset with readings of points out of view missing (NaN), and which records have any reading left (N).
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium at these values.
-    """
+    """The dataset with readings of points out of view missing (NaN), and which records have any reading left (N)."""
     channels, limited, seen = dict(dataset.channels), False, np.zeros(len(dataset), dtype=bool)
     for kernel, grouped, record in zip(problem.kernels, problem.grouped, problem.records(dataset), strict=True):
         own, measurement = kernel.factor.expressed, problem.blueprint.measurements[kernel.factor.name]

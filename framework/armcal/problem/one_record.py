@@ -49,19 +49,12 @@ class OneRecord:
         Args:
             values: of the kernel (n_v).
             record: its channels (n_c).
-
-        Raises:
-            NotConvergedError: the record has no equilibrium.
         """
         residuals, jacobians = self.linearise_several(values, record[None])
         return residuals[0], jacobians[0]
 
     def linearise_several(self, values: Array, records: Array) -> tuple[Array, Array]:
-        """Residuals (k x n_r) and their Jacobians (k x n_r x n_v) of records (k x n_c), in equilibrium.
-
-        Raises:
-            NotConvergedError: a record has no equilibrium.
-        """
+        """Residuals (k x n_r) and their Jacobians (k x n_r x n_v) of records (k x n_c), in equilibrium."""
         count, width = len(records), self._record.shape[1]
         residuals, jacobians = np.empty((count, self._sizes[0])), np.empty((count, *self._sizes))
         self._values[:] = values

@@ -51,11 +51,7 @@ class PosedProblem:
             return float("inf")
 
     def model(self, x: Array) -> NormalEquations:
-        """Cost, gradient and Gauss-Newton Hessian by ``x``.
-
-        Raises:
-            NotConvergedError: a record has no elastic equilibrium there.
-        """
+        """Cost, gradient and Gauss-Newton Hessian by ``x``."""
         data = self.problem.normal_equations(self.values(x), self.records)
         gradient, hessian = self._chained(x, data)
         curvature = self.problem.parameters.curvature(self._entry_gradient(x, data.gradient))
@@ -63,11 +59,7 @@ class PosedProblem:
         return NormalEquations(data.cost + self._prior_cost(x), gradient, hessian)
 
     def convex_model(self, x: Array) -> NormalEquations:
-        """Cost, gradient and Gauss-Newton Hessian by ``c``.
-
-        Raises:
-            NotConvergedError: a record has no elastic equilibrium there.
-        """
+        """Cost, gradient and Gauss-Newton Hessian by ``c``."""
         chain = self.problem.parameters.entries_jacobian(self.values(x)) * self.coordinate_scales
         data = self.problem.normal_equations(self.values(x), self.records).chained(chain)
         gradient = data.gradient + self._prior * self.coordinates(x)

@@ -31,6 +31,9 @@ __all__ = ["FactorRecords", "NormalEquations", "Problem", "triangular"]
 class Problem:
     """Kernels over one set of parameters; ``known_ties`` are what is known between groups beside the records.
 
+    Whatever evaluates records at values, here and in the rooms below, raises ``NotConvergedError`` where one has no
+    elastic equilibrium.
+
     Value vectors hold all canonical entries. Those that the blueprint fixes are compiled in and must be the nominal
     ones; ``parameters`` may hold more. In another process a problem is compiled anew, once, from its blueprint and by
     the same evaluators.
@@ -134,11 +137,7 @@ class Problem:
         ) + sum(len(tie.noise) for tie in self.ties)
 
     def residuals(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
-        """Raw residuals in equilibrium, one (n_r x N) matrix a factor.
-
-        Raises:
-            NotConvergedError: a record has no elastic equilibrium at these values.
-        """
+        """Raw residuals in equilibrium, one (n_r x N) matrix a factor."""
         self._check_fixed(values)
         pairs = zip(self.grouped, records, strict=True)
         return tuple(grouped.residuals(values, record)[:, : record.count] for grouped, record in pairs)

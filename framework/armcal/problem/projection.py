@@ -27,9 +27,6 @@ def projected(problem: Problem, values: Array, records: Sequence[FactorRecords])
     Measured numbers become what the model predicts; where nothing is measured but the joints (a contact), the joint
     angles move to the nearest ones that fit. A record that no angles fit is left as it is. Records that a Jacobian
     does not depend on that way are returned as they are, the same objects.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium at these values.
     """
     result = as_predicted(problem, values, records)
     return tuple(
@@ -39,11 +36,7 @@ def projected(problem: Problem, values: Array, records: Sequence[FactorRecords])
 
 
 def as_predicted(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
-    """Records with what the model predicts in the place of measured numbers, wherever a Jacobian depends on these.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium at these values.
-    """
+    """Records with what the model predicts in the place of measured numbers, wherever a Jacobian depends on these."""
     if not any(_bilinear(kernel.factor.expressed) for kernel in problem.kernels):
         return tuple(records)
     predicted = predicted_records(problem, values, records)
@@ -54,11 +47,7 @@ def as_predicted(problem: Problem, values: Array, records: Sequence[FactorRecord
 
 
 def predicted_records(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
-    """Records with what the model predicts in the place of all measured numbers.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium at these values.
-    """
+    """Records with what the model predicts in the place of all measured numbers."""
     predicted = []
     for kernel, before, outputs in zip(problem.kernels, records, problem.predict(values, records), strict=True):
         record = before.record.copy()
@@ -71,11 +60,7 @@ def predicted_records(problem: Problem, values: Array, records: Sequence[FactorR
 
 
 def factor_at_zero(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Array:
-    """R (m x n) with R'R = J'J of the whitened residuals by coordinates, of the records projected onto the model.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium at these values.
-    """
+    """R (m x n) with R'R = J'J of the whitened residuals by coordinates, of the records projected onto the model."""
     return problem.triangular_factor(values, projected(problem, values, records))
 
 

@@ -29,9 +29,6 @@ def reading_slopes(problem: Problem, values: Array, records: Sequence[FactorReco
 
     None of a factor that reads nothing, and of one of whose residual some part depends on no reading. A reading that
     no residual depends on has slopes of zero: nothing is known of its noise.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium at these values.
     """
     problem.residuals(values, records)  # leaves the states in equilibrium
     result: list[Array | None] = []
@@ -54,7 +51,6 @@ def disturbed_records(
 
     Raises:
         ProblemError: the residual of a measurement depends on something else than its readings.
-        NotConvergedError: a record has no elastic equilibrium at these values.
     """
     before, moved, missing = problem.residuals(values, records), tuple(records), list(noise)
     for _ in range(_STEPS):
@@ -119,9 +115,6 @@ def with_joint_noise(
 
     ``noise_scale`` is what the whitened residuals are multiplied by afterwards. Below 1 it leaves the joints' noise as
     large as stated: records at few joint angles do not show what the joints are off between these.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium at these values.
     """
     arms = problem.blueprint.arms.values()
     stated = {

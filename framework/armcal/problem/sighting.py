@@ -84,11 +84,7 @@ def sighting_of(
 
 
 def tools_of(problem: Problem, values: Array, record: FactorRecords, number: int) -> Tools:
-    """What a measurement's arm shows in each of its records: of the body where its rotation is read, else of the tool.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium at these values.
-    """
+    """What a measurement's arm shows in each of its records: of the body if its rotation is read, else of the tool."""
     outputs = problem.kernels[number].factor.output_channels
     shown = problem.grouped[number].predict(values, record)[:, : record.count]
     parts = [channel.rpartition(".")[2] for channel in outputs]

@@ -96,11 +96,7 @@ class RecordErrors:
 
 
 def errors_of(run: FittedRecords, crossed: CrossValidation | None) -> RecordErrors:
-    """Errors of every record, with those of the folds of the training records.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium.
-    """
+    """Errors of every record, with those of the folds of the training records."""
     problem, records, fitted, train = run.problem, run.records, run.fitted, run.split.train
     unfitted, nominal, values = untrained(problem), problem.parameters.nominal(), fitted.estimate.values
     drifts = any(block.drift for block in problem.parameters.free)

@@ -46,11 +46,7 @@ class FixedParameters:
 
 
 def fixed_parameters(experiment: Experiment, ready: Prepared, progress: Progress = no_progress) -> FixedParameters:
-    """Fit with what is configured, look for what it leaves, and cross-validate what is found.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium at the fit.
-    """
+    """Fit with what is configured, look for what it leaves, and cross-validate what is found."""
     parameters = ready.problem.parameters
     # The problem with every candidate free, too: functions for whatever is chosen of them.
     system, own = experiment.system, [block.name for block in parameters.free]

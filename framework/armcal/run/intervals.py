@@ -110,11 +110,7 @@ def interval_result(
     crossed: tuple[CrossValidation, Sequence[Split]] | None,
     dataset: Dataset,
 ) -> IntervalResult:
-    """From the fit on the training records of a dataset, and the folds (of the training records) that judged them.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium at the values found.
-    """
+    """From the fit on the training records of a dataset, and the folds (of the training records) that judged them."""
     if problem.blueprint.groups:
         return IntervalResult()  # a contact reads nothing that could be predicted
     by, alike = predictor(problem, fitted), whitened_like(problem, fitted, records, estimator)
