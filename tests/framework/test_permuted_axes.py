@@ -12,7 +12,7 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.cli.main import cli
 from armcal.diagnose.permuted_axes import _within, find_permuted_axes
-from armcal.errors import NotConvergedError
+from armcal.errors import DataError, NotConvergedError
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from armcal.run.prepare import Prepared, Stopwatch, assemble
@@ -91,6 +91,38 @@ def test_exchanged_joints_are_named(demo: Prepared) -> None:
 def test_units_are_named(demo: Prepared, channels: str, factor: float, words: str) -> None:
     scaled = {n: c * factor if n.startswith(channels) else c for n, c in demo.dataset.channels.items()}
     assert told(demo, replace(demo.dataset, channels=scaled)) == (words,)
+
+
+SCARA = """
+arms:
+  arm:
+    model:
+      type: mdh
+      convention: standard
+      rows: [{a_mm: 300, d_mm: 100}, {a_mm: 200}, {kind: prismatic}]
+measurements: {tracker: {type: tip_position, noise_mm: 0.1}}
+data: {type: csv, path: scara.csv}
+parameters: {free: ["arm.mdh.theta?", "arm.mdh.a?"]}
+"""
+
+
+def test_a_travel_in_another_unit_is_named(tmp_path: Path) -> None:
+    """A spindle's centimetres in a column of millimetres."""
+    random = np.random.default_rng(0)
+    first, second, travel = random.uniform([[-1.0], [-1.5], [0.0]], [[1.0], [1.5], [0.2]], (3, 40))
+    x, y = (0.3 * turn(first + 0.01) + 0.2 * turn(first + second) for turn in (np.cos, np.sin))
+    positions = np.array([x, y, 0.1 + travel]) + random.normal(0, 1e-4, (3, 40))
+    (tmp_path / "scara.yaml").write_text(SCARA)
+
+    def prepared(unit_mm: float) -> Prepared:
+        table = np.array([*np.degrees([first, second]), travel / unit_mm * 1e3, *(1e3 * positions)]).T
+        head = "q1_deg,q2_deg,q3_mm,x_mm,y_mm,z_mm"
+        np.savetxt(tmp_path / "scara.csv", table, delimiter=",", header=head, comments="")
+        return assemble(Experiment.load(tmp_path / "scara.yaml"), Stopwatch())
+
+    prepared(1.0)
+    with pytest.raises(DataError, match="q3 10 times as large"):
+        prepared(10.0)
 
 
 @pytest.mark.parametrize("record", [41, 42])

@@ -29,7 +29,7 @@ LEFT_HANDED = "a left-handed frame made right-handed (one axis reversed, or two 
 
 
 def single_joints(arm: Arm) -> list[tuple[str, Wires]]:
-    """Each joint's sign, each two joints of a kind exchanged, and all angles or one of them in another unit."""
+    """Each joint's sign, each two joints of a kind exchanged, and all angles, one, or one travel in another unit."""
     joints = tuple(arm.commanded)
     angles = {joint: joint for joint, dimension in arm.commanded.items() if dimension == "angle"}
     readings: list[tuple[str, Wires]] = [
@@ -40,8 +40,9 @@ def single_joints(arm: Arm) -> list[tuple[str, Wires]]:
             readings.append((f"{one} and {other} exchanged", _wires(arm, {one: other, other: one}, 1.0)))
     for factor in (_DEGREES, 1 / _DEGREES, _TURN, _MRAD, 1 / _MRAD):
         readings.append((f"joint angles {factor:.4g} times as large", _wires(arm, angles, factor)))
-    for joint in angles if len(angles) > 1 else ():
-        readings.append((f"{joint} {_DEGREES:.4g} times as large", _wires(arm, {joint: joint}, _DEGREES)))
+    for joint in joints:
+        units = LENGTHS if joint not in angles else (_DEGREES,) if len(angles) > 1 else ()
+        readings += [(f"{joint} {factor:.4g} times as large", _wires(arm, {joint: joint}, factor)) for factor in units]
     return readings
 
 
