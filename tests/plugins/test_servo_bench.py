@@ -27,7 +27,7 @@ from armcal.run.experiment import Experiment
 from armcal.run.plan_clearance import clearance_check
 from armcal_simulation.bench.parts import ServoBenchSettings
 from armcal_simulation.bench.world import BenchWorld
-from armcal_simulation.boards.servo_bench import ServoBench, pulse_bench
+from armcal_simulation.boards.servo_bench import PulseBench, ServoBench
 from click.testing import CliRunner
 from servo_bench_parts import ADDRESS, read_all
 
@@ -137,7 +137,7 @@ def make(experiment: Experiment, tmp_path: Path, ear: socket.socket) -> Iterator
     def build(**given: Any) -> Host:
         folder = tmp_path / f"bench{len(hosts)}"
         folder.mkdir()
-        world = pulse_bench(bench_settings(ear, **given), experiment, folder)
+        world = PulseBench(bench_settings(ear, **given), experiment, folder)
         world.start(folder / "board")
         hosts.append(Host(world, folder))
         return hosts[-1]
@@ -364,7 +364,7 @@ class TestFaults:
     ) -> None:
         boots = []
         for _ in range(3):
-            world = pulse_bench(bench_settings(ear), experiment, tmp_path)
+            world = PulseBench(bench_settings(ear), experiment, tmp_path)
             world.start(tmp_path / "board")
             boots.append(world.answer({"state": True})["board"]["boots"])
             world.close()

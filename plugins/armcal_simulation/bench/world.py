@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import select
-from collections.abc import Callable, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from armcal.base.arrays import Array
@@ -33,53 +34,25 @@ _LOOK_UP_S = 0.25
 """How often it is looked whether the end was asked for."""
 
 
-class Firmware(Protocol):
-    """What a host talks to: it answers the serial line at once, and may have timers."""
-
-    def boot(self) -> None:
-        """Start anew: power-up, or a reset."""
-
-    def receive(self, data: bytes) -> None:
-        """Bytes from the host."""
-
-    def next_event(self) -> float:
-        """When a timer is due (s)."""
-
-    def run_timers(self) -> None:
-        """Do what is due now."""
-
-
-class Electronics(Firmware, Protocol):
-    """What stands between the host's serial line and the motors."""
-
-    split: Split
-    """Messages on the line."""
-
-    def moved(self) -> None:
-        """Time has passed for the motors."""
-
-    def fail(self, fault: FaultRequest) -> None:
-        """Do a fault that is neither the line's nor the tracker's."""
-
-    def state(self) -> dict[str, Any]:
-        """The truth, as JSON."""
-
-
-class BenchWorld:
+class BenchWorld(ABC):
     """A bench as a whole: its time, and what happens in it on requests of the port and the clock's socket.
+
+    A subclass is a kind of bench: it has what stands between the host's serial line and the motors.
 
     Attributes:
         now: simulated seconds since the bench began.
         stopped: a client has asked for the end.
+        split: gives messages on the line.
 
     Args:
         settings: the truth.
         tracked: the arm.
         servos: by joint, in the arm's order.
         bounds: what the experiment allows.
-        folder: for the log.
-        electronics: makes what stands between line and servos.
+        folder: for the log, the port and the clock's socket.
     """
+
+    split: Split
 
     def __init__(
         self,
@@ -88,10 +61,9 @@ class BenchWorld:
         servos: Mapping[str, JointServo],
         bounds: Bounds,
         folder: Path,
-        electronics: Callable[[BenchWorld], Electronics],
     ) -> None:
         self.now, self.stopped = 0.0, False
-        self._settings = settings
+        self._settings, self._folder = settings, folder
         self._sender = DTrackSender(settings.tracker, settings.tracker.host, settings.tracker.port, settings.seed)
         self._world_T_base = settings.world_T_base.matrix
         self.physics = physics_of(settings, tracked, servos, self._track)
@@ -99,7 +71,57 @@ class BenchWorld:
         self.physics.on_failure = self.safety.failed
         self._faults = FaultCalendar(self.clock, self._fail)
         self._line: SerialLine | None = None
-        self._electronics = electronics(self)
+
+    @abstractmethod
+    def boot(self) -> None:
+        """Start anew: power-up, or a reset."""
+
+    @abstractmethod
+    def receive(self, data: bytes) -> None:
+        """Bytes from the host, which are answered at once."""
+
+    @abstractmethod
+    def next_event(self) -> float:
+        """When a timer is due (s)."""
+
+    @abstractmethod
+    def run_timers(self) -> None:
+        """Do what is due now."""
+
+    def moved(self) -> None:
+        """Time has passed for the motors."""
+        return
+
+    @abstractmethod
+    def fail(self, fault: FaultRequest) -> None:
+        """Do a fault that is neither the line's nor the tracker's."""
+
+    @abstractmethod
+    def state(self) -> dict[str, Any]:
+        """The truth of what stands between line and motors, as JSON."""
+
+    def serve(self) -> None:
+        """Answer on the port and the clock's socket until the end; see ``SimulatedBench``.
+
+        Raises:
+            InputError: the folder cannot be used.
+        """
+        with closing(self), Signals() as signals:
+            clock = self._folder / CLOCK
+            vacate(clock, *_TAKEN)
+            self.start(self._folder / BOARD)
+            # After the board: who finds the clock finds the board as well.
+            with closing(JsonServer(clock, *_TAKEN, self.answer)) as server, select.epoll() as edges:
+                server.watch(edges.fileno(), partial(self._attend, edges))
+                watched = None
+                while not (self.stopped or signals.finish):
+                    port = self._line.port if self._line is not None else None
+                    if port is not None and port != watched:
+                        # Edges only: a port that nobody has open is at its end all the time. A closed one left by
+                        # itself.
+                        edges.register(port[0], select.EPOLLIN | select.EPOLLHUP | select.EPOLLET)
+                    watched = port
+                    server.serve(_LOOK_UP_S)
 
     def clock(self) -> float:
         """Seconds, as parts of the bench ask for them."""
@@ -117,9 +139,9 @@ class BenchWorld:
     def start(self, path: Path) -> None:
         """Plug the board in, under this path."""
         random = np.random.default_rng([self._settings.seed, 1])
-        self._line = SerialLine(path, self._electronics.split, random)
+        self._line = SerialLine(path, self.split, random)
         self._line.plug_in()
-        self._electronics.boot()
+        self.boot()
 
     def close(self) -> None:
         """Let go of everything."""
@@ -128,17 +150,17 @@ class BenchWorld:
         self._sender.close()
         self.safety.judge_clearance()
 
-    def port(self) -> tuple[int, int] | None:
-        """What to watch; see ``SerialLine.port``."""
-        return None if self._line is None else self._line.port
-
     def attend_line(self) -> None:
         """Do what the host has written; it takes no time."""
         if self._line is None:
             return
         self._line.flush()
         for piece in self._line.receive():
-            self._electronics.receive(piece)
+            self.receive(piece)
+
+    def _attend(self, edges: select.epoll) -> None:
+        edges.poll(0)
+        self.attend_line()
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """To a client of the clock's socket.
@@ -163,7 +185,7 @@ class BenchWorld:
             **self.physics.state(),
             "failed": [joint for joint, servo in self.physics.servos.items() if servo.failed],
             **self.safety.summary(),
-            **self._electronics.state(),
+            **self.state(),
         }
 
     def _advance(self, seconds: Any) -> None:
@@ -173,13 +195,13 @@ class BenchWorld:
         end = self.now + seconds
         self.safety.passed(self.now)
         while self.now < end:
-            due = min(self.physics.next_event(), self._electronics.next_event(), self._faults.next_event())
+            due = min(self.physics.next_event(), self.next_event(), self._faults.next_event())
             self.now = min(end, max(due, self.now))
             self.physics.move_to(self.now)
-            self._electronics.moved()
+            self.moved()
             self._faults.run()
-            if self._electronics.next_event() <= self.now:
-                self._electronics.run_timers()
+            if self.next_event() <= self.now:
+                self.run_timers()
                 self.safety.passed(self.now)
 
     def _track(self, now: float, base_T_body: Array | None) -> None:
@@ -211,30 +233,4 @@ class BenchWorld:
             tracker.silent, tracker.frozen, tracker.skew_ppm = False, "no", 0.0
             tracker.hidden -= {fault.body} if fault.body else set(tracker.hidden)
         else:
-            self._electronics.fail(fault)
-
-
-def serve_world(world: BenchWorld, folder: Path) -> None:
-    """Answer on the port and the clock's socket in a folder until the end; see ``SimulatedBench``.
-
-    Raises:
-        InputError: the folder cannot be used.
-    """
-    with closing(world), Signals() as signals:
-        vacate(folder / CLOCK, *_TAKEN)
-        world.start(folder / BOARD)
-        # After the board: who finds the clock finds the board as well.
-        with closing(JsonServer(folder / CLOCK, *_TAKEN, world.answer)) as server, select.epoll() as edges:
-            server.watch(edges.fileno(), partial(_attend, world, edges))
-            watched = None
-            while not (world.stopped or signals.finish):
-                if (port := world.port()) != watched and port is not None:
-                    # Edges only: a port that nobody has open is at its end all the time. A closed one left by itself.
-                    edges.register(port[0], select.EPOLLIN | select.EPOLLHUP | select.EPOLLET)
-                watched = port
-                server.serve(_LOOK_UP_S)
-
-
-def _attend(world: BenchWorld, edges: select.epoll) -> None:
-    edges.poll(0)
-    world.attend_line()
+            self.fail(fault)

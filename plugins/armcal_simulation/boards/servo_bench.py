@@ -4,9 +4,8 @@ import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
-from armcal.config.servo_file import ServoFile
 from armcal.devices.simulated import BenchRequest, SimulatedBench
 from armcal.run.experiment import Experiment
 from armcal.testing import EXAMPLE_TRUTH
@@ -16,7 +15,7 @@ from armcal_simulation.bench.faults import FaultRequest
 from armcal_simulation.bench.parts import ServoBenchSettings, bounds_of, tracked_arm, true_servos
 from armcal_simulation.bench.serial_line import delimited
 from armcal_simulation.bench.servo_model import ServoModel
-from armcal_simulation.bench.world import BenchWorld, Firmware, serve_world
+from armcal_simulation.bench.world import BenchWorld
 from armcal_simulation.boards.firmata_board import FirmataBoard
 from armcal_simulation.boards.framed_board import BoardIdentity, FramedBoard
 from armcal_simulation.boards.i2c_bus import I2cBus
@@ -27,71 +26,63 @@ _EEPROM = "eeprom.json"
 _SHOWN_VIOLATIONS = 20
 
 
-class BoardFirmware(Firmware, Protocol):
-    """A board's program; ``delimiter`` ends a message of its protocol."""
-
-    delimiter: int
-
-
-class PulseBoards:
-    """Boards whose pulses drive hobby servos, behind one firmware: the electronics of a ``servo_bench``.
+class PulseBench(BenchWorld):
+    """Boards whose pulses drive hobby servos, behind one firmware.
 
     Args:
-        models: the servos by joint.
-        file: boards and servos as they are.
-        folder: for what the board keeps when it is off.
+        folder: for what the board keeps when it is off, too.
+
+    Raises:
+        ConfigError: the settings do not fit the experiment.
     """
 
-    def __init__(
-        self,
-        world: BenchWorld,
-        settings: ServoBenchSettings,
-        models: Mapping[str, ServoModel],
-        file: ServoFile,
-        folder: Path,
-    ) -> None:
-        self._world, self._eeprom, self._models = world, folder / _EEPROM, models
-        clock = world.clock
-        self._chips = {n: Pca9685Model(clock, b.oscillator_hz, b.address) for n, b in file.boards.items()}
+    def __init__(self, settings: ServoBenchSettings, experiment: Experiment, folder: Path) -> None:
+        tracked = tracked_arm(settings, experiment)
+        file = true_servos(settings, tracked.arm)
+        self._models = {
+            joint: ServoModel(settings.servo_of(joint), file.servos[joint].table, settings.start.get(joint, 0.0))
+            for joint in tracked.arm.commanded
+        }
+        pulses = {joint: servo.pulse_range for joint, servo in file.servos.items()}
+        super().__init__(settings, tracked, self._models, bounds_of(experiment, pulses), folder)
+        self._eeprom = folder / _EEPROM
+        self._chips = {n: Pca9685Model(self.clock, b.oscillator_hz, b.address) for n, b in file.boards.items()}
         for name, chip in self._chips.items():
             chip.on_commit = partial(self._committed, name)
         self._joints = {(servo.board, servo.channel): joint for joint, servo in file.servos.items()}
-        self._bus = I2cBus(clock, list(self._chips.values()))
-        self._board: BoardFirmware
+        self._bus = I2cBus(self.clock, list(self._chips.values()))
+        self._board: FirmataBoard | FramedBoard
         if settings.firmware == "firmata":
-            self._board = FirmataBoard(self._bus, world.send)
+            self._board = FirmataBoard(self._bus, self.send)
         else:
             identity = BoardIdentity(settings.board_id, settings.states_oscillator_hz)
             try:
                 boots = int(json.loads(self._eeprom.read_text(encoding="utf-8"))["boots"])
             except (OSError, ValueError, KeyError, TypeError):
                 boots = 0
-            self._board = FramedBoard(clock, self._bus, world.send, identity, boots)
+            self._board = FramedBoard(self.clock, self._bus, self.send, identity, boots)
         self.split = delimited(self._board.delimiter)
 
+    @override
     def boot(self) -> None:
-        """See ``Electronics``."""
         self._board.boot()
         if isinstance(self._board, FramedBoard):
             self._eeprom.write_text(json.dumps({"boots": self._board.boots}) + "\n", encoding="utf-8")
 
+    @override
     def receive(self, data: bytes) -> None:
-        """See ``Electronics``."""
         self._board.receive(data)
 
+    @override
     def next_event(self) -> float:
-        """See ``Electronics``."""
         return self._board.next_event()
 
+    @override
     def run_timers(self) -> None:
-        """See ``Electronics``."""
         self._board.run_timers()
 
-    def moved(self) -> None:
-        """Servos drive by themselves: nothing is to be noted."""
-
+    @override
     def fail(self, fault: FaultRequest) -> None:
-        """See ``Electronics``."""
         if fault.kind in ("reset", "brown_out"):
             if fault.kind == "brown_out":
                 for chip in self._chips.values():
@@ -102,8 +93,8 @@ class PulseBoards:
         elif fault.kind == "stuck":
             self._bus.hold_down(fault.seconds)
 
+    @override
     def state(self) -> dict[str, Any]:
-        """See ``Electronics``."""
         board = self._board
         framed = {"boots": board.boots, "took_over": board.guard.took_over} if isinstance(board, FramedBoard) else {}
         broken = [[v.time, name, v.rule] for name, chip in self._chips.items() for v in chip.violations]
@@ -117,30 +108,9 @@ class PulseBoards:
     def _committed(self, board: str, commit: Commit) -> None:
         joint = self._joints.get((board, commit.channel))
         if joint is not None:
-            physics = self._world.physics
-            self._world.safety.committed(joint, commit, self._chips[board].period_s, physics.torques[joint])
+            self.safety.committed(joint, commit, self._chips[board].period_s, self.physics.torques[joint])
             self._models[joint].set_pulse(commit.after)
-            physics.commands_changed()
-
-
-def pulse_bench(settings: ServoBenchSettings, experiment: Experiment, folder: Path) -> BenchWorld:
-    """A bench of hobby servos.
-
-    Raises:
-        ConfigError: the settings do not fit the experiment.
-    """
-    tracked = tracked_arm(settings, experiment)
-    file = true_servos(settings, tracked.arm)
-    models = {
-        joint: ServoModel(settings.servo_of(joint), file.servos[joint].table, settings.start.get(joint, 0.0))
-        for joint in tracked.arm.commanded
-    }
-    pulses = {joint: servo.pulse_range for joint, servo in file.servos.items()}
-
-    def electronics(world: BenchWorld) -> PulseBoards:
-        return PulseBoards(world, settings, models, file, folder)
-
-    return BenchWorld(settings, tracked, models, bounds_of(experiment, pulses), folder, electronics)
+            self.physics.commands_changed()
 
 
 class ServoBench(SimulatedBench):
@@ -165,4 +135,4 @@ class ServoBench(SimulatedBench):
 
     @override
     def serve(self, request: BenchRequest) -> None:
-        serve_world(pulse_bench(self._settings, request.experiment, request.folder), request.folder)
+        PulseBench(self._settings, request.experiment, request.folder).serve()

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -9,6 +10,7 @@ from armcal.arm.horn import SPLINE_TEETH
 from armcal.arm.joints import unknown_joint
 from armcal.devices.simulated import BenchRequest, SimulatedBench
 from armcal.errors import ConfigError
+from armcal.run.experiment import Experiment
 from armcal.testing import EXAMPLE_TRUTH
 from pydantic import Field, field_validator, model_validator
 from typing_extensions import override
@@ -16,7 +18,7 @@ from typing_extensions import override
 from armcal_simulation.bench.faults import FaultRequest
 from armcal_simulation.bench.parts import ALL, BenchTruthSettings, bounds_of, merged, tracked_arm
 from armcal_simulation.bench.safety import SafetySettings
-from armcal_simulation.bench.world import BenchWorld, serve_world
+from armcal_simulation.bench.world import BenchWorld
 from armcal_simulation.boards.pca9685_model import Commit
 from armcal_simulation.bus.motor import BusMotor, BusMotorSettings
 from armcal_simulation.bus.registers import TABLES, ServoTable
@@ -95,48 +97,64 @@ class BusBenchSettings(BenchTruthSettings):
         raise ConfigError(f"bench.simulator: found {baud} baud, expected one of {rates} for {servo.model}.")
 
 
-class BusElectronics:
-    """Servos on their bus: the electronics of a ``bus_bench``. Motors are judged by the set points they follow."""
+class BusWorld(BenchWorld):
+    """Smart servos on their bus. Motors are judged by the set points that they follow.
 
-    def __init__(self, world: BenchWorld, bus: ServoBus, servos: Mapping[str, BusServo]) -> None:
-        self.split = bus.split
-        self._world, self._bus, self._servos = world, bus, dict(servos)
-        self._setpoints: dict[str, float | None] = dict.fromkeys(servos)
-        for joint, servo in servos.items():
-            servo.heat = lambda heat=world.physics.heat[joint]: heat.winding  # type: ignore[misc]
+    Raises:
+        ConfigError: the settings do not fit the experiment.
+    """
 
+    def __init__(self, settings: BusBenchSettings, experiment: Experiment, folder: Path) -> None:
+        tracked = tracked_arm(settings, experiment)
+        names = list(tracked.arm.commanded)
+        if fault := unknown_joint([joint for joint in (*settings.joints, *settings.start) if joint != ALL], names):
+            raise ConfigError(f"bench.simulator: {fault}.")
+        if missing := sorted(set(names) - set(settings.joints)):
+            text = f"bench.simulator: found no servo for {', '.join(missing)}."
+            raise ConfigError(text, hint="Give each joint its id.")
+        random = np.random.default_rng([settings.seed, 2])
+        self._servos = {joint: _bus_servo(settings, joint, random) for joint in names}
+        motors = {joint: servo.motor for joint, servo in self._servos.items()}
+        super().__init__(settings, tracked, motors, bounds_of(experiment, {}), folder)
+        supply, chain = (settings.supply_V, settings.supply_ohm), list(self._servos.values())
+        self._bus = ServoBus(self.clock, chain, self.send, self.baud, random, echo=settings.echo, supply=supply)
+        self.split = self._bus.split
+        self._setpoints: dict[str, float | None] = dict.fromkeys(names)
+        for joint, servo in self._servos.items():
+            servo.heat = lambda heat=self.physics.heat[joint]: heat.winding  # type: ignore[misc]
+
+    @override
     def boot(self) -> None:
-        """See ``Electronics``."""
         self._bus.boot()
         self.moved()
 
+    @override
     def receive(self, data: bytes) -> None:
-        """See ``Electronics``."""
         self._bus.receive(data)
         self.moved()
-        self._world.physics.commands_changed()
+        self.physics.commands_changed()
 
+    @override
     def next_event(self) -> float:
-        """See ``Electronics``."""
         return self._bus.next_event()
 
+    @override
     def run_timers(self) -> None:
-        """See ``Electronics``."""
         self._bus.run_timers()
         self.moved()
-        self._world.physics.commands_changed()
+        self.physics.commands_changed()
 
+    @override
     def moved(self) -> None:
-        """Judge what the motors were sent to since the last look."""
         for joint, servo in self._servos.items():
             before, now = self._setpoints[joint], servo.motor.setpoint
             if before != now:
                 self._setpoints[joint] = now
-                commit = Commit(self._world.now, servo.id, before, now)
-                self._world.safety.committed(joint, commit, _TURN, self._world.physics.torques[joint])
+                commit = Commit(self.now, servo.id, before, now)
+                self.safety.committed(joint, commit, _TURN, self.physics.torques[joint])
 
+    @override
     def fail(self, fault: FaultRequest) -> None:
-        """See ``Electronics``."""
         for joint, servo in self._servos.items():
             if fault.joint not in (None, joint):
                 continue
@@ -153,12 +171,12 @@ class BusElectronics:
             elif fault.kind == "put":
                 servo.motor.put(fault.angle)
             elif fault.kind == "heat":
-                self._world.physics.heat[joint].winding = _BURNING
+                self.physics.heat[joint].winding = _BURNING
         self.moved()
-        self._world.physics.commands_changed()
+        self.physics.commands_changed()
 
+    @override
     def state(self) -> dict[str, Any]:
-        """See ``Electronics``."""
         servos = {
             joint: {
                 "id": servo.id,
@@ -189,31 +207,7 @@ class BusBench(SimulatedBench):
 
     @override
     def serve(self, request: BenchRequest) -> None:
-        serve_world(bus_world(self._settings, request), request.folder)
-
-
-def bus_world(settings: BusBenchSettings, request: BenchRequest) -> BenchWorld:
-    """A bench of smart servos.
-
-    Raises:
-        ConfigError: the settings do not fit the experiment.
-    """
-    tracked = tracked_arm(settings, request.experiment)
-    names = list(tracked.arm.commanded)
-    if fault := unknown_joint([joint for joint in (*settings.joints, *settings.start) if joint != ALL], names):
-        raise ConfigError(f"bench.simulator: {fault}.")
-    if missing := sorted(set(names) - set(settings.joints)):
-        raise ConfigError(f"bench.simulator: found no servo for {', '.join(missing)}.", hint="Give each joint its id.")
-    random = np.random.default_rng([settings.seed, 2])
-    servos = {joint: _bus_servo(settings, joint, random) for joint in names}
-
-    def electronics(world: BenchWorld) -> BusElectronics:
-        supply, chain = (settings.supply_V, settings.supply_ohm), list(servos.values())
-        bus = ServoBus(world.clock, chain, world.send, world.baud, random, echo=settings.echo, supply=supply)
-        return BusElectronics(world, bus, servos)
-
-    motors = {joint: servo.motor for joint, servo in servos.items()}
-    return BenchWorld(settings, tracked, motors, bounds_of(request.experiment, {}), request.folder, electronics)
+        BusWorld(self._settings, request.experiment, request.folder).serve()
 
 
 def _bus_servo(settings: BusBenchSettings, joint: str, random: np.random.Generator) -> BusServo:

@@ -16,7 +16,7 @@ from armcal.errors import ArmcalError
 from armcal.run.experiment import Experiment
 from armcal_bench.bench import Bench
 from armcal_simulation.bench.world import BenchWorld
-from armcal_simulation.bus.bus_bench import BusBench, bus_world
+from armcal_simulation.bus.bus_bench import BusBench, BusWorld
 from bench_runs import free_port
 from click.testing import CliRunner
 from servo_bench_parts import read_all
@@ -77,7 +77,7 @@ def settings(experiment: Experiment, **joints: dict[str, Any]) -> Any:
 
 @pytest.fixture
 def host(experiment: Experiment, tmp_path: Path) -> Iterator[Host]:
-    world = bus_world(settings(experiment), BenchRequest(experiment, tmp_path))
+    world = BusWorld(settings(experiment), experiment, tmp_path)
     world.start(tmp_path / "board")
     host = Host(world, tmp_path)
     yield host
@@ -129,7 +129,7 @@ def test_a_joint_that_was_found_beyond_its_limit_may_come_back_but_go_no_further
     experiment: Experiment, tmp_path: Path
 ) -> None:
     away = settings(experiment).model_copy(update={"start": {"shoulder_lift": math.radians(-70)}})
-    world = bus_world(away, BenchRequest(experiment, tmp_path))
+    world = BusWorld(away, experiment, tmp_path)
     world.start(tmp_path / "board")
     host = Host(world, tmp_path)
     host.hold()
@@ -192,7 +192,7 @@ def test_a_hot_servo_a_plug_that_is_out_and_one_servos_brown_out(host: Host) -> 
 def test_what_a_servo_reads_at_its_joints_zero(
     experiment: Experiment, tmp_path: Path, joint: dict[str, Any], reads: float
 ) -> None:
-    world = bus_world(settings(experiment, shoulder_pan=joint), BenchRequest(experiment, tmp_path))
+    world = BusWorld(settings(experiment, shoulder_pan=joint), experiment, tmp_path)
     world.start(tmp_path / "board")
     host = Host(world, tmp_path)
     assert abs(host.position(PAN) - reads) < 2
