@@ -1,13 +1,15 @@
 """What is dangerous in the first motion of an arm and in its last: first pulses, the pose it stands in, letting go."""
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from armcal.base.arrays import Array
+
+from armcal_bench.acquisition.heat import Torques
 
 _GEARS_HOLD = 0.05
 """N m: under less than this the gears of a small servo stand without pulses; more turns them."""
@@ -16,7 +18,6 @@ _LONGEST_FALL = 400
 """Steps: more than two turns of a joint."""
 _BEYOND = math.radians(0.5)
 """A board's counts lie half a degree apart."""
-Torques = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)

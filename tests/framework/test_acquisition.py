@@ -40,14 +40,14 @@ class Run:
         self.settings = settings or AcquisitionSettings()
         self.monitor, self.log, self.asked = FakeTrackerMonitor(self.clock, self.device), FakeLog(), False
         self.log.progress, self.poses = progress or Progress(), POSES
-        self.model = HeatModel.of(self.device.joint_names, heat or {})
+        self.model = HeatModel.of(self.device.joint_names, heat or {}, torques)
 
     def acquisition(self) -> AcquisitionRun:
         settings, clock, device = self.settings, self.clock, self.device
         planner = PathPlanner(None, np.array([[-2.0, 2.0]] * 2), self.poses, 0.02)
-        drive = Drive(device, clock, planner, settings, (self.model, torques), self.log)
+        drive = Drive(device, clock, planner, settings, self.model, self.log)
         scheduler = Scheduler(
-            self.poses, IDS, 0 * self.poses, drive.park, planner, self.model, torques, RATE, 2.0, settings.order
+            self.poses, IDS, 0 * self.poses, drive.park, planner, self.model, RATE, 2.0, settings.order
         )
         gate = MotionGate(self.monitor, clock, settings.lost, lambda: self.asked)
         identity = device.open(clock)

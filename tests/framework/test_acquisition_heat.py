@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 JOINTS = ("q1", "q2")
-HEAT = HeatModel.of(JOINTS, {"q2": ServoHeatSettings.si(continuous=1.0, case_time=600.0, budget=0.6)})
 
 
 def torques(pose: np.ndarray) -> np.ndarray:
@@ -21,12 +20,15 @@ def torques(pose: np.ndarray) -> np.ndarray:
     return np.array([0.1, 2.0 * np.sin(pose[1])])
 
 
+HEAT = HeatModel.of(JOINTS, {"q2": ServoHeatSettings.si(continuous=1.0, case_time=600.0, budget=0.6)}, torques)
+
+
 def scheduler(poses: np.ndarray, order: str = "plan", model: HeatModel = HEAT, check=None) -> Scheduler:
     limits = np.array([[-np.pi, np.pi]] * 2)
     park = np.zeros(2)
     planner = PathPlanner(check, limits, np.vstack([park, poses]), 0.02)
     names = tuple(f"p{i}" for i in range(len(poses)))
-    return Scheduler(poses, names, 0 * poses, park, planner, model, torques, np.deg2rad(20), 8.0, order)
+    return Scheduler(poses, names, 0 * poses, park, planner, model, np.deg2rad(20), 8.0, order)
 
 
 def test_heat_follows_its_differential_equations() -> None:
@@ -58,7 +60,7 @@ def test_the_time_to_cool_is_the_time_after_which_it_is_cool() -> None:
 
 def test_a_joint_that_is_not_there_is_refused() -> None:
     with pytest.raises(ValueError, match=r"'q9'; the joints are q1, q2"):
-        HeatModel.of(JOINTS, {"q9": ServoHeatSettings.si(continuous=1.0)})
+        HeatModel.of(JOINTS, {"q9": ServoHeatSettings.si(continuous=1.0)}, torques)
 
 
 def test_rests_come_before_the_budget_is_spent() -> None:

@@ -41,7 +41,7 @@ def with_constants(scheduler: Scheduler, wrong: np.ndarray, budget: float) -> Sc
     times[Q4] = TRUTH.winding_time * wrong[1], TRUTH.case_time * wrong[2]
     share = TRUTH.winding_share * wrong[3]
     shares[Q4], budgets[Q4] = (share, 1 - share), budget
-    return replace(scheduler, model=HeatModel(continuous, times, shares, budgets))
+    return replace(scheduler, model=HeatModel(continuous, times, shares, budgets, model.torques))
 
 
 def truly(scheduler: Scheduler, forecast: ScheduleForecast) -> np.ndarray:
@@ -53,10 +53,12 @@ def truly(scheduler: Scheduler, forecast: ScheduleForecast) -> np.ndarray:
         hottest = 0.0
         for start, goal in pairwise(step.path):
             for part in (np.arange(6) + 0.5) / 6:
-                torque = scheduler.torques(start + part * (goal - start))[Q4]
+                torque = scheduler.model.torques(start + part * (goal - start))[Q4]
                 servo.advance(travel((start, goal)) / scheduler.rate / 6, float(torque))
                 hottest = max(hottest, servo.winding)
-        servo.advance(step.seconds - travel(step.path) / scheduler.rate, float(scheduler.torques(step.path[-1])[Q4]))
+        servo.advance(
+            step.seconds - travel(step.path) / scheduler.rate, float(scheduler.model.torques(step.path[-1])[Q4])
+        )
         now += step.seconds
         heat.append((now, servo.winding, max(hottest, servo.winding)))
     return np.array(heat)

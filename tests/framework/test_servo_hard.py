@@ -243,9 +243,10 @@ class TestTracker:
 
     @pytest.mark.slow
     def test_warmth_outlasts_the_program(self, run: ServoRun) -> None:
-        heat = HeatModel(np.array([1.0]), np.array([[20.0, 300.0]]), np.array([[0.3, 0.7]]), np.array([0.6]))
+        times, shares = np.array([[20.0, 300.0]]), np.array([[0.3, 0.7]])
+        heat = HeatModel(np.array([1.0]), times, shares, np.array([0.6]), lambda pose: 2.0 * np.abs(pose))
         clock = FakeClock()
-        warm = ThermalState((heat, lambda pose: 2.0 * np.abs(pose)), ("q1",), {"q1": 0.0}, clock)
+        warm = ThermalState(heat, ("q1",), {"q1": 0.0}, clock)
         warm.go_on({"q1": [0.9, 0.5]}, {"q1": 0.0}, 0.0)
         assert warm.must_rest
         warm.go_on({"q1": [0.9, 0.5]}, {"q1": 0.0}, 3600.0)

@@ -11,7 +11,7 @@ from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceError, DeviceRefusedError, JointDevice
 from armcal.devices.returned import measured_angles, standing_at, state_of
 
-from armcal_bench.acquisition.heat import HeatModel, ThermalState, Torques
+from armcal_bench.acquisition.heat import HeatModel, ThermalState
 from armcal_bench.acquisition.path_planner import JointPath, PathPlanner
 from armcal_bench.acquisition.run_log import ENERGISED, RunLog
 from armcal_bench.acquisition.settings import AcquisitionSettings
@@ -107,7 +107,7 @@ class Drive(Motion):
         clock: Clock,
         planner: PathPlanner,
         settings: AcquisitionSettings,
-        heat: tuple[HeatModel, Torques],
+        heat: HeatModel,
         log: RunLog,
     ) -> None:
         thermal_state = ThermalState(heat, device.joint_names, settings.park, clock)

@@ -17,10 +17,15 @@ from armcal_bench.acquisition.settings import ServoHeatSettings
 NEVER = float("inf")
 _ENOUGH = 0.8
 """Of the budget: one more point warms a servo by less than the rest of it."""
-_COOLED_TO = 0.5
+COOLED_TO = 0.5
+"""Of the budget: a rest goes on to here, so that the servos do not rest before every pose."""
 _SAME_HEAT = 1e-4
 _TIMES_OVER = 20.0
 _RESOLUTION_S = 0.01
+
+
+Torques = Callable[[Array], Array]
+"""Holding torques (joints, N m) at joint angles (joints, rad)."""
 
 
 @dataclass(frozen=True)
@@ -36,15 +41,17 @@ class HeatModel:
         times: s (joints x 2: winding, case).
         shares: of the heat (joints x 2).
         budget: the heat that each may come to (joints).
+        torques: that heat them.
     """
 
     continuous: Array
     times: Array
     shares: Array
     budget: Array
+    torques: Torques
 
     @classmethod
-    def of(cls, joints: Sequence[str], settings: Mapping[str, ServoHeatSettings]) -> Self:
+    def of(cls, joints: Sequence[str], settings: Mapping[str, ServoHeatSettings], torques: Torques) -> Self:
         """The model of these joints.
 
         Raises:
@@ -59,6 +66,7 @@ class HeatModel:
             np.array([[(s or usual).winding_time, (s or usual).case_time] for s in servos]),
             np.array([[(s or usual).winding_share, 1 - (s or usual).winding_share] for s in servos]),
             np.array([s.budget if s else NEVER for s in servos]),
+            torques,
         )
 
     @property
@@ -105,10 +113,6 @@ class HeatModel:
         return high
 
 
-Torques = Callable[[Array], Array]
-"""Holding torques (joints, N m) at joint angles (joints, rad)."""
-
-
 def holding_torques(arm: Arm, environment: Environment) -> Torques:
     """What the joints of an arm hold against gravity and its configured load."""
     function = holding_function(arm, environment.gravity, environment.payload_mass, environment.payload_com)
@@ -127,7 +131,7 @@ class ThermalState:
     """How warm the servos are, followed from cold on, or from where another run left it.
 
     Args:
-        heat: the servos' model, and the torques that heat them.
+        model: of the servos.
         joints: in the arm's order.
         rest: where the servos rest (rad by joint; others at zero).
         clock: the bench's.
@@ -136,12 +140,10 @@ class ThermalState:
         warmth: of winding and case (joints x 2).
     """
 
-    def __init__(
-        self, heat: tuple[HeatModel, Torques], joints: Sequence[str], rest: Mapping[str, float], clock: Clock
-    ) -> None:
-        (self.model, self.torques), self._joints, self._clock = heat, joints, clock
+    def __init__(self, model: HeatModel, joints: Sequence[str], rest: Mapping[str, float], clock: Clock) -> None:
+        self.model, self._joints, self._clock = model, joints, clock
         self.warmth, self._since = self.model.cold, clock.now()
-        self._at_rest = self.torques(self._pose(rest))
+        self._at_rest = self.model.torques(self._pose(rest))
 
     def go_on(self, before: Mapping[str, Sequence[float]], standing: Mapping[str, float], seconds: float) -> None:
         """From another run's warmth (winding and case, by joint), after which joints stood at angles (rad) for so long.
@@ -150,12 +152,12 @@ class ThermalState:
         """
         self.warmth = np.array([before.get(joint, (0.0, 0.0)) for joint in self._joints], dtype=float)
         held = np.array([joint in standing for joint in self._joints])
-        self.warmth = self.model.after(self.warmth, self.torques(self._pose(standing)) * held, max(seconds, 0.0))
+        self.warmth = self.model.after(self.warmth, self.model.torques(self._pose(standing)) * held, max(seconds, 0.0))
 
     def pass_to_now(self, angles: Mapping[str, float]) -> None:
         """The servos have stood at these angles (rad) since the last call."""
         now = self._clock.now()
-        self.warmth = self.model.after(self.warmth, self.torques(self._pose(angles)), now - self._since)
+        self.warmth = self.model.after(self.warmth, self.model.torques(self._pose(angles)), now - self._since)
         self._since = now
 
     @property
@@ -180,17 +182,17 @@ class ThermalState:
     @property
     def rest_s(self) -> float:
         """How long to rest; infinite where the servos would not cool."""
-        return self.model.cooled_in(self.warmth, self._at_rest, _COOLED_TO * self.model.budget)
+        return self.model.cooled_in(self.warmth, self._at_rest, COOLED_TO * self.model.budget)
 
     @property
     def too_heavy_at_rest(self) -> str:
         """The joint that would not cool where the servos rest; empty if all do."""
-        hot = self.model.too_hot_for_ever(self._at_rest, _COOLED_TO)
+        hot = self.model.too_hot_for_ever(self._at_rest, COOLED_TO)
         return "" if hot is None else self._joints[hot]
 
     def hotter_than(self, warmth: Array, angles: Mapping[str, float]) -> bool:
         """Whether a servo is hotter than in a thermal state (joints x 2), and still cools at these angles (rad)."""
-        steady = np.repeat(self.model.steady(self.torques(self._pose(angles))), 2, axis=1)
+        steady = np.repeat(self.model.steady(self.model.torques(self._pose(angles))), 2, axis=1)
         least = np.maximum(self.model.heat(warmth), self.model.heat(steady))
         return bool(np.any(self.model.heat(self.warmth) > least + _SAME_HEAT))
 

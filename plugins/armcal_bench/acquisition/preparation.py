@@ -20,7 +20,7 @@ from armcal.run.plan_clearance import clearance_check
 from armcal.run.plan_poses import JointSpace, commands_of, read_poses
 
 from armcal_bench.acquisition.arrival import Arrival
-from armcal_bench.acquisition.heat import HeatModel, Torques, holding_torques
+from armcal_bench.acquisition.heat import HeatModel, holding_torques
 from armcal_bench.acquisition.path_planner import PathPlanner
 from armcal_bench.acquisition.sag import SagJudge
 from armcal_bench.acquisition.schedule import Scheduler
@@ -82,23 +82,22 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
     check = clearance_of(experiment, arm)
     planner = PathPlanner(check, settable, np.vstack([park, poses]), settings.path_step, settings.seed)
     _check_clear(planner, poses, plan, commands)
-    model, torques = heat_of(experiment, settings, arm)
-    _check_park(experiment, planner, (model, torques), park, device.joint_names)
+    heat = heat_of(experiment, settings, arm)
+    _check_park(experiment, planner, heat, park, device.joint_names)
     scheduler = Scheduler(
         poses=poses,
         ids=commands.ids,
         approaches=_approaches(commands, space),
         park=park,
         planner=planner,
-        model=model,
-        torques=torques,
+        model=heat,
         rate=float(np.deg2rad(settings.rate_deg_per_s)),
         capture=settings.settle.wait + settings.settle.window + 0.5,
         order=settings.order,
     )
-    judge = HazardJudge(device.joint_names, device.joint_names, limits, torques, park)
+    judge = HazardJudge(device.joint_names, device.joint_names, limits, heat.torques, park)
     arrival = Arrival(nominal_tools(arm, poses), settings.arrival)
-    sag = SagJudge(device.joint_names, partial(nominal_tools, arm), torques)
+    sag = SagJudge(device.joint_names, partial(nominal_tools, arm), heat.torques)
     return Prepared(bench, device, commands, scheduler, arrival, sag, judge)
 
 
@@ -158,15 +157,15 @@ def _settable_park(experiment: Experiment, settings: AcquisitionSettings, device
 
 
 def _check_park(
-    experiment: Experiment, planner: PathPlanner, heat: tuple[HeatModel, Torques], park: Array, joints: tuple[str, ...]
+    experiment: Experiment, planner: PathPlanner, heat: HeatModel, park: Array, joints: tuple[str, ...]
 ) -> None:
     """Refuse a park pose (joints, rad) that is too near to something, or in which a servo would not cool."""
-    where, (model, torques) = experiment.source.where((*_AT, "park")), heat
+    where = experiment.source.where((*_AT, "park"))
     if not planner.allowed(park):
         raise ConfigError("the pose where the arm parks is too near to something.", where=where, hint="Choose another.")
-    torque = torques(park)
-    if (hot := model.too_hot_for_ever(torque)) is not None:
-        share = 100 * float(model.steady(torque)[hot, 0] / model.budget[hot])
+    torque = heat.torques(park)
+    if (hot := heat.too_hot_for_ever(torque)) is not None:
+        share = 100 * float(heat.steady(torque)[hot, 0] / heat.budget[hot])
         raise ConfigError(
             f"the servo of {joints[hot]} would not cool where the arm parks: it carries {abs(torque[hot]):.2f} N m at "
             f"{np.rad2deg(park[hot]):.1f} deg, which heats it to {share:.0f} % of its budget.",
@@ -237,8 +236,8 @@ def _row(plan: Path, commands: Dataset, row: int) -> Location:
     return Location(str(plan), row=commands.rows[row] if commands.rows else None)
 
 
-def heat_of(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> tuple[HeatModel, Torques]:
-    """The servos' model, and the torques that heat them.
+def heat_of(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> HeatModel:
+    """The servos' model.
 
     Raises:
         ConfigError: the settings name no such joint, or nothing weighs anything.
@@ -248,7 +247,6 @@ def heat_of(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> 
         hint = "Give the masses of the links (arms.NAME.links), or leave heat out."
         raise ConfigError(text, where=experiment.source.where((*_AT, "heat")), hint=hint)
     try:
-        model = HeatModel.of(tuple(arm.commanded), settings.heat)
+        return HeatModel.of(tuple(arm.commanded), settings.heat, holding_torques(arm, experiment.system.environment))
     except ValueError as fault:
         raise ConfigError(f"{fault}.", where=experiment.source.where((*_AT, "heat"))) from fault
-    return model, holding_torques(arm, experiment.system.environment)

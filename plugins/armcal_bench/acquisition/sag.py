@@ -13,6 +13,7 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.diagnose.measured_frame import MeasuredFrame, frame_of
 
+from armcal_bench.acquisition.heat import Torques
 from armcal_bench.settling import Stand
 
 _STEP = 1e-4
@@ -95,7 +96,7 @@ class SagJudge:
 
     joints: tuple[str, ...]
     poses: Poses
-    torques: Callable[[Array], Array]
+    torques: Torques
 
     def sag_of(self, angles: Array, stands: Sequence[Stand], known: tuple[Array, Array]) -> Sag | None:
         """The motion, where it is beyond doubt.

@@ -8,13 +8,11 @@ from typing import TypeGuard
 import numpy as np
 from armcal.base.arrays import Array
 
-from armcal_bench.acquisition.heat import NEVER, HeatModel, Torques
+from armcal_bench.acquisition.heat import COOLED_TO, NEVER, HeatModel
 from armcal_bench.acquisition.path_planner import JointPath, PathPlanner, travel
 
 _SAMPLES = 8
 _CONSIDERED = 12
-_COOLED_TO = 0.5
-"""Of the budget: a rest goes on to here, so that the servos do not rest before every pose."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,6 @@ class Scheduler:
     park: Array
     planner: PathPlanner
     model: HeatModel
-    torques: Torques
     rate: float
     capture: float
     order: str
@@ -95,7 +92,7 @@ class Scheduler:
         if path is None:
             return LeaveOut(pose, f"no clear path to pose {self.ids[pose]} was found")
         there = self.model.after(thermal_state, self._effective(path), travel(path) / self.rate)
-        after = self.model.after(there, self.torques(self.poses[pose]), self.capture)
+        after = self.model.after(there, self.model.torques(self.poses[pose]), self.capture)
         return Measure(pose, path, travel(path) / self.rate + self.capture, np.maximum(there, after))
 
     def _fits(self, step: Measure | LeaveOut) -> TypeGuard[Measure]:
@@ -114,11 +111,11 @@ class Scheduler:
         if path is None:
             return LeaveOut(pose, "no clear path to where the arm parks was found")
         home = self.model.after(thermal_state, self._effective(path), travel(path) / self.rate)
-        at_rest = self.torques(self.park)
+        at_rest = self.model.torques(self.park)
         steady = self.model.steady(at_rest)
         if not self._fits(self._measured(self.park, np.minimum(self.model.cold + steady, thermal_state), pose)):
             return LeaveOut(pose, f"pose {self.ids[pose]} needs more torque than the servos bear, even from cold")
-        for part in (_COOLED_TO, 0.25, 0.1, 0.02):
+        for part in (COOLED_TO, 0.25, 0.1, 0.02):
             limits = np.maximum(part * self.model.budget, 1.02 * steady[:, 0] + 1e-6)
             seconds = self.model.cooled_in(home, at_rest, limits)
             if seconds == NEVER:
@@ -130,13 +127,13 @@ class Scheduler:
 
     def _effective(self, path: JointPath) -> Array:
         """The torque that heats as the path does on average (joints, N m)."""
-        squares, lengths = [], []
+        squares, lengths, torques = [], [], self.model.torques
         for start, goal in pairwise(path):
-            parts = [self.torques(start + t * (goal - start)) ** 2 for t in (np.arange(_SAMPLES) + 0.5) / _SAMPLES]
+            parts = [torques(start + t * (goal - start)) ** 2 for t in (np.arange(_SAMPLES) + 0.5) / _SAMPLES]
             squares.append(np.mean(parts, axis=0))
             lengths.append(float(np.max(np.abs(goal - start))))
         if not sum(lengths):
-            return self.torques(path[-1])
+            return torques(path[-1])
         return np.asarray(np.sqrt(np.average(squares, axis=0, weights=lengths)))
 
 

@@ -194,7 +194,7 @@ def _prepared_run(
     """
     settings, scheduler, progress = prepared.settings, prepared.scheduler, log.progress
     device, clock = prepared.device, gate.clock
-    drive = Drive(device, clock, scheduler.planner, settings, (scheduler.model, scheduler.torques), log)
+    drive = Drive(device, clock, scheduler.planner, settings, scheduler.model, log)
     scheduler.planner.meanwhile = drive.keep_alive  # the board would take a host that plans for one that died
     if progress.thermal_state:  # the warmth that an earlier part of the run has left
         drive.thermal_state.go_on(progress.thermal_state, progress.angles, clock.wall() - progress.at)

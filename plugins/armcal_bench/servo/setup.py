@@ -17,7 +17,7 @@ from armcal.devices.wiring import servo_file_of
 from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment
 
-from armcal_bench.acquisition.heat import HeatModel, Torques
+from armcal_bench.acquisition.heat import HeatModel
 from armcal_bench.acquisition.path_planner import PathPlanner
 from armcal_bench.acquisition.preparation import clearance_of, heat_of, run_limits
 from armcal_bench.bench import SECTION, Bench
@@ -43,7 +43,7 @@ class Setup:
         base: where every servo's joint stands while others are measured (rad).
         ranges: over which each joint may be moved from there (rad).
         nominal: the arm by its model.
-        heat: of the servos, and the torques that heat them.
+        heat: of the servos.
         planner: of straight ways on which nothing comes too near, if that is stated.
         judge: of what is dangerous in the first motions.
     """
@@ -56,7 +56,7 @@ class Setup:
     base: Mapping[str, float]
     ranges: Mapping[str, tuple[float, float]]
     nominal: NominalArm
-    heat: tuple[HeatModel, Torques]
+    heat: HeatModel
     planner: PathPlanner
     judge: HazardJudge
 
@@ -93,7 +93,7 @@ class Setup:
         ends = np.array(list(limits.values()))
         planner = PathPlanner(clearance_of(experiment, arm), ends, np.zeros((0, len(limits))), _LOOK_STEP)
         rest = np.array([base.get(joint, 0.0) for joint in arm.commanded])
-        judge = HazardJudge(tuple(arm.commanded), moved, ends, heat[1], rest)
+        judge = HazardJudge(tuple(arm.commanded), moved, ends, heat.torques, rest)
         setup = cls(bench, settings, path, file, settings.joints or moved, base, {}, nominal, heat, planner, judge)
         return replace(setup, ranges=setup._clear_ranges(experiment, limits))
 
