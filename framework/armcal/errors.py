@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 EXIT_DONE = 0
@@ -70,6 +72,17 @@ class InputError(ArmcalError):
     """Something a user gave is refused."""
 
     exit_code = EXIT_BAD_INPUT
+
+
+@contextmanager
+def noted(warnings: Iterable[str]) -> Iterator[None]:
+    """Give what is refused inside the warnings that came before it, as notes: one of them may be its cause."""
+    try:
+        yield
+    except InputError as fault:
+        for text in warnings:
+            fault.add_note(text)
+        raise
 
 
 class ConfigError(InputError):

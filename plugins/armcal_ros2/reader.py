@@ -220,12 +220,25 @@ class Rosbag2Reader:
         if faulty:
             listed = "; ".join(f"{ids[i]}: {reason}" for i, reason in list(faulty.items())[:_NAMED])
             text += f"; left out: {listed}" + (f"; and {len(faulty) - _NAMED} more" if len(faulty) > _NAMED else "")
+        remarks = [*remarks, *self._moving_remarks(seen)]
         if len(faulty) == count:
             self._refuse(f"{text}.", " ".join(remarks) or "Let the arm stand where it is measured.")
         warnings = tuple(f"{place}: {remark}" for remark in (*remarks, f"{text}."))
         digest = self._digest.hexdigest()
         dataset = Dataset(ids, channels, extra, tuple(range(1, count + 1)), place, digest, warnings=warnings)
         return dataset.without(faulty)
+
+    def _moving_remarks(self, seen: Mapping[str, Sequence[_Seen]]) -> list[str]:
+        """Of measurements that move in most of the rests in which they saw something, sentences."""
+        remarks = []
+        for name, own in seen.items():
+            moves = [bool(one.fault) for one in own if one.samples >= _FEWEST_SAMPLES]
+            if 2 * sum(moves) > len(moves):
+                remark = f"{name} moves in {sum(moves)} of {len(moves)} rests of the joints: its positions are not in m"
+                if self._settings.measurements[name].clock_offset != "estimate":
+                    remark += f", or its clock is another. Set clock_offset: estimate for {name}"
+                remarks.append(f"{remark}.")
+        return remarks
 
     def _seen(self, log: MeasuredLog, place: int, rest: JointRest) -> _Seen:
         """What a measurement saw in a rest once the arm had settled."""

@@ -6,6 +6,7 @@ are those that show only when configuration, data and problem meet.
 
 from __future__ import annotations
 
+import json
 import random
 from pathlib import Path
 
@@ -68,6 +69,18 @@ def test_fewer_equations_than_parameters_needs_priors_and_says_both_numbers(tmp_
     lengths = ', "arm.mdh.a[3-5]": 5 mm, "arm.mdh.d[45]": 5 mm, "arm.mdh.base_[xyz]": 5 mm'
     rest = ', "arm.mdh.tool_[yz]": 5 mm, "arm.mdh.after2_z": 5 mm, "arm.spring.k?": 0.1 rad/Nm}'
     warned(check(*alone, angles + lengths + rest, data=data), "24 equations", "28 free parameters", "priors")
+
+
+def test_a_refusal_comes_with_the_warnings_of_the_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They may be its cause: here most records are copies."""
+    path = some_rows(tmp_path, 3)
+    header, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([header, *(rows * 4)]) + "\n")
+    refused(check(data=path), "exact duplicates", "5 folds of 2 records")
+    arguments = ["check", DEMO, "--json", "--data", str(path)]
+    monkeypatch.setattr("sys.argv", ["armcal", *arguments])
+    shown = CliRunner().invoke(cli, arguments)
+    assert "exact duplicates" in json.loads(shown.stdout)["error"]["warnings"][0]
 
 
 @pytest.mark.slow

@@ -182,9 +182,12 @@ def _exit_code() -> int:
 
 
 def _report(fault: ArmcalError) -> None:
+    notes = getattr(fault, "__notes__", [])
     if "--json" in sys.argv:
         import json
 
-        error = {"message": str(fault), "exit_code": fault.exit_code}
+        error = {"message": str(fault), "exit_code": fault.exit_code, "warnings": notes}
         click.echo(json.dumps({**JSON_SCHEMA, "error": error}, indent=2))
+    for text in notes:
+        say(f"warning: {text}", err=True)
     say(f"armcal: {fault}", err=True)

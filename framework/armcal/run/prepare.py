@@ -13,7 +13,7 @@ from armcal.base.units import digits, to_unit
 from armcal.config.system import System
 from armcal.diagnose.noise_findings import Finding, first_few
 from armcal.diagnose.permuted_axes import MUCH_BETTER, find_permuted_axes
-from armcal.errors import ConfigError, DataError, Location, ProblemError
+from armcal.errors import ConfigError, DataError, Location, ProblemError, noted
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.nuisance import restricted, started
 from armcal.estimate.profile import profiled
@@ -95,7 +95,7 @@ def prepare(
         InputError: data, units, counts or rank do not allow a calibration.
     """
     ready = assemble(experiment, watch, accept, progress)
-    with watch.stage("check"):
+    with watch.stage("check"), noted(ready.warnings):
         problems = require_solvable(ready.problem, ready.training, ready.problem.parameters.nominal())
     return replace(ready, warnings=(*ready.warnings, *problems))
 
@@ -108,11 +108,15 @@ def assemble(
     With ``accept``, data that look mixed up are not refused, but a bad finding.
 
     Raises:
-        InputError: data, units or counts do not allow a calibration.
+        InputError: data, units or counts do not allow a calibration; its notes are the warnings of the data.
     """
     with watch.stage("read"):
         dataset = experiment.read(progress)
-        experiment = experiment.of_records(dataset)
+    with noted(dataset.warnings):
+        return _assembled(experiment.of_records(dataset), dataset, watch, accept)
+
+
+def _assembled(experiment: Experiment, dataset: Dataset, watch: Stopwatch, accept: bool) -> Prepared:
     system = experiment.system
     with watch.stage("build"):
         settings = (experiment.parameters, system.environment)

@@ -97,6 +97,12 @@ def test_a_stated_clock_offset_moves_the_measurement(tour: bags.Tour, name: Path
         read(tour, bag)
 
 
+def test_a_clock_that_is_a_little_off_is_named(tour: bags.Tour, name: Path) -> None:
+    """The times of receipt do not show so little; the measured point moves where the joints stand."""
+    text = " ".join(read(tour, bags.write_bag(name, tour.sent(ahead=0.4))).warnings)
+    assert "tracker moves in " in text and "Set clock_offset: estimate for tracker." in text
+
+
 def test_rests_that_cannot_be_used_are_listed(tour: bags.Tour, name: Path) -> None:
     begin, end = tour.rests[3]
     at, seen = tour.seen
