@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 
 from armcal.base.arrays import Array, Indices
+from armcal.base.domains import Pose, ScrewAxis
 from armcal.errors import NotConvergedError
 from armcal.estimate.combination import Measure
 from armcal.estimate.estimator import Estimate
@@ -49,7 +50,8 @@ class Figure:
 
     Attributes:
         reach_mm: largest distance of the nominal tool from the first joint, over the poses.
-        size: extent of the calibrated tool positions by that of the nominal ones; nan where they do not move.
+        size: extent of the calibrated tool positions by that with nominal lengths and all else calibrated: a joint's
+            wrong zero is no size; nan where they do not move.
         moved_mm, turned_deg: how the calibrated arm as a whole stands away from where the configuration has it.
         displaced: parameters beyond what their priors say, the farthest first.
     """
@@ -70,14 +72,14 @@ def figure_of(problem: Problem, estimate: Estimate, records: Sequence[FactorReco
     """Of the first tool of all, at random poses about the recorded ones: what touches a socket hardly moves in them."""
     poses = problem.subset(random_records(problem, records), np.arange(_POSES, dtype=np.intp))
     try:
-        nominal, calibrated = _both(problem, estimate, poses)
+        nominal, calibrated, bent = _places(problem, estimate, poses)
     except NotConvergedError:
         poses = tuple(records)
-        nominal, calibrated = _both(problem, estimate, poses)
+        nominal, calibrated, bent = _places(problem, estimate, poses)
     arm = problem.blueprint.arms[problem.blueprint.measurements[problem.kernels[0].factor.name].arms[0]]
     chain = arm.nominal_chain
     first = np.array(ca.evalf((chain.base_T_mount @ chain.joints[0].parent_T_joint).translation)).ravel()
-    extent, turn, shift = spread_of(nominal), *rigid_fit(nominal, calibrated)
+    extent, turn, shift = spread_of(bent), *rigid_fit(nominal, calibrated)
     return Figure(
         reach_mm=float(np.max(np.linalg.norm(nominal - first[:, None], axis=0))) * 1000.0,
         size=spread_of(calibrated) / extent if extent > 0 else float("nan"),
@@ -87,11 +89,18 @@ def figure_of(problem: Problem, estimate: Estimate, records: Sequence[FactorReco
     )
 
 
-def _both(problem: Problem, estimate: Estimate, poses: Sequence[FactorRecords]) -> tuple[Array, Array]:
-    """Places of the first tool, as configured and calibrated (3 x N, m)."""
-    configured = problem.blueprint.parameters.nominal()
-    at_nominal, at_estimate = (tools(problem, v, poses)[0] for v in (configured, estimate.values))
-    return at_nominal[0], at_estimate[0]
+def _places(problem: Problem, estimate: Estimate, poses: Sequence[FactorRecords]) -> tuple[Array, Array, Array]:
+    """Places of the first tool (3 x N, m): as configured, calibrated, and calibrated but for its lengths."""
+    parameters, configured = problem.parameters, problem.blueprint.parameters.nominal()
+    bent = estimate.values.copy()
+    for block in parameters.free:
+        if block.unit == "m" or isinstance(block.domain, ScrewAxis | Pose):
+            own = parameters.entries_of(block.name)
+            bent[own] = configured[own]
+    nominal, calibrated, bent_places = (
+        tools(problem, values, poses)[0][0] for values in (configured, estimate.values, bent)
+    )
+    return nominal, calibrated, bent_places
 
 
 def displaced(problem: Problem, estimate: Estimate, records: Sequence[FactorRecords]) -> tuple[Displaced, ...]:

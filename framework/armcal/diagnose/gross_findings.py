@@ -147,7 +147,7 @@ def size_findings(figure: Figure) -> list[Finding]:
     if not off > SIZE:
         return []
     text = f"The calibrated arm is {figure.size:.3g} times as large as the nominal one."
-    test = f"extent of the tool's positions, limits {100 * SIZE:g} and {100 * GROSS_SIZE:g} %"
+    test = f"extent of the tool's positions by lengths, limits {100 * SIZE:g} and {100 * GROSS_SIZE:g} %"
     action = "Check the units and values of known distances and positions, and the tracker's scale."
     return [Finding("bad" if off > GROSS_SIZE else "warning", text, test, action)]
 

@@ -1,0 +1,42 @@
+"""How large the calibrated arm is beside the nominal one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+from armcal.diagnose.gross import figure_of
+from armcal.diagnose.gross_findings import size_findings
+from armcal.estimate.estimator import Estimate
+from armcal.run.experiment import Experiment
+from armcal.run.prepare import Prepared, Stopwatch, assemble
+
+CONFIG = Path(__file__).resolve().parents[2] / "configs" / "so101" / "ruler.yaml"
+FREE = 'parameters.free=["arm.zeros.offset3", "arm.mdh.d[1-5]", "arm.mdh.a[1-5]"]'
+
+
+@pytest.fixture(scope="module")
+def ready() -> Prepared:
+    settings = (FREE, "parameters.priors=null", "validation.folds=0", "evaluator=interpreted")
+    return assemble(Experiment.load(CONFIG, settings), Stopwatch())
+
+
+def size(ready: Prepared, zero_rad: float, factor: float) -> float:
+    """Of an arm whose elbow has another zero, and whose lengths are so many times the nominal ones."""
+    parameters = ready.problem.parameters
+    values = parameters.nominal()
+    for block in parameters.free:
+        own = parameters.entries_of(block.name)
+        values[own] = values[own] * factor if block.unit == "m" else zero_rad
+    figure = figure_of(ready.problem, cast(Estimate, SimpleNamespace(values=values)), ready.training)
+    assert bool(size_findings(figure)) == (factor != 1.0)
+    return figure.size
+
+
+def test_lengths_make_a_size_and_the_zero_of_a_joint_does_not(ready: Prepared) -> None:
+    """A horn two teeth off: the tip goes elsewhere at the same commands, and reaches further or less far."""
+    assert size(ready, 0.5, 1.0) == pytest.approx(1.0)
+    assert size(ready, 0.5, 1.1) == pytest.approx(1.1, abs=0.01)
+    assert size(ready, 0.0, 1.1) == pytest.approx(1.1, abs=0.01)
