@@ -107,19 +107,26 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
                         write_measured(options.folder, experiment, log.progress, _digests(identity, header))
                 raise
         summary = {
-            "how": ending.how,
-            "why": ending.sentence,
-            "poses": len(prepared.plan),
-            "measured": len(progress.measured),
-            "left_out": dict(progress.left_out),
+            **_summary(prepared, ending, progress),
             "gives_way": None if sag is None else sag.content,
-            "set_aside": {set_aside.record_id: set_aside.reason for set_aside in prepared.plan.set_aside},
-            "times": "written" if in_order(progress) else "left out: the clock was set back during the run",
             "board": identity.name,
             "digests": _digests(identity, header),
         }
         write_outputs(options.folder, experiment, progress, summary)
         return Outcome(ending, summary)
+
+
+def _summary(prepared: Prepared, ending: Ending, progress: Progress) -> dict[str, Any]:
+    """How a run ended, and what became of each pose of its plan."""
+    return {
+        "how": ending.how,
+        "why": ending.sentence,
+        "poses": len(prepared.plan),
+        "measured": len(progress.measured),
+        "left_out": dict(progress.left_out),
+        "set_aside": {row.record_id: row.reason for row in prepared.plan.set_aside},
+        "times": "written" if in_order(progress) else "left out: the clock was set back during the run",
+    }
 
 
 def _digests(identity: DeviceIdentity, header: Mapping[str, Any]) -> dict[str, str]:
