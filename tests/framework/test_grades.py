@@ -6,12 +6,14 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import planted_mistakes
 import pytest
 from armcal.cli.main import cli
-from armcal.diagnose.gross_findings import overfitted
+from armcal.diagnose.evidence import Evidence
+from armcal.diagnose.gross_findings import gross_error, overfitted
 from armcal.planning.suggestion import Suggestion, is_worth_measuring
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
@@ -75,6 +77,21 @@ def test_what_time_predicts_excuses_no_error(tmp_path: Path) -> None:
     told = next(f for f in verdict["findings"] if f["grade"] == "bad")
     assert code == 3 and "times the declared noise" in told["text"]
     assert "the base, the tracker or the target moved" in told["action"]
+
+
+@pytest.mark.parametrize("off", ["one axis of all", "a few records"])
+def test_one_axis_of_all_records_counts_as_an_error_of_all_and_a_few_wild_records_do_not(off: str) -> None:
+    """A tracker that was bumped along x left two axes of three as the noise has them, and so was a warning."""
+    whitened = np.random.default_rng(0).normal(size=(3, 200))
+    if off == "one axis of all":
+        whitened[0] += 12 * np.where(np.arange(200) < 100, -1, 1)
+    else:
+        whitened[:, ::20] += 40
+    scale = np.sqrt(np.mean(whitened**2))
+    told = gross_error(
+        np.full(20, 0.5), SimpleNamespace(reach_mm=1000.0), SimpleNamespace(noise_scale=scale), Evidence(), whitened
+    )
+    assert scale > 5 and [finding.grade for finding in told] == (["bad"] if off == "one axis of all" else [])
 
 
 @pytest.mark.slow

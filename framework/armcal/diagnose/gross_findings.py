@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.special import chdtri
 
 from armcal.base.arrays import Array
 from armcal.base.units import digits
@@ -23,8 +24,6 @@ in the residuals makes up a third of it, as gravity does of a printed arm whose 
 OVERFITTED = 3.0
 """Times the noise that training records show, from which on errors of records that did not train are the fit's."""
 FEWEST_JUDGED = 10
-_MEDIAN_OF_NOISE = 0.6745
-"""The median size of a normal number of deviation 1."""
 _NO_EXCUSE = frozenset({"order", "step", "slip", "scale"})
 """Kinds of structure that explain no gross error: something may have moved, or a frame be wrong."""
 _MOVED = (
@@ -64,7 +63,7 @@ def gross_error(
         return [Finding("bad", f"{error}: the values do not describe this arm.", test, CHECK_THE_DATA)]
     explained, predicted = _explained(left)
     limit = EXPLAINED_OF_REACH if explained >= EXPLAINED else UNEXPLAINED_OF_REACH if predicted >= EXPLAINED else 0.0
-    typical = float(np.nanmedian(np.abs(whitened))) / _MEDIAN_OF_NOISE
+    typical = _typical_size(whitened)
     if share <= limit or min(scale, typical if limit == 0 else np.inf) <= TIMES_NOISE:
         return []
     rounded = rounding_findings(evidence.rounding, unit)
@@ -81,6 +80,13 @@ def gross_error(
     action = f"The cause is not known: is the stated noise the instrument's? {CHECK_THE_DATA}"
     action = _MOVED if _by_time(left) else action
     return [Finding("bad", text, test, rounded[0].action if rounded else action)]
+
+
+def _typical_size(whitened: Array) -> float:
+    """That of the middle record, as a multiple of the noise: all its numbers count, for one axis alone may be off."""
+    trained, rows = np.isfinite(whitened).any(axis=0), len(whitened)
+    sizes = np.sqrt(np.nanmean(whitened[:, trained] ** 2, axis=0))
+    return float(np.median(sizes) / np.sqrt(chdtri(rows, 0.5) / rows))
 
 
 def _by_time(left: ResidualStructure | None) -> bool:
