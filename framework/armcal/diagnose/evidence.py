@@ -12,7 +12,7 @@ from armcal.diagnose.held import Contradiction
 from armcal.diagnose.large_errors import LargeErrors
 from armcal.diagnose.residual_structure import ResidualStructure
 from armcal.diagnose.rounded import Rounding
-from armcal.diagnose.unseen import HiddenPayload
+from armcal.diagnose.unseen import Elsewhere, HiddenPayload
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.prediction import NewRecording
 from armcal.planning.candidates import whitened_rows
@@ -58,6 +58,7 @@ class Evidence:
     contradictions: tuple[Contradiction, ...] = ()
     name: str = "Tip"
     rounding: Rounding | None = None
+    elsewhere: Elsewhere | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json."""
@@ -67,6 +68,7 @@ class Evidence:
             "large_errors": self.large_errors and asdict(self.large_errors),
             "priors_alone": alone
             and {"worst_mm": alone.worst_mm, "between_mm": alone.between_mm, "poses": alone.poses},
+            "elsewhere": self.elsewhere and asdict(self.elsewhere),
             "hidden_payload": self.hidden_payload and asdict(self.hidden_payload),
             "contradictions": [asdict(one) for one in self.contradictions],
             "rounding": self.rounding and asdict(self.rounding),
@@ -116,6 +118,25 @@ def priors_alone(problem: Problem, estimate: Estimate, poses: Dataset, between: 
         variance = np.einsum("trnk,kl,trnl->tn", moved, covariance, moved)
         worst.append(float(np.sqrt(np.max(np.maximum(variance, 0.0)))) * _MM)
     return PriorsAlone(worst[0], max(worst), len(poses), "" if _position_rows(problem) else UP_TO_FRAMES)
+
+
+def elsewhere(problem: Problem, estimate: Estimate, poses: Dataset) -> Elsewhere | None:
+    """How far tools at unseen poses are off for the parameters' uncertainty; None where no record is a contact."""
+    if not problem.blueprint.groups or not len(poses):
+        return None
+    free, scales = estimate.parameters.free, estimate.parameters.scales()
+    of_arm = np.array([not block.nuisance for block in free for _ in range(block.domain.dof)], dtype=bool)
+    root = np.linalg.pinv(estimate.parameters.entries_jacobian(estimate.values) * scales)
+    covariance = (root @ estimate.covariance @ root.T)[np.ix_(of_arm, of_arm)]
+    sizes, vectors = np.linalg.eigh(covariance)
+    kept = sizes > np.finfo(float).eps * sizes.max(initial=0.0)
+    if not kept.any():
+        return None
+    directions = np.zeros((int(kept.sum()), len(scales)))
+    directions[:, of_arm] = (vectors[:, kept] * np.sqrt(sizes[kept])).T
+    moved = _tip_motions(problem, estimate.values, poses, directions)
+    rms = float(np.sqrt(np.mean(np.sum(moved**2, axis=(1, 3))))) * _MM
+    return Elsewhere(rms, len(poses), "" if _position_rows(problem) else UP_TO_FRAMES)
 
 
 def _tip_motions(problem: Problem, values: Array, poses: Dataset, null: Array) -> Array:

@@ -1,4 +1,5 @@
-"""What residuals may not show: an instrument's scale, one that a fit holds (a board's printed size), a payload.
+"""What residuals may not show: an instrument's scale, one that a fit holds (a board's printed size), a payload, an arm
+that is wrong away from its contacts.
 
 Where lengths of the arm are free they grow with the scale and no residual shows it; only their priors do. Springs take
 up a payload that nobody stated. So each is estimated beside the free parameters, to first order at the fit, and stated
@@ -12,7 +13,7 @@ import numpy as np
 
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.units import digits
+from armcal.base.units import digits, readable
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.gross import Figure
 from armcal.diagnose.held import OFF, HeldParameter
@@ -29,6 +30,8 @@ _HIDDEN = 0.5
 _LEAST_SHARE = 0.1
 """A parameter that takes up less of it is not named."""
 _MOST_NAMED = 3
+_MISLEADING = 2.0
+"""A tool that is known so many times worse than contacts disagree is off by more than their error says."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,21 @@ class HiddenPayload:
     sd: float
     taken_up: float
     by: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """How well contacts determine the tool away from them, where their own errors say nothing.
+
+    Attributes:
+        rms_mm: root mean square of the tool's distance from where it is predicted, for the parameters' uncertainty.
+        poses: how many unseen poses were looked at.
+        up_to: motions that were left out, because nothing that was measured sees them; empty where none were.
+    """
+
+    rms_mm: float
+    poses: int
+    up_to: str
 
 
 def scale_deviation(problem: Problem, rows: FitRows, positions: Sequence[Array], noise_scale: float) -> float | None:
@@ -129,3 +147,18 @@ def hidden_payload_findings(hidden: HiddenPayload | None) -> list[Finding]:
     )
     test = "two standard deviations of a mass beside the free parameters"
     return [Finding("note", text, test, "Weigh what hangs on the tool, and state it: statics.payload_g.")]
+
+
+def elsewhere_findings(away: Elsewhere | None, judged_mm: Array) -> list[Finding]:
+    """What the verdict says of it beside the errors of records that did not train (none, where all did)."""
+    if away is None:
+        return []
+    text = f"Away from the contacts the tool is known to {readable(away.rms_mm)} mm (root mean square)"
+    mean = float(np.mean(judged_mm)) if len(judged_mm) else np.inf
+    misleading = away.rms_mm > _MISLEADING * mean
+    if misleading:
+        text += f": the error of {readable(mean)} mm is only by how much postures at one place disagree"
+    test = f"from the parameters' covariance, at {away.poses} poses of recorded joint positions"
+    test += f", up to {away.up_to}" if away.up_to else ""
+    action = "Train on more places, farther apart, with the joints turned as far as they go." if misleading else ""
+    return [Finding("warning" if misleading else "note", f"{text}.", test, action)]

@@ -8,7 +8,7 @@ from armcal.arm.joints import Limits, joint_limits
 from armcal.base.arrays import Array
 from armcal.config.system import System
 from armcal.diagnose.coverage import predictor
-from armcal.diagnose.evidence import Evidence, priors_alone, unseen_poses
+from armcal.diagnose.evidence import Evidence, elsewhere, priors_alone, unseen_poses
 from armcal.diagnose.evidence_findings import worse_than_nominal
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.gross import MOST_RECORDS, figure_of, thinned
@@ -21,7 +21,13 @@ from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.outside import predicted_positions
 from armcal.diagnose.residual_structure import structure
 from armcal.diagnose.rounded import rounding
-from armcal.diagnose.unseen import hidden_payload, hidden_payload_findings, scale_deviation, scale_findings
+from armcal.diagnose.unseen import (
+    elsewhere_findings,
+    hidden_payload,
+    hidden_payload_findings,
+    scale_deviation,
+    scale_findings,
+)
 from armcal.diagnose.verdict import Verdict, judge
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.start import certificates
@@ -166,7 +172,8 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     declared = few.weighted(few.subset(records, run.split.train), run.fitted.weights)
     rounded = rounding(few, declared, estimate, own[0], own[1], seen.share if seen else 0.0)
     new = predictor(problem, run.fitted).new_recording(run.records, np.flatnonzero(np.isfinite(judged_mm)))
-    return Evidence(left, missed, alone, error_unit(problem), new, hidden, held, error_name(problem), rounded)
+    away = elsewhere(problem, estimate, unseen_poses(training, motion.channels))
+    return Evidence(left, missed, alone, error_unit(problem), new, hidden, held, error_name(problem), rounded, away)
 
 
 def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array, evidence: Evidence) -> list[Finding]:
@@ -189,6 +196,7 @@ def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array
         *displacement_findings(figure),
         *scale_findings(figure, scale_deviation(problem, rows, read, estimate.noise_scale), scales),
         *hidden_payload_findings(evidence.hidden_payload),
+        *elsewhere_findings(evidence.elsewhere, judged_mm[np.isfinite(judged_mm)]),
     ]
 
 
