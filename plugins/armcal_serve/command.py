@@ -23,6 +23,7 @@ from armcal_serve.server import Opening, Server
 from armcal_serve.transports.datagrams import Datagrams
 from armcal_serve.transports.stream import StandardStreams
 from armcal_serve.transports.unix import UnixSocket
+from armcal_serve.worker import Order
 
 _ALWAYS = ("refused", "worker_lost", "missing", "status", "notice")
 """Events that are written with --quiet too."""
@@ -82,12 +83,16 @@ def serve(
             text = "standard input or output is closed, expected requests by the one and a reader of the other."
             raise InputError(text, hint="Open both, or give --socket or --udp.")
         openings.append(partial(StandardStreams, sys.__stdin__.fileno(), sys.__stdout__.fileno()))
-    order_fields: dict[str, Any] = {"redundancy": redundancy, "within": str(within or ""), "evaluator": evaluator}
-    order_fields |= {"point": point or "tool", "accept": accept}
+    order = Order(
+        str(calibration),
+        redundancy=redundancy,
+        within=str(within or ""),
+        point=point or "tool",
+        evaluator=evaluator,
+        accept=accept,
+    )
     with Signals() as signals:
-        Server(calibration, workers or min(2, os.cpu_count() or 1), order_fields, openings, _notifier(console)).run(
-            signals
-        )
+        Server(order, workers or min(2, os.cpu_count() or 1), openings, _notifier(console)).run(signals)
 
 
 def _notifier(console: Console) -> Notify:

@@ -6,54 +6,25 @@ import tempfile
 import time
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import lost_calibration
-from armcal.calibration.compensation.request import Options, Redundancy
-from armcal.calibration.measured_point import Point
+from armcal.calibration.compensation.request import Options
 from armcal.calibration.recorded_range import PAYLOAD, RecordedRange
 from armcal.errors import ArmcalError, ConfigError, InputError, Location
-from armcal.functions.batch_function import EvaluatorChoice
 
 from armcal_serve.answering import Answerer
 from armcal_serve.protocol import CalibrationTag
 from armcal_serve.served_arm import TEMPERATURE, TEMPERATURE_KEY, ServedArm
+from armcal_serve.worker import Order
 
 _TRIES = 20
 _LONGEST_S = 1.0
 """Requests of each kind before the first real one, and how long they may take (s): caches are filled by them."""
 _ORDINARY_C = 20.0
-
-
-@dataclass(frozen=True)
-class Order:
-    """Which calibration to make ready.
-
-    Attributes:
-        shown: the file as it is called in messages.
-        sequence: its number on this server.
-        sha256: of its bytes.
-        arm: the identity that its arm must have; empty: any.
-        redundancy: which of many commands.
-        within: a configuration whose plan has limits and clearance; empty: none.
-        point: what forward and compensate are about: the tool's frame, or the target that was measured.
-        evaluator: ``compiled`` where a compiler is found, or ``interpreted``.
-        accept: whether one whose level is lost answers as any other; else the first is refused, and a later one
-            answers every request with that error, since those before it are no longer valid either.
-    """
-
-    shown: str
-    sequence: int
-    sha256: str
-    arm: str = ""
-    redundancy: Redundancy = "nearest"
-    within: str = ""
-    point: Point = "tool"
-    evaluator: EvaluatorChoice = "compiled"
-    accept: bool = False
 
 
 def loaded(order: Order, data: bytes) -> Answerer:

@@ -13,6 +13,7 @@ from armcal_serve.dispatcher import Dispatcher
 from armcal_serve.poller import Poller
 from armcal_serve.protocol import VERSION, Notify
 from armcal_serve.transports.transport import Transport
+from armcal_serve.worker import Order
 from armcal_serve.worker_pool import WorkerPool
 
 _STEP_S = 0.1
@@ -27,9 +28,8 @@ class Server:
     """Serves one calibration's file.
 
     Args:
-        path: the file, which may be replaced at any time.
+        order: for the first calibration in the file, which may be replaced at any time.
         workers: how many processes answer.
-        order_fields: those fields of ``armcal_serve.loaded.Order`` that the command line sets.
         openings: make the transports.
         notify: takes events for the program that started it.
 
@@ -37,15 +37,13 @@ class Server:
         InputError: a transport cannot be opened.
     """
 
-    def __init__(
-        self, path: Path, workers: int, order_fields: Mapping[str, Any], openings: Sequence[Opening], notify: Notify
-    ) -> None:
+    def __init__(self, order: Order, workers: int, openings: Sequence[Opening], notify: Notify) -> None:
         self._began = time.monotonic()
         self._notify = notify
         self._poller = Poller()
-        self._watch = CalibrationWatch(path)
+        self._watch = CalibrationWatch(Path(order.shown))
         self._dispatcher = Dispatcher(self.status)
-        self._pool = WorkerPool(workers, self._watch, order_fields, self._poller, self._dispatcher, notify)
+        self._pool = WorkerPool(workers, self._watch, order, self._poller, self._dispatcher, notify)
         self._transports: list[Transport] = []
         try:
             for opening in openings:

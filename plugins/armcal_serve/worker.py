@@ -17,6 +17,10 @@ from typing import TYPE_CHECKING, Any
 from armcal.errors import EXIT_FAULT, ArmcalError, CalibrationWarning, Location
 
 if TYPE_CHECKING:
+    from armcal.calibration.compensation.request import Redundancy
+    from armcal.calibration.measured_point import Point
+    from armcal.functions.batch_function import EvaluatorChoice
+
     from armcal_serve.answering import Answerer
 
 ABOUT_ITSELF = 0
@@ -25,6 +29,36 @@ _HEAD = struct.Struct("!IQd")
 _NICENESS = 19
 """Requests come first."""
 CHUNK = 256 * 1024
+
+
+@dataclass(frozen=True)
+class Order:
+    """To a worker: which calibration to make ready.
+
+    Attributes:
+        shown: the file, as it is called in messages.
+        sequence: its number on this server.
+        sha256: of its bytes.
+        arm: the identity that its arm must have; empty: any.
+        redundancy: which of many commands.
+        within: a configuration whose plan has limits and clearance; empty: none.
+        point: what forward and compensate are about: the tool's frame, or the target that was measured.
+        evaluator: ``compiled`` where a compiler is found, or ``interpreted``.
+        accept: whether one whose level is lost answers as any other; else the first is refused, and a later one
+            answers every request with that error, since those before it are no longer valid either.
+        gently: whether it is made ready at low priority.
+    """
+
+    shown: str
+    sequence: int = 1
+    sha256: str = ""
+    arm: str = ""
+    redundancy: Redundancy = "nearest"
+    within: str = ""
+    point: Point = "tool"
+    evaluator: EvaluatorChoice = "compiled"
+    accept: bool = False
+    gently: bool = False
 
 
 @dataclass(frozen=True)
@@ -75,7 +109,7 @@ def main(descriptor: int) -> None:
     link = socket.socket(fileno=descriptor)
     messages = _messages(link)
     try:
-        order, data = json.loads(next(messages).content), next(messages).content
+        order, data = Order(**json.loads(next(messages).content)), next(messages).content
         answerer, state = _prepared(order, data)
         link.sendall(Message(ABOUT_ITSELF, json.dumps(state).encode()).packed())
         if answerer is None:
@@ -93,7 +127,7 @@ def _messages(link: socket.socket) -> Iterator[Message]:
         yield from cutter.feed(data)
 
 
-def _prepared(order: dict[str, Any], data: bytes) -> tuple[Answerer | None, dict[str, Any]]:
+def _prepared(order: Order, data: bytes) -> tuple[Answerer | None, dict[str, Any]]:
     """The answerer, and that it is ready; None, and why there is none."""
     try:
         with ThreadPoolExecutor(1) as aside:
@@ -104,22 +138,22 @@ def _prepared(order: dict[str, Any], data: bytes) -> tuple[Answerer | None, dict
         return None, {"fault": {**content, "field": where.field, "hint": fault.hint, "exit_code": fault.exit_code}}
     except Exception as fault:
         text = f"it cannot be used ({type(fault).__name__}: {fault})."
-        return None, {"fault": {"message": text, "file": order["shown"], "exit_code": EXIT_FAULT}}
+        return None, {"fault": {"message": text, "file": order.shown, "exit_code": EXIT_FAULT}}
     arms = {name: arm.shown for name, arm in answerer.arms.items()}
     return answerer, {"ready": answerer.tag, "arms": arms, "notices": notices}
 
 
-def _made(order: dict[str, Any], data: bytes) -> tuple[Answerer, list[str]]:
+def _made(order: Order, data: bytes) -> tuple[Answerer, list[str]]:
     """The answerer, and what its users should know of the calibration.
 
     In a thread of its own: on Linux a niceness is a thread's, and could not be taken back from a whole process.
     """
-    if order["gently"] and sys.platform == "linux":
+    if order.gently and sys.platform == "linux":
         os.nice(_NICENESS)
-    from armcal_serve.loaded import Order, loaded
+    from armcal_serve.loaded import loaded
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", CalibrationWarning)
-        answerer = loaded(Order(**{name: value for name, value in order.items() if name != "gently"}), data)
+        answerer = loaded(order, data)
     return answerer, [str(notice.message) for notice in caught]

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from armcal.errors import EXIT_BAD_INPUT, ArmcalError, InputError, Location
@@ -10,6 +11,7 @@ from armcal_serve.calibration_watch import LOOK_S, CalibrationWatch, Snapshot
 from armcal_serve.dispatcher import Dispatcher
 from armcal_serve.poller import Poller
 from armcal_serve.protocol import CalibrationTag, Notify
+from armcal_serve.worker import Order
 from armcal_serve.worker_process import WorkerProcess
 
 LONGEST_S = 20.0
@@ -30,7 +32,7 @@ class WorkerPool:
     Args:
         size: how many answer.
         watch: of the file.
-        order_fields: those fields of ``armcal_serve.loaded.Order`` that the command line sets.
+        order: for the first calibration.
         poller: of the server.
         dispatcher: has the requests.
         notify: takes events.
@@ -45,7 +47,7 @@ class WorkerPool:
         self,
         size: int,
         watch: CalibrationWatch,
-        order_fields: Mapping[str, Any],
+        order: Order,
         poller: Poller,
         dispatcher: Dispatcher,
         notify: Notify,
@@ -53,7 +55,7 @@ class WorkerPool:
         self.tag: CalibrationTag | None = None
         self.arms: Mapping[str, Any] = {}
         self.lost = 0
-        self._size, self._watch, self._order_fields = size, watch, order_fields
+        self._size, self._watch, self._order = size, watch, order
         self._poller, self._dispatcher, self._notify = poller, dispatcher, notify
         self._served: Snapshot | None = None
         self._active: list[WorkerProcess] = []
@@ -142,14 +144,9 @@ class WorkerPool:
         snapshot = self._served if again else self._next
         assert snapshot is not None
         self._made_of, self._gently, known = snapshot, gently, self.tag
-        order = {
-            "shown": str(self._watch.path),
-            "sequence": 1 if known is None else known["sequence"] + (not again),
-            "sha256": snapshot.sha256,
-            "arm": "" if known is None else known["arm"],
-            **self._order_fields,
-            "gently": gently,
-        }
+        order = replace(self._order, sha256=snapshot.sha256, gently=gently)
+        if known is not None:
+            order = replace(order, sequence=known["sequence"] + (not again), arm=known["arm"])
         try:
             self._making = WorkerProcess(order, snapshot.data, self._poller, self.poll)
         except OSError as fault:

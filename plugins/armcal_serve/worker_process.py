@@ -6,12 +6,13 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 from armcal_serve.conversation import Ticket
 from armcal_serve.poller import Poller
-from armcal_serve.worker import ABOUT_ITSELF, CHUNK, Message, Unpacker
+from armcal_serve.worker import ABOUT_ITSELF, CHUNK, Message, Order, Unpacker
 
 # -P: a file of the working directory called like a library is not taken for it, as it is not by the command.
 _COMMAND = (sys.executable, "-P", "-c", "import sys; from armcal_serve.worker import main; main(int(sys.argv[1]))")
@@ -28,7 +29,7 @@ class WorkerProcess:
         gone: whether it ended.
     """
 
-    def __init__(self, order: Mapping[str, Any], data: bytes, poller: Poller, on_message: Callable[[], None]) -> None:
+    def __init__(self, order: Order, data: bytes, poller: Poller, on_message: Callable[[], None]) -> None:
         self.ticket: Ticket | None = None
         self.since = time.monotonic()
         self.state: dict[str, Any] | None = None
@@ -48,7 +49,7 @@ class WorkerProcess:
                 process_group=0,  # Ctrl-C is for the server; a new session would be beyond the reach of niceness
             )
         self._link.setblocking(False)
-        self._send(Message(ABOUT_ITSELF, json.dumps(order).encode()))
+        self._send(Message(ABOUT_ITSELF, json.dumps(asdict(order)).encode()))
         self._send(Message(ABOUT_ITSELF, data))
 
     @property
