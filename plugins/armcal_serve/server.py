@@ -25,13 +25,7 @@ Opening = Callable[[Poller, Dispatcher], Transport]
 
 
 class Server:
-    """Serves one calibration's file.
-
-    Args:
-        order: for the first calibration in the file, which may be replaced at any time.
-        workers: how many processes answer.
-        openings: make the transports.
-        notify: takes events for the program that started it.
+    """Serves one calibration's file, which may be replaced at any time; ``order`` is for the first.
 
     Raises:
         InputError: a transport cannot be opened.

@@ -29,14 +29,6 @@ class WorkerPool:
     A new file gets workers of its own, made ready one after another beside those that answer. When all of them are,
     they get every further request; those before answer what they have, and end. No request ever waits for that.
 
-    Args:
-        size: how many answer.
-        watch: of the file.
-        order: for the first calibration.
-        poller: of the server.
-        dispatcher: has the requests.
-        notify: takes events.
-
     Attributes:
         tag: the calibration that is answered from; None before the first is ready.
         arms: what requests can be about, by name.

@@ -31,12 +31,7 @@ class NoRecords(Source):
 
 
 def roll_back_ended(folder: Path, to: int | str, registry: PluginRegistry) -> Mapping[str, Any]:
-    """Set the estimate in a folder back; the reply that a running recalibration gives.
-
-    Args:
-        folder: of the recalibration, which must not run.
-        to: as ``rolled_back`` takes it.
-        registry: of plugins.
+    """Set the estimate in the folder of a recalibration that does not run back; see ``rolled_back``.
 
     Raises:
         InputError: there is no journal, it is in use, or there is nothing to go back to.

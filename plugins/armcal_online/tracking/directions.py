@@ -45,13 +45,7 @@ def spoken(subject: str) -> str:
 
 
 def find_causes(calibration: Calibration, space: StateSpace, offsets: Collection[str]) -> tuple[Cause, ...]:
-    """Those that the free parameters can follow.
-
-    Args:
-        calibration: of the arms.
-        space: of the free parameters.
-        offsets: parameters that are a joint's own zero: no link's.
-    """
+    """Those that the free parameters can follow; ``offsets`` are parameters that are a joint's own zero, no link's."""
     place = {name: i for i, name in enumerate(space.names)}
     named: list[tuple[CauseKind, str, list[str]]] = [
         ("payload_changed", PAYLOAD, [block.name for block in unstated_payload()]),
@@ -126,13 +120,7 @@ class Steps:
 
 
 def find_steps(calibration: Calibration, observer: Observer, values: Array) -> Steps:
-    """The steps that the free parameters can follow; none where no instrument reads a single pose.
-
-    Args:
-        calibration: predicts readings.
-        observer: of the problem.
-        values: of its parameters.
-    """
+    """The steps that the free parameters can follow; none where no instrument reads a single pose."""
     problem, space, arms = observer.problem, observer.space, calibration.system.arms.values()
     poses = _probing_poses(arms)
     nothing, environment = np.zeros(len(poses)), problem.blueprint.environment

@@ -88,11 +88,7 @@ def judged(
 def decided(state: State, decision: Decision, tip: TipError | None, calm: int) -> dict[str, Any]:
     """Something that was decided: what, since when, how sure, how far the tip was off, what to do, what confirms it.
 
-    Args:
-        state: after the decision.
-        decision: what was decided.
-        tip: how far the tip was off without it, where that is known.
-        calm: after so many records without trouble the level improves.
+    ``state`` is that after the decision; after ``calm`` records without trouble the level improves.
     """
     first, good = state.known(decision.since), state.good_before(decision.since)
     log_odds = min(max(decision.log_odds, -_MOST_LOG_ODDS), _MOST_LOG_ODDS)

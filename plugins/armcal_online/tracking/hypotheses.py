@@ -203,9 +203,7 @@ def is_enough(single: Explanation, large: int) -> bool:
 def pairs(singles: Sequence[Explanation], changes: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
     """Steps of joints and motions of instruments of the stated size, two by two, as a blow makes both at once.
 
-    Args:
-        singles: the likeliest first; only changes of the likeliest joints and instruments are combined.
-        changes: all single changes.
+    Of all single ``changes`` those of the likeliest joints and instruments, which are the first of ``singles``.
     """
     subjects = list(dict.fromkeys(single.hypothesis.subject for single in singles))
     kinds = ("joint_slipped", "sensor_moved")

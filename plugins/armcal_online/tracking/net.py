@@ -41,12 +41,7 @@ _FARTHEST = 1e9
 
 
 class Net:
-    """Refits and predictions of one recalibration; it keeps no state.
-
-    Args:
-        setup: what the filter stands on.
-        changes: all that are looked for: a window's prior allows each of them.
-    """
+    """Refits and predictions of one recalibration; it keeps no state. A window's prior allows each of ``changes``."""
 
     def __init__(self, setup: FilterSetup, changes: Sequence[Hypothesis]) -> None:
         self._setup, self._refitter = setup, Refitter(setup.observer)
@@ -63,10 +58,9 @@ class Net:
     ) -> tuple[State, tuple[Decision, ...]]:
         """With a record in the windows, and the refit that takes over, if one does.
 
+        ``before`` is the filter's belief when the record came, ``state`` what it and its judgement made of it.
+
         Args:
-            state: after the filter and its judgement.
-            record: the last one.
-            before: the filter's belief when it came.
             passed: the distance from the record before, by channel.
             corrected: whether the judgement corrected the filter: the one that failed is no longer there, and what
                 it has become is compared anew.

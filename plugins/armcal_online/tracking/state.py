@@ -261,12 +261,7 @@ def _decoded(kind: Any, content: Any) -> Any:
 def advanced(state: State, recent: Recent, setup: FilterSetup, estimator: OnlineEstimator, nis_window: int) -> State:
     """The state with a record taken in by an estimator.
 
-    Args:
-        state: before it, with belief and anchor at its time.
-        recent: the record.
-        setup: of the recalibration.
-        estimator: a filter, or one that holds the last records back.
-        nis_window: how many NIS the state keeps.
+    The state's belief and anchor are those at the record's time; of NIS it keeps ``nis_window``.
 
     Raises:
         NotConvergedError: the arm has no elastic equilibrium near the belief.

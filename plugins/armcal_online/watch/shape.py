@@ -50,12 +50,7 @@ def drawing_of(path: Path) -> Drawing:
 
 
 class Shape:
-    """The arm's drawing by the newest calibration there is, read again when it changes.
-
-    Args:
-        folder: of the recalibration.
-        every: how long a calibration is used before a newer one is looked for (s).
-    """
+    """The arm's drawing by the newest calibration in a folder; it is looked for a newer one ``every`` so many s."""
 
     def __init__(self, folder: Path, every: float = 30.0) -> None:
         self._folder, self._every = folder, every

@@ -76,13 +76,6 @@ def situation(
 ) -> dict[str, Any]:
     """The first screen.
 
-    Args:
-        level: now.
-        trouble: since it was last nominal.
-        records: the newest, in order.
-        good: the last good record, by what is newest of it.
-        folder: of the recalibration.
-
     Returns:
         ``do``, ``what`` (with how sure that is), ``confirm``; ``earlier``, the last decision where none matters now;
         ``off_mm`` now, from ``off_of`` readings, and ``off_before_mm`` before the last decision; ``since`` and

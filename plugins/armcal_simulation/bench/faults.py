@@ -53,12 +53,7 @@ class FaultRequest(Settings):
 
 
 class FaultCalendar:
-    """Faults that wait for their time.
-
-    Args:
-        clock: seconds.
-        apply: does one.
-    """
+    """Faults that wait for their time (s)."""
 
     def __init__(self, clock: Callable[[], float], apply: Callable[[FaultRequest], None]) -> None:
         self._clock, self._apply = clock, apply

@@ -54,10 +54,6 @@ class FaultyStream:
     """One direction of a line, on which messages or bytes are lost, doubled, swapped, damaged, torn apart or late.
 
     A late one arrives ahead of the next.
-
-    Args:
-        split: gives messages.
-        random: chooses the bit that is damaged.
     """
 
     def __init__(self, split: Split, random: np.random.Generator) -> None:
@@ -124,15 +120,10 @@ class FaultyStream:
 
 
 class SerialLine:
-    """The board's end.
+    """The board's end; the host's is the symlink at ``path``.
 
     Attributes:
         to_board, to_host: what is done to what passes.
-
-    Args:
-        path: where the symlink is to be.
-        split: gives messages, for the faults.
-        random: for the faults.
     """
 
     def __init__(self, path: Path, split: Split, random: np.random.Generator) -> None:

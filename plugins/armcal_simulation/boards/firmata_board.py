@@ -18,13 +18,7 @@ _WRITE, _READ_ONCE = 0, 1
 
 
 class FirmataBoard:
-    """The firmware.
-
-    Args:
-        bus: what it is wired to.
-        send: bytes to the host.
-        name: of the firmware, as it reports it.
-    """
+    """The firmware, wired to a bus; ``send`` takes bytes to the host, ``name`` is what it reports of itself."""
 
     delimiter = END_SYSEX
 

@@ -47,17 +47,11 @@ class _RefusedError(Exception):
 
 
 class FramedBoard:
-    """The firmware.
+    """The firmware, wired to a bus; ``clock`` gives seconds, ``send`` takes bytes to the host.
 
     Attributes:
-        boots: how often it has started.
+        boots: how often it has started, also before.
         guard: its watchdog.
-
-    Args:
-        clock: seconds.
-        bus: what it is wired to.
-        send: bytes to the host.
-        boots: how often it has started before.
     """
 
     delimiter = 0

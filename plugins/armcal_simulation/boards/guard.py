@@ -30,10 +30,6 @@ class BoardGuard:
 
     Attributes:
         took_over: it has begun to drive, and the host has not taken over again.
-
-    Args:
-        clock: seconds.
-        bus: where the channels are.
     """
 
     def __init__(self, clock: Callable[[], float], bus: I2cBus) -> None:

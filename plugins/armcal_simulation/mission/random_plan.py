@@ -137,11 +137,7 @@ def _event(kind: str, dice: Dice, joint: Joint) -> dict[str, Any] | None:
 def random_plan(joints: Sequence[Joint], days: float, bends: bool, seed: int) -> dict[str, Any]:
     """Keys of a mission's settings: events, gaps, outliers and exchanged records; the same for a seed.
 
-    Args:
-        joints: that something may befall.
-        days: of the mission.
-        bends: whether a payload bends the arm.
-        seed: of the draws.
+    ``bends``: whether a payload bends the arm.
     """
     dice = Dice(np.random.default_rng(seed))
     count = int(np.clip(round(days / _DAYS_APART), _FEWEST, _MOST))
