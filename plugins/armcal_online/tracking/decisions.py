@@ -8,11 +8,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 if TYPE_CHECKING:  # the watcher reads this table, and has no need of numpy
-    from armcal_online.tracking.health import Level
     from armcal_online.tracking.sizes import Size
+
+Level = Literal["nominal", "watch", "suspect", "lost"]
+"""Of health."""
+LEVELS: tuple[Level, ...] = get_args(Level)
+"""From the best to the worst."""
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ import numpy as np
 from armcal.estimate.online import Linearised
 
 from armcal_online.sources.source import Incoming
-from armcal_online.tracking.decisions import LEVEL_ADVICE, Decision, advice, per_cent, sure
+from armcal_online.tracking.decisions import LEVEL_ADVICE, LEVELS, Decision, advice, per_cent, sure
 from armcal_online.tracking.directions import CAUSES, LINK, Steps, spoken
-from armcal_online.tracking.health import LEVELS, Health
+from armcal_online.tracking.health import Health
 from armcal_online.tracking.hypotheses import Recent
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.sizes import SHOWN, TipError

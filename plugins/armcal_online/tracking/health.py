@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from scipy.special import bdtrc, chdtrc, chdtri, fdtrc, fdtri
 
-Level = Literal["nominal", "watch", "suspect", "lost"]
-LEVELS: tuple[Level, ...] = ("nominal", "watch", "suspect", "lost")
-"""From the best to the worst."""
+from armcal_online.tracking.decisions import LEVELS, Level
 
 
 @dataclass(frozen=True)

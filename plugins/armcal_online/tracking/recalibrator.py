@@ -11,16 +11,18 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from armcal.base.arrays import Array
 from armcal.calibration.calibration import Calibration
+from armcal.config.system import build_component
+from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ArmcalError, ConfigError, DataError, Location
 from armcal.estimate.online import Linearised, OnlineEstimator, normalised_innovation_squared
 from armcal.estimate.validation import error_unit
 from armcal.measure.reader import ReadRequest
 from armcal.plugins import PluginRegistry, discover
-from pydantic import ValidationError
 
 from armcal_online.sources.source import Incoming
 from armcal_online.tracking import events
@@ -83,17 +85,8 @@ class Recalibrator:
             ConfigError: settings are refused, or the calibration keeps no covariance.
             PluginError: no such estimator.
         """
-        section = dict(settings.estimator)
-        name = section.pop("type", None)
-        if not isinstance(name, str):
-            raise ConfigError("found no type for this estimator.", where=Location("estimator"), hint="Name one.")
-        component = (registry or discover()).find("online", name).load()
-        try:
-            estimator: OnlineEstimator = component(component.Settings.model_validate(section))
-        except ValidationError as fault:
-            first = fault.errors()[0]
-            where = Location(".".join(["estimator", *map(str, first["loc"])]))
-            raise ConfigError(f"{first['msg']}.", where=where, hint=f"See the settings of {name}.") from fault
+        source = ConfigSource({"estimator": settings.estimator}, {(): Location()}, Path(), Path(), ())
+        estimator: OnlineEstimator = build_component(source, registry or discover(), "online", ("estimator",))[0]
         setup = filter_setup(calibration, settings, shares=estimator.window == 1, loads=settings.gating == "on")
         if estimator.window > 1 and setup.space.cones:
             raise ConfigError(

@@ -11,7 +11,6 @@ _MOST_NUMBERS = 64
 _HOSTILE = "\ufffd"
 
 VERDICTS = ("accepted", "rejected", "ignored")
-LEVELS = ("nominal", "watch", "suspect", "lost")
 LISTED = ("started", "decision", "level", "calibration", "control", "alarm", "finished")
 """Events that are listed with their sentence."""
 _TEXTS = (

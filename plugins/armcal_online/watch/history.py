@@ -4,8 +4,9 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from armcal_online.tracking.decisions import LEVELS
 from armcal_online.watch.estimates import Estimates, Thinned
-from armcal_online.watch.events import LEVELS, VERDICTS, Message, message_of, number, record_of, shortened, text, whole
+from armcal_online.watch.events import VERDICTS, Message, message_of, number, record_of, shortened, text, whole
 from armcal_online.watch.hours import Hours, Truth, over_time
 from armcal_online.watch.situation import AFTER_THE_END, Trouble, situation
 

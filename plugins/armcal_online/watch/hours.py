@@ -10,7 +10,8 @@ from pathlib import Path
 from statistics import median, median_low
 from typing import Any
 
-from armcal_online.watch.events import LEVELS, number, rounded, text
+from armcal_online.tracking.decisions import LEVELS
+from armcal_online.watch.events import number, rounded, text
 
 HOUR_S = 3600.0
 MOST_HOURS = 2000

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import Any
 
-from armcal_online.tracking.decisions import KINDS, LEVEL_ADVICE, sure_to
-from armcal_online.watch.events import LEVELS, Message
+from armcal_online.tracking.decisions import KINDS, LEVEL_ADVICE, LEVELS, sure_to
+from armcal_online.watch.events import Message
 
 _NEWEST = 20
 """So many of the last readings show how far off the predictions are now."""
