@@ -10,7 +10,6 @@ from armcal.estimate.simulation import DAY_S, Mission
 from armcal_online.mission.decisions import Finding, Occurrence, Verdict, findings, occurrences
 from armcal_online.mission.log import Decision, MissionLog
 
-Flags = Mask
 USABLE = ("nominal", "watch")
 FILTER, RECENT = "recalibrated", "refit_recent"
 _IN_A_ROW = 3
@@ -31,8 +30,8 @@ class ErrorCurve:
     """
 
     times: Array
-    is_hour: Flags
-    is_record: Flags
+    is_hour: Mask
+    is_record: Mask
     errors: Mapping[str, Array]
     levels: tuple[str, ...]
 

@@ -118,6 +118,10 @@ class Steps:
     sensors: Mapping[str, tuple[Array, tuple[str, ...]]]
     causes: tuple[Cause, ...] = ()
 
+    def dimension(self, joint: str) -> str:
+        """Of a joint's step: ``angle`` or ``length``; empty for what is no joint."""
+        return next((step.dimension for step in self.joints if step.joint == joint), "")
+
 
 def find_steps(calibration: Calibration, observer: Observer, values: Array) -> Steps:
     """The steps that the free parameters can follow; none where no instrument reads a single pose."""

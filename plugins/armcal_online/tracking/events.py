@@ -33,8 +33,7 @@ def started(
     slowest: Mapping[str, float],
 ) -> dict[str, Any]:
     """At the beginning; ``slowest``: the rates (rad or m a day) of gradual changes that a week of records names."""
-    slides = {joint.joint for joint in steps.joints if joint.dimension == "length"} | set(steps.sensors)
-    rates = {name: SHOWN["length a day" if name in slides else "angle a day"] for name in slowest}
+    rates = {name: SHOWN[f"{steps.dimension(name) or 'length'} a day"] for name in slowest}
     blocks = {name: block.entry_unit for block in setup.space.parameters.free for name in block.entry_names}
     return {
         **_event("started", state),

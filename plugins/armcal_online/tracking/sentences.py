@@ -57,7 +57,7 @@ def together(
     parts = best.hypothesis.parts
     if len(alike) > 1:
         names = tuple(dict.fromkeys(part.subject for pair in alike for part in pair.hypothesis.parts))
-        joints = tuple(name for name in names if any(joint.joint == name for joint in steps.joints)) or names
+        joints = tuple(name for name in names if steps.dimension(name)) or names
         what = f"Two of {', '.join(names)} have changed at once"
         why += "; poses since do not distinguish them, and the variance of their offsets is open"
         return (Decision("joint_stepped", what, why, log_odds, onset, joints[0], joints),)

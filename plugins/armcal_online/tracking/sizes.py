@@ -54,7 +54,7 @@ def size_of(space: StateSpace, steps: Steps, before: Belief, after: Belief, chan
     if not change.step.any():
         return Size()
     along = change.step / float(change.step @ change.step)
-    dimension = next((joint.dimension for joint in steps.joints if joint.joint == change.subject), "")
+    dimension = steps.dimension(change.subject)
     if change.kind == "payload_changed":
         return _with_centre(space, moved, covariance, _sized(*_along(along, moved, covariance), "mass"))
     return _sized(*_along(along, moved, covariance), dimension) if dimension else Size()
@@ -64,8 +64,7 @@ def rate_of(steps: Steps, change: Hypothesis, size: Array, covariance: Array) ->
     """How fast a gradual change goes on, by its size and covariance in standard deviations (k, k x k)."""
     rates = np.array(change.rates)
     moved, own = size * rates, covariance * np.outer(rates, rates)
-    sliding = {joint.joint for joint in steps.joints if joint.dimension == "length"}
-    is_length = change.kind == "sensor_drifting" or change.subject in sliding
+    is_length = change.kind == "sensor_drifting" or steps.dimension(change.subject) == "length"
     fast = float(moved[0]) if len(moved) == 1 else float(np.linalg.norm(moved))
     along = moved / (fast or 1.0)
     return _sized(fast, math.sqrt(float(along @ own @ along)), "length a day" if is_length else "angle a day")

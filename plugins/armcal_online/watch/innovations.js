@@ -54,7 +54,7 @@ const Innovations = {
       const level = event.event === "level";
       if (!level && event.event !== "decision" && event.event !== "alarm") continue;
       const x = s.x(Math.min(event.sequence, s.last));
-      parts.push(svg("path", { class: level ? "change" : event.kind === "outlier" ? "decision faint" : "decision", d: `M${at(x + (level ? 1.5 : 0))} ${s.box.top}V${s.box.bottom}` }));
+      parts.push(svg("path", { class: level ? "change" : "decision", d: `M${at(x + (level ? 1.5 : 0))} ${s.box.top}V${s.box.bottom}` }));
       const word = level ? event.to || "" : "";
       if (word && x >= free && x < s.box.right - 7 * word.length) {
         parts.push(svg("text", { class: "change", x: at(x + 4), y: s.box.top - 4 }, word));

@@ -68,7 +68,7 @@ const Parameters = {
     const y = (v) => 70 - ((v - low) / (high - low)) * 66;
     const upper = points.map((r) => [x(r.sequence), y(r.change[index] + spread(r))]);
     const lower = points.map((r) => [x(r.sequence), y(r.change[index] - spread(r))]).reverse();
-    const marks = told.filter((e) => e.event === "decision" && e.kind !== "outlier" && e.sequence >= first && e.sequence <= last);
+    const marks = told.filter((e) => e.event === "decision" && e.sequence >= first && e.sequence <= last);
     const picture = svg("svg", { viewBox: "0 0 240 74", preserveAspectRatio: "none", "aria-hidden": "true" },
       svg("path", { class: "zero", d: `M0 ${at(y(0))}H240` }),
       svg("path", { class: "decision", d: marks.map((e) => `M${at(x(e.sequence))} 0V74`).join("") }),
