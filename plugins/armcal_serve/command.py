@@ -18,12 +18,12 @@ from armcal.functions.batch_function import EvaluatorChoice
 from armcal.io.lines import StandardOutput
 from armcal.io.signals import Signals
 
+from armcal_serve.order import Order
 from armcal_serve.protocol import Notify
 from armcal_serve.server import Opening, Server
 from armcal_serve.transports.datagrams import Datagrams
 from armcal_serve.transports.stream import StandardStreams
 from armcal_serve.transports.unix import UnixSocket
-from armcal_serve.worker import Order
 
 _ALWAYS = ("refused", "worker_lost", "missing", "status", "notice")
 """Events that are written with --quiet too."""

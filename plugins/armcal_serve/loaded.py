@@ -17,9 +17,9 @@ from armcal.calibration.recorded_range import PAYLOAD, RecordedRange
 from armcal.errors import ArmcalError, ConfigError, InputError, Location
 
 from armcal_serve.answering import Answerer
+from armcal_serve.order import Order
 from armcal_serve.protocol import CalibrationTag
 from armcal_serve.served_arm import TEMPERATURE, TEMPERATURE_KEY, ServedArm
-from armcal_serve.worker import Order
 
 _TRIES = 20
 _LONGEST_S = 1.0

@@ -10,10 +10,10 @@ from armcal.io.signals import Signals
 
 from armcal_serve.calibration_watch import CalibrationWatch
 from armcal_serve.dispatcher import Dispatcher
+from armcal_serve.order import Order
 from armcal_serve.poller import Poller
 from armcal_serve.protocol import VERSION, Notify
 from armcal_serve.transports.transport import Transport
-from armcal_serve.worker import Order
 from armcal_serve.worker_pool import WorkerPool
 
 _STEP_S = 0.1

@@ -16,11 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 from armcal.errors import EXIT_FAULT, ArmcalError, CalibrationWarning, Location
 
-if TYPE_CHECKING:
-    from armcal.calibration.compensation.request import Redundancy
-    from armcal.calibration.measured_point import Point
-    from armcal.functions.batch_function import EvaluatorChoice
+from armcal_serve.order import Order
 
+if TYPE_CHECKING:
     from armcal_serve.answering import Answerer
 
 ABOUT_ITSELF = 0
@@ -29,36 +27,6 @@ _HEAD = struct.Struct("!IQd")
 _NICENESS = 19
 """Requests come first."""
 CHUNK = 256 * 1024
-
-
-@dataclass(frozen=True)
-class Order:
-    """To a worker: which calibration to make ready.
-
-    Attributes:
-        shown: the file, as it is called in messages.
-        sequence: its number on this server.
-        sha256: of its bytes.
-        arm: the identity that its arm must have; empty: any.
-        redundancy: which of many commands.
-        within: a configuration whose plan has limits and clearance; empty: none.
-        point: what forward and compensate are about: the tool's frame, or the target that was measured.
-        evaluator: ``compiled`` where a compiler is found, or ``interpreted``.
-        accept: whether one whose level is lost answers as any other; else the first is refused, and a later one
-            answers every request with that error, since those before it are no longer valid either.
-        gently: whether it is made ready at low priority.
-    """
-
-    shown: str
-    sequence: int = 1
-    sha256: str = ""
-    arm: str = ""
-    redundancy: Redundancy = "nearest"
-    within: str = ""
-    point: Point = "tool"
-    evaluator: EvaluatorChoice = "compiled"
-    accept: bool = False
-    gently: bool = False
 
 
 @dataclass(frozen=True)

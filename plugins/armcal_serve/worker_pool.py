@@ -9,9 +9,9 @@ from armcal.errors import EXIT_BAD_INPUT, ArmcalError, InputError, Location
 
 from armcal_serve.calibration_watch import LOOK_S, CalibrationWatch, Snapshot
 from armcal_serve.dispatcher import Dispatcher
+from armcal_serve.order import Order
 from armcal_serve.poller import Poller
 from armcal_serve.protocol import CalibrationTag, Notify
-from armcal_serve.worker import Order
 from armcal_serve.worker_process import WorkerProcess
 
 LONGEST_S = 20.0

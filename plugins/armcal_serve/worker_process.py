@@ -11,8 +11,9 @@ from dataclasses import asdict
 from typing import Any
 
 from armcal_serve.conversation import Ticket
+from armcal_serve.order import Order
 from armcal_serve.poller import Poller
-from armcal_serve.worker import ABOUT_ITSELF, CHUNK, Message, Order, Unpacker
+from armcal_serve.worker import ABOUT_ITSELF, CHUNK, Message, Unpacker
 
 # -P: a file of the working directory called like a library is not taken for it, as it is not by the command.
 _COMMAND = (sys.executable, "-P", "-c", "import sys; from armcal_serve.worker import main; main(int(sys.argv[1]))")

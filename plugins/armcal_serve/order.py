@@ -1,0 +1,41 @@
+"""What a worker is to make ready; light, since a worker of low priority imports the rest itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from armcal.calibration.compensation.request import Redundancy
+    from armcal.calibration.measured_point import Point
+    from armcal.functions.batch_function import EvaluatorChoice
+
+
+@dataclass(frozen=True)
+class Order:
+    """Which calibration to make ready.
+
+    Attributes:
+        shown: the file, as it is called in messages.
+        sequence: its number on this server.
+        sha256: of its bytes.
+        arm: the identity that its arm must have; empty: any.
+        redundancy: which of many commands.
+        within: a configuration whose plan has limits and clearance; empty: none.
+        point: what forward and compensate are about: the tool's frame, or the target that was measured.
+        evaluator: ``compiled`` where a compiler is found, or ``interpreted``.
+        accept: whether one whose level is lost answers as any other; else the first is refused, and a later one
+            answers every request with that error, since those before it are no longer valid either.
+        gently: whether it is made ready at low priority.
+    """
+
+    shown: str
+    sequence: int = 1
+    sha256: str = ""
+    arm: str = ""
+    redundancy: Redundancy = "nearest"
+    within: str = ""
+    point: Point = "tool"
+    evaluator: EvaluatorChoice = "compiled"
+    accept: bool = False
+    gently: bool = False
