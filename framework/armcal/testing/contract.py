@@ -28,51 +28,33 @@ from armcal.testing.settings_checks import Subject, check_settings
 
 __all__ = ["KNOWN_CHECKS", "CheckResult", "assert_contract", "check_component", "check_plugin"]
 
-KNOWN_CHECKS: Mapping[str, int] = MappingProxyType(
+_CHECKS: Mapping[str, tuple[int, Callable[[Recorder, Subject], None] | None]] = MappingProxyType(
     {
-        "model": 28,
-        "effect": 26,
-        "residual": 22,
-        "measurement": 28,
-        "reader": 23,
-        "estimator": 22,
-        "online": 20,
-        "simulator": 14,
-        "exporter": 15,
-        "link": 18,
-        "device": 31,
-        "tracker": 18,
-        "joints": 19,
-        "camera": 16,
-        "bench": 13,
-        "command": 2,
-        "report_section": 2,
+        "model": (28, check_model),
+        "effect": (26, check_effect),
+        "residual": (22, check_residual),
+        "measurement": (28, check_measurement),
+        "reader": (23, check_reader),
+        "estimator": (22, check_estimator),
+        "online": (20, check_online),
+        "simulator": (14, check_simulator),
+        "exporter": (15, check_exporter),
+        "link": (18, check_link),
+        "device": (31, check_device),
+        "tracker": (18, check_tracker),
+        "joints": (19, check_joint_stream),
+        "camera": (16, check_camera),
+        "bench": (13, check_bench),
+        "command": (2, None),
+        "report_section": (2, None),
     }
 )
+"""Of each kind: how many checks there are for any component, and what does them on one that has settings."""
+KNOWN_CHECKS: Mapping[str, int] = MappingProxyType({kind: count for kind, (count, _) in _CHECKS.items()})
 """How many checks there are for any component of a kind; what a component has beside the rest adds to them."""
 
 _MARK = "imported:"
 _LONGEST_IMPORT_S = 60
-
-_CHECKS: Mapping[str, Callable[[Recorder, Subject], None]] = MappingProxyType(
-    {
-        "model": check_model,
-        "effect": check_effect,
-        "residual": check_residual,
-        "measurement": check_measurement,
-        "reader": check_reader,
-        "estimator": check_estimator,
-        "online": check_online,
-        "simulator": check_simulator,
-        "exporter": check_exporter,
-        "joints": check_joint_stream,
-        "camera": check_camera,
-        "bench": check_bench,
-        "tracker": check_tracker,
-        "link": check_link,
-        "device": check_device,
-    }
-)
 
 
 def assert_contract(component: type | str, kind: str, *, at_least: int | None = None) -> Sequence[CheckResult]:
@@ -134,15 +116,21 @@ def check_plugin(plugin: PluginInfo, registry: PluginRegistry) -> list[CheckResu
 
 def _checked(kind: str, name: str, load: Callable[[], Any]) -> list[CheckResult]:
     """Every check of a kind on what ``load`` gives: a component's class."""
-    record = Recorder(f"{kind} {name}")
+    record, (_, check) = Recorder(f"{kind} {name}"), _CHECKS[kind]
     with record.group():
-        if kind == "command":  # it is imported for one call of armcal, and may do to the process what it needs
+        if check is not None:
+            with watched(record) as begin, record.group():
+                with record.needed("it imports"):
+                    made = load()
+                begin(made)
+                check(record, check_settings(record, kind, made))
+        elif kind == "command":  # it is imported for one call of armcal, and may do to the process what it needs
             with record.needed("it imports"):
                 command = load()
             with record.check("it is a click command that says what it does"):
                 expect(isinstance(command, click.Command), f"found {type(command).__name__}, expected a click.Command")
                 expect(bool(command.help), f"found no help of the command {command.name!r}, expected a docstring")
-        elif kind == "report_section":
+        else:
             with record.needed("it imports"):
                 section = load()
             with record.check("it is a function of a run's result"):
@@ -150,12 +138,6 @@ def _checked(kind: str, name: str, load: Callable[[], Any]) -> list[CheckResult]
                 needed = [p for p in inspect.signature(section).parameters.values() if p.default is p.empty]
                 count = len(needed)
                 expect(count == 1, f"found {count} arguments without a default, expected one: the RunResult")
-        else:
-            with watched(record) as begin, record.group():
-                with record.needed("it imports"):
-                    made = load()
-                begin(made)
-                _CHECKS[kind](record, check_settings(record, kind, made))
     return record.results
 
 

@@ -71,11 +71,10 @@ class Springs(JointEffect):
     """A spring on every joint's own axis, and one about x and y at the base; all of one compliance."""
 
     count: int
-    compliance: float = 1e-3
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """The compliance (rad/(N m), or m/N on a sliding joint)."""
-        return (scalar("k", "rad_per_Nm", self.compliance, 1e-3),)
+        return (scalar("k", "rad_per_Nm", 1e-3, 1e-3),)
 
     def springs(self, values: Mapping[str, Expression]) -> tuple[Spring, ...]:
         """The base's first."""
@@ -90,10 +89,8 @@ class Springs(JointEffect):
 class Walls(Contact):
     """The tool on level walls, each at a height of its own (m)."""
 
+    arms = (ARM,)
     group_labels = ("wall",)
-
-    def __init__(self, arm: str = ARM) -> None:
-        self.arms = (arm,)
 
     def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
         """A wall's height."""
@@ -101,7 +98,7 @@ class Walls(Contact):
 
     def group_starts(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> dict[str, Expression]:
         """The tool is at the wall's height."""
-        return {"height": arms[self.arms[0]].base_T_tool.translation[2]}
+        return {"height": arms[ARM].base_T_tool.translation[2]}
 
     def residual(
         self,
@@ -110,7 +107,7 @@ class Walls(Contact):
         values: Mapping[str, Expression],
     ) -> Expression:
         """How far the tool is above the wall (m)."""
-        return arms[self.arms[0]].base_T_tool.translation[2] - values["height"]
+        return arms[ARM].base_T_tool.translation[2] - values["height"]
 
     def noise(self) -> tuple[float, ...]:
         """Of the height."""
