@@ -13,6 +13,7 @@ from armcal.arm.assembly import command_channels
 from armcal.base.units import digits, to_unit
 from armcal.cli.common import FILE, Console, data, overrides, speaking
 from armcal.cli.outlet import say
+from armcal.config.system import System
 from armcal.errors import ProblemError
 from armcal.estimate.identifiability import Identifiability
 from armcal.estimate.start import Start, pose_words
@@ -21,6 +22,8 @@ from armcal.run.experiment import Experiment
 from armcal.run.prepare import Prepared, Stopwatch, assemble, gravity_findings
 
 _MM = 1000.0
+_TILTED = 0.05
+"""Of gravity: what changes by less where the base was found is not worth a line."""
 
 
 @click.command()
@@ -57,7 +60,7 @@ def check(console: Console, config: Path, data: Path | None, overrides: tuple[st
     )
     rows = _excitation(experiment, content["excitation_rad_or_m"])
     console.table("Excitation of the joints", ("joint", "from", "to", "unit", "levels"), rows)
-    for line in _alignment_lines(ready.start):
+    for line in (*_alignment_lines(ready.start), *gravity_lines(experiment.system, ready)):
         out.print(line, soft_wrap=True)
     condition = parameters["scaled_condition"]
     shown = "infinite" if condition is None else f"{condition:.3g}"
@@ -142,3 +145,19 @@ def _alignment_lines(start: Start) -> list[str]:
     ]
     lines += [f"not determined by these positions: {gauge}." for gauge in start.gauges]
     return lines
+
+
+def gravity_lines(system: System, ready: Prepared) -> list[str]:
+    """How gravity pulls an arm with springs that was found tilted: it is stated in the frame of the measurements."""
+    alignment = ready.start.alignment
+    if alignment is None or ready.dataset.has("gravity_z") or not any(a.deflection_size for a in system.arms.values()):
+        return []
+    stated = np.array(system.environment.gravity)
+    inside, meant = alignment.turn.T @ stated, alignment.turn @ stated
+    if np.linalg.norm(inside - stated) < _TILTED * np.linalg.norm(stated):
+        return []
+    shown = [", ".join(f"{x:.2f}" for x in np.round(vector, 2) + 0.0) for vector in (stated, inside, meant)]
+    return [
+        f"gravity, ({shown[0]}) m/s^2 in the instrument's frame, pulls along ({shown[1]}) in the base frame that was "
+        f"found there. If it was meant in the base frame, state statics.gravity_m_s2: [{shown[2]}]."
+    ]

@@ -37,7 +37,8 @@ def outside(
     yield from _of_mistakes(here, problem, values, records)
     if motion.by_load:
         by_load = [slope.transpose(0, 2, 1) for slope in motion.by_load]  # n_r x N x (gravity's turn, size, load)
-        level, weigh = "level the base, or measure its tilt with a spirit level", "weigh what hangs on the tool"
+        level = "level the base, or measure its tilt with a spirit level; gravity is stated in the instrument's frame"
+        weigh = "weigh what hangs on the tool"
         turns = tuple(f"turned about {axis}" for axis in _AXES)
         gravity, size, load = (tuple(slope[:, :, part] for slope in by_load) for part in _LOAD_PARTS)
         words, effect = "the direction of gravity in the base frame", "statics.gravity_r?, freed"
