@@ -78,6 +78,14 @@ def test_preferred_parameters_are_kept_in_the_order_of_preference() -> None:
     assert minimal_set(columns, blocks, [["no such name"]]).kept == ("a", "d")
 
 
+def test_what_is_free_without_being_named_is_kept_whatever_is_preferred() -> None:
+    """A socket's place cannot be left out of a configuration: the set that a user pastes would have it free again."""
+    columns = np.zeros((5, 4))
+    columns[0, :3], columns[1, 3] = (5.0, 1.0, 0.1), 1.0
+    blocks = free("a", "b", "c", "d").replaced({"b": replace(free("b").free[0], nuisance=True)})
+    assert minimal_set(columns, blocks, [["c"]]).kept == ("b", "d")
+
+
 def test_what_has_no_effect_at_all_is_dropped_alone_even_if_preferred() -> None:
     columns = np.diag([1.0, 0.0])
     found = minimal_set(columns, free("seen", "unseen"), [["unseen"]])

@@ -61,6 +61,8 @@ def minimal_set(
 ) -> MinimalSet:
     """Choose blocks that determine all that the data determines, and no more.
 
+    Free parameters of groups, sockets and clamps, are tried first: a configuration has them free without naming them.
+
     Args:
         triangle: R (m x n) with R'R = J'J of the whitened residuals by the coordinates of the free blocks.
         parameters: whose free blocks are chosen from.
@@ -72,7 +74,8 @@ def minimal_set(
     ends = np.cumsum([block.domain.dof for block in parameters.free]).tolist()
     places = {b.name: slice(end - b.domain.dof, end) for b, end in zip(parameters.free, ends, strict=True)}
     tolerance = RANK_TOLERANCE * float(np.linalg.norm(columns, 2)) if columns.size else 0.0
-    ranked = [[name for name in group if name in places] for group in preferred]
+    of_groups = [block.name for block in parameters.free if block.nuisance]
+    ranked = [[name for name in group if name in places] for group in (of_groups, *preferred)]
     ranked.append([name for name in places if not any(name in group for group in ranked)])
     order = _chosen(columns, places, ranked, tolerance)
     kept = order[:most]
