@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
+import numpy as np
 import pytest
 from armcal.diagnose.gross import figure_of
 from armcal.diagnose.gross_findings import size_findings
@@ -30,7 +31,8 @@ def size(ready: Prepared, zero_rad: float, factor: float) -> float:
     for block in parameters.free:
         own = parameters.entries_of(block.name)
         values[own] = values[own] * factor if block.unit == "m" else zero_rad
-    figure = figure_of(ready.problem, cast(Estimate, SimpleNamespace(values=values)), ready.training)
+    known = SimpleNamespace(values=values, covariance=np.zeros((len(parameters.free_entries),) * 2))
+    figure = figure_of(ready.problem, cast(Estimate, known), ready.training)
     assert bool(size_findings(figure)) == (factor != 1.0)
     return figure.size
 

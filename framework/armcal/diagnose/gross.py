@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from scipy.special import stdtr
 
 from armcal.base.arrays import Array, Indices
 from armcal.base.domains import Pose, ScrewAxis
@@ -19,6 +20,7 @@ BEYOND, FAR_BEYOND = 4.0, 20.0
 """Standard deviations of a prior, or typical corrections where there is none: what is worth a look, what is gross."""
 MOST_RECORDS = 300
 _POSES = 60
+_FEWEST_LENGTHS = 3
 _SAME_MOTION = 0.02
 """Of a parameter's motion of the tool: what may differ from that of the base or of the tool's point."""
 
@@ -45,6 +47,26 @@ class Displaced:
 
 
 @dataclass(frozen=True)
+class Proportion:
+    """By how much lengths of the arm are longer than nominal, all in proportion, as a scale that is off makes them.
+
+    Attributes:
+        count: how many lengths.
+        share: of each length, by which it is longer.
+        sd: of the share: lengths that differ from nominal each by its own, and how well they are known.
+    """
+
+    count: int
+    share: float
+    sd: float
+
+    @property
+    def p_value(self) -> float:
+        """That of the share, by Student's t."""
+        return 2.0 * float(stdtr(self.count - 1, -abs(self.share) / max(self.sd, 1e-300)))
+
+
+@dataclass(frozen=True)
 class Figure:
     """The calibrated arm beside the nominal one.
 
@@ -54,6 +76,7 @@ class Figure:
             wrong zero is no size; nan where they do not move.
         moved_mm, turned_deg: how the calibrated arm as a whole stands away from where the configuration has it.
         displaced: parameters beyond what their priors say, the farthest first.
+        proportion: of its free lengths; None where they are too few.
     """
 
     reach_mm: float
@@ -61,6 +84,7 @@ class Figure:
     moved_mm: float
     turned_deg: float
     displaced: tuple[Displaced, ...]
+    proportion: Proportion | None = None
 
 
 def thinned(chosen: Indices, most: int) -> Indices:
@@ -86,6 +110,7 @@ def figure_of(problem: Problem, estimate: Estimate, records: Sequence[FactorReco
         moved_mm=float(np.linalg.norm(turn @ first + shift - first)) * 1000.0,
         turned_deg=float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1.0, 1.0)))),
         displaced=displaced(problem, estimate, poses),
+        proportion=proportion(problem, estimate, poses),
     )
 
 
@@ -113,13 +138,42 @@ def displaced(problem: Problem, estimate: Estimate, records: Sequence[FactorReco
     sizes = np.array([t if b.prior_sd is None else b.prior_sd for b, t in zip(blocks, typical, strict=True)])
     far = []
     for i in np.flatnonzero(np.abs(moved) > BEYOND * sizes):
-        block, direction = blocks[i], np.zeros(len(moved))
-        direction[i] = 1.0
+        block = blocks[i]
         amount, unit = Measure(block.unit, 1.0).shown(float(moved[i]))
-        at, axes = tools(problem, estimate.values, records)
-        moves = along(problem, estimate.values, records, direction).reshape(-1, 1)
-        left = np.linalg.norm(apart_from(np.array(unseen_motions(at, axes)).T, moves))
-        placement = bool(left <= _SAME_MOTION * np.linalg.norm(moves))
+        placement = _only_places(problem, estimate.values, records, int(i))
         times, name = abs(float(moved[i])) / sizes[i], parameters.coordinate_names[i]
         far.append(Displaced(name, amount, unit, float(times), block.prior_sd is not None, placement))
     return tuple(sorted(far, key=lambda coordinate: -coordinate.times))
+
+
+def proportion(problem: Problem, estimate: Estimate, records: Sequence[FactorRecords]) -> Proportion | None:
+    """Regression of what free lengths of an arm are off on their nominal values."""
+    nominal, entries = problem.blueprint.parameters.nominal(), np.array(problem.parameters.free_entries)
+    blocks = [block for block in problem.parameters.free for _ in range(block.domain.dof)]
+    chosen = [
+        problem.free_names.index(block.name)
+        for i, block in enumerate(blocks)
+        if block.unit == "m"
+        and block.domain.dof == 1
+        and nominal[problem.blueprint.parameters.entries_of(block.name)].all()
+        and not _only_places(problem, estimate.values, records, i)
+    ]
+    if len(chosen) < _FEWEST_LENGTHS:
+        return None
+    lengths, values = nominal[entries[chosen]], estimate.values[entries[chosen]]
+    weights = lengths / (lengths @ lengths)
+    share = float(weights @ values) - 1
+    own = float(np.sum((values - (1 + share) * lengths) ** 2) / (len(chosen) - 1) / (lengths @ lengths))
+    known = float(weights @ estimate.covariance[np.ix_(chosen, chosen)] @ weights)
+    return Proportion(len(chosen), share, float(np.sqrt(own + known)))
+
+
+def _only_places(problem: Problem, values: Array, records: Sequence[FactorRecords], coordinate: int) -> bool:
+    """Whether a coordinate only moves where the base stands or which point of the tool is meant; or no tool at all."""
+    names = problem.parameters.coordinate_names
+    if names[coordinate].partition(".")[0] not in problem.blueprint.arms:
+        return True
+    at, axes = tools(problem, values, records)
+    moves = along(problem, values, records, np.eye(len(names))[coordinate]).reshape(-1, 1)
+    left = np.linalg.norm(apart_from(np.array(unseen_motions(at, axes)).T, moves))
+    return bool(left <= _SAME_MOTION * np.linalg.norm(moves))

@@ -33,6 +33,7 @@ _MOVED = (
 SIZE, GROSS_SIZE = 0.02, 0.05
 """How far the calibrated arm may be larger or smaller than the nominal one: worth a look, and gross."""
 MOST_NAMED = 3
+_IN_PROPORTION = 0.01
 
 
 def gross_error(
@@ -149,13 +150,21 @@ def contradicting(minority: Minority | None, ids: Sequence[str]) -> list[Finding
 
 def size_findings(figure: Figure) -> list[Finding]:
     """Is the calibrated arm as large as the nominal one?"""
-    off = abs(figure.size - 1)
-    if not off > SIZE:
-        return []
-    text = f"The calibrated arm is {figure.size:.3g} times as large as the nominal one."
-    test = f"extent of the tool's positions by lengths, limits {100 * SIZE:g} and {100 * GROSS_SIZE:g} %"
+    off, lengths = abs(figure.size - 1), figure.proportion
     action = "Check the units and values of known distances and positions, and the tracker's scale."
-    return [Finding("bad" if off > GROSS_SIZE else "warning", text, test, action)]
+    if off > SIZE:
+        text = f"The calibrated arm is {figure.size:.3g} times as large as the nominal one."
+        test = f"extent of the tool's positions by lengths, limits {100 * SIZE:g} and {100 * GROSS_SIZE:g} %"
+        return [Finding("bad" if off > GROSS_SIZE else "warning", text, test, action)]
+    if lengths is None or lengths.p_value > _IN_PROPORTION:
+        return []
+    share, sd = 100 * abs(lengths.share), 100 * lengths.sd
+    text = (
+        f"The {lengths.count} free lengths of the arm are {share:.2g} % (sd {sd:.1g} %) "
+        f"{'longer' if lengths.share > 0 else 'shorter'} than nominal, in proportion: a known distance or an "
+        "instrument's scale that is off by as much shows in nothing else."
+    )
+    return [Finding("warning", text, f"regression on the nominal lengths, t, {100 * _IN_PROPORTION:g} %", action)]
 
 
 def displacement_findings(figure: Figure) -> list[Finding]:

@@ -1,0 +1,49 @@
+"""Lengths that are all longer in proportion: a known distance, or an instrument's scale, is wrong."""
+
+from __future__ import annotations
+
+import contact_oracle as co
+import numpy as np
+import pytest
+from armcal.diagnose.gross import Figure, Proportion, proportion
+from armcal.diagnose.gross_findings import size_findings
+from armcal.estimate.nuisance import started
+from armcal.estimate.weighing import fit
+from armcal_contact.ball import BallInSocket
+from armcal_ipopt.estimator import IpoptEstimator
+
+IPOPT = IpoptEstimator(IpoptEstimator.Settings())
+PLACES = {"hole_0": (0.35, 0.1, 0.25), "hole_1": (0.2, -0.3, 0.35)}
+FREE = ("arm.mdh.a?", "arm.mdh.d[34]", "arm.mdh.tool_z")
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.012])
+def test_a_known_distance_that_is_wrong_lengthens_all_links_in_proportion(factor: float) -> None:
+    """The links of the true arm differ from nominal by 0.3 mm; its distance between two sockets is stated too long."""
+    random = np.random.default_rng(1)
+    truth = co.named(co.ELBOW)
+    for name in ("a1", "a2", "a3", "d3", "a4", "d4"):
+        truth[f"arm.mdh.{name}"] += random.normal(0, 3e-4)
+    parts = [
+        (co.joints(co.touching(co.ELBOW, co.in_socket(place), 15, seed, truth)), {"position": "here", "socket": name})
+        for seed, (name, place) in enumerate(PLACES.items())
+    ]
+    apart = factor * float(np.linalg.norm(np.subtract(*PLACES.values())))
+    known = {"between": ["hole_0", "hole_1"], "distance": apart, "noise": 1e-5}
+    ball = BallInSocket(BallInSocket.Settings.si(noise=1e-4, distances=[known]), ("arm",))
+    problem, records = co.Bench({"arm": co.the_arm(co.ELBOW)}, {"balls": ball}, FREE).problem(co.dataset(parts))
+    problem = started(problem, records)
+    estimate = fit(problem, records, IPOPT, problem.parameters.nominal()).estimate
+    lengths = proportion(problem, estimate, records)
+    assert lengths is not None and lengths.share == pytest.approx(factor - 1, abs=3 * lengths.sd)
+    assert (lengths.p_value < 0.01) == (factor > 1)
+
+
+def test_it_is_a_warning_with_its_size() -> None:
+    def told(share: float) -> list[str]:
+        figure = Figure(1000.0, 1.0 + share, 0.0, 0.0, (), Proportion(5, share, 0.0007))
+        return [f"{finding.grade}: {finding.text}" for finding in size_findings(figure)]
+
+    (longer,) = told(0.017)
+    assert longer.startswith("warning: The 5 free lengths of the arm are 1.7 % (sd 0.07 %) longer than nominal")
+    assert told(0.001) == []
