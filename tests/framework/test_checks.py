@@ -113,8 +113,8 @@ def test_missing_and_infinite_values_are_set_aside() -> None:
     assert kept.set_aside[1].reason == "tracker.x is infinite"
     (warning,) = kept.warnings
     assert warning == (
-        "poses.csv: 2 of 8 records were set aside because a value is missing or not finite (the first: line 3). "
-        "Measure these again."
+        "poses.csv: 2 of 8 records were set aside because values are missing or not finite: tracker.x in 2, "
+        "q1_deg in 1 (the first: line 3). Fill them in, or measure these again."
     )
 
 
