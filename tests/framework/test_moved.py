@@ -8,7 +8,7 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.diagnose.evidence_findings import worse_than_nominal
 from armcal.diagnose.majority import FEWEST, moved_findings, moved_groups
-from armcal.estimate.nuisance import settled, started, untrained
+from armcal.estimate.nuisance import mislabelled, settled, started, untrained
 from armcal_contact.ball import BallInSocket, BallInSocketSettings
 
 NOISE = 2e-4
@@ -44,6 +44,24 @@ def test_a_socket_that_moved_is_named_with_where_and_how_far(before):
     assert told.distance == pytest.approx(0.006, rel=0.15)
     (finding,) = moved_findings([told])
     assert f"first {before} records" in finding.text and "Did it move" in finding.text
+
+
+@pytest.mark.parametrize("exchanged", [(), (4, 15)])
+def test_records_that_name_each_others_socket_are_listed(exchanged: tuple[int, ...]) -> None:
+    """Two postures of 24 whose labels were exchanged spoiled the fit, and were outliers of unknown cause."""
+    names = [*["hole_0"] * 12, *["hole_1"] * 12]
+    q = np.vstack([co.touching(co.ELBOW, co.in_socket(place), 12, seed) for seed, place in enumerate(PLACES.values())])
+    q += np.random.default_rng(2).normal(0, NOISE / 0.5, q.shape)
+    for record in exchanged:
+        names[record] = "hole_1" if record < 12 else "hole_0"
+    channels = {f"arm.q{i + 1}": q[:, i] for i in range(q.shape[1])}
+    data = Dataset(tuple(map(str, range(24))), channels, {"position": ("here",) * 24, "socket": tuple(names)})
+    ball = BallInSocket(BallInSocketSettings.si(noise=NOISE), ("arm",))
+    problem, records = co.Bench({"arm": co.the_arm(co.ELBOW)}, {"balls": ball}).problem(data)
+    listed = mislabelled(problem, records, data)
+    assert len(listed) == (1 if exchanged else 0)
+    for text in listed:
+        assert "4 (named here/hole_1, at here/hole_0), 15 (named here/hole_0, at here/hole_1)." in text
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from armcal.base.arrays import Array
+from armcal.base.dataset import Dataset
 from armcal.estimate.polish import descended
 from armcal.measure.groups import group_name, owner_of
 from armcal.measure.measurement import GroupedMeasurement
@@ -13,6 +14,11 @@ from armcal.problem.posed import PosedProblem
 from armcal.problem.problem import FactorRecords, Problem
 
 _MOST_STEPS = 50
+_PLACE = ("x", "y", "z")
+_FAR, _NEAR = 8.0, 3.0
+"""Of the typical distance of the nominal arm from the place that a record names: what is another place, and the right
+one."""
+_MOST_NAMED = 5
 _DAMPING = 1e-9
 
 
@@ -42,6 +48,38 @@ def started(problem: Problem, records: Sequence[FactorRecords]) -> Problem:
                 if problem.parameters[name].free and problem.parameters[name].prior_sd is None:
                     nominal[problem.parameters.entries_of(name)] = own[names == local, middling]
     return replace(problem, parameters=problem.parameters.with_nominal(nominal))
+
+
+def mislabelled(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> list[str]:
+    """Warnings of records that the arm, as it starts, has at the place of another group than they name.
+
+    Places are those of the middling record of each group; only groups that are places have them.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at the nominal values.
+    """
+    warnings, plan = [], problem.blueprint
+    starts = problem.nuisance_starts(problem.parameters.nominal(), records) if problem.parameters.nuisances else ()
+    parts = zip(problem.kernels, plan.measurements.items(), records, starts, strict=False)
+    for kernel, (instance, measurement), record, own in parts:
+        if not isinstance(measurement, GroupedMeasurement) or record.group is None:
+            continue
+        owner, group = owner_of(instance, measurement), record.group[: record.count]
+        keys, numbers = plan.groups[owner], np.unique(group[group >= 0])
+        if len(numbers) < 2 or tuple(kernel.factor.nuisance_names) != _PLACE:
+            continue
+        middles = np.array([np.median(own[:, group == number], axis=1) for number in numbers])
+        away = np.linalg.norm(own.T[:, None] - middles, axis=2)
+        named = away[np.arange(len(group)), np.searchsorted(numbers, group).clip(max=len(numbers) - 1)]
+        typical, nearest = np.median(named[group >= 0]), np.argmin(away, axis=1)
+        wrong = np.flatnonzero((group >= 0) & (named > _FAR * typical) & (away.min(axis=1) < _NEAR * typical))
+        texts = [f"{dataset.ids[i]} (named {keys[group[i]]}, at {keys[numbers[nearest[i]]]})" for i in wrong]
+        if texts:
+            more = f" and {len(texts) - _MOST_NAMED} more" if len(texts) > _MOST_NAMED else ""
+            listed = ", ".join(texts[:_MOST_NAMED]) + more
+            text = f"{instance}: records that the nominal arm has at another place than they name: {listed}."
+            warnings.append(f"{text} Were they exchanged? Correct their labels.")
+    return warnings
 
 
 def restricted(problem: Problem, records: Sequence[FactorRecords]) -> Problem:

@@ -15,7 +15,7 @@ from armcal.diagnose.noise_findings import Finding, first_few
 from armcal.diagnose.permuted_axes import MUCH_BETTER, find_permuted_axes
 from armcal.errors import ConfigError, DataError, Location, ProblemError, noted
 from armcal.estimate.estimator import Progress, no_progress
-from armcal.estimate.nuisance import restricted, started
+from armcal.estimate.nuisance import mislabelled, restricted, started
 from armcal.estimate.profile import profiled
 from armcal.estimate.start import Start, aligned_start, with_proposals
 from armcal.estimate.structure import require_solvable
@@ -128,7 +128,7 @@ def _assembled(experiment: Experiment, dataset: Dataset, watch: Stopwatch, accep
         records = acting(problem, records, dataset)
     with watch.stage("check"):
         unlearned(system)
-        mixed_up = check_permuted_axes(problem, records, dataset, accept)
+        mixed_up, named = check_permuted_axes(problem, records, dataset, accept), mislabelled(problem, records, dataset)
         check_reach(problem, records, dataset)
         split = split_of(experiment, dataset)
         if not len(split.train):
@@ -139,7 +139,7 @@ def _assembled(experiment: Experiment, dataset: Dataset, watch: Stopwatch, accep
             raise ConfigError("found a length, and nothing measured is a length.", where=where, hint=hint)
         problem = restricted(problem, problem.subset(records, split.train))
         profiled(problem, experiment.settings.uncertainty.profile)
-    texts = (*experiment.warnings, *dataset.warnings, *start.warnings)
+    texts = (*experiment.warnings, *dataset.warnings, *start.warnings, *named)
     ready = Prepared(dataset, problem, records, split, texts, start, tuple(mixed_up))
     if experiment.settings.validation.folds:
         folds_of(experiment, ready)  # refused before the fit rather than after it
