@@ -10,8 +10,8 @@ import pytest
 from armcal.base.arrays import Array
 from armcal.base.units import length_mistake
 from armcal.calibration.rigid_chain import nominal_tools
-from armcal.diagnose.measured_frame import frame_mistake, frame_of
 from armcal.run.experiment import Experiment
+from armcal_bench.measured_frame import frame_mistake, frame_of
 from scipy.spatial.transform import Rotation
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "bench.yaml"

@@ -12,9 +12,9 @@ from armcal.estimate.online import inverse_times
 from armcal.estimate.online import normalised_innovation_squared as nis
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.functions.compiler import find_compiler
-from armcal.problem.one_record import OneRecord
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
+from armcal_online.tracking.one_record import OneRecord
 from armcal_online.tracking.state_space import nearest_semidefinite
 
 DEMO = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "demo.yaml"

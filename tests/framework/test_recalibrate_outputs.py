@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 from armcal.base.config_text import as_line
-from armcal.io.event_file import EventFile
 from armcal.io.lines import StandardOutput
+from armcal_online.event_file import EventFile
 from armcal_online.running.outputs import Outputs
 from recalibrations import (
     FullFiles,

@@ -20,8 +20,8 @@ import pytest
 import yaml
 from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
-from armcal.io.event_file import EventFile, EventTail
 from armcal.io.lines import MAX_LINE_BYTES
+from armcal_online.event_file import EventFile, EventTail
 from armcal_online.watch.estimates import Thinned
 from armcal_online.watch.events import LONGEST_TEXT, message_of, number, parsed, record_of, text
 from armcal_online.watch.feed import Feed

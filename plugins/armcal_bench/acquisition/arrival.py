@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from armcal.base.arrays import Array
-from armcal.diagnose.measured_frame import FrameMistake, frame_mistake
 
 from armcal_bench.acquisition.settings import ArrivalSettings
+from armcal_bench.measured_frame import FrameMistake, frame_mistake
 
 _ENOUGH = 5
 

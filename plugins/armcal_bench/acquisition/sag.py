@@ -1,7 +1,7 @@
 """Which joint gives way while the arm should stand: slow motions of the target, compared with those of each joint.
 
 While one joint j turns at the rate w, the target moves by its column of the Jacobian times w. The columns are those of
-the nominal, rigid arm, in the frame that the poses themselves lie in (``armcal.diagnose.measured_frame``).
+the nominal, rigid arm, in the frame that the poses themselves lie in (``armcal_bench.measured_frame``).
 """
 
 import math
@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 from armcal.base.arrays import Array
-from armcal.diagnose.measured_frame import MeasuredFrame, frame_of
 
 from armcal_bench.acquisition.heat import Torques
+from armcal_bench.measured_frame import MeasuredFrame, frame_of
 from armcal_bench.settling import Stand
 
 _STEP = 1e-4

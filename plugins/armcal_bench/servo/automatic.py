@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 from armcal.base.arrays import Array
-from armcal.diagnose.measured_frame import FrameMistake, frame_mistake
 from armcal.errors import InputError, Location
 
 from armcal_bench.acquisition.heat import ThermalLimit
 from armcal_bench.acquisition.tracker_monitor import StopRequested, TrackerLost
+from armcal_bench.measured_frame import FrameMistake, frame_mistake
 from armcal_bench.servo.mover import Mover
 from armcal_bench.servo.record import LEFT_OUT, POSE, Record
 from armcal_bench.settling import Settled

@@ -11,11 +11,11 @@ import numpy as np
 from armcal.arm.servo import PulseTable
 from armcal.base.config_text import finite
 from armcal.config.servo_file import BoardSettings, ServoFile, ServoSettings, load_servo_file, servo_file_text
-from armcal.config.servo_file_edit import edited_text
 from armcal.errors import ConfigError
 from armcal.io.journal.files import REAL_FILES, write_whole
 from armcal.io.plain_files import writing
 
+from armcal_bench.servo.file_edit import edited_text
 from armcal_bench.servo.findings import findings, is_usable
 from armcal_bench.servo.fit import FittedServo
 from armcal_bench.servo.outcome import Outcome

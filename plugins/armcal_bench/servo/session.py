@@ -9,7 +9,6 @@ from typing import cast
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceIdentity
 from armcal.devices.wiring import WiringRecord
-from armcal.diagnose.measured_frame import FEWEST
 from armcal.errors import InputError, Location
 
 from armcal_bench.acquisition.recovery import DeviceLost
@@ -17,6 +16,7 @@ from armcal_bench.acquisition.tracker_monitor import MotionGate, StopRequested, 
 from armcal_bench.bench import closing
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.keys import Wishes
+from armcal_bench.measured_frame import FEWEST
 from armcal_bench.servo.automatic import Automatic, FrameWatch, ReportProgress
 from armcal_bench.servo.guided import Guided, next_wish
 from armcal_bench.servo.mover import Mover, ServoDevice

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from armcal.base.config_text import as_line
-from armcal.io.event_file import EventFile
 from armcal.io.journal.files import REAL_FILES, FileLayer, is_full, write_whole
 from armcal.io.lines import StandardOutput
+
+from armcal_online.event_file import EventFile
 
 CALIBRATION = "calibration.yaml"
 STATUS = "status.json"

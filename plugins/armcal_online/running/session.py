@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from armcal.errors import DataError, InputError, Location
-from armcal.io.event_file import EARLIER, EVENTS, EventFile
 from armcal.io.folder import check_folder
 from armcal.io.journal.files import REAL_FILES, FileLayer
 from armcal.io.journal.journal import Journal, JournalLimits
 from armcal.io.journal.reader import read_until, verify
 from armcal.io.lines import StandardOutput
 
+from armcal_online.event_file import EARLIER, EVENTS, EventFile
 from armcal_online.running.control import SOCKET, answer, control_server
 from armcal_online.running.loop import Pace, Recalibration
 from armcal_online.running.outputs import CALIBRATION, RESERVE, STATUS, Outputs

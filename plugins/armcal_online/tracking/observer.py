@@ -15,12 +15,12 @@ from armcal.measure.groups import NO_GROUP, group_key, group_name, group_numbers
 from armcal.measure.measurement import GroupedMeasurement
 from armcal.problem.grouped_kernel import HELD
 from armcal.problem.kernel import Kernel
-from armcal.problem.one_record import OneRecord
 from armcal.problem.problem import Problem
 from scipy.linalg import block_diag
 from typing_extensions import override
 
 from armcal_online.tracking.belief import Belief
+from armcal_online.tracking.one_record import OneRecord
 from armcal_online.tracking.process_noise import GaussMarkovStates
 from armcal_online.tracking.state_space import StateSpace
 

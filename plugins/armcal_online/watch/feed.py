@@ -10,8 +10,8 @@ from secrets import token_hex
 from typing import Any
 
 from armcal.errors import ArmcalError
-from armcal.io.event_file import EVENTS, EventTail
 
+from armcal_online.event_file import EVENTS, EventTail
 from armcal_online.watch.events import VERDICTS, Message, named_record, numbers, parsed, scalar, text
 from armcal_online.watch.history import History
 from armcal_online.watch.hours import MISSION, Truth, truth_beside

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-
 from armcal.arm.equilibrium import MOST_DEFLECTION
 from armcal.base.arrays import Array
 from armcal.functions.c_source import LANES

@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 
 import yaml
-
 from armcal.base.units import split_suffix
 from armcal.config.servo_file import BoardSettings, ServoFile, ServoSettings, board_fields, servo_fields
 

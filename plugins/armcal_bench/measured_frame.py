@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-
 from armcal.base.arrays import Array
 from armcal.base.units import length_mistake
 from armcal.diagnose.permuted_axes import FITS, MISSES, MUCH_BETTER
