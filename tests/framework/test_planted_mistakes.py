@@ -28,6 +28,7 @@ from planted_mistakes import (
     placed,
     reordered,
     scaled_angles,
+    three_joint_arm,
     tips,
     turned,
     with_tips,
@@ -64,6 +65,29 @@ def planted(name: str, folder: Path, arm: PlantedArm = PRINTED, seed: int = 1) -
 def test_gross_faults_are_not_usable(tmp_path: Path, name: str, grade: str, words: str) -> None:
     found = planted(name, tmp_path)
     assert found.grade == grade and words in found.said
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        (
+            0.001,
+            "0.001 times as far from the base frame as the model's tip, the others as far: metres among millimetres?",
+        ),
+        (1000.0, "millimetres among metres?"),
+        (1 / 25.4, "inches among millimetres?"),
+        (0.0, ""),
+    ],
+)
+def test_the_unit_of_a_single_position_is_named(tmp_path: Path, factor: float, words: str) -> None:
+    """One that is wrong in another way is no matter of units: at the base's place, or anywhere within reach."""
+    arm = three_joint_arm(tmp_path)
+    data = arm.recording(1)
+    moved = tips(data).copy()
+    moved[:, 7] = factor * moved[:, 7] if factor else (0.05, 0.02, -0.1)
+    found = outcome(arm, with_tips(data, moved), tmp_path)
+    assert (found.grade == "refused") == bool(factor) and words in found.said
+    assert "the position of record 8 is about" in found.said or not factor
 
 
 @pytest.mark.slow

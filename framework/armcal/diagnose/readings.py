@@ -22,6 +22,7 @@ _INCH = 25.4
 FEWEST_IN_PART = 8
 """Records in a part: an alignment has nine numbers."""
 _PARTS, _ROUNDS = (0.25, 0.5, 0.75), 3
+_UNITS = {"millimetres": 0.001, "centimetres": 0.01, "metres": 1.0, "inches": _INCH / 1000}
 LENGTHS = (10.0, 0.1, 1000.0, 0.001, _INCH, 1 / _INCH, 1000 / _INCH, _INCH / 1000)
 """What lengths are off by that were read in mm, cm, m or inches and taken for another of these."""
 _AXIS_LENGTHS = (10.0, 0.1, 1000.0, 0.001)
@@ -100,6 +101,12 @@ def scaled_positions() -> Iterator[tuple[str, Array]]:
     for axis, factor in product(range(3), _AXIS_LENGTHS):
         scale = np.diag([factor if i == axis else 1.0 for i in range(3)])
         yield f"{_AXES[axis]} {factor:.4g} times as large", scale
+
+
+def unit_mistaken(factor: float) -> str:
+    """Which unit, taken for which other, makes lengths so many times as large as they are."""
+    pairs = product(_UNITS.items(), repeat=2)
+    return next(f"{own} among {other}" for (own, size), (other, taken) in pairs if np.isclose(taken / size, factor))
 
 
 @dataclass(frozen=True)

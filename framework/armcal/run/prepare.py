@@ -8,11 +8,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from armcal.arm.assembly import command_channels, shown_joint
+from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.units import digits, to_unit
 from armcal.config.system import System
 from armcal.diagnose.noise_findings import Finding, first_few
 from armcal.diagnose.permuted_axes import MUCH_BETTER, find_permuted_axes
+from armcal.diagnose.readings import LENGTHS, unit_mistaken
 from armcal.errors import ConfigError, DataError, Location, ProblemError, noted
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.nuisance import mislabelled, restricted, started
@@ -37,6 +39,8 @@ _ALIKE = 0.35
 _STILL = {"angle": ("deg", 1.0), "length": ("mm", 1.0)}
 """A joint that moved by less stood still, but for the noise of its reading."""
 _FEWEST_ROWS, _NEARLY_ALL, _NEAREST = 3, 0.95, 1e-6
+_NEAR = 0.2
+"""Of their distance from the base: so near are positions to where the nominal arm has them."""
 
 
 @dataclass(frozen=True)
@@ -216,34 +220,57 @@ def group_texts(dataset: Dataset, label: str) -> tuple[str, ...]:
 
 
 def check_reach(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> None:
-    """Positions ten times farther out, or nearer, than the model's: a unit is wrong."""
+    """Positions ten times farther out, or nearer, than the model's: a unit is wrong, of all records or of some.
+
+    Raises:
+        DataError: which, and as which unit they are read.
+    """
     shown = problem.predict(problem.parameters.nominal(), records)
     for kernel, values in zip(problem.kernels, shown, strict=True):
         channels = kernel.factor.output_channels
         if [channel.rpartition(".")[2] for channel in channels] != ["x", "y", "z"]:
             continue
-        far, distances = (np.linalg.norm(x, axis=0) for x in (values[:3], dataset.stacked(channels)))
-        ratio, name = distances / np.maximum(far, _NEAREST), kernel.factor.name
-        # Some records as far out as the model (ratio 1), all others a thousand or ten times farther or nearer.
-        orders = np.log10(np.where(ratio > 0, ratio, np.nan))
-        right = np.abs(orders) < _ALIKE
-        for power in (3, -3, 1, -1):
-            wrong = np.abs(orders - power) < _ALIKE
-            if min(right.sum(), wrong.sum()) >= _FEWEST_ROWS and np.mean(right | wrong) >= _NEARLY_ALL:
-                first = int(np.argmax(wrong))
-                raise DataError(
-                    f"{name}: {wrong.sum()} of {len(dataset)} positions are about {10.0**power:g} times as far from "
-                    f"the base frame as the model's tip, the others as far (the first: record {dataset.ids[first]}).",
-                    where=Location(dataset.source, row=dataset.rows[first] if dataset.rows else None),
-                    hint="Write all rows in the unit of the column names.",
-                )
-        reach, measured = float(np.median(far)), float(np.median(distances))
-        if measured > _REACH_RATIO * reach or reach > _REACH_RATIO * measured:
+        name, measured = kernel.factor.name, dataset.stacked(channels)
+        factor, wrong = _in_another_unit(measured, values[:3])
+        if wrong.any():
+            first, count = int(np.argmax(wrong)), int(wrong.sum())
+            which, more = f"the position of record {dataset.ids[first]} is", ""
+            if count > 1:
+                which, more = f"{count} of {len(dataset)} positions are", f" (the first: record {dataset.ids[first]})"
             raise DataError(
-                f"{name}: positions are typically {measured:.4g} m from the base frame, the model's tip {reach:.4g} m.",
+                f"{name}: {which} about {digits(factor)} times as far from the base frame "
+                f"as the model's tip, the others as far{more}: {unit_mistaken(factor)}?",
+                where=Location(dataset.source, row=dataset.rows[first] if dataset.rows else None),
+                hint="Write all rows in the unit of the column names.",
+            )
+        far, distances = (float(np.median(np.linalg.norm(x, axis=0))) for x in (values[:3], measured))
+        if distances > _REACH_RATIO * far or far > _REACH_RATIO * distances:
+            raise DataError(
+                f"{name}: positions are typically {distances:.4g} m from the base frame, the model's tip {far:.4g} m.",
                 where=Location(dataset.source),
                 hint="Check the unit in the column names (x_mm or x_m) and the frame of the measurements.",
             )
+
+
+def _in_another_unit(measured: Array, shown: Array) -> tuple[float, Mask]:
+    """Positions so many times as far out as the model's (3 x N each, m), where the others are as far; or none.
+
+    Many are known by their distances alone, as where half of them spoil the place of the base. Few are where the model
+    has them once they are divided by that, and the others are typically where it has them.
+    """
+    far, distances = (np.linalg.norm(x, axis=0) for x in (shown, measured))
+    far = np.maximum(far, _NEAREST)
+    orders = np.log10(np.where(distances > 0, distances, np.nan) / far)
+    right, fits = np.abs(orders) < _ALIKE, float(np.nanmedian(np.linalg.norm(measured - shown, axis=0) / far)) < _NEAR
+    best = np.inf, 1.0, np.zeros(len(far), dtype=bool)
+    for factor in LENGTHS:
+        off = np.abs(orders - np.log10(factor))
+        wrong = off < _ALIKE
+        if min(right.sum(), wrong.sum()) < _FEWEST_ROWS or np.mean(right | wrong) < _NEARLY_ALL:
+            wrong = (np.linalg.norm(measured / factor - shown, axis=0) < _NEAR * far) & fits
+        if wrong.any():
+            best = min(best, (float(np.median(off[wrong])), factor, wrong), key=lambda one: one[0])
+    return best[1:]
 
 
 def check_permuted_axes(
