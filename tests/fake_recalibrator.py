@@ -13,6 +13,8 @@ from armcal.measure.reader import ReadRequest, RequestedChannel
 from armcal_online.commands.recalibrate import open_source
 from armcal_online.running.loop import Pace
 from armcal_online.running.session import Setup, opened
+from armcal_online.sources.row_parser import RowParser
+from armcal_online.tracking.settings import RecalibrateSettings
 
 HEADER = "pose_id,q1_deg,q2_deg,x_mm,y_mm,z_mm"
 CALIBRATION = "armcal_calibration: 0\n"
@@ -41,8 +43,9 @@ def row(number, note=None):
 class FakeRecalibrator:
     """Sums that hang on the order and on every bit of what was taken."""
 
-    def __init__(self, differs=0.0):
+    def __init__(self, differs=0.0, settings=None):
         self.request = request()
+        self.settings = settings or RecalibrateSettings(output={"calibration_every_records": 10})
         self.evaluator = {"name": "fake"}
         self.ids = hashlib.sha256().hexdigest()
         self.total = 0.1 + differs
@@ -97,17 +100,15 @@ def setup(folder, pace=None, stream=None, **given):
     if not calibration.exists():
         calibration.parent.mkdir(parents=True, exist_ok=True)
         calibration.write_text(CALIBRATION)
-    pace = pace or Pace(
-        calibration_records=10, calibration_gap_s=0.0, status_s=0.05, checkpoint_records=25, digest_records=7
-    )
-    return Setup(Path(folder), calibration, pace=pace, stream=StandardOutput(stream), **given)
+    pace = pace or Pace(calibration_gap_s=0.0, status_s=0.05, checkpoint_records=25, digest_records=7)
+    return Setup(Path(folder), calibration, StandardOutput(stream), pace, **given)
 
 
 def main(folder, source, at_end):
     """Recalibrate with the fake, as the command does."""
-    with opened(
-        setup(folder, stream=sys.stdout.buffer), FakeRecalibrator(), lambda rows: open_source(source, rows, at_end)
-    ) as going:
+    fake = FakeRecalibrator()
+    records = open_source(source, RowParser(fake.request, {}), at_end)
+    with opened(setup(folder, stream=sys.stdout.buffer), fake, records) as going:
         going.run()
 
 

@@ -58,10 +58,10 @@ def table(count: int) -> str:
     return "\n".join([HEADER, *(row(i) for i in range(1, count + 1))]) + "\n"
 
 
-def run(folder: Path, source: Any, **given: Any) -> FakeRecalibrator:
+def run(folder: Path, source: Any, settings: Any = None, **given: Any) -> FakeRecalibrator:
     """To its end, in this process."""
-    fake = FakeRecalibrator()
-    with opened(setup(folder, **given), fake, lambda rows: source) as going:
+    fake = FakeRecalibrator(settings=settings)
+    with opened(setup(folder, **given), fake, source) as going:
         going.run()
     return fake
 
@@ -95,7 +95,7 @@ def kinds(folder: Path) -> list[str]:
 @contextmanager
 def stepping(folder: Path, source: Any) -> Iterator[tuple[Recalibration, FakeRecalibrator]]:
     fake = FakeRecalibrator()
-    with opened(setup(folder), fake, lambda rows: source) as going:
+    with opened(setup(folder), fake, source) as going:
         yield going, fake
 
 

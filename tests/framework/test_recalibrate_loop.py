@@ -17,7 +17,9 @@ from armcal_online.commands.recalibrate import open_source
 from armcal_online.running.loop import Pace, Recalibration
 from armcal_online.running.session import opened
 from armcal_online.running.state_replayer import ReplayDiffersError
+from armcal_online.sources.row_parser import RowParser
 from armcal_online.sources.source import Incoming
+from armcal_online.tracking.settings import RecalibrateSettings
 from fake_recalibrator import FakeRecalibrator, setup
 from recalibrations import (
     FullFiles,
@@ -104,8 +106,8 @@ def test_an_update_of_armcal_goes_on_where_it_was_though_the_last_bits_differ(
     monkeypatch.setattr(FakeRecalibrator, "take", other)
     begin = FakeRecalibrator.__init__
 
-    def updated(self: FakeRecalibrator) -> None:
-        begin(self)
+    def updated(self: FakeRecalibrator, **given: Any) -> None:
+        begin(self, **given)
         self.evaluator = {"name": "the next"}
 
     monkeypatch.setattr(FakeRecalibrator, "__init__", updated)
@@ -130,12 +132,12 @@ def test_damage_before_the_newest_checkpoint_is_told_and_stops_nothing(tmp_path:
 
 def test_a_folder_of_another_calibration_or_other_settings_is_refused(tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    run(folder, Listed(made(1, 5)), settings={"gate": 1})
+    run(folder, Listed(made(1, 5)), settings=RecalibrateSettings())
     with pytest.raises(InputError, match="begun with other settings"):
-        run(folder, Listed(made(1, 9)), settings={"gate": 2})
+        run(folder, Listed(made(1, 9)), settings=RecalibrateSettings(gating="off"))
     (tmp_path / "out.start.yaml").write_text("other: 1\n")
     with pytest.raises(InputError, match="begun with another calibration"):
-        run(folder, Listed(made(1, 9)), settings={"gate": 1})
+        run(folder, Listed(made(1, 9)), settings=RecalibrateSettings())
     foreign = tmp_path / "foreign"
     foreign.mkdir()
     (foreign / "thesis.tex").write_text("mine")
@@ -144,12 +146,12 @@ def test_a_folder_of_another_calibration_or_other_settings_is_refused(tmp_path: 
     own = setup(tmp_path / "own")
     (tmp_path / "own").mkdir()
     (tmp_path / "own" / "calibration.yaml").symlink_to(own.calibration)
-    with pytest.raises(InputError, match="would be replaced"), opened(own, FakeRecalibrator(), lambda rows: Listed([])):
+    with pytest.raises(InputError, match="would be replaced"), opened(own, FakeRecalibrator(), Listed([])):
         pass
 
 
 def test_a_second_one_in_the_folder_is_refused(tmp_path: Path) -> None:
-    with opened(setup(tmp_path / "out"), FakeRecalibrator(), lambda rows: Listed([])), pytest.raises(InputError):
+    with opened(setup(tmp_path / "out"), FakeRecalibrator(), Listed([])), pytest.raises(InputError):
         run(tmp_path / "out", Listed([]))
 
 
@@ -251,7 +253,7 @@ def test_a_rollback_that_no_checkpoint_followed_is_made_again_after_a_restart(
 def test_records_wait_unacknowledged_while_the_journal_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("armcal_online.running.loop.FULL_WAIT_S", 0.0)
     files, fake, source, out = FullFiles(), FakeRecalibrator(), Listed(made(1, 9)), BytesIO()
-    with opened(setup(tmp_path / "out", files=files, stream=out), fake, lambda rows: source) as going:
+    with opened(setup(tmp_path / "out", files=files, stream=out), fake, source) as going:
         steps(going, 3)
         files.full = {"journal-"}
         steps(going, 5)
@@ -275,9 +277,10 @@ def test_records_wait_unacknowledged_while_the_journal_is_full(tmp_path: Path, m
 
 
 def test_the_pace_of_what_is_written(tmp_path: Path) -> None:
-    pace = Pace(calibration_records=1000, calibration_s=1e9, status_s=1e9, checkpoint_records=10, digest_records=1000)
+    pace = Pace(status_s=1e9, checkpoint_records=10, digest_records=1000)
+    settings = RecalibrateSettings(output={"calibration_every_records": 1000, "calibration_every_s": 1e9})
     folder = tmp_path / "out"
-    run(folder, Listed(made(1, 20)), pace=pace)
+    run(folder, Listed(made(1, 20)), settings, pace=pace)
     assert kinds(folder).count("calibration") == 2
     found = [e.sequence for e in read_entries(folder / "journal") if e.kind == "checkpoint"]
     assert len(found) == 4
@@ -287,9 +290,9 @@ def test_the_pace_of_what_is_written(tmp_path: Path) -> None:
 def test_the_real_source_in_the_real_loop(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "a.csv").write_text(table(10))
-    with opened(
-        setup(tmp_path / "out"), FakeRecalibrator(), lambda rows: open_source(str(tmp_path / "in"), rows)
-    ) as going:
+    fake = FakeRecalibrator()
+    records = open_source(str(tmp_path / "in"), RowParser(fake.request, {}))
+    with opened(setup(tmp_path / "out"), fake, records) as going:
         ends = time.monotonic() + 10
         while len(taken(tmp_path / "out")) < 10 and time.monotonic() < ends:
             going.step(0.1)

@@ -20,15 +20,13 @@ from armcal.estimate.estimator import no_progress
 from armcal.functions.compiler import find_compiler
 from armcal.io.journal.journal import JournalLimits
 from armcal.io.journal.reader import read_entries, read_segments, read_until
-from armcal.io.lines import StandardOutput
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
-from armcal_online.commands.recalibrate import setup_of
 from armcal_online.replaying.kept_journal import kept_calibration, kept_journal
 from armcal_online.replaying.replay import replay
 from armcal_online.replaying.replay_verifier import BOUND, DiffersError, ReplayVerifier, distance
 from armcal_online.running.loop import Pace, Recalibration
-from armcal_online.running.session import opened
+from armcal_online.running.session import Setup, opened
 from armcal_online.sources.source import Incoming
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import RecalibrateSettings
@@ -76,8 +74,7 @@ def records() -> list[Incoming]:
 def going(folder: Path, calibration: Path, source: Listed, settings: Settings) -> Any:
     assert isinstance(settings, RecalibrateSettings)
     session = Recalibrator.begin(Calibration.load(calibration), settings)
-    setup = replace(setup_of(settings, calibration, folder, StandardOutput(None)), pace=PACE)
-    return opened(setup, session, lambda rows: source)
+    return opened(Setup(folder, calibration, pace=PACE), session, source)
 
 
 def sequence_of(folder: Path, name: str) -> int:

@@ -16,7 +16,6 @@ from armcal.io.lines import StandardOutput
 from armcal.plugins import PluginRegistry
 from armcal.run.prepare import Stopwatch
 
-from armcal_online.commands.recalibrate import setup_of
 from armcal_online.mission.files import SURPRISE, figures, write_files
 from armcal_online.mission.mission import (
     BENCH,
@@ -29,7 +28,7 @@ from armcal_online.mission.mission import (
     run_mission,
 )
 from armcal_online.mission.settings import MissionPlan
-from armcal_online.running.session import opened
+from armcal_online.running.session import Setup, opened
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import RecalibrateSettings
 
@@ -124,9 +123,9 @@ def loop_session(registry: PluginRegistry) -> Session:
     ) -> Sequence[Mapping[str, Any]]:
         recalibrator = Recalibrator.begin(Calibration.load(calibration, registry), settings, registry)
         events = io.BytesIO()
-        setup = setup_of(settings, calibration, folder, StandardOutput(events))
+        setup = Setup(folder, calibration, StandardOutput(events))
         try:
-            with opened(setup, recalibrator, lambda rows: source) as loop:
+            with opened(setup, recalibrator, source) as loop:
                 loop.run()
                 if not source.ended:
                     raise KeyboardInterrupt

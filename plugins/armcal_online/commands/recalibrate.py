@@ -2,17 +2,14 @@
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import click
 from armcal.calibration.calibration import Calibration
 from armcal.cli.common import Console, overrides, speaking
 from armcal.errors import InputError, Location
-from armcal.io.journal.journal import JournalLimits
 from armcal.io.lines import StandardOutput
 from armcal.io.udp import UDP_KINDS, parsed
 
-from armcal_online.running.loop import Pace
 from armcal_online.running.session import Setup, opened
 from armcal_online.sources.csv_file import CsvFile
 from armcal_online.sources.folder import Folder
@@ -20,11 +17,9 @@ from armcal_online.sources.row_parser import RowParser
 from armcal_online.sources.source import AtEnd, Source
 from armcal_online.sources.streams import Lines, Udp
 from armcal_online.tracking.recalibrator import Recalibrator
-from armcal_online.tracking.settings import RecalibrateSettings, load_settings
+from armcal_online.tracking.settings import load_settings
 
 KINDS = f"- (standard input), {UDP_KINDS}, a directory, or a CSV file"
-_NOT_DECIDING = ("output", "journal")
-"""Settings on which no decision hangs: they may differ when a recalibration is gone on with."""
 
 
 @click.command()
@@ -60,24 +55,10 @@ def recalibrate(
     session = Recalibrator.begin(loaded, settings, registry)
     stream = StandardOutput(None if console.quiet else sys.stdout.buffer)
     at_end: AtEnd = "wait" if follow else "stop"
-    setup = setup_of(settings, calibration, out, stream)
-    with opened(setup, session, lambda rows: open_source(source, rows, at_end)) as loop:
+    records = open_source(source, RowParser(session.request, settings.columns), at_end)
+    with opened(Setup(out, calibration, stream), session, records) as loop:
         console.detail(f"records from {source}, kept in {out}")
         loop.run()
-
-
-def setup_of(settings: RecalibrateSettings, calibration: Path, out: Path, stream: StandardOutput) -> Setup:
-    """A recalibration's parts from its settings."""
-    deciding: dict[str, Any] = {k: v for k, v in settings.to_config().items() if k not in _NOT_DECIDING}
-    return Setup(
-        folder=out,
-        calibration=calibration,
-        settings=deciding,
-        columns=settings.columns,
-        pace=Pace(settings.output.calibration_every_records, settings.output.calibration_every),
-        limits=JournalLimits(settings.journal.segment_bytes, settings.journal.total_bytes),
-        stream=stream,
-    )
 
 
 def open_source(text: str, rows: RowParser, at_end: AtEnd = "stop") -> Source:

@@ -52,11 +52,10 @@ def roll_back_ended(folder: Path, to: int | str, registry: PluginRegistry) -> Ma
     setup = Setup(
         folder=folder,
         calibration=Path(str(header.get("path", ""))),
-        settings=dict(header.get("settings") or {}),
         limits=JournalLimits(total_bytes=1 << 62),  # nothing of the past goes for this
-        begun_from=str(header["text"]).encode(),
+        kept=header,
     )
-    with opened(setup, session, lambda rows: NoRecords()) as loop:
+    with opened(setup, session, NoRecords()) as loop:
         reply = rolled_back(loop, to)
         loop.finishing = "The estimate was set back after the end."
         loop.run()

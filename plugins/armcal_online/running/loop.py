@@ -26,12 +26,10 @@ FULL_WAIT_S = 1.0
 class Pace:
     """How often things are written; seconds are of a monotonic clock, and nothing that is estimated hangs on them.
 
-    The calibration is written after so many records or so much time, but not twice within ``calibration_gap_s``:
-    it takes longer than many records do. A decision, and the end, write it at once.
+    The calibration is written as the settings have it, but not twice within ``calibration_gap_s``: it takes longer than
+    many records do. A decision, and the end, write it at once.
     """
 
-    calibration_records: int = 20
-    calibration_s: float = 600.0
     calibration_gap_s: float = 1.0
     status_s: float = 1.0
     checkpoint_records: int = 1000
@@ -127,9 +125,9 @@ class Recalibration:
             self._journal.wants_checkpoint or self._since_checkpoint >= self._pace.checkpoint_records
         ):
             self._checkpoint()
-        now = time.monotonic()
-        enough = self._since_calibration >= self._pace.calibration_records
-        gap_s = self._pace.calibration_gap_s if enough else self._pace.calibration_s
+        now, output = time.monotonic(), self.session.settings.output
+        enough = self._since_calibration >= output.calibration_every_records
+        gap_s = self._pace.calibration_gap_s if enough else output.calibration_every
         if self._since_calibration and now - self._calibrated >= gap_s:
             self.write_calibration()
         if now - self._status_written >= self._pace.status_s:

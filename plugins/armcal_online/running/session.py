@@ -2,7 +2,7 @@
 
 import hashlib
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -21,7 +21,6 @@ from armcal_online.running.control import SOCKET, answer, control_server
 from armcal_online.running.loop import Pace, Recalibration
 from armcal_online.running.outputs import CALIBRATION, RESERVE, STATUS, Outputs
 from armcal_online.running.state_replayer import STARTED, StateReplayer
-from armcal_online.sources.row_parser import RowParser
 from armcal_online.sources.source import Source
 from armcal_online.tracking.recalibrator import Recalibrator
 
@@ -29,6 +28,8 @@ JOURNAL = "journal"
 _REPLACED = (CALIBRATION, STATUS, RESERVE)
 OURS = (JOURNAL, EVENTS, EARLIER, SOCKET, *_REPLACED, *(f"{name}.new" for name in _REPLACED))
 
+_NOT_DECIDING = ("output", "journal")
+"""Settings on which no decision hangs: they may differ when a recalibration is gone on with."""
 _DECIDING = ("calibration", "settings")
 """Keys of the journal's header that may not differ when it is resumed."""
 
@@ -40,49 +41,37 @@ class Setup:
     Attributes:
         folder: of everything that it keeps.
         calibration: the file it begins from.
-        settings: those that its decisions depend on, as JSON.
-        columns: the source's own names (wanted name to own name).
-        pace: how often things are written.
-        limits: how large the journal may grow.
         stream: where events are written to, besides the file.
-        begun_from: the text of ``calibration``, where that file may be gone.
+        pace: how often other things are.
+        limits: how large the journal may grow; None: as the settings have it.
+        kept: the header of the journal that is gone on with, where ``calibration`` may be gone.
     """
 
     folder: Path
     calibration: Path
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    columns: Mapping[str, str] = field(default_factory=dict)
-    pace: Pace = field(default_factory=Pace)
-    limits: JournalLimits = field(default_factory=JournalLimits)
     stream: StandardOutput = field(default_factory=lambda: StandardOutput(None))
+    pace: Pace = field(default_factory=Pace)
+    limits: JournalLimits | None = None
     files: FileLayer = REAL_FILES
-    begun_from: bytes | None = None
-
-
-SourceOf = Callable[[RowParser], Source]
+    kept: Mapping[str, Any] | None = None
 
 
 @contextmanager
-def opened(setup: Setup, session: Recalibrator, source_of: SourceOf) -> Iterator[Recalibration]:
+def opened(setup: Setup, session: Recalibrator, source: Source) -> Iterator[Recalibration]:
     """Begin in a new folder, or go on in one: its newest checkpoint, the entries after it, the source after these.
+
+    The source is closed in the end.
 
     Raises:
         InputError: the folder is another's, is in use, or belongs to another calibration or other settings.
         DataError: the journal is damaged, or going through it again gives another state.
     """
-    folder, begun_from = setup.folder / JOURNAL, _calibration_text(setup)
+    folder, sizes = setup.folder / JOURNAL, session.settings.journal
     with ExitStack() as stack:
-        source = source_of(RowParser(session.request, setup.columns))
         stack.callback(source.close)
-        # All that a replay needs besides the entries.
-        header = {
-            "calibration": hashlib.sha256(begun_from).hexdigest(),
-            "text": begun_from.decode("utf-8", errors="replace"),
-            "path": str(setup.calibration),
-            "settings": dict(setup.settings),
-            "evaluator": dict(session.evaluator),
-        }
-        journal = stack.enter_context(Journal.open(folder, header, files=setup.files, limits=setup.limits))
+        header = _header(setup, session)
+        limits = setup.limits or JournalLimits(sizes.segment_bytes, sizes.total_bytes)
+        journal = stack.enter_context(Journal.open(folder, header, files=setup.files, limits=limits))
         state_replayer = StateReplayer(session, partial(read_until, folder), str(folder))
         resumed = _recover(setup, journal, state_replayer, header)
         source.resume(state_replayer.progress.positions)
@@ -110,10 +99,10 @@ def opened(setup: Setup, session: Recalibrator, source_of: SourceOf) -> Iterator
         yield recalibration
 
 
-def _calibration_text(setup: Setup) -> bytes:
-    """The calibration to begin from, which the folder must not replace."""
-    if setup.begun_from is not None:
-        return setup.begun_from
+def _header(setup: Setup, session: Recalibrator) -> dict[str, Any]:
+    """All that a replay needs besides the entries. The folder must not replace the calibration to begin from."""
+    if setup.kept is not None:
+        return {**setup.kept, "evaluator": dict(session.evaluator)}
     if setup.calibration.resolve() == (setup.folder / CALIBRATION).resolve():
         raise InputError(
             "the calibration to begin from would be replaced by the updated one.",
@@ -122,7 +111,14 @@ def _calibration_text(setup: Setup) -> bytes:
         )
     if not (setup.folder / JOURNAL).is_dir():
         check_folder(setup.folder, OURS)
-    return setup.calibration.read_bytes()
+    text = setup.calibration.read_bytes()
+    return {
+        "calibration": hashlib.sha256(text).hexdigest(),
+        "text": text.decode("utf-8", errors="replace"),
+        "path": str(setup.calibration),
+        "settings": {key: value for key, value in session.settings.to_config().items() if key not in _NOT_DECIDING},
+        "evaluator": dict(session.evaluator),
+    }
 
 
 def _recover(setup: Setup, journal: Journal, state_replayer: StateReplayer, header: Mapping[str, Any]) -> bool:

@@ -62,7 +62,7 @@ class Recalibrator:
         setup: FilterSetup,
         steps: Steps,
     ) -> None:
-        self._calibration, self._settings, self._estimator = calibration, settings, estimator
+        self._calibration, self.settings, self._estimator = calibration, settings, estimator
         self.setup, self.steps = setup, steps
         hypothesis_filter = HypothesisFilter(setup.observer, estimator, setup.process_noise, settings.outliers)
         changes = hypotheses(setup.space, steps, settings.changes, setup.observer.size)
@@ -130,7 +130,7 @@ class Recalibrator:
         """
         time = incoming.channels.get("time")
         time = time if time is not None and math.isfinite(time) else None
-        tick = ticked(self.state.clock, time, incoming.arrived, self._settings.clock)
+        tick = ticked(self.state.clock, time, incoming.arrived, self.settings.clock)
         state, why = self._admitted(incoming, replace(self.state, sequence=sequence), time, tick)
         readings = () if why else self.setup.observer.readings(incoming.channels, incoming.labels)
         if not why and not readings:
@@ -143,7 +143,7 @@ class Recalibrator:
             passed["sequence"] = 1e9 if state.place is None else abs(place - state.place)
             state = replace(state, place=place)
         judged = self._judged(incoming, replace(state, clock=tick.clock), readings, passed)
-        calm = self._settings.levels.calm
+        calm = self.settings.levels.calm
         return (events.noted(self.state, "clock", tick.note, calm), *judged) if tick.note else judged
 
     def _admitted(self, incoming: Incoming, state: State, time: float | None, tick: Tick) -> tuple[State, str]:
@@ -183,7 +183,7 @@ class Recalibrator:
         state = replace(state, belief=before, anchor=anchor, slow=self._slow.passed(state.slow, passed))
         try:
             gated, first, limit = self._gated(state, readings, passed)
-            state, decisions = self._judge.after(gated) if self._settings.gating == "on" else (gated, ())
+            state, decisions = self._judge.after(gated) if self.settings.gating == "on" else (gated, ())
         except ArmcalError as fault:
             return self._without_filter(incoming, state, readings, passed, fault.message)
         recent = gated.recent[-1]
@@ -198,7 +198,7 @@ class Recalibrator:
         record_events = [events.judged(incoming, state, recent, first, limit, self.setup)]
         is_good = not recent.rejected and not decisions and health.level == "nominal"
         self.state = state = troubled(replace(state, health=health), decisions, is_good)
-        calm = self._settings.levels.calm
+        calm = self.settings.levels.calm
         for decision in decisions:
             # These two stand until something else is decided: they are news once.
             if decision.kind not in ("unexplained", "model_no_longer_fits") or decision.level != level:
@@ -207,7 +207,7 @@ class Recalibrator:
                 record_events.append(events.decided(state, decision, tip, calm))
         if health.level != level:
             record_events.append(events.level_changed(state, level, health, calm))
-        every = self._settings.output.estimate_every_records
+        every = self.settings.output.estimate_every_records
         if decisions or (state.counts["accepted"] % every == 0 and not recent.rejected):
             record_events.append(events.estimated(self.state, self.estimate))
         return tuple(record_events)
@@ -225,16 +225,16 @@ class Recalibrator:
         first = observer.observation(before, readings, noise).at(before.gaussian.mean)
         covariance = first.slope @ before.gaussian.covariance @ first.slope.T + first.noise
         nis, dof = normalised_innovation_squared(first.innovation, covariance), len(first.innovation)
-        limit = nis_limit(dof, self._settings.gate.probability, observer.freedom(readings))
-        rejected = self._settings.gating == "on" and not nis <= limit
+        limit = nis_limit(dof, self.settings.gate.probability, observer.freedom(readings))
+        rejected = self.settings.gating == "on" and not nis <= limit
         recent = Recent(state.sequence, readings, noise, passed, before, rejected, nis, dof)
-        nis_window = self._settings.levels.window
+        nis_window = self.settings.levels.window
         after = state if rejected else advanced(state, recent, self.setup, self._estimator, nis_window)
         if not rejected:
             slow = self._slow.after(state.slow, state.sequence, before.gaussian, first, covariance)
             after = replace(after, slow=slow)
         counted = _counted(after, "rejected" if rejected else "accepted")
-        return replace(counted, recent=(*counted.recent, recent)[-self._settings.gate.window :]), first, limit
+        return replace(counted, recent=(*counted.recent, recent)[-self.settings.gate.window :]), first, limit
 
     def _without_filter(
         self, incoming: Incoming, state: State, readings: tuple[Reading, ...], passed: Mapping[str, float], why: str
@@ -248,7 +248,7 @@ class Recalibrator:
             return self._ignored(incoming, state, why)
         record = NetRecord(state.sequence, readings, noise)
         state, decisions = self._net.after(state, record, state.belief, passed, corrected=False)
-        ignored, calm = self._ignored(incoming, state, why), self._settings.levels.calm
+        ignored, calm = self._ignored(incoming, state, why), self.settings.levels.calm
         for decision in decisions:
             health = self.state.health.troubled(decision.level, decision.sentence)
             self.state = replace(self.state, health=health)
@@ -256,12 +256,12 @@ class Recalibrator:
 
     def started_event(self, resumed: bool) -> dict[str, Any]:
         """The first event of a process."""
-        slowest = self._slow.slowest(_WEEK, self._settings.changes.odds)
-        return events.started(self.state, self.setup, self._settings, self.estimate, resumed, self.steps, slowest)
+        slowest = self._slow.slowest(_WEEK, self.settings.changes.odds)
+        return events.started(self.state, self.setup, self.settings, self.estimate, resumed, self.steps, slowest)
 
     def rolled_back_event(self, sequence: int, to: int) -> dict[str, Any]:
         """That entry ``sequence`` set the estimate back to what it was after entry ``to``, where it is now."""
-        return events.rolled_back(self.state, sequence, to, self._settings.levels.calm)
+        return events.rolled_back(self.state, sequence, to, self.settings.levels.calm)
 
     def status(self) -> dict[str, Any]:
         """Health, counts and estimate now, as JSON."""
