@@ -86,8 +86,7 @@ class Corrections:
             stated = build_system(described, registry).parameters()
             return cls(stated, with_values(stated, given.data, given, ()))
         calibration = Calibration.load(path, registry)
-        nominal = np.array([entry.nominal for entry in calibration.record.parameters])
-        return cls(calibration.parameters.with_nominal(nominal), calibration.parameters)
+        return cls(calibration.nominal, calibration.parameters)
 
     def applied(self, design: Parameters) -> Parameters:
         """A design's parameters with the same differences from what the design states.
@@ -119,8 +118,7 @@ def of_calibration(calibration: Calibration, rules: ConfigSource | None, name: s
         ConfigError: there are several arms, no limits, or the clearance is refused.
     """
     arm = examined_arm(calibration.system, name)
-    nominal = calibration.parameters.with_nominal(np.array([e.nominal for e in calibration.record.parameters]))
-    plain = arm_expression(arm, nominal, calibration.system.environment)
+    plain = arm_expression(arm, calibration.nominal, calibration.system.environment)
     limits, check = _rules(arm, calibration.system, rules, name)
     return Subject(name, arm, calibration.expression(), plain, limits, check, calibration)
 

@@ -157,6 +157,11 @@ class Calibration:
         return texts
 
     @property
+    def nominal(self) -> Parameters:
+        """The parameters as they were before the calibration."""
+        return self.parameters.with_nominal(np.array([entry.nominal for entry in self.record.parameters]))
+
+    @property
     def readable(self) -> Mapping[str, Measurement]:
         """The measurements whose readings a single pose has: a contact reads nothing."""
         return readable(self.system)
@@ -218,7 +223,7 @@ class Calibration:
                 "the covariance in the calibration does not fit its free parameters.",
                 hint="The file was edited or damaged; run the calibration again.",
             )
-        fitted = self.parameters.with_nominal(np.array([entry.nominal for entry in entries])).with_free(self.free)
+        fitted = self.nominal.with_free(self.free)
         try:
             nan = float("nan")  # where null is kept
             stated: list[dict[str, Any]] = [

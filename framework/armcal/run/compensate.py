@@ -128,10 +128,8 @@ class Bench:
 
     def nominal(self) -> Compensator:
         """The arm as it was thought to be: nominal parameters, rigid, without effects."""
-        stated = np.array([entry.nominal for entry in self.calibration.record.parameters])
         plain = replace(self.calibration.system.arms[self.arm], effects={}, masses=())
-        nominal = self.calibration.parameters.with_nominal(stated)
-        system = self.calibration.system
+        nominal, system = self.calibration.nominal, self.calibration.system
         expression = pointed(arm_expression(plain, nominal, system.environment), self.point, system, nominal)
         return Compensator(expression, nominal, Options(limits=self.options.limits))
 

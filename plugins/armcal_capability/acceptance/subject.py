@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
-import numpy as np
 from armcal.base.parameters import Parameters
 from armcal.calibration.calibration import Calibration
 from armcal.config.system import System
@@ -71,8 +70,8 @@ class ArmToJudge:
             record, kept = calibration.record, calibration.record.prediction
             free = {e.name.partition("[")[0] for e in record.parameters if e.free and not e.held_by_prior}
             fitted = calibration.parameters.with_free(free)
-            nominal = fitted.with_nominal(np.array([e.nominal for e in record.parameters]))
-            models, system = {"nominal": nominal, "calibrated": fitted}, calibration.system
+            models = {"nominal": calibration.nominal.with_free(free), "calibrated": fitted}
+            system = calibration.system
             columns = dict(kept.columns) if kept and rules is None else {}
             files, trained_on = _files(path, source), record.identity.get("data", "")
             return cls(path.name, _judged(system, path), models, source, columns, trained_on, files)
