@@ -101,7 +101,7 @@ class ServoRun:
 
     def entries(self, kind: str) -> list[Any]:
         """Of the record, of a kind."""
-        return Record(self.out).of_kind(kind)
+        return [entry for entry in Record(self.out).entries if entry["kind"] == kind]
 
     def rows(self) -> list[dict[str, Any]]:
         """The record, line by line."""

@@ -11,6 +11,7 @@ from typing import Literal
 
 from armcal.arm.horn import TOOTH_DEG, teeth_text
 
+_WITHIN_DEG = 2.0
 Units = Literal["degrees", "percent"]
 
 LAST_COUNT = 4095
@@ -75,10 +76,10 @@ def zero_shift_deg(one: Motor, two: Motor) -> float:
     return math.remainder(counts, COUNTS_A_TURN) * 360 / COUNTS_A_TURN
 
 
-def teeth_of(degrees: float, within_deg: float = 2.0) -> int:
+def teeth_of(degrees: float) -> int:
     """By how many teeth of the horn an angle is explained; 0 for none, or where it is no whole number of them."""
     teeth = round(degrees / TOOTH_DEG)
-    return teeth if teeth and abs(degrees - teeth * TOOTH_DEG) <= within_deg else 0
+    return teeth if teeth and abs(degrees - teeth * TOOTH_DEG) <= _WITHIN_DEG else 0
 
 
 def remount(offset: float) -> str:

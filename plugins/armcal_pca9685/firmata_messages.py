@@ -74,9 +74,9 @@ def unpaired(data: bytes) -> bytes | None:
     return bytes(a | b << 7 for a, b in zip(low, high, strict=True))
 
 
-def i2c_config(delay_us: int = 0) -> bytes:
-    """Switch I2C on, with a pause between writing a register's number and reading."""
-    return bytes((SYSEX, I2C_CONFIG, delay_us & 0x7F, delay_us >> 7 & 0x7F, END))
+def i2c_config() -> bytes:
+    """Switch I2C on, without a pause between writing a register's number and reading."""
+    return bytes((SYSEX, I2C_CONFIG, 0, 0, END))
 
 
 def i2c_write(address: int, data: bytes) -> bytes:

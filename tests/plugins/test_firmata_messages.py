@@ -108,7 +108,7 @@ def test_pairs_that_are_none(data):
 
 def test_requests_are_those_of_the_protocol():
     """Written out by hand from the protocol's description."""
-    assert firmata.i2c_config(500) == bytes.fromhex("f0 78 74 03 f7")
+    assert firmata.i2c_config() == bytes.fromhex("f0 78 00 00 f7")
     assert firmata.i2c_write(0x40, bytes((0x06, 0xFF))) == bytes.fromhex("f0 76 40 00 06 00 7f 01 f7")
     assert firmata.i2c_read(0x40, 0xFE, 1) == bytes.fromhex("f0 76 40 08 7e 01 01 00 f7")
     assert firmata.i2c_reply(bytes.fromhex("40 00 7e 01 79 00")) == (0x40, 0xFE, b"\x79")

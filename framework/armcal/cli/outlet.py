@@ -18,9 +18,9 @@ _MOST = 1 << 18
 """Bytes kept for a terminal that takes nothing; of more, the oldest go."""
 
 
-def say(text: str, err: bool = False, nl: bool = True) -> None:
+def say(text: str, err: bool = False) -> None:
     """One text, to standard output or error."""
-    click.echo(shown(text), err=err, nl=nl)
+    click.echo(shown(text), err=err)
 
 
 class Outlet:

@@ -52,11 +52,10 @@ _MEAN_LENGTH = math.sqrt(8 / math.pi)
 
 @dataclass(frozen=True)
 class RobotFolder:
-    """What was written: where, the parameters chosen, and the noise that the simulated records have (mm)."""
+    """What was written: where, and the parameters chosen."""
 
     folder: Path
     choice: MinimalSet
-    noise_mm: float = NOISE_MM
 
 
 def write_robot(robot: Robot, folder: Path, registry: PluginRegistry) -> RobotFolder:
@@ -203,4 +202,4 @@ def try_out(made: RobotFolder, registry: PluginRegistry, command: str = "", prog
     table = result.table
     held = (table.nominal["holdout"].mean, table.calibrated["holdout"].mean)
     nominal, calibrated = (math.nan if error is None else error for error in held)
-    return Trial(result, folder, nominal, calibrated, made.noise_mm * _MEAN_LENGTH)
+    return Trial(result, folder, nominal, calibrated, NOISE_MM * _MEAN_LENGTH)

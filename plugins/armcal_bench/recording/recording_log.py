@@ -1,7 +1,7 @@
 """The postures of a recording, as they were captured: their journal, and the dataset that they make."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -65,8 +65,8 @@ class RecordingLog:
         last: the newest that was captured, undone or not; None if there is none.
     """
 
-    def __init__(self, journal: Journal, wall: Callable[[], float] = time.time) -> None:
-        self._journal, self._wall = journal, wall
+    def __init__(self, journal: Journal) -> None:
+        self._journal = journal
         self._postures: dict[str, Posture] = {}
         self.last: Posture | None = None
         self._count = 0
@@ -83,7 +83,7 @@ class RecordingLog:
 
     def next_posture(self, mean: Mean, labels: Mapping[str, str], values: Mapping[str, float]) -> Posture:
         """The posture that a capture would make now."""
-        at = max(self._wall(), self.last.at if self.last else 0.0)
+        at = max(time.time(), self.last.at if self.last else 0.0)
         name = str(self._count + 1)
         return Posture(name, dict(mean.angles), mean.spread, mean.readings, at, dict(labels), mean.stamp, values=values)
 

@@ -94,11 +94,9 @@ class Automatic:
     mover: Mover
     record: Record
     report: ReportProgress
-    restless: int = 0
-    first: int = 0
 
     def __post_init__(self) -> None:
-        self._frame = FrameWatch(self.mover)
+        self._frame, self._first, self._restless = FrameWatch(self.mover), len(self.record.entries), 0
 
     def run(self) -> None:
         """Measure all that is left; the arm ends in its base pose.
@@ -109,7 +107,7 @@ class Automatic:
                 stand: then it is in its base pose.
             DeviceLost: the device is gone and does not come back.
         """
-        mover, self.first = self.mover, len(self.record.entries)
+        mover = self.mover
         sweeps = {joint: sweep(mover, joint) for joint in mover.setup.joints}
         if not any(left(points, self._done) for points in sweeps.values()):
             return
@@ -134,7 +132,7 @@ class Automatic:
     def _done(self) -> list[Mapping[str, Any]]:
         """Lines of points that are not to be measured now; what an earlier run left out is tried once more."""
         lines = enumerate(self.record.entries)
-        return [line for i, line in lines if i >= self.first or line["kind"] != LEFT_OUT]
+        return [line for i, line in lines if i >= self._first or line["kind"] != LEFT_OUT]
 
     def _settled(self, point: Point) -> Settled | str:
         """Where the tool stands at a point, or why that is not known. Servos that get hot rest in the base pose."""
@@ -164,14 +162,14 @@ class Automatic:
         self._check_frame()
         if isinstance(settled, str):
             self.record.append(LEFT_OUT, {**line, "why": settled})
-            self.restless += 1
-            if self.restless >= _MOST_RESTLESS:
-                text = f"{point.joint} did not stop moving {self.restless} times in a row ({settled})"
+            self._restless += 1
+            if self._restless >= _MOST_RESTLESS:
+                text = f"{point.joint} did not stop moving {self._restless} times in a row ({settled})"
                 raise Restless(f"{text}: does a servo stall, or let go?")
             return
         deviations = [float(d) if np.isfinite(d) else None for d in settled.deviations]
         self.record.append(POSE, {**line, **settled.record, "deviations": deviations, "frames": settled.frames})
-        self.restless = 0
+        self._restless = 0
 
     def _check_frame(self) -> None:
         """Refuse other units than expected. A left-handed frame cannot be told from a reversed servo, one by one.
@@ -184,7 +182,7 @@ class Automatic:
         if mistake is None or 1 / _FAR_GAIN < mistake.frame.gain < _FAR_GAIN:
             return
         hint = f"{mistake.mend} Then give another --out."
-        if self.first <= 1:
+        if self._first <= 1:
             hint = f"{mistake.mend} Then give the same command: what was measured is kept as "
             hint += f"{self.record.set_aside().name}, and not used."
         raise InputError(f"{mistake.sentence}.", where=Location(str(self.record.path)), hint=hint)

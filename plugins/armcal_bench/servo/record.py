@@ -145,9 +145,10 @@ class Record:
         """All lines, in their order."""
         return tuple(self._entries)
 
-    def of_kind(self, kind: str) -> list[Mapping[str, Any]]:
-        """The lines of a kind."""
-        return [entry for entry in self._entries if entry["kind"] == kind]
+    @property
+    def begun(self) -> Mapping[str, Any] | None:
+        """The first line; None where there is none."""
+        return self._entries[0] if self._entries else None
 
     @property
     def is_measured(self) -> bool:
@@ -202,10 +203,9 @@ def begin(setup: Setup, record: Record, device: DeviceIdentity | None, say: Call
     servos = {joint: _as_stated(setup, joint) for joint in setup.base}
     board = {} if device is None else {"device": device.name, "adapter": device.adapter}
     content = {"servos": servos, **board, "base": dict(setup.base)}
-    begun = record.of_kind(BEGUN)
-    if begun and {**begun[0], **content} == begun[0]:
-        return
-    if begun:
+    if (begun := record.begun) is not None:
+        if {**begun, **content} == begun:
+            return
         kept = record.set_aside()
         say(
             f"{record.path}: it was begun with another base pose, servo file or board, and holds no measurement; it is "
@@ -220,7 +220,7 @@ def check_same(setup: Setup, record: Record, device: DeviceIdentity) -> None:
     Raises:
         InputError: it would be another one.
     """
-    begun = record.of_kind(BEGUN)[0]
+    begun = record.entries[0]
     where = Location(str(record.path))
     adapter = str(begun.get("adapter", ""))
     if adapter and device.adapter and adapter != device.adapter:

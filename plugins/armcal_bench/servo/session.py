@@ -21,7 +21,7 @@ from armcal_bench.servo.automatic import Automatic, FrameWatch, ReportProgress
 from armcal_bench.servo.guided import Guided, next_wish
 from armcal_bench.servo.mover import Mover, ServoDevice
 from armcal_bench.servo.outcome import Outcome, outcome_of
-from armcal_bench.servo.record import BEGUN, Record, begin, check_same, stated_by
+from armcal_bench.servo.record import Record, begin, check_same, stated_by
 from armcal_bench.servo.setup import Setup
 from armcal_bench.servo.trial import Move, Verdict, answered, judged, noted, wrapped
 
@@ -78,17 +78,15 @@ def evaluated(setup: Setup, folder: Path) -> Outcome:
         InputError: there is no record, or nothing in it.
     """
     record = Record(folder)
-    begun = record.of_kind(BEGUN)
-    if not begun:
+    if record.begun is None:
         raise InputError("it holds nothing measured.", where=Location(str(folder)), hint="Measure first.")
-    servos, boards = stated_by(setup, begun[0], setup.joints)
+    servos, boards = stated_by(setup, record.begun, setup.joints)
     return outcome_of(record.entries, servos, boards, setup.nominal, setup.settings)
 
 
 def adapter_of(folder: Path) -> str:
     """The adapter that the record in a folder was measured on; empty if that is not known."""
-    begun = Record(folder).of_kind(BEGUN)
-    return str(begun[0].get("adapter", "")) if begun else ""
+    return str((Record(folder).begun or {}).get("adapter", ""))
 
 
 def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
@@ -136,7 +134,7 @@ def _opened(
     device = cast(ServoDevice, setup.bench.device())
     servos = {joint: setup.table_of(joint) for joint in setup.base}
     if record is not None and record.is_measured:
-        stated, _ = stated_by(setup, record.of_kind(BEGUN)[0], tuple(setup.base))
+        stated, _ = stated_by(setup, record.entries[0], tuple(setup.base))
         servos = {servo.joint: (servo.table, servos[servo.joint][1]) for servo in stated}
     lost = setup.bench.settings.acquisition.lost
     mover = Mover(setup, device, servos, MotionGate(None, clock, lost, talk.asked_to_stop, talk.waits))
