@@ -113,7 +113,8 @@ def _motor(path: Path, name: str, entry: Any) -> Motor:
             _refuse(path, f"{name}.{field}", "found nothing, expected a whole number.", f"{_CALIBRATE}.")
         if type(entry[field]) is not int:
             shown = json.dumps(entry[field])[:40]
-            _refuse(path, f"{name}.{field}", f"found {shown}, expected a whole number.", "Write it without a fraction.")
+            hint = f"Write it without quotes or a fraction, or: {_CALIBRATE}."
+            _refuse(path, f"{name}.{field}", f"found {shown}, expected a whole number.", hint)
     beyond = [key for key in entry if key not in _FIELDS]
     if beyond:
         _refuse(path, f"{name}.{beyond[0]}", f"found another field, expected {', '.join(_FIELDS)}.", "Remove it.")

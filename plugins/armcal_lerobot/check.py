@@ -52,6 +52,7 @@ def check_content(
         content["motors"][name] = {**asdict(motor), "range_deg": 2 * motor.half_range_deg}
     if other is not None:
         content["notes"] += [f"{other.path.name}: {text}" for text in other.notes]
+        content["notes"] += _other_servos(file, other)
         for name, motor in file.motors.items():
             apart = zero_shift_deg(motor, other.motors[name])
             content["motors"][name] |= {"zero_moved_deg": apart, "teeth": teeth_of(apart)}
@@ -69,6 +70,17 @@ def check_content(
             content["motors"][gripper.motor_of(joint)[0]]["moved_mm"] = asdict(cost)
         content["moved_mm"] = asdict(together)
     return content
+
+
+def _other_servos(file: MotorFile, other: MotorFile) -> list[str]:
+    """Motors that have another id in the other file, sentences."""
+    ids = {name: (motor.id, other.motors[name].id) for name, motor in file.motors.items()}
+    text = "another servo answers to it, and what follows is not the whole of what changed. Give each its id again."
+    return [
+        f"{name} has the id {one} in {file.path.name} and {two} in {other.path.name}: {text}"
+        for name, (one, two) in ids.items()
+        if one != two
+    ]
 
 
 def show_check(console: Console, content: Mapping[str, Any]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -104,7 +106,11 @@ class Gripper:
         idle = [motor for motor in motors if motor not in wired and not is_gripper(motor)]
         if missing:
             text = f"found no motor for the joint {missing[0]}; the motors are {', '.join(motors)}."
-            mend = f"Say which one turns it: --joint {(idle or [motors[0]])[0]}={missing[0]} (or =-{missing[0]})."
+            mend = "None of them is without a joint: give the file of this arm, or the configuration of that one."
+            if idle:
+                nearest = difflib.get_close_matches(missing[0], idle, n=1, cutoff=0.0)[0]
+                option = shlex.quote(f"{nearest}={missing[0]}")
+                mend = f"Say which one turns it: --joint {option} (or =-{missing[0]})."
             raise InputError(text, where=self._where, hint=mend)
 
     def motor_of(self, joint: str) -> tuple[str, int]:

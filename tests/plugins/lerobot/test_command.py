@@ -54,6 +54,25 @@ def test_what_a_wrong_zero_costs(tmp_path: Path) -> None:
     assert "At the same command the gripper stands" in called("check", one, two, "--arm", ARM)
 
 
+def test_servos_that_were_exchanged_between_the_files_are_named(tmp_path: Path) -> None:
+    one, swapped = write_motors(tmp_path / "one.json"), {"shoulder_lift": {"id": 3}, "elbow_flex": {"id": 2}}
+    two = write_motors(tmp_path / "two.json", **swapped)
+    notes = json_of("check", one, two)["notes"]
+    assert "shoulder_lift has the id 2 in one.json and 3 in two.json" in notes[0] and len(notes) == 2
+
+
+def test_a_joint_without_a_motor_is_offered_the_nearest_that_is_free(tmp_path: Path) -> None:
+    file = tmp_path / "one.json"
+    entries = json.loads(write_motors(file).read_text())
+    renamed = {name.replace("_", " "): entry for name, entry in entries.items()}
+    file.write_text(json.dumps(renamed))
+    with pytest.raises(InputError, match="--joint 'shoulder pan=shoulder_pan'"):
+        called("check", file, "--arm", ARM)
+    file.write_text(json.dumps({name: entry for name, entry in entries.items() if name != "elbow_flex"}))
+    with pytest.raises(InputError, match="None of them is without a joint"):
+        called("check", file, "--arm", ARM)
+
+
 @pytest.mark.slow
 def test_a_range_in_percent_stretches_the_motion(tmp_path: Path) -> None:
     one = write_motors(tmp_path / "one.json")
