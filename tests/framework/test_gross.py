@@ -1,4 +1,4 @@
-"""How large the calibrated arm is beside the nominal one."""
+"""The calibrated arm beside the nominal one: how large it is, and whether its tips were measured at all."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import cast
 
 import numpy as np
 import pytest
-from armcal.diagnose.gross import figure_of
-from armcal.diagnose.gross_findings import size_findings
+from armcal.diagnose.gross import Figure, figure_of
+from armcal.diagnose.gross_findings import computed_findings, size_findings
 from armcal.estimate.estimator import Estimate
 from armcal.run.experiment import Experiment
 from armcal.run.prepare import Prepared, Stopwatch, assemble
@@ -42,3 +42,22 @@ def test_lengths_make_a_size_and_the_zero_of_a_joint_does_not(ready: Prepared) -
     assert size(ready, 0.5, 1.0) == pytest.approx(1.0)
     assert size(ready, 0.5, 1.1) == pytest.approx(1.1, abs=0.01)
     assert size(ready, 0.0, 1.1) == pytest.approx(1.1, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("nominal_mm", "judged_mm", "grade", "words"),
+    [
+        (1e-4, 2e-4, "bad", "follow the nominal arm to 0.0001 mm"),
+        (1.5, 0.003, "warning", "follow the calibrated arm to 0.003 mm"),
+        (1.5, 0.02, "", ""),
+        (1.5, np.nan, "", ""),
+    ],
+)
+def test_tips_that_are_computed_from_the_joints_are_named(
+    nominal_mm: float, judged_mm: float, grade: str, words: str
+) -> None:
+    """As the controller reports them: by the nominal arm, or by the arm that its maker calibrated. Reach 1 m."""
+    figure = Figure(1000.0, 1.0, 0.0, 0.0, ())
+    findings = computed_findings(np.full(20, nominal_mm), np.append(np.full(9, judged_mm), np.nan), figure)
+    assert [finding.grade for finding in findings] == [grade] * bool(grade)
+    assert all(words in finding.text for finding in findings)

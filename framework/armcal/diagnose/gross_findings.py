@@ -10,7 +10,7 @@ from armcal.base.units import digits
 from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.gross import BEYOND, FAR_BEYOND, Displaced, Figure
 from armcal.diagnose.majority import Minority
-from armcal.diagnose.noise_findings import Finding, first_few
+from armcal.diagnose.noise_findings import Finding, Grade, first_few
 from armcal.diagnose.residual_structure import ResidualStructure
 from armcal.diagnose.rounded import rounding_findings
 from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
@@ -32,6 +32,8 @@ _MOVED = (
 )
 SIZE, GROSS_SIZE = 0.02, 0.05
 """How far the calibrated arm may be larger or smaller than the nominal one: worth a look, and gross."""
+EXACT = 1e-5
+"""Of the reach, 10 um a metre: no arm follows a model so closely, and no instrument measures it so well."""
 MOST_NAMED = 3
 _IN_PROPORTION = 0.01
 
@@ -165,6 +167,28 @@ def size_findings(figure: Figure) -> list[Finding]:
         "instrument's scale that is off by as much shows in nothing else."
     )
     return [Finding("warning", text, f"regression on the nominal lengths, t, {100 * _IN_PROPORTION:g} %", action)]
+
+
+def computed_findings(nominal_mm: Array, judged_mm: Array, figure: Figure) -> list[Finding]:
+    """Tips that are computed from the joints: errors of the nominal arm and judged ones (N; nan where there are none).
+
+    Those of the nominal arm leave nothing to calibrate. Those of another model, a controller's, give that.
+    """
+    limit = EXACT * figure.reach_mm
+    medians = [
+        np.median(errors[known]) if (known := np.isfinite(errors)).any() else limit
+        for errors in (nominal_mm, judged_mm)
+    ]
+    if not min(medians) < limit:
+        return []
+    grade: Grade = "bad" if medians[0] < limit else "warning"
+    text = (
+        f"The measured tips follow the {'nominal' if grade == 'bad' else 'calibrated'} arm to "
+        f"{digits(float(min(medians)))} mm, as no measured tip of an arm does: they seem to be computed from the "
+        "joints, by the controller, robot_state_publisher or a simulation."
+    )
+    test = f"median, limit {limit:.2g} mm, {EXACT:g} of the arm's reach"
+    return [Finding(grade, text, test, "Give what an instrument measured, not the pose that the robot reports.")]
 
 
 def displacement_findings(figure: Figure) -> list[Finding]:

@@ -12,7 +12,14 @@ from armcal.diagnose.evidence import Evidence, elsewhere, priors_alone, unseen_p
 from armcal.diagnose.evidence_findings import worse_than_nominal
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.gross import MOST_RECORDS, figure_of, thinned
-from armcal.diagnose.gross_findings import contradicting, displacement_findings, gross_error, overfitted, size_findings
+from armcal.diagnose.gross_findings import (
+    computed_findings,
+    contradicting,
+    displacement_findings,
+    gross_error,
+    overfitted,
+    size_findings,
+)
 from armcal.diagnose.held import MOST_RECORDS as MOST_FOR_HELD
 from armcal.diagnose.held import contradictions, freed, held_scales
 from armcal.diagnose.large_errors import Judged, large_errors
@@ -70,7 +77,7 @@ def verdict_of(
     drifts = _AT_REST if any(block.drift is not None for block in problem.parameters.free) else ""
     gross, moved = list[Finding](), _accuracies(run)
     if estimate.verdict.converged:
-        gross = _gross(run, acting, judged, evidence)
+        gross = _gross(run, acting, errors, judged, evidence)
         moved += moved_findings(moved_groups(problem, estimate.values, acting))
     worse = _worse(run, errors, judged)
     verdict = judge(
@@ -176,7 +183,13 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     return Evidence(left, missed, alone, error_unit(problem), new, hidden, held, error_name(problem), rounded, away)
 
 
-def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array, evidence: Evidence) -> list[Finding]:
+def _gross(
+    run: FittedRecords,
+    acting: Sequence[FactorRecords],
+    errors: RecordErrors,
+    judged_mm: Array,
+    evidence: Evidence,
+) -> list[Finding]:
     """What is grossly wrong with a fit that converged to weighted records, and what its data cannot show."""
     problem, estimate, train = run.problem, run.fitted.estimate, run.split.train
     looked_at = thinned(train, MOST_RECORDS)
@@ -190,6 +203,11 @@ def _gross(run: FittedRecords, acting: Sequence[FactorRecords], judged_mm: Array
     position = recorded_position(run.dataset)[looked_at]
     read = predicted_positions(problem, estimate.values, acting, dataset)
     return [
+        *(
+            computed_findings(errors.nominal_mm, judged_mm, figure)
+            if (errors.name, errors.unit) == ("Tip", "mm")
+            else []
+        ),
         *gross_error(judged_mm, figure, estimate, evidence, _whitened(run)),
         *contradicting(minority(rows, estimate.noise_scale, position), dataset.ids),
         *size_findings(figure),
