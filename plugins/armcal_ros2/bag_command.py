@@ -39,6 +39,8 @@ def info(console: Console, path: Path) -> None:
         console.warn(remark)
     if data:
         _show_data(console, data)
+        if "names" in data["joints"]:
+            console.line("Leave names out where the arm's joints are called as in the recording, as in a URDF.")
 
 
 @bag.command()

@@ -113,7 +113,11 @@ class Rosbag2Reader:
         strange = [name for name in s.joints.names if name not in names and alone + name not in names]
         if strange:
             have = ", ".join(name.removeprefix(alone) for name in names)
-            self._refuse(f"found joints.names.{strange[0]}, expected joints of the arm: {have}.", "Correct the name.")
+            hint = "Correct the name, or leave out what has its own name in the recording."
+            self._refuse(f"found joints.names.{strange[0]}, expected joints of the arm: {have}.", hint)
+        if twice := [name for name in names.values() if [*names.values()].count(name) > 1]:
+            both = " and ".join(joint.removeprefix(alone) for joint, name in names.items() if name == twice[0])
+            self._refuse(f"found {twice[0]} for {both}, expected one joint of the recording each.", "Correct names.")
         slides = [kind == "length" for joints in commanded.values() for kind in joints.values()]
         log = JointLog(tuple(names.values()), slides, s.joints, s.still)
         paths = {name: MeasuredLog(name, own) for name, own in s.measurements.items() if own.clock_offset == "estimate"}

@@ -1,5 +1,6 @@
 """What a recording holds: topics, frames, joints and their rests, and the data section that would read it."""
 
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,19 +11,31 @@ from armcal_ros2.bag import Bag
 from armcal_ros2.joints import JointLog, JointsSettings, RestSettings
 from armcal_ros2.message import JOINT_STATE
 from armcal_ros2.samples import MEASURED, TRANSFORMS
+from armcal_ros2.stamps import nanoseconds
 
 _MOST_FRAMES = 200
+_LATEST = 20
+"""So many stamps of joint states are kept: transforms that are computed from them come at once."""
 
 
 @dataclass
 class TopicSummary:
-    """A topic: its type, messages, first and last receipt (s since 1970), and frames (of transforms ``a -> b``)."""
+    """A topic: its type, messages, first and last receipt (s since 1970), and frames (of transforms ``a -> b``).
+
+    ``computed`` counts transforms, by frame, with the very stamp of a joint state: robot_state_publisher's.
+    """
 
     type: str
     first: float
     last: float = 0.0
     count: int = 0
     frames: dict[str, int] = field(default_factory=dict)
+    computed: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def measured(self) -> list[str]:
+        """The frames that are not computed from joint states."""
+        return [frame for frame, count in self.frames.items() if 2 * self.computed[frame] < count]
 
 
 @dataclass(frozen=True)
@@ -52,12 +65,12 @@ class Survey:
             section["joints"]["names"] = numbered
         measured: dict[str, dict[str, str]] = {}
         for name, summary in self.topics.items():
-            if summary.type not in MEASURED or name.endswith("_static"):
+            if summary.type not in MEASURED or name.endswith("_static") or not summary.measured:
                 continue
             instance = f"tracker{len(measured) + 1}" if measured else "tracker"
             measured[instance] = {"topic": name}
             if summary.type == TRANSFORMS:
-                parent, _, child = next(reversed(summary.frames)).partition(" -> ")
+                parent, _, child = summary.measured[-1].partition(" -> ")
                 measured[instance] |= {"frame": child, "reference": parent}
         return {**section, "measurements": measured} if measured else section
 
@@ -70,6 +83,7 @@ def survey(bag: Bag) -> Survey:
         PluginError: rosbags is not there.
     """
     topics, joints, remarks = dict[str, TopicSummary](), dict[str, JointLog](), list[str]()
+    stamps = deque[int](maxlen=_LATEST)
     for (topic, received, _), message in bag.decoded(lambda topic: topic.type in (JOINT_STATE, *MEASURED)):
         time = received / 1e9
         own = topics.setdefault(topic.name, TopicSummary(topic.type, time))
@@ -81,12 +95,15 @@ def survey(bag: Bag) -> Survey:
                 own_settings, still = JointsSettings(topic=topic.name), [False] * len(message.name)
                 joints[topic.name] = JointLog(message.name, still, own_settings, RestSettings())
             joints[topic.name].add(topic.name, message, received)
+            stamps.append(nanoseconds(message.header.stamp) or -1)
             continue
         for part in message.transforms if topic.type == TRANSFORMS else [message]:
             child = getattr(part, "child_frame_id", "")
             frame = f"{part.header.frame_id} -> {child}" if child else part.header.frame_id
             if frame in own.frames or len(own.frames) < _MOST_FRAMES:
                 own.frames[frame] = own.frames.get(frame, 0) + 1
+                if child and nanoseconds(part.header.stamp) in stamps:
+                    own.computed[frame] += 1
     if not topics:
         hint = "Record again, or give another recording."
         raise DataError(
@@ -97,4 +114,7 @@ def survey(bag: Bag) -> Survey:
             remarks += log.close(str(bag.path))
         except DataError as fault:
             remarks.append(f"{fault.message} {fault.hint}")
+    for name, topic_summary in topics.items():
+        if sum(topic_summary.computed.values()) and not topic_summary.measured:
+            remarks.append(f"all frames in {name} are computed from the joints: they measure nothing.")
     return Survey(topics, joints, [*bag.remarks, *remarks])

@@ -39,6 +39,23 @@ def test_info_lists_topics_and_rests_and_suggests_a_data_section_that_reads(tour
     assert "6 rests of 0.9 to 1.0 s" in shown and "type: rosbag2" in shown
 
 
+@pytest.mark.parametrize("tracked", [True, False])
+def test_frames_that_are_computed_from_joints_are_not_suggested(tour: bags.Tour, tracked: bool) -> None:
+    """robot_state_publisher stamps transforms as the joint states that they are computed from."""
+    joints = [m for m in tour.sent() if m[1] == "/joint_states"]
+    times = tour.joints[0]
+    frames = [bags.transform(t, "link5", "link6", [0.1, 0, 0]) for t in times]
+    frames += [bags.transform(t + 0.0017, "world", "marker", [0.1, 0, 0]) for t in times[::3] if tracked]
+    kind = "tf2_msgs/msg/TFMessage"
+    sent = [(f.header.stamp.sec + f.header.stamp.nanosec / 1e9 + 0.004, f) for f in frames]
+    listed = [*joints, *((t, "/tf", kind, bags.message(kind, transforms=[frame])) for t, frame in sent)]
+    path = bags.write_bag(tour.config.with_name(f"frames_{tracked}"), listed)
+    content = json.loads(CliRunner().invoke(command, ["info", str(path), "--json"], catch_exceptions=False).stdout)
+    suggested = content["data"].get("measurements", {})
+    assert suggested == ({"tracker": {"topic": "/tf", "frame": "marker", "reference": "world"}} if tracked else {})
+    assert any("computed from the joints" in text for text in content["remarks"]) != tracked
+
+
 def test_joint_states_without_names_are_counted(tour: bags.Tour) -> None:
     sent = [entry for entry in tour.sent() if entry[1] == "/tip"]
     sent += [(t, "/joint_states", "sensor_msgs/msg/JointState", bags.joint_state(t, [], [])) for t in tour.joints[0]]

@@ -97,6 +97,18 @@ def test_a_stated_clock_offset_moves_the_measurement(tour: bags.Tour, name: Path
         read(tour, bag)
 
 
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        ({"q2": "q3"}, "found q3 for q2 and q3, expected one joint"),
+        ({"j1": "q1"}, "found joints.names.j1, expected joints of the arm: q1.*leave out"),
+    ],
+)
+def test_names_that_cannot_be_are_refused(tour: bags.Tour, name: Path, names: dict[str, str], expected: str) -> None:
+    with pytest.raises(DataError, match=expected):
+        read(tour, bags.write_bag(name, []), joints={"names": names})
+
+
 def test_a_clock_that_is_a_little_off_is_named(tour: bags.Tour, name: Path) -> None:
     """The times of receipt do not show so little; the measured point moves where the joints stand."""
     text = " ".join(read(tour, bags.write_bag(name, tour.sent(ahead=0.4))).warnings)
