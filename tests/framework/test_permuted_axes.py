@@ -125,6 +125,15 @@ def test_a_travel_in_another_unit_is_named(tmp_path: Path) -> None:
         prepared(10.0)
 
 
+@pytest.mark.quick("q3--90")
+@pytest.mark.parametrize(("joint", "turn"), [("q2", 180), ("q3", -90), ("q5", 90)])
+def test_a_zero_a_quarter_or_half_a_turn_off_is_named(demo: Prepared, joint: str, turn: int) -> None:
+    """Half the counts of a servo, or where another convention has the zero."""
+    angles = demo.dataset.column(f"arm.{joint}") - np.radians(turn)
+    moved = replace(demo.dataset, channels={**demo.dataset.channels, f"arm.{joint}": angles})
+    assert told(demo, moved) == (f"{turn} deg added to {joint}",)
+
+
 @pytest.mark.parametrize("record", [41, 42])
 def test_one_record_far_off_is_no_other_reading(demo: Prepared, record: int) -> None:
     x = demo.dataset.channels["tracker.x"].copy()

@@ -247,12 +247,12 @@ def _of(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, arm: Ar
 
 
 def _rewired(problem: Problem, seen: _Seen, read_as: Wires) -> FactorRecords:
-    """Records with channels read as others, times a factor."""
+    """Records with channels read as others, times a factor, and a summand."""
     channels, own = problem.kernels[seen.sighting.kernel].factor.channels, seen.records
     rewired = own.record.copy()
-    for channel, (other, factor) in read_as.items():
+    for channel, (other, factor, added) in read_as.items():
         if channel in channels and other in channels:
-            rewired[channels.index(channel)] = factor * own.record[channels.index(other)]
+            rewired[channels.index(channel)] = factor * own.record[channels.index(other)] + added
     return replace(own, record=rewired, state=np.zeros_like(own.state))
 
 

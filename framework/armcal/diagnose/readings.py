@@ -13,9 +13,11 @@ from armcal.arm.assembly import Arm
 from armcal.base.arrays import Array
 from armcal.problem.rigid_alignment import Tools, nearest
 
-Wires = Mapping[str, tuple[str, float]]
-"""Channels, each read as another one times a factor."""
+Wires = Mapping[str, tuple[str, float, float]]
+"""Channels, each read as another one times a factor, and a summand."""
 _DEGREES, _TURN, _MRAD = 180 / np.pi, 360.0, 1000 * np.pi / 180
+_ZEROS_DEG = (180, 90, -90)
+"""What the zero of a joint is off by: half the counts of a servo, or where another convention has it."""
 _MOST_SIGNS = 8
 _AXES = "xyz"
 _INCH = 25.4
@@ -44,6 +46,8 @@ def single_joints(arm: Arm) -> list[tuple[str, Wires]]:
     for joint in joints:
         units = LENGTHS if joint not in angles else (_DEGREES,) if len(angles) > 1 else ()
         readings += [(f"{joint} {factor:.4g} times as large", _wires(arm, {joint: joint}, factor)) for factor in units]
+    for joint, turn in product(angles, _ZEROS_DEG):
+        readings.append((f"{turn} deg added to {joint}", _wires(arm, {joint: joint}, 1.0, np.radians(turn))))
     return readings
 
 
@@ -75,12 +79,12 @@ def axes_words(order: Sequence[int], signs: Sequence[float]) -> str:
     return f"({', '.join(taken)}) taken for (x, y, z)"
 
 
-def _wires(arm: Arm, joints: Mapping[str, str], factor: float) -> dict[str, tuple[str, float]]:
+def _wires(arm: Arm, joints: Mapping[str, str], factor: float, added: float = 0.0) -> Wires:
     """Commands and approaches of some joints read as those of others, times a factor; of approaches, times its sign."""
     return {
-        f"{arm.name}.{part}{joint}": (f"{arm.name}.{part}{other}", scale)
+        f"{arm.name}.{part}{joint}": (f"{arm.name}.{part}{other}", scale, summand)
         for joint, other in joints.items()
-        for part, scale in (("", factor), ("approach.", float(np.sign(factor))))
+        for part, scale, summand in (("", factor, added), ("approach.", float(np.sign(factor)), 0.0))
     }
 
 

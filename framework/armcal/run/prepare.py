@@ -32,7 +32,10 @@ from armcal.problem.readings import with_joint_noise
 from armcal.run.experiment import Experiment
 from armcal.run.pose_residual import unlearned
 
-_MEND = {True: "the order or the directions of the joints in the model", False: "how the tracker's frame lies"}
+_MEND = {
+    True: "the order, the directions or the zeros of the joints in the model",
+    False: "how the tracker's frame lies",
+}
 _REACH_RATIO = 10.0
 _ALIKE = 0.35
 """In powers of ten: so alike are two distances of one unit."""
