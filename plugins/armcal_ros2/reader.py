@@ -1,7 +1,7 @@
 """The reader ``rosbag2``: records from a recording of ROS 2, one a rest of the arm."""
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NoReturn
 
@@ -9,10 +9,8 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.settings import InputPath, Settings
-from armcal.calibration.rigid_chain import nominal_tools
 from armcal.io.plain_files import refuse
 from armcal.measure.checks import check_dataset, layout_of
-from armcal.measure.layout import warned
 from armcal.measure.missing import with_absent
 from armcal.measure.reader import ReadRequest
 from armcal.measure.stillness import deviations_of_mean, judged, mean_pose
@@ -23,15 +21,12 @@ from armcal_ros2.bag import Bag
 from armcal_ros2.clock import estimated_offset
 from armcal_ros2.joints import GUARD_S, JointLog, JointRest, JointsSettings, RestSettings, channels_of
 from armcal_ros2.message import JOINT_STATE, Topic
+from armcal_ros2.nominal import NO_NOISE_M, follows, is_inverted, joint_channels, tool_of
 from armcal_ros2.samples import MEASURED, TRANSFORMS, MeasuredLog, MeasuredSettings
 
 _FEWEST_SAMPLES = 4
 _CLOCKS_APART_S, _DRIFT_S = 0.5, 0.01
 _NAMED = 5
-_NO_NOISE_M = 1e-5
-"""Smaller than what any arm errs by."""
-_FEWEST_COMPARED = 26
-"""Twice the numbers of an affine map of the tool's pose."""
 _FULL_TURN = 2 * np.pi * (1 + 1e-9)
 
 
@@ -97,10 +92,6 @@ class Rosbag2Reader:
         for log in logs:
             remarks += log.close(str(s.path)) + self._clock_remarks(log, joints)
         dataset = self._dataset(request, joints, logs, (*bag.remarks, *remarks))
-        for name in s.measurements:
-            if _follows_nominal(request, name, dataset):
-                text = f"{name} follows the nominal arm to {1e6 * _NO_NOISE_M:g} um: it seems to be computed from "
-                dataset = warned(dataset, f"{text}joints, as robot_state_publisher does, and not measured.")
         dataset = with_absent(dataset, request.channels)
         return check_dataset(dataset, layout_of(request.channels, dataset, {}, {}, by_line=False))
 
@@ -167,7 +158,7 @@ class Rosbag2Reader:
             assert not isinstance(offset, str)
             return offset, []
         seen.close(str(self._settings.path))
-        blocks, tool = request.measurements[name].parameters(), _tool_of(request, name)
+        blocks, tool = request.measurements[name].parameters(), tool_of(request, name)
         stated = {block.name: block.nominal[0] for block in blocks if len(block.nominal) == 1}
         target = np.array([stated.get(f"target_{axis}", 0.0) for axis in "xyz"] + [1.0])
 
@@ -199,7 +190,7 @@ class Rosbag2Reader:
     ) -> Dataset:
         """A record a rest."""
         rests, count = joints.rests, len(joints.rests)
-        names = _joint_channels(request)
+        names = joint_channels(request)
         means = np.array([rest.means for rest in rests]).T
         sides = np.array([joints.approach(rest.end) for rest in rests]).T
         channels = dict(zip(names, means, strict=True))
@@ -210,6 +201,7 @@ class Rosbag2Reader:
         extra["joint_scatter"] = tuple(f"{rest.scatter.max():.2g}" for rest in rests)
         for name, own in seen.items():
             channels |= self._measured(name, request, own)
+            remarks = [*remarks, *self._beside_nominal(tool_of(request, name)(means.T), name, own)]
             extra[f"{name}_samples"] = tuple(str(one.samples) for one in own)
             extra[f"{name}_scatter_mm"] = tuple(f"{1000 * one.deviation:.4f}" for one in own)
         faulty = {}
@@ -231,6 +223,23 @@ class Rosbag2Reader:
         digest = self._digest.hexdigest()
         dataset = Dataset(ids, channels, extra, tuple(range(1, count + 1)), place, digest, warnings=warnings)
         return dataset.without(faulty)
+
+    def _beside_nominal(self, tools: Array, name: str, seen: Sequence[_Seen]) -> list[str]:
+        """A sentence on poses that the nominal tools (N x 4 x 4) have themselves.
+
+        Raises:
+            DataError: it is the inverses of the poses that move as the tools do.
+        """
+        poses = np.array([one.pose for one in seen])
+        if is_inverted(tools, poses):
+            settings = self._settings.measurements[name]
+            mend = f"Set inverted: {str(not settings.inverted).lower()} for {name}."
+            text = f"the poses of {name} are those of its instrument in the body: their inverses move as the arm does"
+            self._refuse(f"{text}.", mend if settings.reference is None else "Exchange frame and reference.")
+        if not follows(tools, poses):
+            return []
+        text = f"{name} follows the nominal arm to {1e6 * NO_NOISE_M:g} um: it seems to be computed from joints"
+        return [f"{text}, as robot_state_publisher does, and not measured."]
 
     def _moving_remarks(self, seen: Mapping[str, Sequence[_Seen]]) -> list[str]:
         """Of measurements that move in most of the rests in which they saw something, sentences."""
@@ -291,34 +300,10 @@ class Rosbag2Reader:
     def _refuse_degrees(self, request: ReadRequest, positions: Array) -> None:
         """Angles beyond one turn of joints that do not turn on and on."""
         turning = {w.channel for w in request.channels if w.dimension == "angle" and not w.is_endless}
-        for name, largest in zip(_joint_channels(request), positions, strict=True):
+        for name, largest in zip(joint_channels(request), positions, strict=True):
             if name in turning and largest > _FULL_TURN:
                 hint = "If these are degrees, set joints: {unit: deg}; if not, record angles within one turn."
                 self._refuse(f"{name} stands at {largest:.6g} rad, more than one turn (2 pi rad).", hint)
 
     def _refuse(self, message: str, hint: str) -> NoReturn:
         refuse(self._settings.path, message, hint)
-
-
-def _joint_channels(request: ReadRequest) -> list[str]:
-    return [f"{name}.{joint}" for name, arm in request.arms.items() for joint in arm.commanded]
-
-
-def _tool_of(request: ReadRequest, name: str) -> Callable[[Array], Array]:
-    """The pose of the nominal tool that a measurement sees (N x 4 x 4, m) at the joints of all arms (N x joints)."""
-    own = request.measurements[name].arms[0]
-    arm, channels = request.arms[own], _joint_channels(request)
-    columns = [channels.index(f"{own}.{joint}") for joint in arm.commanded]
-    return lambda joints: nominal_tools(arm, joints[:, columns])
-
-
-def _follows_nominal(request: ReadRequest, name: str, dataset: Dataset) -> bool:
-    """Whether measured places are those of a point on the nominal tool, whatever point and base, beyond any noise."""
-    places = np.array([dataset.channels.get(f"{name}.{axis}", np.full(len(dataset), np.nan)) for axis in "xyz"])
-    known = np.isfinite(places).all(axis=0)
-    if known.sum() < _FEWEST_COMPARED:
-        return False
-    tools = _tool_of(request, name)(dataset.stacked(_joint_channels(request)).T[known])
-    design = np.column_stack([np.ones(len(tools)), tools[:, :3].reshape(len(tools), 12)])
-    left = places.T[known] - design @ np.linalg.lstsq(design, places.T[known], rcond=None)[0]
-    return bool(np.sqrt((left**2).mean()) < _NO_NOISE_M)

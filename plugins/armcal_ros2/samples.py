@@ -41,13 +41,16 @@ class MeasuredSettings(TopicSettings):
     """Where a measurement comes from.
 
     ``topic`` is one of PoseStamped, PointStamped or TransformStamped; ``frame`` is then the frame_id that its headers
-    must have. Of transforms (``/tf``) the pose of ``frame`` in ``reference`` is read. ``clock_offset`` is how far the
-    clock of its stamps is ahead of that of the joints; ``estimate`` finds it from the motions between rests.
+    must have. Of transforms (``/tf``) the pose of ``frame`` in ``reference`` is read. With ``inverted`` poses are those
+    of the instrument in the body, as of a marker that a camera on the hand sees, and their inverses are read.
+    ``clock_offset`` is how far the clock of its stamps is ahead of that of the joints; ``estimate`` finds it from the
+    motions between rests.
     """
 
     topic: str
     frame: str | None = None
     reference: str | None = None
+    inverted: bool = False
     clock_offset: Duration | Literal["estimate"] = 0.0
 
     @model_validator(mode="after")
@@ -211,10 +214,16 @@ class MeasuredLog:
             self._faults["position is not finite"] += 1
             return
         if turn is None:
+            if self.settings.inverted:
+                self._faults["orientation is missing, so that they have no inverse"] += 1
+                return
             turn = np.full(4, np.nan)
         elif not abs((norm := float(np.linalg.norm(turn))) - 1) <= _NORM_TOLERANCE:
             self._faults["quaternion is zero" if norm < _NORM_TOLERANCE else "quaternion is not of length 1"] += 1
             return
+        elif self.settings.inverted:
+            inverse = Rotation.from_quat(turn).inv()
+            position, turn = -inverse.apply(position), inverse.as_quat()
         sample = (time, *position.tolist(), *turn.tolist())
         if not self._rests:
             is_later = not self._path or time - self._path[-8] >= THINNED_S

@@ -17,6 +17,7 @@ import yaml
 from armcal.base.dataset import Dataset
 from armcal.errors import DataError
 from armcal.run.experiment import Experiment
+from armcal_ros2.nominal import is_inverted
 from scipy.spatial.transform import Rotation
 
 TOPIC = "geometry_msgs/msg/PointStamped"
@@ -177,6 +178,39 @@ def test_poses_are_read_with_their_orientation(tour: bags.Tour, name: Path) -> N
     quaternions = dataset.stacked([f"tracker.{axis}" for axis in ("qx", "qy", "qz", "qw")]).T
     np.testing.assert_allclose(quaternions, turns * np.sign(turns[:, 3:]), atol=1e-9)
     assert any("whose quaternion is zero" in text for text in dataset.warnings)
+
+
+def test_inverted_poses_are_read_the_right_way_round(tour: bags.Tour, name: Path) -> None:
+    """As of a marker that a camera on the hand sees."""
+    turn = Rotation.from_euler("xyz", [20, -30, 140], degrees=True)
+    sent = [m for m in tour.sent() if m[1] == "/joint_states"]
+    kind, q = "geometry_msgs/msg/PoseStamped", bags.vector("Quaternion", turn.inv().as_quat())
+    for t, p in zip(*tour.seen, strict=True):
+        place = bags.vector("Point", -turn.inv().apply(p))
+        pose = bags.message("geometry_msgs/msg/Pose", position=place, orientation=q)
+        sent.append((t, "/tip", kind, bags.message(kind, header=bags.header(t, "hand"), pose=pose)))
+    require_rests(read(tour, bags.write_bag(name, sent), inverted=True), tour)
+
+
+@pytest.mark.parametrize("off_m", [1e-3, 5e-3])
+def test_poses_that_are_the_wrong_way_round_are_recognised(off_m: float) -> None:
+    """Of any base and body, on an arm that is some mm off its nominal one."""
+    random = np.random.default_rng(1)
+    tools, (base, body) = poses(random, 30, 0.5), poses(random, 2, 1.0)
+    measured = base @ tools @ body
+    measured[:, :3, 3] += random.normal(0, off_m, (30, 3))
+    assert is_inverted(tools, np.linalg.inv(measured)) and not is_inverted(tools, measured)
+    assert not is_inverted(tools[:20], np.linalg.inv(measured)[:20]), "too few"
+    measured[:, :3, :3] = np.nan
+    assert not is_inverted(tools, measured), "points have no inverse"
+
+
+def poses(random: np.random.Generator, count: int, reach: float) -> np.ndarray:
+    """Any poses (N x 4 x 4; m)."""
+    made = np.tile(np.eye(4), (count, 1, 1))
+    made[:, :3, :3] = Rotation.random(count, random_state=random.integers(100)).as_matrix()
+    made[:, :3, 3] = random.uniform(-reach, reach, (count, 3))
+    return made
 
 
 Change = Callable[[list[bags.Sent]], list[bags.Sent]]
