@@ -28,6 +28,7 @@ from armcal.scaffold.dh_table import read_rows
 from armcal.scaffold.rendering import number, word
 from armcal.scaffold.robot import RobotJoint, Row, robot_of_rows
 from armcal.scaffold.robot_files import RECORDS, SIMULATED, RobotFolder, _levels, write_robot
+from armcal.scaffold.urdf_source import robot_of_urdf
 from click.testing import CliRunner, Result
 from scaffolds import ROOT, commands_of, files_of, page
 
@@ -274,6 +275,16 @@ def test_a_urdf_gives_limits_and_masses(here: Path) -> None:
             low, high = (math.degrees(limit) for limit in joint.limits)
             assert low - 1e-6 <= plan["limits_deg"][joint.name][0] < plan["limits_deg"][joint.name][1] <= high + 1e-6
     assert experiment.simulator() is not None
+
+
+def test_a_joint_that_follows_another_has_priors_too(here: Path) -> None:
+    """A parallelogram: what carries the forearm is off its drawing as any joint is."""
+    follows, text = '<mimic joint="j2" multiplier="-1"/>', (ROOT / "configs" / "ball" / "arm7.urdf").read_text()
+    name = table(
+        here, re.sub(r'(<joint name="j3".*?)(</joint>)', rf"\1{follows}\2", text, count=1, flags=re.S), "r.urdf"
+    )
+    robot = robot_of_urdf("r", Path(name), "ball_link", REGISTRY)
+    assert "j3" not in [joint.name for joint in robot.joints] and "arm.urdf.j3_[xyz]" in robot.priors
 
 
 @pytest.mark.slow

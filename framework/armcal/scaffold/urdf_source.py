@@ -37,10 +37,10 @@ def robot_of_urdf(name: str, path: Path, tip: str | None, registry: PluginRegist
         )
     check_joint_names([joint.name for joint in joints], [where] * len(joints))
     priors: dict[str, Unit] = {}  # how far joints may be off the URDF; where the arm stands before the tracker has none
-    for joint in joints:
-        priors[f"arm.urdf.{joint.name}_[xyz]"] = "mm"
-        priors[f"arm.urdf.{joint.name}_[rpy][oia]*"] = "deg"
-    moving = tuple(f"arm.urdf.{joint.name}_*" for joint in joints)
+    for moved in chain.joints:  # a joint that follows another too
+        priors[f"arm.urdf.{moved.name}_[xyz]"] = "mm"
+        priors[f"arm.urdf.{moved.name}_[rpy][oia]*"] = "deg"
+    moving = tuple(f"arm.urdf.{moved.name}_*" for moved in chain.joints)
     # Without a placement of its own the tracker's frame would end up in the first joint, and with it in every export.
     placed = ((f"arm.{PLACEMENT}_*",), ("tracker.target_*",))
     return Robot(
