@@ -24,9 +24,10 @@ from armcal_lerobot.motion import Motion
 from armcal_lerobot.tracking import Tracking, trackings
 
 LIMITS_OF_DATA = (
-    "What one data set cannot show: a wrong zero of leader or follower (the follower is sent the leader's numbers and "
-    "answers in its own), and play between a servo's encoder and the link. Compare two calibration files (armcal "
-    "lerobot check), two data sets, or measure the gripper (armcal run)."
+    "What one data set cannot show: its unit (degrees are assumed; else --units percent), a wrong zero of leader or "
+    "follower (the follower is sent the leader's numbers and answers in its own), and play between a servo's encoder "
+    "and the link. Compare two calibration files (armcal lerobot check), two data sets, or measure the gripper (armcal "
+    "run)."
 )
 _FIGURES = ("delay_s", "gain", "offset", "backlash", "load")
 Table = tuple[str, tuple[str, ...], list[list[str]]]
