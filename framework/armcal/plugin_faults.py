@@ -80,16 +80,20 @@ def _blamed(work: Callable[P, R], *given: P.args, **named: P.kwargs) -> R:
         raise
 
 
-def refuse(method: Callable[..., Any], returned: Any, expected: str) -> NoReturn:
-    """Refuse what a method of a component returned: a text describes it, of anything else the type is named.
+def refuse(method: Callable[..., Any] | property, returned: Any, expected: str) -> NoReturn:
+    """Refuse what a method of a component (or a property, or the class that sets an attribute) returned.
+
+    A text describes it, of anything else the type is named.
 
     Raises:
         PluginError: with the method, its file and line, what it returned and what was expected.
     """
-    method = getattr(method, "fget", method)  # of a property
-    function = inspect.unwrap(getattr(method, "__func__", method))
+    getter: Any = getattr(method, "fget", method)  # of a property
+    function = inspect.unwrap(getattr(getter, "__func__", getter))
     code = getattr(function, "__code__", None)
     where = Location(code.co_filename, line=code.co_firstlineno) if code else None
+    if isinstance(function, type) and (file := getattr(sys.modules.get(function.__module__), "__file__", None)):
+        where = Location(file)
     name = getattr(function, "__qualname__", type(method).__qualname__)
     if not isinstance(returned, str):
         returned = "None" if returned is None else f"an object of type {type(returned).__name__}"

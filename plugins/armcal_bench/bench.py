@@ -12,6 +12,7 @@ from armcal.config.validate import validate
 from armcal.devices.clock import Clock, RealClock, SimulatedClock
 from armcal.devices.device import JointDevice
 from armcal.devices.live import JointStream, LiveCamera, Tracker
+from armcal.devices.returned import check_joint_names
 from armcal.devices.simulated import SimulatedBench
 from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment
@@ -126,7 +127,9 @@ class Bench:
             ConfigError: refused, or none is configured.
         """
         link = None if self.settings.link is None else self._built("link")
-        built: JointDevice = self._built("device", tuple(self.arm.commanded), link)
+        joints = tuple(self.arm.commanded)
+        built: JointDevice = self._built("device", joints, link)
+        check_joint_names(built, joints)
         return built
 
     def tracker(self) -> Tracker:

@@ -288,6 +288,36 @@ def ended(folder: Path, plugin: str, command: str, *more: str, measurement: str 
     return done or 0
 
 
+@pytest.mark.parametrize(
+    ("command", "right", "wrong", "sentence"),
+    [
+        ("acquire", '("a", "b")', "None", "D returned None as joint_names, expected .'a', 'b'., as it was given them"),
+        ("acquire", '("a", "b")', '("a",)', "D returned .'a',. as joint_names, expected .'a', 'b'., as it was given"),
+        (
+            "acquire",
+            "    refused = {}",
+            "    refused = 0",
+            "T returned 0 as refused, expected a mapping of reasons to co",
+        ),
+        (
+            "servo",
+            "    refused = {}",
+            "    refused = {'x': None}",
+            "T returned ..x.: None. as refused, expected a mapp",
+        ),
+        ("record", '"touch"', '"board"', "C returned 'board' as measurement, expected one of touch"),
+    ],
+)
+def test_what_is_wrong_from_the_beginning(
+    command: str, right: str, wrong: str, sentence: str, tmp_path: Path, clock: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, _, options, measurement = COMMANDS[command]
+    assert right in PLUGIN
+    assert ended(tmp_path, PLUGIN.replace(right, wrong, 1), command, *options, measurement=measurement) == 2
+    shown = capsys.readouterr().err
+    assert re.search(rf"armcal: .*mine.py: {sentence}", shown) and "Traceback" not in shown, shown
+
+
 def mistaken(method: str, statement: str) -> str:
     """The plugin with a method that does that, once it is late."""
     kind, _, name = method.partition(".")

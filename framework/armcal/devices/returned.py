@@ -6,7 +6,7 @@ expected. What the method itself raises passes.
 
 from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceIdentity, DeviceState, JointDevice, MeasuringDevice
 from armcal.devices.link import Link, LinkIdentity
 from armcal.devices.live import JointSample, JointStream, LiveCamera, RestStream, Shot, Tracker, TrackerFrame
+from armcal.measure.measurement import Measurement
 from armcal.plugin_faults import refuse
 
 Method = Callable[..., Any]
@@ -134,8 +135,26 @@ def refused_by(part: Tracker | JointStream) -> Mapping[str, int]:
     """How much was passed over, by reason."""
     refused = part.refused
     if not isinstance(refused, Mapping) or not _is_all(int, refused.values()):
-        refuse(type(part).refused, f"{refused!r:.60}", "a mapping of reasons to counts")
+        _refuse_attribute(part, "refused", "a mapping of reasons to counts")
     return refused
+
+
+def check_joint_names(device: JointDevice, joints: tuple[str, ...]) -> None:
+    """Refuse a device that moves other joints than those that it was given."""
+    if device.joint_names != joints:
+        _refuse_attribute(device, "joint_names", f"{joints}, as it was given them")
+
+
+def check_seen(camera: LiveCamera, measurements: Mapping[str, Measurement]) -> None:
+    """Refuse a camera, open, that is of none of these measurements."""
+    if camera.measurement not in measurements:
+        _refuse_attribute(camera, "measurement", f"one of {', '.join(measurements)}")
+
+
+def _refuse_attribute(part: Any, name: str, expected: str) -> NoReturn:
+    declared = getattr(type(part), name, None)
+    given = f"{getattr(part, name)!r:.60} as {name}"
+    refuse(declared if isinstance(declared, property) else type(part), given, expected)
 
 
 def _check_shot(method: Method, shot: Any) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from armcal.devices.clock import Clock
 from armcal.devices.live import JointStream, LiveCamera, RestStream
-from armcal.devices.returned import samples_of
+from armcal.devices.returned import check_seen, samples_of
 from armcal.errors import ConfigError
 
 from armcal_bench.bench import SECTION, Bench, closing
@@ -54,6 +54,7 @@ def record(
     with bench.clock() as clock, closing(stream, *(() if camera is None else (camera,))):
         if camera is not None:
             camera.open(clock, bench.experiment.system.measurements)
+            check_seen(camera, bench.experiment.system.measurements)
         contacts_of(bench.experiment, camera)
         stream.open(clock, channels)
         with opened_journal(*to, OURS, header, "recording", _SAME) as journal:
