@@ -121,7 +121,7 @@ class PluginRegistry:
         known = sorted(n for k, n in self._by_name if k == kind)
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"Did you mean {near[0]!r}?" if near else f"Known: {', '.join(known) or 'none'}."
-        if others := [_spoken(k) for k, n in self._by_name if n == name]:
+        if others := [spoken(k) for k, n in self._by_name if n == name]:
             hint = f"It is registered as {' and '.join(others)}."
         hint += " A plugin's file is loaded by --plugin FILE."
         if self.faults:
@@ -129,7 +129,7 @@ class PluginRegistry:
             hint += f" These plugins failed to load and may have had it: {failed}."
         if plugin_files.disabled():
             hint += f" Left out as --disable-plugin asks: {', '.join(plugin_files.disabled())}."
-        raise PluginError(f"no plugin offers {_spoken(kind)} called {name!r}.", hint=hint)
+        raise PluginError(f"no plugin offers {spoken(kind)} called {name!r}.", hint=hint)
 
     def notify(self, event: str, **what: Any) -> list[str]:
         """Tell every observer of an event; gives what went wrong in those that failed, which stops nothing."""
@@ -157,7 +157,7 @@ def _kind_name(kind: str) -> str:
     return names.get(kind, kind)
 
 
-def _spoken(kind: str) -> str:
+def spoken(kind: str) -> str:
     """A kind with its article."""
     name = _kind_name(kind)
     return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"

@@ -64,6 +64,24 @@ def estimate(folder: Path) -> Any:
     return yaml.safe_load((folder / "calibration.yaml").read_text())["parameters"]
 
 
+@pytest.mark.parametrize(
+    ("estimator", "says"),
+    [
+        (
+            "{type: extended, iteratons: 3}",
+            "estimator.iteratons: found the unknown key 'iteratons': did you mean",
+        ),
+        ("{iterations: 3}", "estimator: found no type of an online estimator"),
+        ("{type: extendd}", "Did you mean 'extended'?"),
+    ],
+)
+def test_an_estimator_that_is_none_is_refused(calibration: Path, tmp_path: Path, estimator: str, says: str) -> None:
+    config = tmp_path / "online.yaml"
+    config.write_text(f"estimator: {estimator}\n")
+    done = armcal("recalibrate", calibration, "--from", POSES, "--config", config, "--out", tmp_path / "out")
+    assert done.exit_code == 2 and says in done.stderr
+
+
 @pytest.mark.slow
 def test_the_stream_is_json_lines_and_the_calibration_can_be_used(whole: Path, tmp_path: Path) -> None:
     told = [json.loads(line) for line in (whole / "stdout").read_text().splitlines()]

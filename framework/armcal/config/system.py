@@ -23,7 +23,7 @@ from armcal.measure.groups import Groups, group_blocks
 from armcal.measure.measurement import Borrowing, Carried, Measurement
 from armcal.measure.reader import surroundings
 from armcal.measure.returned import check_channels
-from armcal.plugins import Component, PluginRegistry
+from armcal.plugins import Component, PluginRegistry, spoken
 
 T = TypeVar("T")
 Path = tuple[str | int, ...]
@@ -174,7 +174,7 @@ def build_component(
     for step in at:
         section = section[step]
     if not isinstance(section, dict) or not isinstance(section.get("type"), str):
-        source.refuse(at, f"found no type for this {kind}.", "Write type: NAME; see armcal plugins list.")
+        source.refuse(at, f"found no type of {spoken(kind)}.", "Write type: NAME; see armcal plugins list.")
     name = str(section["type"])
     try:
         registered = registry.find(kind, name)
