@@ -142,7 +142,7 @@ class Kept:
 def kept_true(calibration: Calibration, world: World, count: int, **settings) -> Kept:
     """Of so many good records after a calibration."""
     given = RecalibrateSettings.model_validate({"evaluator": "interpreted", **settings})
-    session, dataset = Recalibrator.begin(calibration, given, registry()), world.records(count)
+    session, dataset = Recalibrator(calibration, given, registry()), world.records(count)
     counted: Counter[str] = Counter()
     decisions = []
     for i, name in enumerate(dataset.ids):

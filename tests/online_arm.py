@@ -253,7 +253,7 @@ class Filtered:
 
 def begun(given: RecalibrateSettings | None = None, **of) -> Recalibrator:
     """A recalibrator of the arm; ``of`` is for ``calibration``."""
-    return Recalibrator.begin(calibration(**of), given or settings())
+    return Recalibrator(calibration(**of), given or settings())
 
 
 def told(events: Iterable[Mapping[str, Any]], kind: str) -> list[Mapping[str, Any]]:

@@ -122,7 +122,7 @@ def launched(folder: Path) -> Calibration:
 def decided(folder: Path, *overrides: str) -> list[Mapping[str, Any]]:
     """The decisions of a mission."""
     plan = MissionPlan.load(CONFIG, (f"simulation.days={DAYS}", "evaluator=interpreted", *overrides))
-    mission, session = simulated(plan), Recalibrator.begin(launched(folder), plan.recalibrate)
+    mission, session = simulated(plan), Recalibrator(launched(folder), plan.recalibrate)
     records = as_incoming(mission.records, mission.times, mission.began)
     return [event for k, record in enumerate(records, 1) for event in told(session.take(record, k), "decision")]
 

@@ -90,7 +90,7 @@ def halves(request: pytest.FixtureRequest, poses: Path, tmp_path_factory: pytest
 
 
 def run(halves: Halves, settings: RecalibrateSettings, step_rad: float = 0.0) -> Course:
-    session = Recalibrator.begin(halves.calibration, settings)
+    session = Recalibrator(halves.calibration, settings)
     events: list[dict] = []
     for i in range(len(halves.even)):
         channels = {name: float(values[i]) for name, values in halves.even.channels.items()}
@@ -228,13 +228,13 @@ def test_the_window_starts_from_nominal_values_as_well(poses: Path, tmp_path: Pa
 def test_the_window_is_refused_for_matrices(poses: Path, tmp_path: Path) -> None:
     found = calibrated("best", poses, tmp_path, "parameters.drift={}")
     with pytest.raises(ConfigError, match="3x3 compliances"):
-        Recalibrator.begin(found, RecalibrateSettings(estimator={"type": "window"}))
+        Recalibrator(found, RecalibrateSettings(estimator={"type": "window"}))
 
 
 def from_nominal(batch: Calibration, experiment: Experiment, estimator: dict | None = None) -> Recalibrator:
     """A session that knows nothing but nominal values and priors, five times the typical scale where none is stated."""
     settings = RecalibrateSettings(gating="off", model_error="white", estimator=estimator or {"type": "extended"})
-    session = Recalibrator.begin(batch, settings)
+    session = Recalibrator(batch, settings)
     free = session.setup.space.parameters.free
     stated = [(b, experiment.parameters[b.name].prior_sd or 5 * b.scale) for b in free]
     deviations = np.array([sd / b.scale for b, sd in stated for _ in range(b.domain.dof)])

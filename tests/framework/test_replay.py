@@ -73,7 +73,7 @@ def records() -> list[Incoming]:
 
 def going(folder: Path, calibration: Path, source: Listed, settings: Settings) -> Any:
     assert isinstance(settings, RecalibrateSettings)
-    session = Recalibrator.begin(Calibration.load(calibration), settings)
+    session = Recalibrator(Calibration.load(calibration), settings)
     return opened(Setup(folder, calibration, pace=PACE), session, source)
 
 
@@ -136,7 +136,7 @@ def test_every_state_comes_out_again_to_the_last_bit(whole: Path, tmp_path: Path
 @pytest.mark.slow
 def test_the_calibration_as_it_was_at_any_entry(whole: Path, tmp_path: Path) -> None:
     checkpoint = [segment.checkpoint for segment in read_segments(whole / "journal")][2]
-    session = Recalibrator.begin(Calibration.load(whole / "calibration.yaml"), SETTINGS)
+    session = Recalibrator(Calibration.load(whole / "calibration.yaml"), SETTINGS)
     session.restore(checkpoint.content["state"])
     out = tmp_path / "then.yaml"
     told(whole, "--until", checkpoint.sequence, "--calibration", out)
@@ -199,7 +199,7 @@ def test_damage_is_told_and_everything_before_it_is_replayed(whole: Path, tmp_pa
 def test_a_state_or_a_decision_that_differs_is_told(whole: Path, calibration: Path) -> None:
     header = next(read_segments(whole / "journal")).header
     journal = kept_journal(whole / "journal")
-    nudged = Recalibrator.begin(Calibration.load(calibration), SETTINGS)
+    nudged = Recalibrator(Calibration.load(calibration), SETTINGS)
     belief = nudged.state.belief
     mean = belief.gaussian.mean.copy()
     mean[0] += 1e-9
@@ -232,7 +232,7 @@ def test_what_cannot_be_replayed_ends_with_2(whole: Path, tmp_path: Path) -> Non
 
 @pytest.mark.slow
 def test_distance_is_measured_in_standard_deviations(calibration: Path) -> None:
-    session = Recalibrator.begin(Calibration.load(calibration), SETTINGS)
+    session = Recalibrator(Calibration.load(calibration), SETTINGS)
     state, space = session.state, session.setup.space
     belief = state.belief
     sd = np.sqrt(np.diag(belief.gaussian.covariance))

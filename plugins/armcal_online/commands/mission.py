@@ -121,7 +121,7 @@ def loop_session(registry: PluginRegistry) -> Session:
     def session(
         calibration: Path, settings: RecalibrateSettings, source: MissionSource, folder: Path
     ) -> Sequence[Mapping[str, Any]]:
-        recalibrator = Recalibrator.begin(Calibration.load(calibration, registry), settings, registry)
+        recalibrator = Recalibrator(Calibration.load(calibration, registry), settings, registry)
         events = io.BytesIO()
         setup = Setup(folder, calibration, StandardOutput(events))
         try:

@@ -52,7 +52,7 @@ def recalibrate(
     registry = console.registry()
     settings = load_settings(config, overrides)
     loaded = Calibration.load(calibration, registry)
-    session = Recalibrator.begin(loaded, settings, registry)
+    session = Recalibrator(loaded, settings, registry)
     stream = StandardOutput(None if console.quiet else sys.stdout.buffer)
     at_end: AtEnd = "wait" if follow else "stop"
     records = open_source(source, RowParser(session.request, settings.columns), at_end)

@@ -71,13 +71,13 @@ def replay_command(
         other_settings = load_settings(config, overrides)
     with kept_in(folder):
         begun_from = kept_calibration(header, folder, registry)
-        session = Recalibrator.begin(begun_from, _evaluated(kept_settings(header), evaluator), registry)
+        session = Recalibrator(begun_from, _evaluated(kept_settings(header), evaluator), registry)
     verifier = ReplayVerifier(session.evaluator)
     with console.progress() as progress:
         done = replay(held, session, verifier, until, progress)
         other = None
         if other_settings is not None:
-            others = Recalibrator.begin(begun_from, _evaluated(other_settings, evaluator), registry)
+            others = Recalibrator(begun_from, _evaluated(other_settings, evaluator), registry)
             other = compared(done, replay(held, others, None, until, progress, "with other settings"))
     chosen = other.replayer if other else done
     written = calibration if calibration and not done.difference else None

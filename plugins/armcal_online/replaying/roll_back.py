@@ -48,7 +48,7 @@ def roll_back_ended(folder: Path, to: int | str, registry: PluginRegistry) -> Ma
     header = held.first.header
     with kept_in(journal):
         calibration = kept_calibration(header, journal, registry)
-        session = Recalibrator.begin(calibration, kept_settings(header), registry)
+        session = Recalibrator(calibration, kept_settings(header), registry)
     setup = Setup(
         folder=folder,
         calibration=Path(str(header.get("path", ""))),

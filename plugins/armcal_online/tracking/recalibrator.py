@@ -28,7 +28,7 @@ from armcal_online.sources.source import Incoming
 from armcal_online.tracking import events
 from armcal_online.tracking.belief import most_likely
 from armcal_online.tracking.decisions import EXPLAINED
-from armcal_online.tracking.directions import Steps, find_steps
+from armcal_online.tracking.directions import find_steps
 from armcal_online.tracking.evaluator import identity
 from armcal_online.tracking.health import nis_limit
 from armcal_online.tracking.hypotheses import GRADUAL, Recent, hypotheses, slow_changes
@@ -39,7 +39,7 @@ from armcal_online.tracking.refit import NetRecord
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.sizes import tip_error
 from armcal_online.tracking.slow_changes import SlowChanges
-from armcal_online.tracking.start import FilterSetup, filter_setup
+from armcal_online.tracking.start import filter_setup
 from armcal_online.tracking.state import Arrival, State, Tick, advanced, remembering, ticked, troubled
 from armcal_online.tracking.updated import calibration_text, deviations
 from armcal_online.tracking.what_if import worth_of_record
@@ -52,21 +52,31 @@ _FARTHEST = 100.0
 
 
 class Recalibrator:
-    """A session: mutable, and nothing but a ``State`` changes in it."""
+    """A session that begins at a calibration: mutable, and nothing but a ``State`` changes in it.
+
+    Raises:
+        ConfigError: settings are refused, or the calibration keeps no covariance.
+        PluginError: no such estimator.
+    """
 
     def __init__(
-        self,
-        calibration: Calibration,
-        settings: RecalibrateSettings,
-        estimator: OnlineEstimator,
-        setup: FilterSetup,
-        steps: Steps,
+        self, calibration: Calibration, settings: RecalibrateSettings, registry: PluginRegistry | None = None
     ) -> None:
+        source = ConfigSource({"estimator": settings.estimator}, {(): Location()}, Path(), Path(), ())
+        estimator: OnlineEstimator = build_component(source, registry or discover(), "online", ("estimator",))[0]
         self._calibration, self.settings, self._estimator = calibration, settings, estimator
-        self.setup, self.steps = setup, steps
+        is_filter = estimator.window == 1
+        self.setup = setup = filter_setup(calibration, settings, shares=is_filter, loads=settings.gating == "on")
+        if not is_filter and setup.space.cones:
+            raise ConfigError(
+                "found an estimator that holds records back, and 3x3 compliances: together they may not converge.",
+                where=Location("estimator.type"),
+                hint="Take extended, which linearises each record again from where it leads.",
+            )
+        self.steps = steps = find_steps(calibration, setup.observer, setup.belief.origin)
         hypothesis_filter = HypothesisFilter(setup.observer, estimator, setup.process_noise, settings.outliers)
         changes = hypotheses(setup.space, steps, settings.changes, setup.observer.size)
-        slow = slow_changes(changes, steps, settings.changes, setup.observer.size) if estimator.window == 1 else ()
+        slow = slow_changes(changes, steps, settings.changes, setup.observer.size) if is_filter else ()
         if hypothesis_filter.is_model_wrong:
             # Neighbours err alike: a load that no record shows cannot be distinguished from the error of the model.
             slow = tuple(change for change in slow if change.kind in GRADUAL)
@@ -74,29 +84,6 @@ class Recalibrator:
         self._judge = Judge(setup.space, steps, hypothesis_filter, changes, self._slow, settings)
         self._net = Net(setup, changes) if settings.net and settings.gating == "on" else None
         self.state = State(setup.belief, setup.belief)
-
-    @classmethod
-    def begin(
-        cls, calibration: Calibration, settings: RecalibrateSettings, registry: PluginRegistry | None = None
-    ) -> Recalibrator:
-        """A session at its calibration.
-
-        Raises:
-            ConfigError: settings are refused, or the calibration keeps no covariance.
-            PluginError: no such estimator.
-        """
-        source = ConfigSource({"estimator": settings.estimator}, {(): Location()}, Path(), Path(), ())
-        estimator: OnlineEstimator = build_component(source, registry or discover(), "online", ("estimator",))[0]
-        setup = filter_setup(calibration, settings, shares=estimator.window == 1, loads=settings.gating == "on")
-        if estimator.window > 1 and setup.space.cones:
-            raise ConfigError(
-                "found an estimator that holds records back, and 3x3 compliances: together they may not converge.",
-                where=Location("estimator.type"),
-                hint="Take extended, which linearises each record again from where it leads.",
-            )
-        return cls(
-            calibration, settings, estimator, setup, find_steps(calibration, setup.observer, setup.belief.origin)
-        )
 
     @property
     def request(self) -> ReadRequest:
