@@ -7,14 +7,18 @@ from dataclasses import replace
 import numpy as np
 import oracle
 import pytest
+from armcal.diagnose.evidence_findings import worse_than_declared
 from armcal.diagnose.noise_findings import component_findings
 from armcal.errors import ProblemError
 from armcal.estimate.likelihood import Term, _evaluate, maximise
 from armcal.estimate.variance import apply_components, estimate_components
 from armcal.estimate.weighing import NoiseSettings, fit, weighed
 from armcal.problem.factor_records import by_covariance, transformed
+from armcal.run.experiment import Experiment
+from armcal.run.prepare import Stopwatch, prepare
 from armcal_ipopt.estimator import IpoptEstimator
 from noise_cases import NOISE_M, deviations_off, measured, posed
+from planted_mistakes import three_joint_arm
 
 IPOPT = IpoptEstimator(IpoptEstimator.Settings())
 JOINT_RAD = np.array([0.004, 0.006, 0.0, 0.005, 0.0, 0.0])
@@ -277,3 +281,28 @@ def test_too_few_equations_are_refused(lrm):
     problem, records, start = posed(lrm, q, points)
     with pytest.raises(ProblemError, match=r"13\.0 degrees of freedom, too few to estimate 7 variance components"):
         fit(problem, records, weighed(IPOPT, NoiseSettings(estimate=True)), start)
+
+
+def test_a_fit_with_estimated_variances_keeps_the_one_by_the_declared_noise(tmp_path):
+    """So that held-out records can compare the two, and no third fit is made."""
+    arm = three_joint_arm(tmp_path)
+    path = arm.write(arm.recording(1), tmp_path / "data.csv")
+    plain, weighing = (Experiment.load(arm.config, (f"noise.estimate={flag}",), path) for flag in ("false", "true"))
+    ready = prepare(plain, Stopwatch())
+    one, other = (
+        fit(ready.problem, ready.training, e.estimator, ready.start.values(ready.problem)[0]) for e in (plain, weighing)
+    )
+    assert one.as_declared is None and np.array_equal(other.as_declared, one.estimate.values)
+    assert not np.array_equal(other.estimate.values, one.estimate.values)
+
+
+def test_worse_predictions_by_estimated_variances_are_not_chance():
+    random = np.random.default_rng(1)
+    declared, differ = random.uniform(1, 3, 61), 0.5 * random.normal(size=61)
+    declared[-1], differ[:-1] = np.nan, differ[:-1] - differ[:-1].mean()
+    (found,) = worse_than_declared(declared + differ + 0.3, declared)
+    before = np.nanmean(declared)
+    assert found.grade == "note" and f"{before + 0.3:.2f} mm on average, {before:.2f} mm by" in found.text
+    assert not worse_than_declared(declared + differ + 0.05, declared)  # chance makes as much
+    assert not worse_than_declared(declared + 0.01, declared)  # certain, and less than 1 %
+    assert not worse_than_declared(declared - 0.3, declared) and not worse_than_declared(declared * np.nan, declared)

@@ -91,6 +91,26 @@ def _at_its_edge(estimate: Estimate, block: ParameterBlock) -> bool:
     return not set(block.entry_names).isdisjoint(estimate.at_bound)
 
 
+def worse_than_declared(judged_mm: Array, declared_mm: Array, unit: str = _MM) -> list[Finding]:
+    """Where held-out records are missed by more than by the fit with the declared noise (N each; nan elsewhere)."""
+    seen = np.isfinite(judged_mm) & np.isfinite(declared_mm)
+    more, before = judged_mm[seen] - declared_mm[seen], float(np.mean(declared_mm[seen])) if seen.any() else 0.0
+    if len(more) < 2 or np.mean(more) <= max(_by_chance(more), WORTHWHILE * before):
+        return []
+    text = (
+        f"Estimated variances make predictions worse: held-out records have an error of "
+        f"{readable(before + float(np.mean(more)))} {unit} on average, {readable(before)} {unit} by the declared noise."
+    )
+    action = "Leave out noise.estimate for the values, and use it to learn where the noise comes from."
+    return [Finding("note", text, "paired differences, one-sided, 5 %, and 1 % of the error", action)]
+
+
+def _by_chance(differences: Array) -> float:
+    """A mean of so many differences that chance makes in one of twenty cases, one-sided."""
+    count = len(differences)
+    return float(stdtrit(count - 1, 0.95) * np.std(differences, ddof=1) / np.sqrt(count))
+
+
 def worse_than_nominal(judged_mm: Array, nominal_mm: Array, unit: str = _MM) -> list[Finding]:
     """Where records that did not train are missed by more than before calibration (N each; nan where not judged)."""
     seen = np.isfinite(judged_mm) & np.isfinite(nominal_mm)
@@ -102,7 +122,7 @@ def worse_than_nominal(judged_mm: Array, nominal_mm: Array, unit: str = _MM) -> 
     which = f"on records that did not train it: {readable(after)} {unit} on average, {readable(before)} before."
     more = judged_mm[seen] - nominal_mm[seen]
     test = "paired differences, one-sided, 5 %"
-    if len(more) > 1 and after - before <= stdtrit(len(more) - 1, 0.95) * np.std(more, ddof=1) / np.sqrt(len(more)):
+    if len(more) > 1 and after - before <= _by_chance(more):
         action = "Nothing is gained by it on poses like these: keep the nominal arm, or look at what trained."
         return [Finding("warning", f"No better than the nominal arm {which}", test, action)]
     action = "Do not use it. Look at what trained: too few postures, too much alike, or some of them wrong."

@@ -80,6 +80,7 @@ class WeighedFit:
         loss: which one; ``none`` for least squares.
         rounds: of reweighting and selecting.
         warnings: what a user should know.
+        as_declared: values of the fit by the declared noise, which came before variances were estimated; else None.
     """
 
     solution: Solution
@@ -91,6 +92,7 @@ class WeighedFit:
     loss: str = "none"
     rounds: tuple[Round, ...] = ()
     warnings: tuple[str, ...] = ()
+    as_declared: Array | None = None
 
     @property
     def set_aside(self) -> tuple[Suspect, ...]:
@@ -122,13 +124,14 @@ class Weighing:
         progress: Progress = no_progress,
     ) -> Solution:
         """The values alone."""
-        return self._weighed(problem, tuple(records), start, progress)[0].solution
+        return self._weighed(problem, self._declared(problem, records, start, progress), records, progress)[0].solution
 
     def fit(
         self, problem: Problem, records: Sequence[FactorRecords], start: Array, progress: Progress = no_progress
     ) -> WeighedFit:
         """Values, and everything that is known of how records weighed."""
-        robust, whitened, components = self._weighed(problem, tuple(records), start, progress)
+        declared = self._declared(problem, records, start, progress)
+        robust, whitened, components = self._weighed(problem, declared, records, progress)
         loss, acting, suspects = self.settings.loss, None, list[Suspect]()
         if loss != "none":
             distances = studentised_distances(problem, robust.solution.values, whitened, robust.weights)
@@ -151,17 +154,23 @@ class Weighing:
             loss,
             robust.rounds,
             robust.warnings,
+            None if components is None else declared.solution.values,
         )
 
+    def _declared(
+        self, problem: Problem, records: Sequence[FactorRecords], start: Array, progress: Progress
+    ) -> RobustFit:
+        """The fit by the declared noise."""
+        return self._robust(problem, tuple(records), self.inner.solve(problem, records, start, progress), progress)
+
     def _weighed(
-        self, problem: Problem, records: tuple[FactorRecords, ...], start: Array, progress: Progress
+        self, problem: Problem, robust: RobustFit, records: Sequence[FactorRecords], progress: Progress
     ) -> tuple[RobustFit, tuple[FactorRecords, ...], VarianceComponents | None]:
         """The fit, its records whitened, and components: these and values in turn, until the components rest.
 
-        Suspects are no evidence of the variances.
+        Begins with a fit by the declared noise. Suspects are no evidence of the variances.
         """
-        robust = self._robust(problem, records, self.inner.solve(problem, records, start, progress), progress)
-        axes, whitened, before = self.settings.axes, records, None
+        axes, whitened, before = self.settings.axes, tuple(records), None
         for number in range(MOST_ESTIMATES if self.settings.estimate else 0):
             if not robust.solution.verdict.converged:
                 break

@@ -9,7 +9,7 @@ from armcal.base.arrays import Array
 from armcal.config.system import System
 from armcal.diagnose.coverage import predictor
 from armcal.diagnose.evidence import Evidence, elsewhere, priors_alone, unseen_poses
-from armcal.diagnose.evidence_findings import worse_than_nominal
+from armcal.diagnose.evidence_findings import worse_than_declared, worse_than_nominal
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.gross import MOST_RECORDS, figure_of, thinned
 from armcal.diagnose.gross_findings import (
@@ -38,7 +38,7 @@ from armcal.diagnose.unseen import (
 from armcal.diagnose.verdict import Verdict, judge
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.start import certificates
-from armcal.estimate.validation import error_name, error_unit
+from armcal.estimate.validation import error_name, error_unit, record_errors
 from armcal.measure.measurement import StatesAccuracy
 from armcal.planning.candidates import deviations as deviations_of
 from armcal.planning.suggestion import Suggestion, suggest
@@ -232,6 +232,9 @@ def _worse(run: FittedRecords, errors: RecordErrors, judged_mm: Array) -> list[F
     problem, fitted, arms = run.problem, run.fitted, run.problem.blueprint.arms
     moves = any(block.name.partition(".")[0] in arms for block in problem.parameters.free)
     worse = worse_than_nominal(judged_mm, errors.nominal_mm, errors.unit) if moves else []
+    if fitted.as_declared is not None and len(run.split.holdout):
+        declared_mm = record_errors(problem, fitted.as_declared, run.records) * _MM
+        worse += worse_than_declared(judged_mm, declared_mm, errors.unit)
     if any(arm.residual is not None and arm.residual.is_learned for arm in arms.values()):
         return worse
     trained = (errors.calibrated_mm if errors.at_rest_mm is None else errors.at_rest_mm)[run.split.train]
