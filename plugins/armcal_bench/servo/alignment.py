@@ -84,7 +84,7 @@ def aligned(
         return alignment, None
     if alignment.seat is None:
         alignment = replace(alignment, seat=_mean_seat(alignment.base, tracked, springs))
-    rows = [_rows(alignment, joint, sweep, springs[joint]) for joint, sweep in tracked.items()]
+    rows = [_rows(alignment, sweep, springs[joint]) for joint, sweep in tracked.items()]
     by_springs, by_others, by_plays, offs = (list(part) for part in zip(*rows, strict=True))
     sds = np.concatenate([_sds(nominal), np.full(len(rows) * len(nominal.joints), _PLAY_SD)])
     others = np.vstack([np.hstack([np.concatenate(by_others), block_diag(*by_plays)]), np.diag(1 / sds)])
@@ -125,16 +125,16 @@ def _step(
     return solution[: len(now)], solution[len(now) :]
 
 
-def _rows(alignment: Alignment, joint: str, sweeps: Sweeps, springs: Springs) -> tuple[Array, Array, Array, Array]:
+def _rows(alignment: Alignment, sweeps: Sweeps, springs: Springs) -> tuple[Array, Array, Array, Array]:
     """One joint's weighted turns across its axis, in the base's axes, two rows a line.
 
     Slopes by the compliances, by the numbers of an alignment, and by where the joints stand; and what is off.
     """
-    tool, by_angles, by_joints, by_springs = springs.about.turns(springs.poses(sweeps.lines, joint))
+    tool, by_angles, by_joints, by_springs = springs.about.turns(springs.poses(sweeps.lines))
     seen = sweeps.rotations
     predicted = alignment.base @ tool @ alignment.tool_R_body
     off = Rotation.from_matrix(seen @ np.swapaxes(predicted, 1, 2)).as_rotvec()
-    axes = by_joints[:, :, springs.about.joints.index(joint)] @ alignment.base.T
+    axes = by_joints[:, :, springs.about.joints.index(sweeps.joint)] @ alignment.base.T
     across = np.linalg.svd(axes[:, None])[2][:, 1:] / sweeps.sds[:, None, None]
     known = across @ alignment.base
     by_numbers = np.concatenate([known @ by_angles, known @ by_joints, across, across @ seen], axis=2)
@@ -147,7 +147,7 @@ def _mean_seat(base: Array, sweeps: Mapping[str, Sweeps], springs: Mapping[str, 
     """How the tracked body sits on the model's tool, on the average (3x3)."""
     seats = []
     for joint, sweep in sweeps.items():
-        tools = springs[joint].about.tools(springs[joint].poses(sweep.lines, joint))
+        tools = springs[joint].about.tools(springs[joint].poses(sweep.lines))
         seats.append(np.swapaxes(base @ tools[:, :3, :3], 1, 2) @ sweep.rotations)
     return np.asarray(Rotation.from_matrix(np.concatenate(seats)).mean().as_matrix())
 

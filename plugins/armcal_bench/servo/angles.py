@@ -41,6 +41,11 @@ class Sweeps:
     turning: Turning | None = None
 
     @property
+    def joint(self) -> str:
+        """Whose."""
+        return str(self.lines[0]["joint"])
+
+    @property
     def rotations(self) -> Array:
         """``base_R_body`` as the tracker saw it (N x 3 x 3)."""
         return np.array([line["rotation"] for line in self.lines])
@@ -72,15 +77,15 @@ class Springs:
     angles: tuple[float, ...]
     seat: Array = field(default_factory=lambda: np.eye(3))
 
-    def given(self, lines: Sequence[Entry], joint: str) -> Array:
+    def given(self, lines: Sequence[Entry]) -> Array:
         """What springs give in each line (N x 4 x 4): a rotation in the body's axes, a translation in the base's."""
-        given = self.about.give(self.poses(lines, joint))
+        given = self.about.give(self.poses(lines))
         given[:, :3, :3] = self.seat.T @ given[:, :3, :3] @ self.seat
         return given
 
-    def poses(self, lines: Sequence[Entry], joint: str) -> list[dict[str, float]]:
+    def poses(self, lines: Sequence[Entry]) -> list[dict[str, float]]:
         """All joints' angles (rad), line by line."""
-        return [{**line["told"], joint: angle} for line, angle in zip(lines, self.angles, strict=True)]
+        return [{**line["told"], line["joint"]: angle} for line, angle in zip(lines, self.angles, strict=True)]
 
 
 def sweeps_of(
@@ -97,21 +102,22 @@ def sweeps_of(
         return "nothing was measured"
     if not poses:
         return Sweeps(tuple(by_eye), np.array([e["angle"] for e in by_eye]), np.array([e["sd"] for e in by_eye]))
-    given = np.tile(np.eye(4), (len(poses), 1, 1)) if springs is None else springs.given(poses, joint)
+    given = np.tile(np.eye(4), (len(poses), 1, 1)) if springs is None else springs.given(poses)
     try:
         return _tracked(poses, joint, nominal, settings, given)
     except NoTurnError as fault:
         return str(fault)
 
 
-def observations_of(sweeps: Sweeps, joint: str, nominal: NominalArm, springs: Springs | None) -> list[Observation]:
+def observations_of(sweeps: Sweeps, nominal: NominalArm, springs: Springs | None) -> list[Observation]:
     """As a fit takes them. Of what springs give, the change of compliances from ``nominal`` is left to the fit."""
+    joint = sweeps.joint
     rows = list(zip(sweeps.counts, sweeps.approaches, sweeps.angles.tolist(), sweeps.sds.tolist(), strict=True))
     if springs is None or sweeps.by is None:
         return [Observation(joint, *row) for row in rows]
     about = springs.about
     changes = np.array([about.compliance(name) - nominal.compliance(name) for name in about.compliances])
-    slopes = about.slopes(joint, springs.poses(sweeps.lines, joint), sweeps.by)
+    slopes = about.slopes(joint, springs.poses(sweeps.lines), sweeps.by)
     return [
         Observation(joint, *row, -float(slope @ changes), dict(zip(about.compliances, slope, strict=True)))
         for row, slope in zip(rows, slopes, strict=True)

@@ -95,7 +95,7 @@ def _fitted(
     spans = dict.fromkeys(now.sweeps, 0.0)
     for joint, bent in now.springs.items():
         if by := now.sweeps[joint].by:
-            spans[joint] = float(np.ptp(bent.about.sag(joint, bent.poses(now.sweeps[joint].lines, joint), by)))
+            spans[joint] = float(np.ptp(bent.about.sag(joint, bent.poses(now.sweeps[joint].lines), by)))
     return Outcome(now.fit, now.task, now.sweeps, silent, values, zero, spans)
 
 
@@ -123,7 +123,7 @@ def _better(
     rows = None
     if arm == "bending":
         about = shifted(nominal, alignment)
-        stood = {s.joint: Springs(about, _stood(now.sweeps[s.joint], s, now)) for s in task.servos}
+        stood = {s.joint: Springs(about, _stood(s, now)) for s in task.servos}
         sd = settings.sag_sd if settings.sag == "fitted" else 0.0
         alignment, rows = aligned(alignment, nominal, now.sweeps, stood, sd)
         about = shifted(nominal, alignment)
@@ -132,7 +132,7 @@ def _better(
     observations = [
         observation
         for servo in task.servos
-        for observation in observations_of(sweeps[servo.joint], servo.joint, nominal, springs.get(servo.joint))
+        for observation in observations_of(sweeps[servo.joint], nominal, springs.get(servo.joint))
     ]
     if settings.sag != "fitted":
         observations, rows = [replace(o, sag=0.0, sag_slopes={}) for o in observations], None
@@ -140,9 +140,9 @@ def _better(
     return _Round(sweeps, task, fit_servos(task), alignment, springs)
 
 
-def _stood(sweeps: Sweeps, servo: KnownServo, now: _Round) -> tuple[float, ...]:
+def _stood(servo: KnownServo, now: _Round) -> tuple[float, ...]:
     """Where the joint stood in each line (rad), by its fitted table, or the stated one."""
-    fitted = now.fit.servos.get(servo.joint)
+    sweeps, fitted = now.sweeps[servo.joint], now.fit.servos.get(servo.joint)
     table: FittedServo | PulseTable = fitted or servo.table
     clock = now.fit.clocks[servo.board] if fitted else now.task.boards[servo.board].clock
     lag = (fitted.lag or 0.0) if fitted else 0.0
