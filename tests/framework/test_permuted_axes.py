@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import armcal_ipopt.estimator as ipopt
+import contact_oracle as co
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
@@ -16,6 +17,7 @@ from armcal.errors import DataError, NotConvergedError
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from armcal.run.prepare import Prepared, Stopwatch, assemble
+from armcal_contact.ball import BallInSocket
 from click.testing import CliRunner
 from scipy.optimize import minimize
 
@@ -132,6 +134,25 @@ def test_a_zero_a_quarter_or_half_a_turn_off_is_named(demo: Prepared, joint: str
     angles = demo.dataset.column(f"arm.{joint}") - np.radians(turn)
     moved = replace(demo.dataset, channels={**demo.dataset.channels, f"arm.{joint}": angles})
     assert told(demo, moved) == (f"{turn} deg added to {joint}",)
+
+
+@pytest.mark.parametrize("turned", [None, 2, 3])
+def test_a_joint_that_turns_the_other_way_is_named_from_sockets(turned: int | None) -> None:
+    """By the places that single records give to a socket: the fit ended in a zero 180 deg off, or not at all."""
+    random, places = np.random.default_rng(0), {"hole_0": (0.35, 0.1, 0.25), "hole_1": (0.2, -0.3, 0.35)}
+    q = np.vstack([co.touching(co.ELBOW, co.in_socket(place), 12, seed) for seed, place in enumerate(places.values())])
+    q += random.normal(0.01, 1e-3, q.shape)
+    if turned is not None:
+        q[:, turned - 1] *= -1
+    data = Dataset(
+        tuple(map(str, range(24))),
+        co.joints(q),
+        {"position": ("here",) * 24, "socket": ("hole_0",) * 12 + ("hole_1",) * 12},
+    )
+    ball = BallInSocket(BallInSocket.Settings.si(noise=1e-4), ("arm",))
+    problem, records = co.Bench({"arm": co.the_arm(co.ELBOW)}, {"balls": ball}).problem(data)
+    found = find_permuted_axes(problem, records, data)
+    assert (found and found.readings) == (None if turned is None else (f"the sign of q{turned} reversed",))
 
 
 @pytest.mark.parametrize("record", [41, 42])

@@ -20,6 +20,9 @@ from armcal.base.units import digits
 from armcal.diagnose.readings import (
     LEFT_HANDED,
     Wires,
+    apart_in_groups,
+    is_place,
+    rewired,
     scaled_positions,
     several_joints,
     single_joints,
@@ -32,7 +35,7 @@ from armcal.problem.factor_records import subset
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.rigid_alignment import nearest
 from armcal.problem.sighting import Sighting, sighting_of, tools_of
-from armcal.problem.tool_motion import rigid_fit, spread_of
+from armcal.problem.tool_motion import rigid_fit, spread_of, tools
 
 MUCH_BETTER = 3.0
 """A permutation leaves so many times less than the data as they stand."""
@@ -62,6 +65,7 @@ class PermutedAxes:
         as_given_mm: what the data leave as they stand (root mean square, free parameters adapted).
         left_mm: what the best reading leaves.
         of_joints: whether it is joints that it reads otherwise; else axes.
+        adapted: whether free parameters were; else the arm is the nominal one.
     """
 
     measurement: str
@@ -69,6 +73,7 @@ class PermutedAxes:
     as_given_mm: float
     left_mm: float
     of_joints: bool
+    adapted: bool = True
 
 
 @dataclass(frozen=True)
@@ -164,13 +169,48 @@ def find_permuted_axes(problem: Problem, records: Sequence[FactorRecords], datas
     for number, kernel in enumerate(problem.kernels):
         try:
             seen = _seen(problem, records, dataset, number)
-            arms = problem.blueprint.measurements[kernel.factor.name].arms
-            permuted = None if seen is None else _of(problem, records, seen, problem.blueprint.arms[arms[0]])
+            arms = [problem.blueprint.arms[name] for name in problem.blueprint.measurements[kernel.factor.name].arms]
+            if seen is None:
+                permuted = _of_contact(problem, records, number, arms)
+            else:
+                permuted = _of(problem, records, seen, arms[0])
         except NotConvergedError:
             continue
         if permuted is not None:
             return permuted
     return None
+
+
+def _of_contact(
+    problem: Problem, records: Sequence[FactorRecords], number: int, arms: Sequence[Arm]
+) -> PermutedAxes | None:
+    """Of a contact: how far apart single records put what they touch together, by the nominal arm, however read."""
+    kernel, own, nominal = problem.kernels[number], records[number], problem.blueprint.parameters.nominal()
+    if kernel.factor.output_channels or not is_place(kernel.factor.nuisance_names):
+        return None
+
+    def left(read_as: Wires) -> float:
+        """A reading's."""
+        try:
+            return apart_in_groups(problem, number, rewired(kernel.factor.channels, own, read_as), nominal)
+        except NotConvergedError:
+            return np.inf
+
+    reach, as_given = spread_of(tools(problem, nominal, records)[0][0]), left({})
+    if not MISSES * reach < as_given < np.inf:
+        return None
+    # Another unit of angles would put all tools near one place, whatever they touch.
+    readings = [
+        _Reading(left(wires), words if len(arms) == 1 else f"{words} ({arm.name})", True)
+        for arm in arms
+        for words, wires in single_joints(arm)
+        if all(abs(factor) == 1 for _, factor, _ in wires.values())
+    ]
+    best, *others = sorted(readings, key=lambda reading: reading.left)
+    if best.left > min(FITS * reach, as_given / MUCH_BETTER):
+        return None
+    words = (best.words, *(other.words for other in others[: _MOST_NAMED - 1] if other.left <= _ALIKE * best.left))
+    return PermutedAxes(kernel.factor.name, words, as_given * _MM, best.left * _MM, True, adapted=False)
 
 
 def _seen(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, number: int) -> _Seen | None:
@@ -246,19 +286,10 @@ def _of(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, arm: Ar
     return PermutedAxes(name, likeliest, as_given * _MM, best.left * _MM, best.of_joints)
 
 
-def _rewired(problem: Problem, seen: _Seen, read_as: Wires) -> FactorRecords:
-    """Records with channels read as others, times a factor, and a summand."""
-    channels, own = problem.kernels[seen.sighting.kernel].factor.channels, seen.records
-    rewired = own.record.copy()
-    for channel, (other, factor, added) in read_as.items():
-        if channel in channels and other in channels:
-            rewired[channels.index(channel)] = factor * own.record[channels.index(other)] + added
-    return replace(own, record=rewired, state=np.zeros_like(own.state))
-
-
 def _positions(problem: Problem, seen: _Seen, read_as: Wires, values: Array) -> _Positions | None:
     """At these values, channels read as others, times a factor; None where a record has no equilibrium."""
-    number, parameters, records = seen.sighting.kernel, problem.parameters, _rewired(problem, seen, read_as)
+    number, parameters = seen.sighting.kernel, problem.parameters
+    records = rewired(problem.kernels[number].factor.channels, seen.records, read_as)
     try:
         blocks = list(problem.grouped[number].linearised(values, records))
     except NotConvergedError:
@@ -280,8 +311,8 @@ def _left(problem: Problem, seen: _Seen, read_as: Wires, measured: Array, enough
     if placing is None:
         positions = _positions(problem, seen, read_as, nominal)
         return np.inf if positions is None else positions.left(measured, enough)
-    tools = tools_of(problem, nominal, _rewired(problem, seen, read_as), number)
-    alignment = nearest(tools, measured, placing.basis)
+    as_read = rewired(problem.kernels[number].factor.channels, seen.records, read_as)
+    alignment = nearest(tools_of(problem, nominal, as_read, number), measured, placing.basis)
     if alignment.left > _ROUGHLY * enough:
         return alignment.left
     values = placing.with_target(problem.parameters, nominal, alignment.offset)

@@ -4,13 +4,14 @@ And positions in one frame up to a record and in another from there on: the inst
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, permutations, product
 
 import numpy as np
 
 from armcal.arm.assembly import Arm
 from armcal.base.arrays import Array
+from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.rigid_alignment import Tools, nearest
 
 Wires = Mapping[str, tuple[str, float, float]]
@@ -141,3 +142,31 @@ def two_frames(tools: Tools, measured: Array, basis: Array) -> TwoFrames | None:
             begins = int(np.argmin(left[FEWEST_IN_PART:-FEWEST_IN_PART])) + FEWEST_IN_PART
             divisions.append(TwoFrames(begins, float(np.sqrt(left[begins] / len(every)))))
     return min(divisions, key=lambda one: one.left)
+
+
+def rewired(channels: Sequence[str], own: FactorRecords, read_as: Wires) -> FactorRecords:
+    """Records with channels read as others, times a factor, and a summand."""
+    read = own.record.copy()
+    for channel, (other, factor, added) in read_as.items():
+        if channel in channels and other in channels:
+            read[channels.index(channel)] = factor * own.record[channels.index(other)] + added
+    return replace(own, record=read, state=np.zeros_like(own.state))
+
+
+def is_place(names: Sequence[str]) -> bool:
+    """Whether the first of a group's parameters are a place."""
+    return tuple(name[-1:] for name in names[:3]) == tuple(_AXES)
+
+
+def apart_in_groups(problem: Problem, number: int, own: FactorRecords, values: Array) -> float:
+    """How far single records of a group typically put its place from their middle (m): all are of one without groups.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at these values.
+    """
+    groups = np.zeros(own.count) if own.group is None else own.group[: own.count]
+    places = problem.grouped[number].nuisance_starts(values, own)[:3, : own.count]
+    members = [np.flatnonzero(groups == group) for group in np.unique(groups[groups >= 0])]
+    middles = [np.median(places[:, chosen], axis=1, keepdims=True) for chosen in members]
+    away = [places[:, chosen] - middle for chosen, middle in zip(members, middles, strict=True)]
+    return float(np.median(np.linalg.norm(np.hstack(away), axis=0))) if away else np.inf

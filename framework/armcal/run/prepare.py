@@ -287,9 +287,10 @@ def check_permuted_axes(
     reading = find_permuted_axes(problem, records, dataset)
     if reading is None:
         return []
+    adapted = "model, however its free parameters adapt" if reading.adapted else "nominal arm"
     text = (
-        f"{reading.measurement}: as they stand, the data are typically {digits(reading.as_given_mm)} mm off the model, "
-        f"however its free parameters adapt; with {', or with '.join(reading.readings)}, they are "
+        f"{reading.measurement}: as they stand, the data are typically {digits(reading.as_given_mm)} mm off the "
+        f"{adapted}; with {', or with '.join(reading.readings)}, they are "
         f"{digits(reading.left_mm)} mm off."
     )
     mend = _MEND[reading.of_joints]
