@@ -8,6 +8,7 @@ import yaml
 from armcal.cli.common import FILE, Console, speaking
 
 from armcal_ros2.bag import Bag
+from armcal_ros2.message import IMAGES
 
 
 @click.group()
@@ -37,10 +38,11 @@ def info(console: Console, path: Path) -> None:
         console.line(f"{name}: {len(lengths)} rests{spans}; joints {', '.join(log.names)}.")
     for remark in content.remarks:
         console.warn(remark)
-    if data:
-        _show_data(console, data)
-        if "names" in data["joints"]:
-            console.line("Leave names out where the arm's joints are called as in the recording, as in a URDF.")
+    pictures = [name for name, topic in content.topics.items() if topic.type in IMAGES]
+    if data.get("measurements"):
+        _show_data(console, data, "names" in data["joints"])
+    for name in pictures if data else ():
+        console.line(f"Images of its rests: armcal bag images {path} --topic {name} --out FOLDER")
 
 
 @bag.command()
@@ -62,12 +64,15 @@ def images(
     console.line(f"{len(extracted.images)} images written: {out}")
     for remark in extracted.remarks:
         console.warn(remark)
-    if not set(extracted.joints) <= {f"q{i}" for i in range(1, len(extracted.joints) + 1)}:
+    named = not set(extracted.joints) <= {f"q{i}" for i in range(1, len(extracted.joints) + 1)}
+    if named:
         names = {f"q{i}_rad": f"{name}_rad" for i, name in enumerate(extracted.joints, start=1)}
         data["poses"] = {"type": "csv", "path": str(out / "joints.csv"), "columns": names}
-    _show_data(console, data)
+    _show_data(console, data, named)
 
 
-def _show_data(console: Console, data: dict[str, Any]) -> None:
+def _show_data(console: Console, data: dict[str, Any], named: bool) -> None:
     console.line("A data section for a configuration:")
     console.out.print(yaml.safe_dump({"data": data}, sort_keys=False, default_flow_style=None), soft_wrap=True)
+    if named:
+        console.line("Leave q1, q2, ... out where the arm's joints are called as in the recording, as in a URDF.")

@@ -72,8 +72,11 @@ class Rosbag2Reader:
         """
         s, bag = self._settings, Bag(self._settings.path)
         unknown = sorted(set(s.measurements) - set(request.measurements))
+        have = ", ".join(request.measurements) or "none"
+        if not s.measurements and any(c.channel.partition(".")[0] in request.measurements for c in request.channels):
+            hint = "Give measurements: {NAME: {topic: TOPIC}}; images are taken out of it with armcal bag images."
+            self._refuse(f"found no measurements, expected a topic for one of {have}.", hint)
         if unknown:
-            have = ", ".join(request.measurements) or "none"
             self._refuse(f"found measurements.{unknown[0]}, expected one of {have}.", "Correct the name.")
         self._digest = hashlib.sha256()
         joints, paths = self._joints(bag, request)

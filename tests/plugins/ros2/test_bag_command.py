@@ -56,6 +56,16 @@ def test_frames_that_are_computed_from_joints_are_not_suggested(tour: bags.Tour,
     assert any("computed from the joints" in text for text in content["remarks"]) != tracked
 
 
+def test_a_recording_of_images_alone_is_answered_with_the_command_that_takes_them_out(tour: bags.Tour) -> None:
+    sent = [m for m in tour.sent() if m[1] == "/joint_states"]
+    seen = image(bags.BEGIN_S, np.zeros((4, 4), np.uint8), "mono8")
+    path = bags.write_bag(
+        tour.config.with_name("pictures"), [*sent, (bags.BEGIN_S, "/eye", "sensor_msgs/msg/Image", seen)]
+    )
+    shown = CliRunner().invoke(command, ["info", str(path)], catch_exceptions=False).stdout
+    assert f"armcal bag images {path} --topic /eye" in shown and "type: rosbag2" not in shown
+
+
 def test_joint_states_without_names_are_counted(tour: bags.Tour) -> None:
     sent = [entry for entry in tour.sent() if entry[1] == "/tip"]
     sent += [(t, "/joint_states", "sensor_msgs/msg/JointState", bags.joint_state(t, [], [])) for t in tour.joints[0]]

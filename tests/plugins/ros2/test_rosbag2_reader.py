@@ -110,6 +110,15 @@ def test_names_that_cannot_be_are_refused(tour: bags.Tour, name: Path, names: di
         read(tour, bags.write_bag(name, []), joints={"names": names})
 
 
+def test_a_data_section_without_a_measurement_is_refused(tour: bags.Tour, name: Path) -> None:
+    config = bags.of_bag(tour, bags.write_bag(name, []))
+    settings = yaml.safe_load(config.read_text())
+    settings["data"] |= {"measurements": {}}
+    config.write_text(yaml.safe_dump(settings))
+    with pytest.raises(DataError, match=r"found no measurements, expected a topic for one of tracker\..*bag images"):
+        Experiment.load(config).read()
+
+
 def test_a_clock_that_is_a_little_off_is_named(tour: bags.Tour, name: Path) -> None:
     """The times of receipt do not show so little; the measured point moves where the joints stand."""
     text = " ".join(read(tour, bags.write_bag(name, tour.sent(ahead=0.4))).warnings)
