@@ -11,6 +11,7 @@ import pytest
 from armcal.base.units import (
     UNITS,
     Unit,
+    amount_in_time,
     digits,
     display_unit,
     from_unit,
@@ -176,3 +177,23 @@ def test_units_import_nothing_heavy() -> None:
 def test_an_inch_is_25_4_mm_to_the_last_bit() -> None:
     assert parse_quantity("10 inch", "length") == 0.254
     assert split_suffix("x_inch") == ("x", UNITS["inch"])
+
+
+@pytest.mark.parametrize(
+    ("text", "amount", "seconds"),
+    [
+        ("0.05 deg in 30 d", "0.05 deg", 30 * 86400.0),
+        ("0.1 mm in a week", "0.1 mm", 7 * 86400.0),
+        ("0.02 in 2 months", "0.02", 60 * 86400.0),
+        ("1 rad in 12h", "1 rad", 12 * 3600.0),
+        ("1 rad in 90 minutes", "1 rad", 5400.0),
+    ],
+)
+def test_an_amount_in_a_time(text: str, amount: str, seconds: float) -> None:
+    assert amount_in_time(text) == (amount, seconds)
+
+
+@pytest.mark.parametrize("text", ["0.05 deg", "0.05 deg in 0 d", "in 3 d", "1 mm in 3 furlongs", "1 mm in 1.2.3 d"])
+def test_what_is_no_amount_in_a_time_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"such as 0\.05 deg in 30 d"):
+        amount_in_time(text)

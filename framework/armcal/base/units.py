@@ -187,6 +187,35 @@ def split_suffix(name: str, dimension: str | None = None) -> tuple[str, Unit] | 
     return None
 
 
+_RATE = re.compile(r"(?P<amount>.+?)\s+in\s+(?:(?P<count>[0-9.]+)\s*)?(?:an?\s+)?(?P<unit>[A-Za-z]+)\s*")
+_LONG = {"d": 86400.0, "week": 7 * 86400.0, "month": 30 * 86400.0, "year": 365.25 * 86400.0}
+_SHORT = {"day": "d", "hour": "h", "minute": "min", "second": "s"}
+
+
+def amount_in_time(text: str) -> tuple[str, float]:
+    """What comes about in which time: ``0.05 deg in 30 d``, ``0.1 mm in a week``, ``0.02 in 1 month``.
+
+    Returns:
+        the amount as it is written, and the time (s).
+
+    Raises:
+        ValueError: it is not written so.
+    """
+    match = _RATE.fullmatch(text)
+    if match is not None:
+        unit = match["unit"].lower()
+        single = unit.removesuffix("s") if len(unit) > 1 else unit
+        name = _SHORT.get(single, single)
+        try:
+            one = _LONG[name] if name in _LONG else parse_quantity(f"1 {name}", "time")
+            seconds = float(match["count"] or 1.0) * one
+        except ValueError:
+            seconds = 0.0
+        if seconds > 0 and math.isfinite(seconds):
+            return match["amount"], seconds
+    raise ValueError(f"found {text!r}, expected an amount and a time, such as 0.05 deg in 30 d")
+
+
 def parse_quantity(text: str, dimension: str) -> float:
     """Read a number with its unit, ``"5 mm"`` or ``"9.81 m/s^2"``.
 

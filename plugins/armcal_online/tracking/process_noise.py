@@ -7,8 +7,6 @@ neighbouring records have in common, shifts what an instrument reads.
 """
 
 import fnmatch
-import math
-import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,17 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from armcal.base.arrays import Array, Indices
 from armcal.base.parameters import Parameters
-from armcal.base.units import parse_quantity
+from armcal.base.units import amount_in_time
 from armcal.config.selection import quantity
 from armcal.errors import ConfigError, Location
 from armcal.estimate.online import Gaussian, checked
 from armcal.problem.correlation import kept, passed_on
 
 from armcal_online.tracking.belief import Belief
-
-_RATE = re.compile(r"(?P<amount>.+?)\s+in\s+(?:(?P<count>[0-9.]+)\s*)?(?:an?\s+)?(?P<unit>[A-Za-z]+)\s*")
-_SECONDS = {"day": 86400.0, "week": 7 * 86400.0, "month": 30 * 86400.0, "year": 365.25 * 86400.0, "hour": 3600.0}
-_SHORT = {"d": "day", "h": "hour", "minute": "min", "second": "s"}
 
 
 @dataclass(frozen=True)
@@ -136,8 +130,14 @@ def variance_rates(parameters: Parameters, stated: Mapping[str, str]) -> Array:
                 where=where,
                 hint="armcal check -v lists the names; list others under free to let them move.",
             )
-        amount, seconds = _amount_and_seconds(text, where)
+        try:
+            amount, seconds = amount_in_time(str(text))
+        except ValueError as fault:
+            message = f"found {text!r}, expected how far a parameter may wander in which time."
+            hint = 'Write for example "0.05 deg in 30 d", "0.1 mm in a week" or "0.02 in 1 month".'
+            raise ConfigError(message, where=where, hint=hint) from fault
         for name in names:
+            size: str | float
             block, size = parameters[name], amount
             if block.unit == "1":
                 with suppress(ValueError):
@@ -145,24 +145,3 @@ def variance_rates(parameters: Parameters, stated: Mapping[str, str]) -> Array:
             deviation = quantity(block, size, None, ())
             rates[name] = (deviation / block.scale) ** 2 / seconds
     return np.array([rates[block.name] for block in parameters.free for _ in range(block.domain.dof)])
-
-
-def _amount_and_seconds(text: str, where: Location) -> tuple[str | float, float]:
-    match = _RATE.fullmatch(str(text))
-    if match is not None:
-        unit = match["unit"].lower()
-        unit = _SHORT.get(unit, unit)
-        single = unit.removesuffix("s") if len(unit) > 1 else unit
-        single = _SHORT.get(single, single)
-        try:
-            count = float(match["count"] or 1.0)
-            seconds = count * (_SECONDS[single] if single in _SECONDS else parse_quantity(f"1 {single}", "time"))
-        except ValueError:
-            seconds = 0.0
-        if seconds > 0 and math.isfinite(seconds):
-            return match["amount"], seconds
-    raise ConfigError(
-        f"found {text!r}, expected how far a parameter may wander in which time.",
-        where=where,
-        hint='Write for example "0.05 deg in 30 d", "0.1 mm in a week" or "0.02 in 1 month".',
-    )

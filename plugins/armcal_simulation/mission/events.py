@@ -1,14 +1,11 @@
 """What may happen in a simulated mission: to a joint, a link, the payload, the camera, the weather."""
 
 import math
-import re
 from typing import Annotated, Literal, Self
 
 from armcal.base.settings import Angle, Angle3, Length3, Mass, Settings, Temperature
+from armcal.base.units import amount_in_time
 from pydantic import Field, field_validator, model_validator
-
-_CREEP = re.compile(r"\s*(?P<walk>walk\s+)?(?P<amount>\S.*?)\s+in\s+(?P<over>[0-9.]+)\s*(?P<unit>d|h|min|s)\s*")
-_SECONDS = {"d": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0}
 
 Angle2 = tuple[Angle, Angle]
 Day = Annotated[float, Field(ge=0)]
@@ -20,10 +17,9 @@ def parsed_creep(text: str) -> tuple[str, float, bool]:
     Raises:
         ValueError: it is not written so.
     """
-    match = _CREEP.fullmatch(text)
-    if match is None or not float(match["over"]) > 0:
-        raise ValueError(f"found {text!r}, expected an amount and a time, such as 0.05 deg in 30 d")
-    return match["amount"], float(match["over"]) * _SECONDS[match["unit"]], match["walk"] is not None
+    first, _, rest = text.strip().partition(" ")
+    walks = first == "walk"
+    return *amount_in_time(rest.strip() if walks else text.strip()), walks
 
 
 class EventSettings(Settings):
