@@ -41,7 +41,7 @@ def run() -> Iterator[Row]:
         found["armcal"] = experiment.estimator.solve(problem, records, parameters.nominal()).values
 
     def error_mm(values: Array) -> float:
-        shown = problem.predict(values, problem.records(rigid_arm.dataset(fresh, fresh_tips)))[0][:3]
+        shown = problem.predict(values, problem.records(rigid_arm.dataset(fresh, fresh_tips)))[0].outputs[:3]
         return _rms_mm(shown.T - fresh_tips)
 
     work = f"IPOPT, {problem.backend}, {problem.increments} parameters"

@@ -179,8 +179,7 @@ def predicted(subject: Subject, parameters_of: str, commands: np.ndarray, acting
     dataset = Dataset(tuple(map(str, range(count))), channels)
     alone = {"pose": ArmsAlone(("arm",))}
     problem = Problem.build(system.arms, alone, parameters, system.environment, dataset, "interpreted", groups={})
-    shown = problem.predict(parameters.nominal(), problem.records(dataset))[0]
-    return shown.reshape(4, 3, count).transpose(2, 1, 0)
+    return problem.predict(parameters.nominal(), problem.records(dataset))[0].tools[0].transpose(2, 1, 0)
 
 
 @pytest.mark.slow

@@ -132,7 +132,8 @@ def test_points_ride_on_the_arm_as_its_kinematics_says(lrm, arm) -> None:
     stiff = experiment.parameters.with_free(())
     tip = (
         lrm.problem(experiment, dataset, parameters=stiff)
-        .predict(stiff.nominal(), lrm.problem(experiment, dataset, parameters=stiff).records(dataset))[0][:3]
+        .predict(stiff.nominal(), lrm.problem(experiment, dataset, parameters=stiff).records(dataset))[0]
+        .outputs[:3]
         .T
     )
     origin = (0.1, -0.2, 0.3)

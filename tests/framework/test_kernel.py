@@ -487,7 +487,7 @@ def test_residuals_with_springs_too_soft_for_repetition_are_true_or_refused(lrm,
 @pytest.mark.quick("all-100.0", "k2-1000.0")
 def test_predictions_with_springs_too_soft_for_repetition_are_true_or_refused(lrm, which, compliance):
     def use(problem, values, records, dataset):
-        return problem.predict(values, records)[0][:3, 0]
+        return problem.predict(values, records)[0].outputs[:3, 0]
 
     truly_settled(lrm, "interpreted", softened(which, compliance), use)
 

@@ -67,7 +67,7 @@ def channels(loads):
 
 def predicted(problem, values, dataset):
     """The measured points armcal predicts (N x 3)."""
-    return problem.predict(values, problem.records(dataset))[0][:3].T
+    return problem.predict(values, problem.records(dataset))[0].outputs[:3].T
 
 
 @pytest.mark.parametrize("is_physical", [False, True], ids=["as counted by the authors", "physical"])
@@ -326,7 +326,7 @@ def test_turning_and_shifting_the_root_frame_with_gravity_changes_no_deflection(
             {"arm": one}, system.measurements, parameters, system.environment, dataset, "interpreted"
         )
         records = problem.records(dataset)
-        points.append(problem.predict(stiff, records)[0][:3].T)
+        points.append(problem.predict(stiff, records)[0].outputs[:3].T)
         at_rest.append(records[0].state[:, :30])
     np.testing.assert_allclose(at_rest[0], at_rest[1], rtol=0, atol=1e-12)
     np.testing.assert_allclose(turn.apply(points[0]) + shift, points[1], rtol=0, atol=1e-12)

@@ -276,7 +276,7 @@ def visited(lrm, seed, count=POSES):
 def predicted(lrm, experiment, dataset, evaluator="interpreted"):
     """The tip by armcal, at the configured values."""
     problem = lrm.problem(experiment, dataset, evaluator)
-    return problem.predict(problem.parameters.nominal(), problem.records(dataset))[0][:3].T
+    return problem.predict(problem.parameters.nominal(), problem.records(dataset))[0].outputs[:3].T
 
 
 # ---------------------------------------------------------------- laws
@@ -340,7 +340,7 @@ def test_gravity_is_turned_about_the_bases_x_axis_and_then_about_its_y_axis(lrm,
     changed = {name: replace(parameters[name], nominal=(angle,)) for name, angle in tilt.items()}
     dataset = visited(lrm, 9)
     problem = lrm.problem(experiment, dataset, "interpreted", parameters.replaced(changed))
-    found = problem.predict(problem.parameters.nominal(), problem.records(dataset))[0][:3].T
+    found = problem.predict(problem.parameters.nominal(), problem.records(dataset))[0].outputs[:3].T
     turned = Rotation.from_rotvec([0, -0.07, 0]) * Rotation.from_rotvec([0.11, 0, 0])
     expected = expected_tip(["compliance"], drawn, dataset, oracle.Loads(gravity=turned.apply(oracle.EARTH)))
     np.testing.assert_allclose(found, expected, rtol=0, atol=AGREEMENT_M)
@@ -354,7 +354,7 @@ def test_a_configured_tilt_turns_the_gravity_of_each_record_too(lrm, tmp_path):
     dataset = replace(dataset, channels={**dataset.channels, **columns})
     parameters = experiment.parameters.replaced({"statics.gravity_ry": changed})
     problem = lrm.problem(experiment, dataset, "interpreted", parameters)
-    found = problem.predict(problem.parameters.nominal(), problem.records(dataset))[0][:3].T
+    found = problem.predict(problem.parameters.nominal(), problem.records(dataset))[0].outputs[:3].T
     loads = oracle.Loads(gravity=Rotation.from_rotvec([0, 0.2, 0]).apply(own))
     np.testing.assert_allclose(found, expected_tip(["compliance"], drawn, dataset, loads), rtol=0, atol=AGREEMENT_M)
 
@@ -508,7 +508,7 @@ def scara(effects, q, gravity, **columns):
     dataset = Dataset(tuple(map(str, range(len(q)))), {**channels, **columns})
     environment = Environment(tuple(gravity), force=(0.4, -0.2, 0.7))
     problem = Problem.build({"arm": arm}, {"t": tracker}, parameters, environment, dataset, "interpreted")
-    return problem.predict(values, problem.records(dataset))[0][:3].T
+    return problem.predict(values, problem.records(dataset))[0].outputs[:3].T
 
 
 def scara_chain(count, growth=(1, 1, 1, 1)):

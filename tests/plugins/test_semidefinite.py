@@ -88,7 +88,7 @@ def same_answer(problem, records, one, other):
     free = list(problem.parameters.free_entries)
     off = np.abs(one - other)[free] / deviations(problem, records, one)
     assert off.max() <= SAME_SD, dict(zip(problem.free_names, off, strict=True))
-    shown = [problem.predict(values, records)[0][:3] for values in (one, other)]
+    shown = [problem.predict(values, records)[0].outputs[:3] for values in (one, other)]
     np.testing.assert_allclose(*shown, rtol=0, atol=SAME_M)
 
 

@@ -106,7 +106,7 @@ def predict(system: System, parameters: Parameters, commands: Dataset) -> tuple[
     parts = (system.arms, measurements, fixed, system.environment, commands)
     problem = Problem.build(*parts, "interpreted", groups={})
     shown = problem.predict(fixed.nominal(), problem.records(commands))
-    return problem.by_channel(shown), poses_of(shown[0][len(problem.kernels[0].factor.output_channels) :])
+    return problem.by_channel(shown), poses_of(shown[0].tools)
 
 
 def components(system: System, registry: PluginRegistry) -> tuple[ComponentRecord, ...]:

@@ -168,7 +168,7 @@ class Equilibrium:
         """Arms for records (channels x N), from states near or from none."""
         states = np.zeros((self._size, record.shape[1])) if state is None else state.copy()
         tools, settled = self._evaluator.settle(np.zeros(0), record, states)
-        return Standing(states, poses_of(tools)[0], settled)
+        return Standing(states, poses_of(tools.reshape(1, 4, 3, -1))[0], settled)
 
     def required(self, record: Array) -> Array:
         """base_T_tool (N x 4 x 4) for records that must settle.
@@ -177,13 +177,12 @@ class Equilibrium:
             NotConvergedError: one has no equilibrium.
         """
         tools = self._evaluator(np.zeros(0), record, np.zeros((self._size, record.shape[1])))
-        return np.asarray(poses_of(tools)[0])
+        return np.asarray(poses_of(tools.reshape(1, 4, 3, -1))[0])
 
 
 def poses_of(tools: Array) -> Array:
-    """Columns of 3x4 matrices (12 an arm x N) as homogeneous ones (arms x N x 4 x 4)."""
-    columns = tools.reshape(len(tools) // 12, 4, 3, tools.shape[1])
-    poses = np.zeros((len(columns), tools.shape[1], 4, 4))
-    poses[:, :, :3, :] = columns.transpose(0, 3, 2, 1)
+    """Columns of 3x4 matrices (arms x 4 x 3 x N) as homogeneous ones (arms x N x 4 x 4)."""
+    poses = np.zeros((len(tools), tools.shape[-1], 4, 4))
+    poses[:, :, :3, :] = tools.transpose(0, 3, 2, 1)
     poses[:, :, 3, 3] = 1.0
     return poses

@@ -161,9 +161,6 @@ def pose_words(alignment: Alignment) -> str:
     return f"({x:.1f}, {y:.1f}, {z:.1f}) mm, roll, pitch, yaw ({roll:.2f}, {pitch:.2f}, {yaw:.2f}) deg"
 
 
-_TOOL_ROWS = 12
-
-
 def with_proposals(start: Start, records: Sequence[FactorRecords], dataset: Dataset) -> Start:
     """The start with what measurements propose, where it is much nearer than the configuration.
 
@@ -250,9 +247,8 @@ def carriers_of(
     frames = {BASE_FRAME: still}
     for name in set(measurement.carriers.values()) if isinstance(measurement, Carried) else {TOOL_FRAME}:
         if name == TOOL_FRAME:
-            shown = problem.grouped[number].predict(values, records[number])[len(factor.output_channels) :]
-            rows = shown[:_TOOL_ROWS, : len(dataset)].reshape(4, 3, -1)
-            frames[name] = np.concatenate([rows.transpose(2, 1, 0), still[:, 3:]], axis=1)
+            columns = problem.grouped[number].predict(values, records[number]).tools[0]
+            frames[name] = np.concatenate([columns.transpose(2, 1, 0), still[:, 3:]], axis=1)
         else:
             frames[name] = _frame(problem, values, dataset, measurement.arms[0], name)
     return frames

@@ -48,9 +48,7 @@ def moved_by(problem: Problem, values: Array, records: Sequence[FactorRecords], 
         some = np.zeros((size, own.count))
         some[list(rows)] = corrections[list(rows)]
         shown = problem.predict(values, corrected_records(problem, records, arm, some))[place]
-        first = len(problem.kernels[place].factor.output_channels)
-        at = first + 12 * _arms_of(problem, problem.kernels[place].factor.name).index(arm.name) + 9
-        return shown[at : at + 3]
+        return np.asarray(shown.tools[_arms_of(problem, problem.kernels[place].factor.name).index(arm.name), 3])
 
     none, joints = tools(()), [i for i in range(len(OF_TOOL), size) if np.any(corrections[i])]
     parts = {"tool": range(len(OF_TOOL)), **{arm.joint_names[i - len(OF_TOOL)]: (i,) for i in joints}}

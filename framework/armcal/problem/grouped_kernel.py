@@ -26,6 +26,20 @@ Block = tuple[Array, Array]
 
 
 @dataclass(frozen=True)
+class Shown:
+    """What records show in equilibrium.
+
+    Attributes:
+        outputs: what the instrument would read (n_o x N).
+        tools: base_T_tool of each of the measurement's arms, column by column: three axes, then the place
+            (arms x 4 x 3 x N, m).
+    """
+
+    outputs: Array
+    tools: Array
+
+
+@dataclass(frozen=True)
 class GroupedKernel:
     """A kernel, where its values come from, and where its Jacobian goes.
 
@@ -82,12 +96,14 @@ class GroupedKernel:
         slopes = slopes.reshape(shape)
         return slopes if records.present is None else np.where(records.present[:, None], slopes, 0.0)
 
-    def predict(self, values: Array, records: FactorRecords) -> Array:
-        """Outputs, then tool poses (n_o + 12 an arm x width)."""
+    def predict(self, values: Array, records: FactorRecords) -> Shown:
+        """What the records show."""
         factor = self.kernel.factor
-        shown = np.empty((len(factor.output_channels) + factor.tools.numel(), records.record.shape[1]))
+        count = len(factor.output_channels)
+        shown = np.empty((count + factor.tools.numel(), records.record.shape[1]))
         self._evaluate(self.kernel.predict, values, records, shown)
-        return shown
+        shown = shown[:, : records.count]
+        return Shown(shown[:count], shown[count:].reshape(factor.tools.numel() // 12, 4, 3, records.count))
 
     def nuisance_starts(self, values: Array, records: FactorRecords) -> Array:
         """Where each record alone has its group's parameters start (entries x width)."""

@@ -20,7 +20,7 @@ from armcal.measure.partners import with_partners
 from armcal.problem import factor_records
 from armcal.problem.blueprint import Blueprint
 from armcal.problem.factor_records import FactorRecords, correlation_of, mean_shares, transformed
-from armcal.problem.grouped_kernel import GroupedKernel
+from armcal.problem.grouped_kernel import GroupedKernel, Shown
 from armcal.problem.kernel import Kernel
 from armcal.problem.normal_equations import ExtraRows, NormalEquations, TieFunction, stacked
 
@@ -241,16 +241,15 @@ class Problem:
             grouped.channel_slopes(values, record, channels)[:, :, : record.count] for grouped, record in pairs
         )
 
-    def predict(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
-        """Outputs and tool positions in equilibrium, one (n_o + 12 an arm x N) matrix a factor."""
+    def predict(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Shown, ...]:
+        """What the records of each factor show."""
         self._check_fixed(values)
-        pairs = zip(self.grouped, records, strict=True)
-        return tuple(grouped.predict(values, record)[:, : record.count] for grouped, record in pairs)
+        return tuple(grouped.predict(values, record) for grouped, record in zip(self.grouped, records, strict=True))
 
-    def by_channel(self, shown: Sequence[Array]) -> dict[str, Array]:
+    def by_channel(self, shown: Sequence[Shown]) -> dict[str, Array]:
         """Of what ``predict`` gives, the outputs by channel (N each)."""
-        names = [kernel.factor.output_channels for kernel in self.kernels]
-        return {name: row for own, rows in zip(names, shown, strict=True) for name, row in zip(own, rows, strict=False)}
+        pairs = [(kernel.factor.output_channels, own.outputs) for kernel, own in zip(self.kernels, shown, strict=True)]
+        return {name: row for names, rows in pairs for name, row in zip(names, rows, strict=True)}
 
     def nuisance_starts(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
         """Where each record alone has its group's parameters start, one (entries x N) matrix a factor."""

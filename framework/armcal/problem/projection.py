@@ -49,10 +49,10 @@ def as_predicted(problem: Problem, values: Array, records: Sequence[FactorRecord
 def predicted_records(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
     """Records with what the model predicts in the place of all measured numbers."""
     predicted = []
-    for kernel, before, outputs in zip(problem.kernels, records, problem.predict(values, records), strict=True):
+    for kernel, before, shown in zip(problem.kernels, records, problem.predict(values, records), strict=True):
         record = before.record.copy()
         for row in _measured(kernel.factor):
-            readings = outputs[kernel.factor.output_channels.index(kernel.factor.channels[row])]
+            readings = shown.outputs[kernel.factor.output_channels.index(kernel.factor.channels[row])]
             record[row, : before.count] = readings
             record[row, before.count :] = readings[-1] if before.count else 0.0
         predicted.append(replace(before, record=record))

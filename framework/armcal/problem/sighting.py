@@ -17,7 +17,6 @@ from armcal.problem.tool_motion import spread_of
 
 _SAME_M = 1e-6
 _QUATERNION = ("qw", "qx", "qy", "qz")
-_TOOL_ROWS = 12
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ def sighting_of(
     if not len(chosen):
         return None
     some, values = problem.subset(records, chosen), problem.parameters.nominal()
-    measured, shown = dataset.stacked(channels)[:, chosen], problem.predict(values, some)[number][:3]
+    measured, shown = dataset.stacked(channels)[:, chosen], problem.predict(values, some)[number].outputs[:3]
     if not np.allclose(problem.residuals(values, some)[number][:3], measured - shown, atol=_SAME_M):
         return None
     quaternion = [f"{factor.name}.{part}" for part in _QUATERNION]
@@ -85,13 +84,11 @@ def sighting_of(
 
 def tools_of(problem: Problem, values: Array, record: FactorRecords, number: int) -> Tools:
     """What a measurement's arm shows in each of its records: of the body if its rotation is read, else of the tool."""
-    outputs = problem.kernels[number].factor.output_channels
-    shown = problem.grouped[number].predict(values, record)[:, : record.count]
-    parts = [channel.rpartition(".")[2] for channel in outputs]
+    shown = problem.grouped[number].predict(values, record)
+    parts = [channel.rpartition(".")[2] for channel in problem.kernels[number].factor.output_channels]
     if set(_QUATERNION) <= set(parts):
-        return Tools(shown[:3], _rotations(shown[[parts.index(part) for part in _QUATERNION]]))
-    axes = shown[len(outputs) : len(outputs) + _TOOL_ROWS].reshape(4, 3, -1)[:3]
-    return Tools(shown[:3], np.ascontiguousarray(np.transpose(axes, (2, 1, 0))))
+        return Tools(shown.outputs[:3], _rotations(shown.outputs[[parts.index(part) for part in _QUATERNION]]))
+    return Tools(shown.outputs[:3], np.ascontiguousarray(np.transpose(shown.tools[0, :3], (2, 1, 0))))
 
 
 def _rotations(quaternions: Array) -> Array:

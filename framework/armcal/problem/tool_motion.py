@@ -23,9 +23,7 @@ def along(problem: Problem, values: Array, poses: Sequence[FactorRecords], direc
 
 def tools(problem: Problem, values: Array, poses: Sequence[FactorRecords]) -> tuple[Array, Array]:
     """All tools, one for each measurement and arm: places (tools x 3 x N, m) and axes (tools x axis x 3 x N)."""
-    shown = zip(problem.kernels, problem.predict(values, poses), strict=True)
-    rows = [outputs[len(kernel.factor.output_channels) :] for kernel, outputs in shown]
-    tools = np.concatenate([poses_of.reshape(-1, 4, 3, poses_of.shape[1]) for poses_of in rows])
+    tools = np.concatenate([shown.tools for shown in problem.predict(values, poses)])
     return tools[:, 3], tools[:, :3]
 
 

@@ -105,7 +105,6 @@ def errors_of(run: FittedRecords, crossed: CrossValidation | None) -> RecordErro
         judged[train], judged_at_rest[train] = crossed.errors * _MM, crossed.at_rest * _MM
     dimensions = [dimension for kernel in problem.kernels for dimension in kernel.factor.dimensions]
     columns = _columns(problem)
-    first = len(problem.kernels[0].factor.output_channels)
     try:
         before, after = settled(unfitted, nominal, records), settled(problem, values, records)
         nominal_errors, nominal_turns = errors_and_turns(unfitted, nominal, records)
@@ -122,7 +121,7 @@ def errors_of(run: FittedRecords, crossed: CrossValidation | None) -> RecordErro
             cross_validated_mm=judged,
             nominal_residual_mm=_known(problem.residuals(before, records), records) * _MM,
             calibrated_residual_mm=_known(residuals(problem, after, records, fitted.records), records) * _MM,
-            position_mm=problem.predict(values, records)[0][first + 9 : first + 12] * _MM,
+            position_mm=problem.predict(values, records)[0].tools[0, 3] * _MM,
             failed_folds=0 if crossed is None else crossed.failed_folds,
             at_rest_mm=record_errors(problem, values, records) * _MM if drifts else None,
             cross_validated_at_rest_mm=judged_at_rest if drifts else None,

@@ -229,12 +229,12 @@ def check_reach(problem: Problem, records: Sequence[FactorRecords], dataset: Dat
         DataError: which, and as which unit they are read.
     """
     shown = problem.predict(problem.parameters.nominal(), records)
-    for kernel, values in zip(problem.kernels, shown, strict=True):
+    for kernel, own in zip(problem.kernels, shown, strict=True):
         channels = kernel.factor.output_channels
         if [channel.rpartition(".")[2] for channel in channels] != ["x", "y", "z"]:
             continue
         name, measured = kernel.factor.name, dataset.stacked(channels)
-        factor, wrong = _in_another_unit(measured, values[:3])
+        factor, wrong = _in_another_unit(measured, own.outputs[:3])
         if wrong.any():
             first, count = int(np.argmax(wrong)), int(wrong.sum())
             which, more = f"the position of record {dataset.ids[first]} is", ""
@@ -246,7 +246,7 @@ def check_reach(problem: Problem, records: Sequence[FactorRecords], dataset: Dat
                 where=Location(dataset.source, row=dataset.rows[first] if dataset.rows else None),
                 hint="Write all rows in the unit of the column names.",
             )
-        far, distances = (float(np.median(np.linalg.norm(x, axis=0))) for x in (values[:3], measured))
+        far, distances = (float(np.median(np.linalg.norm(x, axis=0))) for x in (own.outputs[:3], measured))
         if distances > _REACH_RATIO * far or far > _REACH_RATIO * distances:
             raise DataError(
                 f"{name}: positions are typically {distances:.4g} m from the base frame, the model's tip {far:.4g} m.",

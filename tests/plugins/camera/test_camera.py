@@ -114,7 +114,7 @@ def test_points_evaluate_as_one_long_expression(experiment: Experiment, dataset:
         _, expected, slopes = (np.asarray(x) for x in function(free, records[0].record[order, i], np.zeros(0)))
         assert np.allclose(residual[:, i], expected.ravel(), atol=1e-13)
         assert np.allclose(jacobian[:, :, i] * noise[:, None], slopes.T, atol=1e-10)
-    shown = problem.predict(values, records)[0][: len(noise)]
+    shown = problem.predict(values, records)[0].outputs
     read = dataset.stacked(kernel.factor.output_channels)[:, few]
     assert np.allclose(read - shown, residual, atol=1e-13)
 
@@ -221,4 +221,4 @@ def test_a_camera_on_an_arm_that_changes_reads_as_one_on_a_still_arm(experiment:
     for rows, own in ((slice(0, 3), values), (slice(3, 6), moved[5])):
         (shown,) = problem.predict(own, problem.records(poses))
         channels = problem.kernels[0].factor.output_channels
-        assert np.allclose([read[c][rows] for c in channels], shown[: len(channels), rows], atol=1e-12)
+        assert np.allclose([read[c][rows] for c in channels], shown.outputs[:, rows], atol=1e-12)
