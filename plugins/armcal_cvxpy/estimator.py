@@ -106,10 +106,9 @@ class _ConvexStep:
             constraints.append(self._step[np.flatnonzero(self._has_low)] >= self._to_low)
         if self._has_high.any():
             constraints.append(self._step[np.flatnonzero(self._has_high)] <= self._to_high)
-        self._cones, start = list[_Cone](), 0
-        for block in posed.problem.parameters.free:
-            place = slice(start, start + block.domain.dof)
-            start = place.stop
+        self._cones, parameters = list[_Cone](), posed.problem.parameters
+        for block in parameters.free:
+            place = parameters.coordinates_of[block.name]
             if isinstance(block.domain, Semidefinite):
                 self._cones.append(_Cone(np.array(block.nominal) / posed.coordinate_scales[place], place))
         constraints += [cone.constraint(self._step) for cone in self._cones]

@@ -240,6 +240,17 @@ class Parameters:
         return tuple(i for block in self.free for i in range(*self.entries_of(block.name).indices(1 << 30)))
 
     @cached_property
+    def coordinate_blocks(self) -> tuple[ParameterBlock, ...]:
+        """The free block of each coordinate."""
+        return tuple(block for block in self.free for _ in range(block.domain.dof))
+
+    @cached_property
+    def coordinates_of(self) -> Mapping[str, slice]:
+        """Where each free block's coordinates stand among all."""
+        ends = np.cumsum([block.domain.dof for block in self.free]).tolist()
+        return {b.name: slice(end - b.domain.dof, end) for b, end in zip(self.free, ends, strict=True)}
+
+    @cached_property
     def coordinate_names(self) -> tuple[str, ...]:
         """A name for each number of an increment: the entry's, where coordinates are entries."""
         names: list[str] = []
@@ -265,7 +276,7 @@ class Parameters:
         return _Layout(places, entries, increments, tuple(others), (entry, increment))
 
     def _per_increment(self, of: Callable[[ParameterBlock], float]) -> Array:
-        return np.array([number for block in self.free for number in [of(block)] * block.domain.dof])
+        return np.array([of(block) for block in self.coordinate_blocks])
 
     def scales(self) -> Array:
         """The typical scale of each coordinate."""

@@ -113,8 +113,7 @@ def _content(experiment: Experiment, result: PlanResult) -> dict[str, Any]:
         "efficiency": bound.efficiency,
         "by": bound.how,
     }
-    blocks = experiment.parameters.free
-    units = [block.unit for block in blocks for _ in range(block.domain.dof)]
+    units = [block.unit for block in experiment.parameters.coordinate_blocks]
     scales = experiment.parameters.scales()
     before, after = result.deviations
     return {

@@ -132,7 +132,7 @@ def displaced(problem: Problem, estimate: Estimate, records: Sequence[FactorReco
     """Coordinates of geometry that are more than ``BEYOND`` prior standard deviations from their nominal values."""
     parameters = problem.parameters
     moved = parameters.coordinates(parameters.local(estimate.values))
-    blocks = [block for block in parameters.free for _ in range(block.domain.dof)]
+    blocks = parameters.coordinate_blocks
     # By its prior, else by a typical correction of a length or angle; of others nothing is known.
     typical = [b.scale if b.unit in ("m", "rad") and not b.nuisance else np.inf for b in blocks]
     sizes = np.array([t if b.prior_sd is None else b.prior_sd for b, t in zip(blocks, typical, strict=True)])

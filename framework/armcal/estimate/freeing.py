@@ -70,8 +70,7 @@ def freeing(wide: Problem, own: Sequence[str], values: Array, records: Sequence[
     priors = parameters.prior_information() * parameters.scales() ** 2
     off = parameters.coordinates(parameters.local(values)) / parameters.scales()
     model = NormalEquations(model.cost, model.gradient + priors * off, model.hessian + np.diag(priors))
-    ends = np.cumsum([block.domain.dof for block in parameters.free]).tolist()
-    places = {b.name: np.arange(end - b.domain.dof, end) for b, end in zip(parameters.free, ends, strict=True)}
+    places = {name: np.arange(own.start, own.stop) for name, own in parameters.coordinates_of.items()}
     search = _Search(model, priors, wide.equations(records), parameters.scales())
     taken, left = [i for name in own for i in places[name]], [name for name in places if name not in set(own)]
     gaining, count = list[Candidate](), len(left)

@@ -101,7 +101,7 @@ class Identifiability:
 
 def measures_of(parameters: Parameters) -> tuple[Measure, ...]:
     """How each coordinate of the free blocks is shown."""
-    return tuple(Measure(block.unit, block.scale) for block in parameters.free for _ in range(block.domain.dof))
+    return tuple(Measure(block.unit, block.scale) for block in parameters.coordinate_blocks)
 
 
 def analyse(

@@ -4,7 +4,7 @@ QR with column pivoting on the scaled Jacobian [Golub2013], block by block, pref
 base parameters are found numerically [Khalil2002].
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,8 +71,7 @@ def minimal_set(
         most_uncertain: leave out, the most uncertain first, what stays uncertain by more than so many typical scales.
     """
     columns = triangle * parameters.scales()
-    ends = np.cumsum([block.domain.dof for block in parameters.free]).tolist()
-    places = {b.name: slice(end - b.domain.dof, end) for b, end in zip(parameters.free, ends, strict=True)}
+    places = parameters.coordinates_of
     tolerance = RANK_TOLERANCE * float(np.linalg.norm(columns, 2)) if columns.size else 0.0
     of_groups = [block.name for block in parameters.free if block.nuisance]
     ranked = [[name for name in group if name in places] for group in (of_groups, *preferred)]
@@ -89,7 +88,9 @@ def minimal_set(
     return _described(columns, parameters, places, kept, tolerance)
 
 
-def _chosen(columns: Array, places: dict[str, slice], groups: Sequence[Sequence[str]], tolerance: float) -> list[str]:
+def _chosen(
+    columns: Array, places: Mapping[str, slice], groups: Sequence[Sequence[str]], tolerance: float
+) -> list[str]:
     """Blocks in the order in which they are taken: within a group, the one with most that is new."""
     basis = np.zeros((len(columns), 0))
     chosen: list[str] = []
@@ -112,7 +113,7 @@ def _chosen(columns: Array, places: dict[str, slice], groups: Sequence[Sequence[
 
 
 def _described(
-    columns: Array, parameters: Parameters, places: dict[str, slice], kept: Sequence[str], tolerance: float
+    columns: Array, parameters: Parameters, places: Mapping[str, slice], kept: Sequence[str], tolerance: float
 ) -> MinimalSet:
     names, measures = parameters.coordinate_names, measures_of(parameters)
     inside = np.zeros(len(names), dtype=bool)
@@ -143,7 +144,7 @@ def _described(
     )
 
 
-def _deviations(columns: Array, places: dict[str, slice], kept: Sequence[str]) -> Array:
+def _deviations(columns: Array, places: Mapping[str, slice], kept: Sequence[str]) -> Array:
     """Standard deviations in typical scales (n) if these blocks are free; infinite where undetermined, or not kept."""
     inside = np.concatenate([np.arange(columns.shape[1])[places[name]] for name in kept]) if kept else np.zeros(0, int)
     deviation = np.full(columns.shape[1], np.inf)

@@ -143,7 +143,7 @@ def _disagreement(problem: Problem, values: Array, configured: float, left: floa
     """Which parameters are farther from their nominal values than their priors allow; empty if none is."""
     parameters = problem.parameters
     moved = parameters.coordinates(parameters.local(values))
-    times = np.abs(moved) / np.array([b.prior_sd or np.inf for b in parameters.free for _ in range(b.domain.dof)])
+    times = np.abs(moved) / np.array([block.prior_sd or np.inf for block in parameters.coordinate_blocks])
     beyond = [(parameters.coordinate_names[i], times[i]) for i in np.argsort(-times)[:3] if times[i] > BEYOND]
     named = ", ".join(f"{name} ({times:.0f} standard deviations)" for name, times in beyond)
     return named and (

@@ -167,7 +167,7 @@ def slow_changes(
 
 def _deviations(cause: Cause, space: StateSpace, settings: ChangeSettings) -> dict[int, float]:
     """Standard deviations of what a cause changes, by coordinate (scaled)."""
-    payload, units = settings.payload, [b.unit for b in space.parameters.free for _ in range(b.domain.dof)]
+    payload, units = settings.payload, [block.unit for block in space.parameters.coordinate_blocks]
     by_unit = {"kg": payload, "kg_m": payload * settings.payload_lever}
     by_unit |= {"m": settings.link_length, "rad": settings.link_angle}
     if cause.kind == "gravity_tilted":

@@ -144,4 +144,4 @@ def variance_rates(parameters: Parameters, stated: Mapping[str, str]) -> Array:
                     size = float(amount)
             deviation = quantity(block, size, None, ())
             rates[name] = (deviation / block.scale) ** 2 / seconds
-    return np.array([rates[block.name] for block in parameters.free for _ in range(block.domain.dof)])
+    return np.array([rates[block.name] for block in parameters.coordinate_blocks])

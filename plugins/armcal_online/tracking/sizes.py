@@ -84,7 +84,7 @@ def _with_centre(space: StateSpace, moved: Array, covariance: Array, mass: Size)
 def _of_link(space: StateSpace, steps: Steps, moved: Array, covariance: Array, subject: str) -> Size:
     """The numbers of a link that changed clearly, the clearest first; the clearest is its size."""
     at = next(cause.coordinates for cause in steps.causes if cause.subject == subject)
-    units = [block.unit for block in space.parameters.free for _ in range(block.domain.dof)]
+    units = [block.unit for block in space.parameters.coordinate_blocks]
     sizes = []
     for i in at:
         value, deviation = (float(x * space.scales[i]) for x in (moved[i], math.sqrt(max(covariance[i, i], 0.0))))

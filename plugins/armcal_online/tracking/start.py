@@ -148,12 +148,9 @@ def _initial_belief(calibration: Calibration, space: StateSpace, opened: Mapping
     whole = np.zeros((len(names), len(names)))
     whole[np.ix_(place, place)] = own + np.tril(own, -1).T
     covariance = space.of_entries(values, whole)
-    start = 0
-    for block in space.parameters.free:
+    for i, block in enumerate(space.parameters.coordinate_blocks):
         if block.name in opened:
-            at = np.arange(start, start + block.domain.dof)
-            covariance[at, at] = (opened[block.name] / block.scale) ** 2
-        start += block.domain.dof
+            covariance[i, i] = (opened[block.name] / block.scale) ** 2
     unconstrained = values.copy()
     for position, entry in enumerate(calibration.record.parameters):
         if entry.unconstrained is not None:

@@ -41,12 +41,8 @@ class StateSpace:
     @cached_property
     def _blocks(self) -> tuple[tuple[ParameterBlock, slice, slice], ...]:
         """The free blocks, with their places in a value vector and among the coordinates."""
-        blocks, start = [], 0
-        for block in self.parameters.free:
-            stop = start + block.domain.dof
-            blocks.append((block, self.parameters.entries_of(block.name), slice(start, stop)))
-            start = stop
-        return tuple(blocks)
+        own = self.parameters
+        return tuple((block, own.entries_of(block.name), own.coordinates_of[block.name]) for block in own.free)
 
     @cached_property
     def _turning(self) -> tuple[tuple[ParameterBlock, slice, slice], ...]:
