@@ -33,7 +33,7 @@ from armcal.config.system import System, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ArmcalError, CalibrationWarning, ConfigError, DataError, Location
-from armcal.estimate.prediction import Recording
+from armcal.estimate.validation import Recording
 from armcal.estimate.variance import Component
 from armcal.measure.measurement import Measurement
 from armcal.plugins import PluginRegistry, discover

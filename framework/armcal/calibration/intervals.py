@@ -27,10 +27,10 @@ from armcal.estimate.prediction import (
     TURN,
     KnownDrift,
     Predictor,
-    Recording,
     Spread,
     is_position,
 )
+from armcal.estimate.validation import Recording
 from armcal.estimate.variance import Axes, Component, VarianceComponents, apply_components
 from armcal.problem.drift import Chain, chain, with_drift
 from armcal.problem.problem import FactorRecords, Problem

@@ -28,12 +28,11 @@ from armcal.estimate.prediction import (
     STATED,
     KnownDrift,
     Predictor,
-    Recording,
     Spread,
     is_position,
     quantile,
 )
-from armcal.estimate.validation import FitTask, JudgedFit, Split, failed_fit, fit_and_judge, judged_fit
+from armcal.estimate.validation import FitTask, JudgedFit, Recording, Split, failed_fit, fit_and_judge, judged_fit
 from armcal.estimate.variance import apply_components
 from armcal.estimate.weighing import WeighedFit, Weighing, fit
 from armcal.problem.problem import FactorRecords, Problem
@@ -81,19 +80,6 @@ class Stretch:
         """For YAML and JSON."""
         named: dict[str, float | None] = {level_name(p): x for p, x in zip(LEVELS, self.coordinates, strict=True)}
         return {**named, "radius_95": self.radius}
-
-
-@dataclass(frozen=True)
-class PredictedFit(JudgedFit):
-    """A fit with how its predictions missed.
-
-    Attributes:
-        held_residuals: raw residuals of the records that judge, by recording (``new`` only where something drifts).
-        unknown: covariance of these by what a pose residual did not know (N x n_r x n_r each); None without one.
-    """
-
-    held_residuals: Mapping[Recording, Residuals]
-    unknown: Residuals | None = None
 
 
 @dataclass(frozen=True)
@@ -205,13 +191,11 @@ def fit_and_predict(task: FitTask) -> JudgedFit:
         judged = judged_fit(task, fitted.solution, train, held, began)
         if not judged.converged:
             return judged
-        held_residuals = missed(
-            predictor(task.problem, fitted), whitened_like(task.problem, fitted, held, task.estimator)
-        )
+        alike = whitened_like(task.problem, fitted, held, task.estimator)
+        own = missed(predictor(task.problem, fitted), alike)
+        return replace(judged, held_residuals=own, seconds=time.perf_counter() - began)
     except NotConvergedError:
         return failed_fit(task, began)
-    seconds = time.perf_counter() - began
-    return PredictedFit(judged.errors, judged.at_rest, judged.turns, True, seconds, held_residuals)
 
 
 def besides(scores: Scores, places: Indices) -> Scores:

@@ -13,20 +13,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from scipy.special import fdtri, stdtrit
 
 from armcal.base.arrays import Array, Indices
-from armcal.estimate.validation import error_dimension
+from armcal.estimate.validation import Recording, error_dimension
 from armcal.problem.corrected import unexplained
 from armcal.problem.factor_records import noise_roots
 from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem
 
-Recording = Literal["same", "new"]
-"""Whether what is predicted lies within the recording of the fit, whose drift is known, or in another one."""
 LEVELS = (0.5, 0.9, 0.95)
 """Of the intervals that are stated and judged."""
 STATED = 0.9

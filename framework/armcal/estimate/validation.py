@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from armcal.estimate.nuisance import restricted, settled
 from armcal.io.parallel import Executor, Sequential
 from armcal.problem.drift import residuals
 from armcal.problem.problem import FactorRecords, Problem
+
+Recording = Literal["same", "new"]
+"""Whether what is predicted lies within the recording of the fit, whose drift is known, or in another one."""
 
 FEWEST_FOR_P95 = 20
 
@@ -217,9 +220,18 @@ class FitTask:
 
 @dataclass(frozen=True)
 class JudgedFit:
-    """Errors (m) of the records that judge, by a fit on those that train; nan if it did not converge.
+    """How a fit on the records that train does on those that judge; errors are nan if it did not converge.
 
-    ``at_rest`` are the errors if nothing is known of a drift, ``turns`` those of orientations (rad), where measured.
+    Attributes:
+        errors: m.
+        at_rest: the errors if nothing is known of a drift.
+        turns: errors of orientations (rad), where measured.
+        converged: whether the fit did.
+        seconds: that it took.
+        held_residuals: raw residuals of the records that judge, by recording (``new`` only where something drifts);
+            none where no predictions were asked for.
+        unknown: covariance of these by what a pose residual did not know (N x n_r x n_r each); None without one.
+        without: the errors ``at_rest`` without the pose residual that the fit learned; None where it learns none.
     """
 
     errors: Array
@@ -227,6 +239,9 @@ class JudgedFit:
     turns: Array | None
     converged: bool
     seconds: float
+    held_residuals: Mapping[Recording, tuple[Array, ...]] = field(default_factory=dict)
+    unknown: tuple[Array, ...] | None = None
+    without: Array | None = None
 
 
 @dataclass(frozen=True)

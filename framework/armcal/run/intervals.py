@@ -12,7 +12,6 @@ from armcal.base.dataset import Dataset
 from armcal.base.units import readable
 from armcal.diagnose.coverage import (
     Coverage,
-    PredictedFit,
     Scores,
     Stretch,
     besides,
@@ -28,8 +27,8 @@ from armcal.diagnose.coverage import (
 from armcal.diagnose.dependences import MOST_LEVELS
 from armcal.diagnose.noise_findings import Finding
 from armcal.estimate.estimator import Estimator
-from armcal.estimate.prediction import LEVELS, POSITION, STATED, Predictor, Recording, Spread, is_position
-from armcal.estimate.validation import CrossValidation, Split
+from armcal.estimate.prediction import LEVELS, POSITION, STATED, Predictor, Spread, is_position
+from armcal.estimate.validation import CrossValidation, Recording, Split
 from armcal.estimate.weighing import WeighedFit
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -161,12 +160,11 @@ def _crossed(
     if crossed is None:
         return {}, {}, {}
     judged, splits = crossed
-    fits = [fit if isinstance(fit, PredictedFit) else None for fit in judged.fits]
-    held_residuals = collected(splits, [fit.held_residuals if fit else {} for fit in fits], len(split.train))
+    held_residuals = collected(splits, [fit.held_residuals for fit in judged.fits], len(split.train))
     # What the pose residuals of folds did not know of the records that they did not see; None without any.
     unknown: list[Array] | None = None
-    for fit, fold in zip(fits, splits, strict=True):
-        if fit is None or fit.unknown is None:
+    for fit, fold in zip(judged.fits, splits, strict=True):
+        if fit.unknown is None:
             continue
         if unknown is None:
             unknown = [np.zeros((fitted.records[0].count, *block.shape[1:])) for block in fit.unknown]

@@ -1,7 +1,7 @@
 """The pose residual of a run: learned from what the physical fit leaves, kept only if records held out say so."""
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Self
 
@@ -12,7 +12,7 @@ from armcal.arm.pose_residual import OF_TOOL, ModelErrors, PoseResidual, Posture
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.config.system import System
-from armcal.diagnose.coverage import PredictedFit, missed, predictor, whitened_like
+from armcal.diagnose.coverage import missed, predictor, whitened_like
 from armcal.diagnose.noise_findings import Finding
 from armcal.errors import ConfigError, NotConvergedError
 from armcal.estimate.estimator import Progress
@@ -155,13 +155,6 @@ class ResidualOutcome:
 
 
 @dataclass(frozen=True)
-class LayeredFit(PredictedFit):
-    """A fit with a pose residual, and its errors without (m; at rest where something drifts)."""
-
-    without: Array = field(default_factory=lambda: np.zeros(0))
-
-
-@dataclass(frozen=True)
 class Layer:
     """What a fold needs to learn: whose pose residual, as far as it has learned, and all records' postures."""
 
@@ -258,7 +251,7 @@ def _compared(crossed: CrossValidation, splits: tuple[Split, ...], chances: tupl
     """With and without; records of one of the ``chances`` may miss alike."""
     without = np.full(len(crossed.errors), np.nan)
     for split, own in zip(splits, crossed.fits, strict=True):
-        if isinstance(own, LayeredFit):
+        if own.without is not None:
             without[split.holdout] = own.without
     return Comparison.of(_MM * without, _MM * crossed.at_rest, chances)
 
@@ -281,14 +274,16 @@ def judged_with(task: FitTask, layer: Layer) -> JudgedFit:
             )
             fitted = fit(task.problem, train, task.estimator, fitted.solution.values)
         judged = judged_fit(task, fitted.solution, train, held, began)
+        if not judged.converged:
+            return judged
         alike = whitened_like(task.problem, fitted, held, task.estimator)
         held_residuals = missed(predictor(task.problem, fitted), alike)
         own = {} if learned is None else {layer.arm: (learned, layer.postures.subset(task.split.holdout))}
         unknown = tuple(unexplained(task.problem, fitted.solution.values, held, own))
     except NotConvergedError:
         return failed_fit(task, began)
-    seconds, errors = time.perf_counter() - began, (judged.errors, judged.at_rest, judged.turns)
-    return LayeredFit(*errors, True, seconds, held_residuals, unknown, plain.at_rest)
+    seconds = time.perf_counter() - began
+    return replace(judged, seconds=seconds, held_residuals=held_residuals, unknown=unknown, without=plain.at_rest)
 
 
 def model_errors(
