@@ -9,6 +9,7 @@ import numpy as np
 from armcal.base.arrays import Array, Indices
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.prediction import POSITION, is_position
+from armcal.problem.factor_records import correlation_of
 from armcal.problem.problem import FactorRecords, Problem
 
 
@@ -43,7 +44,7 @@ class FitRows:
         chain = parameters.entries_jacobian(values) * scales
         parts = [np.einsum("rvn,vc->rnc", block, chain) for block in problem.jacobians(values, records)]
         weighted = problem.weighted_residuals(values, records)
-        shared = records[0].correlation
+        shared = correlation_of(records)
         drifted = [np.zeros((*r.shape, 0)) for r in weighted] if shared is None else shared.shared()
         drifted = [slope[:, :count] for slope in drifted]
         drift = np.zeros(0)

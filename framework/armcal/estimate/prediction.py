@@ -20,7 +20,7 @@ from scipy.special import fdtri, stdtrit
 from armcal.base.arrays import Array, Indices
 from armcal.estimate.validation import Recording, error_dimension
 from armcal.problem.corrected import unexplained
-from armcal.problem.factor_records import noise_roots
+from armcal.problem.factor_records import correlation_of, noise_roots, unweighted
 from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -97,7 +97,7 @@ class KnownDrift:
     @classmethod
     def by(cls, problem: Problem, values: Array, records: Sequence[FactorRecords]) -> KnownDrift | None:
         """From the records of a fit at the values found; None where nothing drifts."""
-        shared = records[0].correlation if records else None
+        shared = correlation_of(records)
         if shared is None:
             return None
         jacobians = [np.moveaxis(jacobian, 1, 2) for jacobian in problem.jacobians(values, records)]
@@ -147,7 +147,7 @@ class Predictor:
 
     def residuals(self, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
         """Raw residuals less the known drift, one (n_r x N) a factor; records on the chain of those of the fit."""
-        raw, here = self.problem.residuals(self.values, records), records[0].correlation
+        raw, here = self.problem.residuals(self.values, records), correlation_of(records)
         return raw if here is None or self.drift is None else here.taken_off(raw, self.drift.states)
 
     def spreads(self, records: Sequence[FactorRecords], recording: Recording) -> tuple[Spread, ...]:
@@ -181,7 +181,7 @@ class Predictor:
         that part, and in a new recording it is an error. For residuals of slopes J and the covariance S, of which D
         is the drift's, what both have in common is J C J' S^-1 D, with C the covariance of the values.
         """
-        here, there = records[0].correlation, self.drift
+        here, there = correlation_of(records), self.drift
         if here is None or there is None or not len(judged):
             return None
         counted, whole, common = error_dimension(self.problem), 0.0, 0.0
@@ -209,7 +209,7 @@ class Predictor:
 
         What pose residuals do not know counts as noise: it is the same whether or not a record was learned from.
         """
-        here, there, parts = records[0].correlation, self.drift if recording == "same" else None, []
+        here, there, parts = correlation_of(records), self.drift if recording == "same" else None, []
         blocks, variance = self.problem.parameters.free, self.noise_scale**2
         drifting = np.array([0.0 if b.drift is None else b.drift.sd**2 for b in blocks for _ in range(b.size)])
         unknown = unexplained(self.problem, self.values, records) if unknown is None else unknown
@@ -228,9 +228,7 @@ class Predictor:
 
     def _slopes(self, records: Sequence[FactorRecords]) -> list[Array]:
         """Residuals by free canonical entries, raw, one (n_r x n_v x N) a factor."""
-        bare = [
-            replace(record, weight=np.ones_like(record.weight), whitening=None, correlation=None) for record in records
-        ]
+        bare = [replace(record, whitening=None) for record in unweighted(records)]
         pairs = zip(self.problem.kernels, self.problem.jacobians(self.values, bare), strict=True)
         return [jacobian * np.array(kernel.factor.noise)[:, None, None] for kernel, jacobian in pairs]
 

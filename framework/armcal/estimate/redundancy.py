@@ -14,6 +14,7 @@ from scipy.special import fdtri
 from armcal.base.arrays import Array
 from armcal.estimate.identifiability import InverseInformation
 from armcal.estimate.loss import median_norm
+from armcal.problem.factor_records import correlation_of
 from armcal.problem.problem import FactorRecords, Problem
 
 LEVEL = 0.01
@@ -80,9 +81,9 @@ def remaining(
 
     Of drifting records less the drift that they determine with these further weights (N each).
     """
-    residuals, shared = problem.weighted_residuals(values, records), records[0].correlation
+    residuals, shared = problem.weighted_residuals(values, records), correlation_of(records)
     weighed = problem.weighted(records, weights) if shared is not None else records
-    correlation = weighed[0].correlation
+    correlation = correlation_of(weighed)
     if shared is None or correlation is None:
         return residuals
     states = correlation.states([r[:, :, None] for r in problem.weighted_residuals(values, weighed)])

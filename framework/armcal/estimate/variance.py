@@ -22,7 +22,7 @@ from armcal.errors import ProblemError
 from armcal.estimate.estimator import CONFIDENCE, degrees_of_freedom
 from armcal.estimate.identifiability import correlated_pairs
 from armcal.estimate.likelihood import Term, maximise
-from armcal.problem.factor_records import by_covariance, noise_roots, transformed, whitening_of
+from armcal.problem.factor_records import by_covariance, correlation_of, noise_roots, transformed, whitening_of
 from armcal.problem.many_points import with_few_points
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -210,7 +210,7 @@ def _terms(
 
 
 def _require_freedom(problem: Problem, values: Array, records: Sequence[FactorRecords], components: int) -> None:
-    if records[0].correlation is not None:
+    if correlation_of(records) is not None:
         raise ProblemError(
             "variance components cannot be estimated beside drifting parameters.",
             hint="Take the drifts away, or set noise.estimate: false.",

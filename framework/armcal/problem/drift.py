@@ -17,7 +17,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.parameters import Drift, ParameterBlock
 from armcal.errors import DataError
 from armcal.problem.correlation import Correlation
-from armcal.problem.factor_records import noise_roots
+from armcal.problem.factor_records import correlation_of, noise_roots, unweighted
 from armcal.problem.problem import FactorRecords, Problem
 
 
@@ -96,7 +96,7 @@ def with_drift(
     if along is None:
         return tuple(records)
     drifting = _drifting(problem)
-    shared = [replace(record, weight=np.ones_like(record.weight), correlation=None) for record in records]
+    shared = unweighted(records)
     place = {name: i for i, name in enumerate(problem.free_names)}
     chosen, sds = [place[block.name] for block, _ in drifting], np.array([drift.sd for _, drift in drifting])
     slopes, raw = [], []  # by states, each a standard deviation of a parameter's drift
@@ -117,7 +117,7 @@ def residuals(
 ) -> tuple[Array, ...]:
     """Raw residuals less the drift that the training records determine, one (n_r x N) a factor."""
     raw = problem.residuals(values, records)
-    here, there = records[0].correlation, training[0].correlation
+    here, there = correlation_of(records), correlation_of(training)
     if here is None or there is None:
         return raw
     states = there.states([r[:, :, None] for r in problem.weighted_residuals(values, training)])

@@ -32,6 +32,7 @@ from armcal.io.parallel import Executor
 from armcal.measure.contact import Contact
 from armcal.measure.partners import PairedMeasurement
 from armcal.problem.corrected import Moved, corrected_records, unexplained
+from armcal.problem.factor_records import unweighted
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.run.experiment import Experiment
 
@@ -303,18 +304,13 @@ def model_errors(
     good = np.any(moved[:, :, :3] != 0, axis=(1, 2))
     if good.sum() < _FEWEST:
         return None
-    values_slopes = [np.moveaxis(own, 2, 0) for own in problem.jacobians(values, _bare(records))]
+    values_slopes = [np.moveaxis(own, 2, 0) for own in problem.jacobians(values, unweighted(records))]
     taken = np.concatenate(
         [own * root[:, None, None] for own, root in zip(values_slopes, acting, strict=True)], axis=1
     )[good]
     of_tool = next((n for n in (len(OF_TOOL), 3) if _determined(moved[good][:, :, :n])), 0)
     basis = _basis(taken.reshape(-1, taken.shape[2]))
     return ModelErrors(postures.subset(good), arm.joint_dimensions, left[good], moved[good], of_tool, basis)
-
-
-def _bare(records: tuple[FactorRecords, ...]) -> list[FactorRecords]:
-    """Records without weights and what they share."""
-    return [replace(own, weight=np.ones_like(own.weight), correlation=None) for own in records]
 
 
 def _basis(columns: Array) -> Array:
