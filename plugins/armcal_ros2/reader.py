@@ -250,9 +250,10 @@ class Rosbag2Reader:
         for name, own in seen.items():
             moves = [bool(one.fault) for one in own if one.samples >= _FEWEST_SAMPLES]
             if 2 * sum(moves) > len(moves):
-                remark = f"{name} moves in {sum(moves)} of {len(moves)} rests of the joints: its positions are not in m"
+                remark = f"{name} moves in {sum(moves)} of {len(moves)} rests of the joints."
+                remark += " It is on another arm, or not in m"
                 if self._settings.measurements[name].clock_offset != "estimate":
-                    remark += f", or its clock is another. Set clock_offset: estimate for {name}"
+                    remark += f"; or its clock is another: set clock_offset: estimate for {name}"
                 remarks.append(f"{remark}.")
         return remarks
 

@@ -122,7 +122,7 @@ def test_a_data_section_without_a_measurement_is_refused(tour: bags.Tour, name: 
 def test_a_clock_that_is_a_little_off_is_named(tour: bags.Tour, name: Path) -> None:
     """The times of receipt do not show so little; the measured point moves where the joints stand."""
     text = " ".join(read(tour, bags.write_bag(name, tour.sent(ahead=0.4))).warnings)
-    assert "tracker moves in " in text and "Set clock_offset: estimate for tracker." in text
+    assert "tracker moves in " in text and "set clock_offset: estimate for tracker." in text
 
 
 def test_rests_that_cannot_be_used_are_listed(tour: bags.Tour, name: Path) -> None:
