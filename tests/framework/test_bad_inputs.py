@@ -81,6 +81,11 @@ def test_a_refusal_comes_with_the_warnings_of_the_data(tmp_path: Path, monkeypat
     monkeypatch.setattr("sys.argv", ["armcal", *arguments])
     shown = CliRunner().invoke(cli, arguments)
     assert "exact duplicates" in json.loads(shown.stdout)["error"]["warnings"][0]
+    alone = ("validation.folds=0", "validation.holdout=0", "noise.estimate=true", 'parameters.free=["arm.mdh.theta2"]')
+    (tmp_path / "one.csv").write_text("\n".join([header, *([rows[0]] * 4)]) + "\n")
+    flags = [text for setting in alone for text in ("--set", setting)]
+    run = ["run", DEMO, "--data", str(tmp_path / "one.csv"), "--out", str(tmp_path / "run"), *flags]
+    refused(CliRunner().invoke(cli, run), "exact duplicates", "too few to estimate")
 
 
 @pytest.mark.slow

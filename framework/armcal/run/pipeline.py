@@ -10,6 +10,7 @@ from armcal.calibration.intervals import PredictionRecord, covariance_rows, reco
 from armcal.calibration.recorded_range import recorded_ranges
 from armcal.diagnose.clustered import widened
 from armcal.diagnose.coverage import fit_and_predict
+from armcal.errors import noted
 from armcal.estimate.bootstrap import Bootstrap, bootstrap
 from armcal.estimate.estimator import Progress, no_progress, spread
 from armcal.estimate.polish import hopeless, typical_off
@@ -54,7 +55,8 @@ def calibrate(
     faults = list(registry.notify("armcal_run_started", name=experiment.name, records=len(ready.dataset)))
     faults += _notify_rejected(registry, ready.dataset.set_aside)
     context = RunContext(experiment, progress, executor, watch)
-    before = FittedRecords(**vars(ready), fitted=_fitted(context, ready))
+    with noted(ready.warnings):
+        before = FittedRecords(**vars(ready), fitted=_fitted(context, ready))
     faults += registry.notify("armcal_estimate_changed", estimate=before.fitted.estimate)
     run, outcome = _with_pose_residual(context, before)
     resampled, profiled = _uncertainty(context, run)
