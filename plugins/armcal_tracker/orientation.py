@@ -158,9 +158,10 @@ class AnglesColumns(Orientation):
 
     @override
     def others(self, values: Array) -> dict[str, Rotation]:
-        """Turns about the axes that turned before, and the other unit."""
+        """Turns about the axes that turned before, a rotation vector as a UR writes it, and the other unit."""
         degrees = self.unit == "deg"
         return {
+            "it as rotation_vector": Rotation.from_rotvec(values, degrees=degrees),
             "R = Rx(roll) Ry(pitch) Rz(yaw)": Rotation.from_euler("XYZ", values, degrees=degrees),
             f"unit: {'rad' if degrees else 'deg'}": Rotation.from_euler("xyz", values, degrees=not degrees),
         }
@@ -218,9 +219,10 @@ class VectorColumns(AnglesColumns):
 
     @override
     def others(self, values: Array) -> dict[str, Rotation]:
-        """The inverse, and the other unit."""
+        """The inverse, roll, pitch and yaw, and the other unit."""
         degrees = self.unit == "deg"
         return {
+            "it as rpy": Rotation.from_euler("xyz", values, degrees=degrees),
             "it as that of body_T_base": self.rotations(values).inv(),
             f"unit: {'rad' if degrees else 'deg'}": Rotation.from_rotvec(values, degrees=not degrees),
         }

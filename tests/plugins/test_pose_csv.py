@@ -183,6 +183,14 @@ def test_angles_of_the_other_order_and_inverse_vectors_are_refused(tmp_path):
     assert "as that of body_T_base" in told
 
 
+def test_a_rotation_vector_and_three_angles_are_distinguished(tmp_path):
+    """A UR writes its TCP's orientation as a rotation vector, in columns rx, ry and rz as others write angles."""
+    angles = joints(40)
+    truth, three = seen(angles), {"columns": list("abc"), "unit": "rad"}
+    assert "with it as rotation_vector by" in refusal(tmp_path, table(angles, truth.as_rotvec(), "abc"), rpy=three)
+    assert "with it as rpy by" in refusal(tmp_path, table(angles, truth.as_euler("xyz"), "abc"), rotation_vector=three)
+
+
 def test_a_pose_that_is_not_turned_is_kept(tmp_path):
     angles = joints(40)
     numbers = seen(angles).as_rotvec()
