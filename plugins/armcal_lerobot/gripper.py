@@ -105,7 +105,9 @@ class Gripper:
         wired = {self._wiring[joint][0] for joint in self.joints}
         idle = [motor for motor in motors if motor not in wired and not is_gripper(motor)]
         if missing:
-            text = f"found no motor for the joint {missing[0]}; the motors are {', '.join(motors)}."
+            stated = self._wiring[missing[0]][0]
+            which = "no motor" if stated == missing[0] else f"no motor called {stated!r}"
+            text = f"found {which} for the joint {missing[0]}; the motors are {', '.join(motors)}."
             mend = "None of them is without a joint: give the file of this arm, or the configuration of that one."
             if idle:
                 nearest = difflib.get_close_matches(missing[0], idle, n=1, cutoff=0.0)[0]

@@ -68,6 +68,8 @@ def test_a_joint_without_a_motor_is_offered_the_nearest_that_is_free(tmp_path: P
     file.write_text(json.dumps(renamed))
     with pytest.raises(InputError, match="--joint 'shoulder pan=shoulder_pan'"):
         called("check", file, "--arm", ARM)
+    with pytest.raises(InputError, match="no motor called 'shoulder_pun' for the joint shoulder_pan"):
+        called("check", write_motors(tmp_path / "two.json"), "--arm", ARM, "--joint", "shoulder_pun=shoulder_pan")
     file.write_text(json.dumps({name: entry for name, entry in entries.items() if name != "elbow_flex"}))
     with pytest.raises(InputError, match="None of them is without a joint"):
         called("check", file, "--arm", ARM)
