@@ -124,8 +124,8 @@ def elsewhere(problem: Problem, estimate: Estimate, poses: Dataset) -> Elsewhere
     """How far tools at unseen poses are off for the parameters' uncertainty; None where no record is a contact."""
     if not problem.blueprint.groups or not len(poses):
         return None
-    free, scales = estimate.parameters.free, estimate.parameters.scales()
-    of_arm = np.array([not block.nuisance for block in free for _ in range(block.domain.dof)], dtype=bool)
+    scales = estimate.parameters.scales()
+    of_arm = np.array([not block.nuisance for block in estimate.parameters.coordinate_blocks], dtype=bool)
     root = np.linalg.pinv(estimate.parameters.entries_jacobian(estimate.values) * scales)
     covariance = (root @ estimate.covariance @ root.T)[np.ix_(of_arm, of_arm)]
     sizes, vectors = np.linalg.eigh(covariance)

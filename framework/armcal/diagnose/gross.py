@@ -149,7 +149,7 @@ def displaced(problem: Problem, estimate: Estimate, records: Sequence[FactorReco
 def proportion(problem: Problem, estimate: Estimate, records: Sequence[FactorRecords]) -> Proportion | None:
     """Regression of what free lengths of an arm are off on their nominal values."""
     nominal, entries = problem.blueprint.parameters.nominal(), np.array(problem.parameters.free_entries)
-    blocks = [block for block in problem.parameters.free for _ in range(block.domain.dof)]
+    blocks = problem.parameters.coordinate_blocks
     chosen = [
         problem.free_names.index(block.name)
         for i, block in enumerate(blocks)
