@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from armcal.cli.main import cli
 from armcal.errors import InputError
-from armcal.io.json_server import JsonServer
+from armcal.io.json_server import MOST_CLIENTS, JsonServer
 from armcal_online.running.control import SOCKET, answer, ask, control_server, joint_values
 from click.testing import CliRunner
 from fake_recalibrator import request
@@ -99,14 +99,30 @@ def test_a_request_without_an_end_is_refused_and_many_clients_do_no_harm(tmp_pat
         (told,) = raw(tmp_path, b"x" * 70_000)
         assert "64 KiB" in told["error"]
         idle = []
-        for _ in range(20):
+        for _ in range(MOST_CLIENTS + 4):
             connection = socket.socket(socket.AF_UNIX)
             connection.connect(str(tmp_path / SOCKET))
             idle.append(connection)
             time.sleep(0.004)
         assert ask(tmp_path, {"command": "status"})["ok"]
+        idle[0].settimeout(5.0)
+        assert idle[0].recv(1) == b""  # the first had to go
         for connection in idle:
             connection.close()
+        assert ask(tmp_path, {"command": "status"})["ok"]
+
+
+def test_a_client_that_asks_on_and_never_reads_is_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("armcal.io.json_server._PATIENCE_S", 0.1)
+    line = json.dumps({"command": "status", "filler": "x" * 20_000}).encode() + b"\n"
+    with serving(tmp_path), socket.socket(socket.AF_UNIX) as connection:
+        connection.settimeout(5.0)
+        connection.connect(str(tmp_path / SOCKET))
+        ends = time.monotonic() + 5.0
+        with pytest.raises((BrokenPipeError, ConnectionResetError)):
+            while time.monotonic() < ends:
+                connection.sendall(line)
+                time.sleep(0.01)
         assert ask(tmp_path, {"command": "status"})["ok"]
 
 

@@ -94,7 +94,8 @@ class JsonServer:
             return
         except OSError:
             data = b""
-        client.heard = time.monotonic()
+        if not client.replies:  # else it has to read first, however much it asks
+            client.heard = time.monotonic()
         *lines, rest = bytes(client.received + data).split(b"\n")
         client.received = bytearray(rest)
         for line in lines:
