@@ -75,4 +75,4 @@ def _show_data(console: Console, data: dict[str, Any], named: bool) -> None:
     console.line("A data section for a configuration:")
     console.out.print(yaml.safe_dump({"data": data}, sort_keys=False, default_flow_style=None), soft_wrap=True)
     if named:
-        console.line("Leave q1, q2, ... out where the arm's joints are called as in the recording, as in a URDF.")
+        console.line("# Leave q1, q2, ... out where the arm's joints are called as in the recording, as in a URDF.")
