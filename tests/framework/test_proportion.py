@@ -36,12 +36,23 @@ def test_a_known_distance_that_is_wrong_lengthens_all_links_in_proportion(factor
     estimate = fit(problem, records, IPOPT, problem.parameters.nominal()).estimate
     lengths = proportion(problem, estimate, records)
     assert lengths is not None and lengths.share == pytest.approx(factor - 1, abs=3 * lengths.sd)
-    assert (lengths.p_value < 0.01) == (factor > 1)
+    assert lengths.is_clear == (factor > 1)
+
+
+@pytest.mark.parametrize("each_by", ["a length", "a share of its own"])
+def test_links_that_are_each_off_by_their_own_are_seldom_called_a_scale(each_by: str) -> None:
+    """Those of a UR5: two long ones carry nearly all of the share."""
+    random, lengths, tries = np.random.default_rng(1), np.array([0.089, 0.425, 0.392, 0.109, 0.095, 0.082]), 1000
+    sizes = 0.001 * np.ones(6) if each_by == "a length" else 0.005 * lengths
+    known = np.zeros((6, 6))
+    alarms = [Proportion.of(lengths, lengths + random.normal(0, sizes), known).is_clear for _ in range(tries)]
+    assert np.mean(alarms) < (0.02 if each_by == "a length" else 0.06)
+    assert Proportion.of(lengths, 1.015 * lengths + random.normal(0, 2e-4, 6), known).is_clear
 
 
 def test_it_is_a_warning_with_its_size() -> None:
     def told(share: float) -> list[str]:
-        figure = Figure(1000.0, 1.0 + share, 0.0, 0.0, (), Proportion(5, share, 0.0007))
+        figure = Figure(1000.0, 1.0 + share, 0.0, 0.0, (), Proportion(5, share, 0.0007, (4.0, 1.5)))
         return [f"{finding.grade}: {finding.text}" for finding in size_findings(figure)]
 
     (longer,) = told(0.017)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import casadi as ca
 import numpy as np
@@ -21,6 +22,8 @@ BEYOND, FAR_BEYOND = 4.0, 20.0
 MOST_RECORDS = 300
 _POSES = 60
 _FEWEST_LENGTHS = 3
+AS_MUCH, BY_SHARES = 0.01, 0.05
+"""Levels at which lengths are off in proportion: against each off by as much, and each by a share of its own."""
 _SAME_MOTION = 0.02
 """Of a parameter's motion of the tool: what may differ from that of the base or of the tool's point."""
 
@@ -54,16 +57,31 @@ class Proportion:
         count: how many lengths.
         share: of each length, by which it is longer.
         sd: of the share: lengths that differ from nominal each by its own, and how well they are known.
+        freedoms: all lengths less one, and as many as carry the share, less one: one long one that is off is no scale.
     """
 
     count: int
     share: float
     sd: float
+    freedoms: tuple[float, float]
+
+    @classmethod
+    def of(cls, lengths: Array, values: Array, covariance: Array) -> Self:
+        """Regression of what lengths are off on their nominal values (n each, m; n x n, m^2)."""
+        squares = lengths**2
+        weights, count = lengths / squares.sum(), len(lengths)
+        share = float(weights @ values) - 1
+        own = float(np.sum((values - (1 + share) * lengths) ** 2) / (count - 1) / squares.sum())
+        # Kish's effective number: lengths that are off by a share of their own pull by their squares.
+        carrying = float(squares.sum() ** 2 / np.sum(squares**2))
+        sd = float(np.sqrt(own + weights @ covariance @ weights))
+        return cls(count, share, sd, (count - 1.0, carrying - 1.0))
 
     @property
-    def p_value(self) -> float:
-        """That of the share, by Student's t."""
-        return 2.0 * float(stdtr(self.count - 1, -abs(self.share) / max(self.sd, 1e-300)))
+    def is_clear(self) -> bool:
+        """Whether lengths give it seldom by chance, be each off by as much as the others or by a share of its own."""
+        t, levels = -abs(self.share) / max(self.sd, 1e-300), (AS_MUCH, BY_SHARES)
+        return all(2 * stdtr(freedom, t) < level for freedom, level in zip(self.freedoms, levels, strict=True))
 
 
 @dataclass(frozen=True)
@@ -147,25 +165,20 @@ def displaced(problem: Problem, estimate: Estimate, records: Sequence[FactorReco
 
 
 def proportion(problem: Problem, estimate: Estimate, records: Sequence[FactorRecords]) -> Proportion | None:
-    """Regression of what free lengths of an arm are off on their nominal values."""
-    nominal, entries = problem.blueprint.parameters.nominal(), np.array(problem.parameters.free_entries)
-    blocks = problem.parameters.coordinate_blocks
+    """By how much free lengths of an arm are longer than nominal in proportion; None where they are too few."""
+    parameters, nominal = problem.parameters, problem.blueprint.parameters.nominal()
     chosen = [
         problem.free_names.index(block.name)
-        for i, block in enumerate(blocks)
+        for i, block in enumerate(parameters.coordinate_blocks)
         if block.unit == "m"
         and block.domain.dof == 1
-        and nominal[problem.blueprint.parameters.entries_of(block.name)].all()
+        and nominal[parameters.entries_of(block.name)].all()
         and not _only_places(problem, estimate.values, records, i)
     ]
     if len(chosen) < _FEWEST_LENGTHS:
         return None
-    lengths, values = nominal[entries[chosen]], estimate.values[entries[chosen]]
-    weights = lengths / (lengths @ lengths)
-    share = float(weights @ values) - 1
-    own = float(np.sum((values - (1 + share) * lengths) ** 2) / (len(chosen) - 1) / (lengths @ lengths))
-    known = float(weights @ estimate.covariance[np.ix_(chosen, chosen)] @ weights)
-    return Proportion(len(chosen), share, float(np.sqrt(own + known)))
+    entries = np.array(parameters.free_entries)[chosen]
+    return Proportion.of(nominal[entries], estimate.values[entries], estimate.covariance[np.ix_(chosen, chosen)])
 
 
 def _only_places(problem: Problem, values: Array, records: Sequence[FactorRecords], coordinate: int) -> bool:

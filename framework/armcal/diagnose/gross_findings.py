@@ -8,7 +8,7 @@ from scipy.special import chdtri
 from armcal.base.arrays import Array
 from armcal.base.units import digits
 from armcal.diagnose.evidence import Evidence
-from armcal.diagnose.gross import BEYOND, FAR_BEYOND, Displaced, Figure
+from armcal.diagnose.gross import AS_MUCH, BEYOND, BY_SHARES, FAR_BEYOND, Displaced, Figure
 from armcal.diagnose.majority import Minority
 from armcal.diagnose.noise_findings import Finding, Grade, first_few
 from armcal.diagnose.residual_structure import ResidualStructure
@@ -35,7 +35,6 @@ SIZE, GROSS_SIZE = 0.02, 0.05
 EXACT = 1e-5
 """Of the reach, 10 um a metre: no arm follows a model so closely, and no instrument measures it so well."""
 MOST_NAMED = 3
-_IN_PROPORTION = 0.01
 
 
 def gross_error(
@@ -158,7 +157,7 @@ def size_findings(figure: Figure) -> list[Finding]:
         text = f"The calibrated arm is {figure.size:.3g} times as large as the nominal one."
         test = f"extent of the tool's positions by lengths, limits {100 * SIZE:g} and {100 * GROSS_SIZE:g} %"
         return [Finding("bad" if off > GROSS_SIZE else "warning", text, test, action)]
-    if lengths is None or lengths.p_value > _IN_PROPORTION:
+    if lengths is None or not lengths.is_clear:
         return []
     share, sd = 100 * abs(lengths.share), 100 * lengths.sd
     text = (
@@ -166,7 +165,8 @@ def size_findings(figure: Figure) -> list[Finding]:
         f"{'longer' if lengths.share > 0 else 'shorter'} than nominal, in proportion: a known distance or an "
         "instrument's scale that is off by as much shows in nothing else."
     )
-    return [Finding("warning", text, f"regression on the nominal lengths, t, {100 * _IN_PROPORTION:g} %", action)]
+    levels = f"{100 * AS_MUCH:g} % against lengths off by as much, {100 * BY_SHARES:g} % by shares of their own"
+    return [Finding("warning", text, f"regression on the nominal lengths, t, {levels}", action)]
 
 
 def computed_findings(nominal_mm: Array, judged_mm: Array, figure: Figure) -> list[Finding]:
