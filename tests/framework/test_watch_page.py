@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -155,6 +156,26 @@ def test_a_page_that_is_opened_too_early_or_loses_its_server_comes_to_itself(bro
         browser.wait_for("document.getElementById('last-id').textContent === 'p11'")
     finally:
         again.close()
+
+
+@pytest.mark.slow
+def test_a_watcher_that_does_not_answer_is_not_taken_for_a_recalibration_that_was_killed(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served, gap = Served(made_up_folder(tmp_path / "dir", 10)), threading.Event()
+    state = served.feed.state
+    try:
+        browser.open(served.server.address)
+        browser.wait_for("document.getElementById('connection').dataset.state === 'live'")
+        monkeypatch.setattr(served.feed, "state", lambda *since: gap.wait(60.0) and state(*since))
+        browser.wait_for("document.getElementById('connection').textContent === 'no answer; waiting for it'", 20.0)
+        browser.value("Known.status -= 3600e3; age()")  # as after a long gap
+        assert content(browser, "connection") == "no answer; waiting for it" and content(browser, "alive") == ""
+        gap.set()
+        browser.wait_for("document.getElementById('connection').dataset.state === 'live'")
+    finally:
+        gap.set()
+        served.close()
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 
 const MOST_RECORDS = 8000, MOST_LISTED = 800; // more than the server keeps: then all is fetched anew
 const PAUSE_MS = 250, AGAIN_MS = 3000, LONGEST_MS = 30000;
+const LATE_MS = 8000; // the server answers within 5 s, be there news or not
 const token = new URLSearchParams(location.search).get("token");
 const address = (path, query = {}) => {
   const asked = new URLSearchParams(token === null ? query : { ...query, token });
@@ -10,7 +11,7 @@ const address = (path, query = {}) => {
 };
 
 const SILENT_S = 15;
-const Known = { state: null, heard: 0, status: 0, due: new Set(), timer: null };
+const Known = { state: null, asked: Infinity, heard: 0, status: 0, due: new Set(), timer: null };
 
 function ask(...parts) {
   for (const part of parts) Known.due.add(part);
@@ -136,10 +137,12 @@ async function follow() {
   const known = Known.state;
   const isMuch = known && (known.records.length > MOST_RECORDS || Math.max(known.told.length, known.estimates.rows.length) > MOST_LISTED);
   try {
+    Known.asked = performance.now();
     const place = known && !isMuch ? { after: known.place } : {};
     const answer = await fetch(address("state", place), { cache: "no-store", signal: AbortSignal.timeout(LONGEST_MS) });
     if (!answer.ok) throw new Error(`the server answered ${answer.status}`);
     take(await answer.json());
+    Known.asked = Infinity;
     connection("live", "live");
     setTimeout(follow, PAUSE_MS);
   } catch (fault) {
@@ -166,6 +169,7 @@ function life(state) {
 
 function age() {
   const state = Known.state, host = byId("connection");
+  if (Known.connection === "live" && performance.now() - Known.asked > LATE_MS) connection("lost", "no answer; waiting for it");
   if (!state || Known.connection !== "live") {
     say("connection", Known.connection || "loading");
     return;
