@@ -190,8 +190,11 @@ def test_the_state_says_what_the_events_said(tmp_path: Path) -> None:
     assert state["written"]["sequence"] == SLIP + 4
 
 
-def test_what_was_rotated_away_is_told_by_the_status_and_the_calibration(tmp_path: Path, calibration: Path) -> None:
-    """A watcher that comes late knows neither the first records nor the event that told the units."""
+@pytest.mark.parametrize("source", ["calibration", "start"])
+def test_what_was_rotated_away_is_known_from_the_status_and_the_calibration_or_a_later_start(
+    tmp_path: Path, calibration: Path, source: str
+) -> None:
+    """A watcher that comes late knows neither the first records nor the event with the units."""
     name = next(entry["name"] for entry in _entries(calibration) if entry["unit"] == "rad")
     events = [
         {"event": "estimate", "sequence": 900 + n, "parameters": {name: [0.1 + 0.01 * n, 0.02]}} for n in range(3)
@@ -202,7 +205,12 @@ def test_what_was_rotated_away_is_told_by_the_status_and_the_calibration(tmp_pat
     before = feed.state()
     row = before["estimates"]["rows"][-1]
     assert row["change"] == [pytest.approx(0.02)] and feed.state()["estimates"]["parameters"][0]["unit"] == ""
-    shutil.copy(calibration, tmp_path / "calibration.yaml")
+    if source == "calibration":
+        shutil.copy(calibration, tmp_path / "calibration.yaml")
+    else:
+        listed = [{"name": name, "unit": "rad", "value": 0.12, "sd": 0.02}]
+        start = {"event": "started", "sequence": 903, "resumed": True, "parameters": listed}
+        append(tmp_path / "events.jsonl", written([start]))
     counts = {"accepted": 890, "rejected": 9, "ignored": 3}
     (tmp_path / "status.json").write_text(json.dumps({"level": "watch", "why": "Because.", "counts": counts}))
     feed.step()

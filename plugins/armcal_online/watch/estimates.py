@@ -76,9 +76,14 @@ class Followed:
 
 
 class Estimates:
-    """The estimates of all parameters, in bounded memory."""
+    """The estimates of all parameters, in bounded memory.
+
+    Attributes:
+        conversions: how often rows that were kept were converted to other units.
+    """
 
     def __init__(self) -> None:
+        self.conversions = 0
         self._followed: dict[str, Followed] = {}
         self._rows: Thinned[dict[str, Any]] = Thinned(_RECENT, _OLDER)
 
@@ -114,24 +119,18 @@ class Estimates:
         """Whether there are parameters whose unit no event gave: the start was rotated away."""
         return any(not followed.unit for followed in self._followed.values())
 
-    def add_units(self, units: Mapping[str, str]) -> bool:
-        """Units by name, where none is known yet; rows that are kept are converted to them.
-
-        Returns:
-            whether any was new.
-        """
-        new = False
+    def add_units(self, units: Mapping[str, str]) -> None:
+        """Units by name, where none is known yet; rows that are kept are converted to them."""
         for index, (name, known) in enumerate(self._followed.items()):
             if known.unit or name not in units:
                 continue
             followed = Followed(name, *_shown(units[name]), known.start, known.start_sd)
             self._followed[name] = followed
-            new = True
+            self.conversions += 1
             for row in self._rows:
                 for column in (row["change"], row["sd"]):
                     if index < len(column) and column[index] is not None:
                         column[index] = rounded(column[index] * followed.factor)
-        return new
 
     def _follow(self, name: str, estimate: tuple[float, float | None], unit: Any) -> None:
         known = self._followed.get(name)

@@ -58,13 +58,15 @@ class Feed:
         except OSError as fault:
             lines, self.trouble = [], f"{self.folder} cannot be read: {fault}"
         with self._changed:
-            self.history.step = self._number + 1
+            self.history.step, conversions = self._number + 1, self.history.estimates.conversions
             messages = [message for line in lines for message in self.history.take(parsed(line))]
             if lines:
                 self._event_at = time.time()
                 with contextlib.suppress(OSError):
                     self._event_at = (self.folder / EVENTS).stat().st_mtime
-            is_other, has_status = self._read_truth() | self._found_units(), self._read_status()
+            self._find_units()
+            is_converted = self.history.estimates.conversions != conversions
+            is_other, has_status = self._read_truth() or is_converted, self._read_status()
             if is_other or {"event": "reset"} in messages:
                 self._run = token_hex(4)  # what pages have is void: they begin anew
             if is_other or has_status or lines:
@@ -147,13 +149,13 @@ class Feed:
         """Seconds; none where clocks disagree."""
         return round(max(0.0, time.time() - moment), 1)
 
-    def _found_units(self) -> bool:
-        """Whether the calibration has units of parameters that no event gave."""
+    def _find_units(self) -> None:
+        """In the calibration, those of parameters that no event gave."""
         estimates, path = self.history.estimates, self.folder / CALIBRATION
         if not estimates.without_unit or time.monotonic() < self._units_after or not path.exists():
-            return False
+            return
         self._units_after = time.monotonic() + _RETRY
-        return estimates.add_units(units_of(path))
+        estimates.add_units(units_of(path))
 
     def _read_truth(self) -> bool:
         """Whether a simulated mission has another truth."""
