@@ -186,7 +186,7 @@ def test_the_state_says_what_the_events_said(tmp_path: Path) -> None:
     assert row["change"][theta3] == pytest.approx(math.degrees(last[0] - start["value"]), rel=1e-5)
     assert row["sd"][theta3] == pytest.approx(math.degrees(last[1]), rel=1e-3)
     assert {p["unit"] for p in state["estimates"]["parameters"]} == {"deg", "mm", "deg/Nm"}
-    assert "joint_slipped" in [e.get("kind") for e in state["told"]]
+    assert "joint_slipped" in [e.get("kind") for e in state["events"]]
     assert state["written"]["sequence"] == SLIP + 4
 
 

@@ -69,12 +69,12 @@ def test_ten_pages_get_what_is_new_and_a_page_that_was_away_gets_what_it_missed(
     served.tell(*(decision(61, f"Sentence {n}.") for n in range(5)))
     pages = [served.state(first["place"]) for _ in range(10)]  # the first of them waits for it
     for page in pages:
-        assert [event["sentence"] for event in page["told"]] == [f"Sentence {n}." for n in range(5)]
+        assert [event["sentence"] for event in page["events"]] == [f"Sentence {n}." for n in range(5)]
         assert not page["whole"] and page["records"] == page["estimates"]["rows"] == page["over_time"]["rows"] == []
     served.tell({**made_up(60)[-2], "sequence": 62, "id": "p62"})
     newer, back = served.state(pages[0]["place"]), served.state(first["place"])
-    assert [record["id"] for record in newer["records"]] == ["p62"] and newer["told"] == []
-    assert [record["id"] for record in back["records"]] == ["p62"] and back["told"] == pages[0]["told"]
+    assert [record["id"] for record in newer["records"]] == ["p62"] and newer["events"] == []
+    assert [record["id"] for record in back["records"]] == ["p62"] and back["events"] == pages[0]["events"]
     assert len(newer["over_time"]["rows"]) == 1 and newer["last"]["id"] == "p62"
 
 

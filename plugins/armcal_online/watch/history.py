@@ -108,7 +108,7 @@ class History:
             "gate_probability": self.gate,
             "records": [{k: v for k, v in r.items() if k != "event"} for r in records],
             "estimates": {**estimates, "rows": _newer(estimates["rows"], since)},
-            "told": _newer(self._listed, since),
+            "events": _newer(self._listed, since),
             "written": self.written,
             "finished": self.finished,
             "unknown": self.unknown,

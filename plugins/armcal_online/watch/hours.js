@@ -4,7 +4,7 @@
 const STRIP = 12, HOUR = 3600;
 
 const Hours = {
-  draw(known, told) {
+  draw(known, events) {
     const host = byId("hours"), rows = known.rows || [], truth = known.truth || [];
     this.words(known);
     byId("k-truth").hidden = !truth.length;
@@ -13,7 +13,7 @@ const Hours = {
     const width = Math.max(host.clientWidth, 260), height = width < 600 ? 190 : 220;
     const s = this.scales(every, known, width, height);
     const picture = svg("svg", { viewBox: `0 0 ${width} ${height}`, height, role: "img", "aria-label": "Error over time, mm" },
-      ...this.gaps(s, rows), ...this.off(s, known.off || []), ...this.axes(s), ...this.marks(s, told), ...this.limit(s, known),
+      ...this.gaps(s, rows), ...this.off(s, known.off || []), ...this.axes(s), ...this.marks(s, events), ...this.limit(s, known),
       svg("path", { class: "truth", d: line(truth.map((r) => [s.x(r.at), s.y(r.mm)])) }),
       svg("path", { class: "accepted dots", d: dots(rows.map((r) => [s.x(r.at + HOUR / 2), s.y(r.mm)])) }),
       ...this.levels(s, truth.length ? truth : rows));
@@ -52,7 +52,7 @@ const Hours = {
       }
     const days = s.last > 1e8, most = Math.max((s.box.right - s.box.left) / 110, 2);
     const steps = [1, 2, 3, 6, 12, 24, 48, 96, 168, 336, 720].map((h) => h * HOUR);
-    const step = steps.find((each) => (s.last - s.first) / each <= most) || niceStep((s.last - s.first) / most);
+    const step = steps.find((step_s) => (s.last - s.first) / step_s <= most) || niceStep((s.last - s.first) / most);
     for (let t = Math.ceil(s.first / step) * step; t < s.last; t += step) {
       const word = !days ? `${digits(t / HOUR)} h` : step >= 24 * HOUR ? when(t).slice(5, 10) : when(t).slice(5, 16);
       parts.push(svg("text", { x: at(s.x(t)), y: s.box.bottom + STRIP + 18, "text-anchor": "middle" }, word));
@@ -80,8 +80,8 @@ const Hours = {
     return isNumber(known.limit_mm) ? [svg("path", { class: "gate", d: `M${s.box.left} ${at(s.y(known.limit_mm))}H${s.box.right}` })] : [];
   },
 
-  marks(s, told) {
-    const places = told.filter((e) => e.event === "decision" && e.at >= s.first && e.at <= s.last).map((e) => at(s.x(e.at)));
+  marks(s, events) {
+    const places = events.filter((e) => e.event === "decision" && e.at >= s.first && e.at <= s.last).map((e) => at(s.x(e.at)));
     return [svg("path", { class: "decision", d: places.map((x) => `M${x} ${s.box.top}V${s.box.bottom}`).join("") })];
   },
 

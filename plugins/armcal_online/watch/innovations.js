@@ -5,11 +5,11 @@ const Innovations = {
   shown: [],
   chosen: null,
 
-  window(records, told) {
+  window(records, events) {
     const size = Number(byId("window").value);
     const shown = size ? records.slice(-size) : records;
     const first = shown.length ? shown[0].sequence : 0;
-    return { shown, told: told.filter((e) => isNumber(e.sequence) && e.sequence >= first) };
+    return { shown, events: events.filter((e) => isNumber(e.sequence) && e.sequence >= first) };
   },
 
   scales(shown, width, height) {
@@ -47,10 +47,10 @@ const Innovations = {
     return parts;
   },
 
-  lines(s, told) {
+  lines(s, events) {
     const parts = [];
     let free = s.box.left;
-    for (const event of told) {
+    for (const event of events) {
       const level = event.event === "level";
       if (!level && event.event !== "decision" && event.event !== "alarm") continue;
       const x = s.x(Math.min(event.sequence, s.last));
@@ -76,10 +76,10 @@ const Innovations = {
     return points.length ? [svg("path", { class: "gate", d: line(points) })] : [];
   },
 
-  draw(records, told) {
+  draw(records, events) {
     const host = byId("innovations");
     const width = Math.max(host.clientWidth, 260), height = width < 600 ? 240 : 290;
-    const seen = this.window(records, told);
+    const seen = this.window(records, events);
     const s = this.scales(seen.shown, width, height);
     const places = { accepted: [], rejected: [], ignored: [] };
     for (const r of seen.shown) {
@@ -89,7 +89,7 @@ const Innovations = {
     const label = `NIS of ${seen.shown.length} records: ${places.accepted.length} accepted, ` +
       `${places.rejected.length} rejected, ${places.ignored.length} ignored`;
     const picture = svg("svg", { viewBox: `0 0 ${width} ${height}`, height, role: "img", "aria-label": label },
-      ...this.axes(s), ...this.lines(s, seen.told), ...this.gate(s, seen.shown),
+      ...this.axes(s), ...this.lines(s, seen.events), ...this.gate(s, seen.shown),
       svg("path", { class: "ignored rings", d: rings(places.ignored) }),
       svg("path", { class: "accepted dots", d: dots(places.accepted) }),
       svg("path", { class: "rejected crosses", d: crosses(places.rejected) }));
@@ -98,7 +98,7 @@ const Innovations = {
     host.replaceChildren(picture);
     this.scale = s;
     this.shown = seen.shown;
-    this.told = seen.told;
+    this.events = seen.events;
     if (this.chosen !== null) this.choose(this.chosen);
   },
 
@@ -111,8 +111,8 @@ const Innovations = {
     const parts = [`Record ${sequence}${record.id ? ` (${record.id})` : ""}, ${when(record.at)}: ${record.verdict}`];
     if (isNumber(record.nis)) parts.push(`NIS ${digits(record.nis)}${isNumber(record.limit) ? `, gate ${digits(record.limit)}` : ""}`);
     if (record.residual_mm) parts.push(`off by ${digits(length3(record.residual_mm))} mm`);
-    const told = this.told.filter((e) => e.sequence === sequence).map((e) => e.sentence);
-    byId("readout").textContent = `${parts.join("; ")}. ${[record.why, ...told].filter(Boolean).join(" ")}`;
+    const sentences = this.events.filter((e) => e.sequence === sequence).map((e) => e.sentence);
+    byId("readout").textContent = `${parts.join("; ")}. ${[record.why, ...sentences].filter(Boolean).join(" ")}`;
   },
 
   pointed(event) {

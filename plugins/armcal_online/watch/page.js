@@ -24,11 +24,11 @@ function redraw() {
   const due = new Set(Known.due), state = Known.state;
   Known.due.clear();
   if (due.has("health")) drawHealth(state);
-  if (due.has("hours")) Hours.draw(state.over_time, state.told);
-  if (due.has("innovations")) Innovations.draw(state.records, state.told);
+  if (due.has("hours")) Hours.draw(state.over_time, state.events);
+  if (due.has("innovations")) Innovations.draw(state.records, state.events);
   if (due.has("events")) drawEvents(state);
   if (due.has("arm")) Arm.draw(state.records, state.arm || {}, state.tips);
-  if (due.has("parameters")) Parameters.draw(state.estimates, state.told);
+  if (due.has("parameters")) Parameters.draw(state.estimates, state.events);
 }
 const redrawAll = () => ask("health", "hours", "innovations", "events", "arm", "parameters");
 
@@ -87,12 +87,12 @@ function drawCounts(state, status) {
 
 function drawEvents(state) {
   const names = new Map(state.records.map((record) => [record.sequence, record.id]));
-  const decided = new Set(state.told.filter((event) => event.event === "decision").map((event) => event.sequence));
-  byId("events").replaceChildren(...[...state.told].reverse().map((event) => eventItem(state, event, names, decided)));
+  const decided = new Set(state.events.filter((event) => event.event === "decision").map((event) => event.sequence));
+  byId("events").replaceChildren(...[...state.events].reverse().map((event) => eventItem(state, event, names, decided)));
   const faults = [];
   if (state.unreadable) faults.push(`${count(state.unreadable)} lines could not be read.`);
   if (state.unknown) faults.push(`${count(state.unknown)} events are of kinds that this page does not know.`);
-  say("unread", state.told.length ? faults.join(" ") : ["No events yet.", ...faults].join(" "));
+  say("unread", state.events.length ? faults.join(" ") : ["No events yet.", ...faults].join(" "));
 }
 
 function eventItem(state, event, names, decided) {
@@ -115,15 +115,15 @@ function eventItem(state, event, names, decided) {
 
 // A state, or what is new in it: of its lists that come after those that are known.
 function take(state) {
-  const known = Known.state, hours = state.over_time, { records, told } = state, { rows } = state.estimates;
+  const known = Known.state, hours = state.over_time, { records, events } = state, { rows } = state.estimates;
   if (state.whole || records.length) ask("innovations", "arm");
-  if (state.whole || told.length) ask("hours", "innovations", "events", "parameters");
+  if (state.whole || events.length) ask("hours", "innovations", "events", "parameters");
   if (state.whole || rows.length) ask("parameters");
   if (state.whole || hours.rows.length) ask("hours");
   if (state.arm && state.arm.sequence !== (known && known.arm || {}).sequence) ask("arm");
   if (!state.whole) {
     state.records = [...known.records, ...records];
-    state.told = [...known.told, ...told];
+    state.events = [...known.events, ...events];
     state.estimates.rows = [...known.estimates.rows, ...rows];
     hours.rows = [...new Map([...known.over_time.rows, ...hours.rows].map((hour) => [hour.at, hour])).values()];
     hours.truth = known.over_time.truth;
@@ -135,7 +135,7 @@ function take(state) {
 
 async function follow() {
   const known = Known.state;
-  const isMuch = known && (known.records.length > MOST_RECORDS || Math.max(known.told.length, known.estimates.rows.length) > MOST_LISTED);
+  const isMuch = known && (known.records.length > MOST_RECORDS || Math.max(known.events.length, known.estimates.rows.length) > MOST_LISTED);
   try {
     Known.asked = performance.now();
     const place = known && !isMuch ? { after: known.place } : {};
@@ -163,7 +163,7 @@ const ago = (since) => span((performance.now() - since) / 1000);
 function life(state) {
   const status = state.status || {};
   if (status.finished) return "ended";
-  if (!Object.keys(status).length && !state.last && !state.told.length) return "waiting";
+  if (!Object.keys(status).length && !state.last && !state.events.length) return "waiting";
   return Object.keys(status).length && performance.now() - Known.status > 1000 * SILENT_S ? "silent" : "live";
 }
 
@@ -174,7 +174,7 @@ function age() {
     say("connection", Known.connection || "loading");
     return;
   }
-  const now = life(state), known = state.last || state.told.length;
+  const now = life(state), known = state.last || state.events.length;
   host.dataset.state = now;
   const ended = state.finished ? ` ${when(state.finished.at)}` : "";
   const words = { ended: `ended${ended}, level ${state.level}`, silent: `silent for ${ago(Known.status)}`, live: "live", waiting: "waiting" }[now];

@@ -19,17 +19,17 @@ const Parameters = {
     return (x) => (sd > 0 || x === 0 ? x.toFixed(decimals) : digits(x, 6));
   },
 
-  draw(estimates, told) {
+  draw(estimates, events) {
     const wanted = byId("filter").value.trim().toLowerCase();
     const all = estimates.parameters.map((parameter, index) => {
       const row = this.latest(estimates.rows, index);
       const change = row ? row.change[index] : null;
       return { parameter, index, change, sd: row ? row.sd[index] : null, ratio: this.moved(parameter, change) };
     });
-    const chosen = all.filter((each) => each.parameter.name.toLowerCase().includes(wanted));
+    const chosen = all.filter((shown) => shown.parameter.name.toLowerCase().includes(wanted));
     chosen.sort((a, b) => b.ratio - a.ratio);
-    const first = wanted ? chosen.length : Math.max(LEAST, chosen.filter((each) => each.ratio > MOVED).length);
-    const cards = (some) => some.map((each) => this.card(each, estimates.rows, told));
+    const first = wanted ? chosen.length : Math.max(LEAST, chosen.filter((shown) => shown.ratio > MOVED).length);
+    const cards = (some) => some.map((shown) => this.card(shown, estimates.rows, events));
     const others = chosen.slice(first);
     say("parameter-count", all.length ? `${chosen.length} of ${all.length}` : "none known yet");
     byId("parameters").replaceChildren(...cards(chosen.slice(0, first)));
@@ -38,15 +38,15 @@ const Parameters = {
     byId("parameters-others").replaceChildren(...cards(others));
   },
 
-  card(each, rows, told) {
-    const { parameter, index, change, sd, ratio } = each;
+  card(shown, rows, events) {
+    const { parameter, index, change, sd, ratio } = shown;
     const unit = parameter.unit ? ` ${parameter.unit}` : "";
     const fixed = this.fixed(isNumber(sd) ? sd : parameter.start_sd);
     const band = isNumber(sd) ? ` \u00b1 ${fixed(BAND * sd)}` : "";
     const sized = ratio >= 0.05 ? `; moved ${digits(ratio, 2)} sd` : "";
     const now = isNumber(change) ? `${change >= 0 ? "+" : ""}${fixed(change)}${band}${unit}` : "not estimated yet";
     const value = `${isNumber(change) ? "now" : "start"} ${fixed(parameter.start + (change || 0))}${unit}${sized}`;
-    const trace = this.trace(rows, index, told);
+    const trace = this.trace(rows, index, events);
     return html("div", { class: ratio > MOVED ? "parameter moved" : "parameter" },
       html("span", { class: "name" }, parameter.name),
       html("span", { class: "now" }, now), html("small", { class: "value" }, value),
@@ -54,7 +54,7 @@ const Parameters = {
         html("div", { class: "ends" }, html("span", {}, signed(trace.high, 2)), html("span", {}, signed(trace.low, 2)))));
   },
 
-  trace(rows, index, told) {
+  trace(rows, index, events) {
     const points = rows.filter((r) => isNumber(r.change[index]));
     const spread = (r) => BAND * (isNumber(r.sd[index]) ? r.sd[index] : 0);
     let low = 0, high = 0;
@@ -68,7 +68,7 @@ const Parameters = {
     const y = (v) => 70 - ((v - low) / (high - low)) * 66;
     const upper = points.map((r) => [x(r.sequence), y(r.change[index] + spread(r))]);
     const lower = points.map((r) => [x(r.sequence), y(r.change[index] - spread(r))]).reverse();
-    const marks = told.filter((e) => e.event === "decision" && e.sequence >= first && e.sequence <= last);
+    const marks = events.filter((e) => e.event === "decision" && e.sequence >= first && e.sequence <= last);
     const picture = svg("svg", { viewBox: "0 0 240 74", preserveAspectRatio: "none", "aria-hidden": "true" },
       svg("path", { class: "zero", d: `M0 ${at(y(0))}H240` }),
       svg("path", { class: "decision", d: marks.map((e) => `M${at(x(e.sequence))} 0V74`).join("") }),

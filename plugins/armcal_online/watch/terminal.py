@@ -27,9 +27,9 @@ def picture(state: Mapping[str, Any], width: int = 80) -> RenderableType:
         parts += [_strip(state["records"], width), _records(state["records"][-_RECORDS:])]
     if state["estimates"]["rows"]:
         parts.append(_parameters(state["estimates"]))
-    if state["told"]:
+    if state["events"]:
         events = _table("event", "at", "")
-        for event in reversed(state["told"][-_EVENTS:]):
+        for event in reversed(state["events"][-_EVENTS:]):
             events.add_row(Text(_kind(event)), Text(_place(event)), Text(event["sentence"]))
         parts.append(events)
     return Group(*parts)
