@@ -593,7 +593,7 @@ class TestCommand:
     def test_settings_that_do_not_fit_are_refused(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str, told: str
     ) -> None:
-        monkeypatch.setattr(JsonServer, "serve", lambda *given: None)
+        monkeypatch.setattr(JsonServer, "serve", lambda *given: pytest.fail("a bench runs"))
         arguments = ["simulated-bench", str(LRM / "bench.yaml"), "--dir", str(tmp_path / "bench"), "--set", change]
         result = CliRunner().invoke(cli, arguments)
         assert result.exit_code == 2 and told in result.stderr
