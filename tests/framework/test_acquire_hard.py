@@ -8,6 +8,8 @@ import math
 import os
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from armcal.devices.clock import SimulatedClock
 from armcal.devices.device import DeviceError, DeviceRefusedError
 from armcal.errors import ArmcalError, InputError
 from armcal.io.journal.journal import Journal, JournalFailedError, JournalFullError
+from armcal.io.json_server import JsonServer
 from armcal.run.experiment import Experiment
 from armcal_bench.acquisition.arrival import Arrival
 from armcal_bench.acquisition.drive import Drive
@@ -708,11 +711,16 @@ class TestFolders:
     def test_no_folder_below_a_device(self, tmp_path: Path) -> None:
         self.refused(tmp_path, Path("/proc/nothing"), write_plan(tmp_path / "p.csv"))
 
-    def test_a_path_too_long_for_a_socket(self, tmp_path: Path) -> None:
-        folder, plan = tmp_path / ("y" * 100), write_plan(tmp_path / "p.csv")
-        result = CliRunner().invoke(cli, ["rehearse", str(CONFIG), "--plan", str(plan), "--out", str(folder)])
-        assert result.exit_code == 2, result.output
-        assert "short path" in result.output and "Traceback" not in result.output
+    def test_a_long_path_of_a_simulated_bench(self, tmp_path: Path) -> None:
+        folder = tmp_path / ("y" * 120)
+        folder.mkdir()
+        server = JsonServer(folder / "clock", "taken", "hint", lambda request: {"now": 1.5, "wall": 2.5})
+        with closing(server), ThreadPoolExecutor(1) as pool:
+            clock = pool.submit(SimulatedClock, folder / "clock")
+            while not clock.done():
+                server.serve(0.01)
+        with closing(clock.result()) as read:
+            assert (read.now(), read.wall()) == (1.5, 2.5)
 
     @pytest.mark.slow
     def test_letters_of_other_alphabets(self, tmp_path: Path) -> None:

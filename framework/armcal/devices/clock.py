@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from typing_extensions import override
 
 from armcal.errors import InputError, Location
+from armcal.io.unix_socket import short_address
 
 _LONGEST_ANSWER_S = 60.0
 
@@ -59,7 +60,8 @@ class SimulatedClock(Clock):
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._socket.settimeout(_LONGEST_ANSWER_S)
         try:
-            self._socket.connect(str(path))
+            with short_address(path) as address:
+                self._socket.connect(address)
         except OSError as fault:
             self._socket.close()
             raise self._refusal(str(fault)) from fault

@@ -1,6 +1,5 @@
 """A measuring run against a simulated bench, in a process of its own."""
 
-import os
 import subprocess
 import sys
 import time
@@ -19,7 +18,6 @@ from armcal_bench.bench import SECTION, Bench
 _STARTED_IN_S = 60.0
 _ENDED_IN_S = 10.0
 _FALLEN_IN_S = 5.0
-_LONGEST_SOCKET_PATH = 107
 
 
 def overrides_for(folder: Path, part: str = "link") -> tuple[str, ...]:
@@ -70,12 +68,6 @@ def simulated_bench(config: Path, overrides: Sequence[str], folder: Path) -> Ite
     Raises:
         InputError: the folder cannot be used, or the bench does not start; its own words are in the message.
     """
-    if len(os.fsencode(folder.absolute() / CLOCK)) > _LONGEST_SOCKET_PATH:
-        raise InputError(
-            f"the path of the simulated bench's socket would be longer than {_LONGEST_SOCKET_PATH} bytes.",
-            where=Location(str(folder)),
-            hint="Give --out a short path.",
-        )
     make_bench_folder(folder)
     sets = [word for text in overrides for word in ("--set", text)]
     # -P: a file of the working directory called like a library is not taken for it, as it is not by the command.
