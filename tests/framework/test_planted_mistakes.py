@@ -16,6 +16,7 @@ from armcal.errors import ConfigError
 from armcal.estimate.validation import folds, hold_out
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
+from armcal.run.prepare import Stopwatch, assemble, check_reach
 from click.testing import CliRunner
 from planted_mistakes import (
     DEMO,
@@ -88,6 +89,20 @@ def test_the_unit_of_a_single_position_is_named(tmp_path: Path, factor: float, w
     found = outcome(arm, with_tips(data, moved), tmp_path)
     assert (found.grade == "refused") == bool(factor) and words in found.said
     assert "the position of record 8 is about" in found.said or not factor
+
+
+def test_a_tip_near_the_origin_of_its_frame_is_in_no_other_unit(tmp_path: Path) -> None:
+    """The nominal arm is off by a millimetre or two there, and so has it at a tenth of the measured distance."""
+    data = PRINTED.recording(1)
+    path = PRINTED.write(data, tmp_path / "data.csv")
+    ready = assemble(Experiment.load(PRINTED.config, QUICK, path), Stopwatch())
+    problem, nominal = ready.problem, ready.problem.parameters.nominal()
+    shown = problem.predict(nominal, ready.records)[0].outputs[:3, 7]
+    origin = shown - (tips(data)[:, 7] - shown) / 9
+    for axis, place in zip("xyz", origin, strict=True):
+        nominal[problem.parameters.entries_of(f"arm.mdh.base_{axis}")] -= place
+    moved = replace(problem, parameters=problem.parameters.with_nominal(nominal))
+    check_reach(moved, ready.records, with_tips(data, tips(data) - origin[:, None]))
 
 
 @pytest.mark.slow

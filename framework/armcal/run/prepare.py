@@ -261,16 +261,18 @@ def _in_another_unit(measured: Array, shown: Array) -> tuple[float, Mask]:
     Many are known by their distances alone, as where half of them spoil the place of the base. Few are where the model
     has them once they are divided by that, and the others are typically where it has them.
     """
-    far, distances = (np.linalg.norm(x, axis=0) for x in (shown, measured))
+    far, distances, missed = (np.linalg.norm(x, axis=0) for x in (shown, measured, measured - shown))
     far = np.maximum(far, _NEAREST)
     orders = np.log10(np.where(distances > 0, distances, np.nan) / far)
-    right, fits = np.abs(orders) < _ALIKE, float(np.nanmedian(np.linalg.norm(measured - shown, axis=0) / far)) < _NEAR
+    right = np.abs(orders) < _ALIKE
+    # Near the origin any factor comes about by a little that the nominal arm is off.
+    far_off = (missed > _NEAR * np.median(far)) & (np.nanmedian(missed / far) < _NEAR)
     best = np.inf, 1.0, np.zeros(len(far), dtype=bool)
     for factor in LENGTHS:
         off = np.abs(orders - np.log10(factor))
         wrong = off < _ALIKE
         if min(right.sum(), wrong.sum()) < _FEWEST_ROWS or np.mean(right | wrong) < _NEARLY_ALL:
-            wrong = (np.linalg.norm(measured / factor - shown, axis=0) < _NEAR * far) & fits
+            wrong = (np.linalg.norm(measured / factor - shown, axis=0) < _NEAR * far) & far_off
         if wrong.any():
             best = min(best, (float(np.median(off[wrong])), factor, wrong), key=lambda one: one[0])
     return best[1:]
