@@ -41,7 +41,7 @@ def test_rounded_angles_are_named_with_what_they_leave(
     assert rounding is not None and rounding.joints == tuple(arm.joints)
     assert rounding.leaves == pytest.approx(1000 * np.sqrt(np.mean(np.sum(off**2, axis=0))), rel=0.15)
     texts = {finding.grade: finding.text for finding in reversed(result.verdict.findings)}
-    assert "rounding of the recorded joints leaves as much" in texts["bad"]
+    assert "rounding of the recorded joints would leave as much" in texts["bad"]
     assert f"All recorded angles of q1, q2, q3 are multiples of {words}." in result.verdict.paragraph
 
 

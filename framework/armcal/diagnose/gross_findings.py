@@ -70,7 +70,7 @@ def gross_error(
         return []
     rounded = rounding_findings(evidence.rounding, unit)
     why = (
-        "rounding of the recorded joints leaves as much"
+        "rounding of the recorded joints would leave as much"
         if rounded
         else "what was found in the residuals does not explain it"
     )

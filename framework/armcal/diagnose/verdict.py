@@ -252,7 +252,7 @@ def _size(estimate: Estimate, seen: Evidence) -> Finding:
     if total > chdtri(freedom, LEVEL / 2):
         why = "the model's error or the instrument's, which this test cannot separate"
         if seen.rounding is not None:
-            why = "rounding of the recorded joints leaves as much, see below"
+            why = "rounding of the recorded joints would leave as much, see below"
         elif seen.structure is not None or seen.contradictions:
             known = "some of it is the model's: what residuals depend on is named below"
             left = seen.structure
