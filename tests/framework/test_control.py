@@ -98,16 +98,17 @@ def test_a_request_without_an_end_is_refused_and_many_clients_do_no_harm(tmp_pat
     with serving(tmp_path):
         (told,) = raw(tmp_path, b"x" * 70_000)
         assert "64 KiB" in told["error"]
-        idle = []
+        clients: list[socket.socket] = []
         for _ in range(MOST_CLIENTS + 4):
             connection = socket.socket(socket.AF_UNIX)
+            connection.settimeout(5.0)
             connection.connect(str(tmp_path / SOCKET))
-            idle.append(connection)
-            time.sleep(0.004)
+            clients.append(connection)
+            clients[0].sendall(b'{"command": "status"}\n')  # it came first, and is never idle
+            assert b"status" in clients[0].recv(4096)
         assert ask(tmp_path, {"command": "status"})["ok"]
-        idle[0].settimeout(5.0)
-        assert idle[0].recv(1) == b""  # the first had to go
-        for connection in idle:
+        assert clients[1].recv(1) == b""  # the one that was idle for longest had to go
+        for connection in clients:
             connection.close()
         assert ask(tmp_path, {"command": "status"})["ok"]
 

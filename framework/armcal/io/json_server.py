@@ -15,7 +15,7 @@ from armcal.errors import ArmcalError
 from armcal.io.unix_socket import listening
 
 MOST_CLIENTS = 64
-"""The one that came first has to go for another."""
+"""The one that was idle for longest has to go for another."""
 _LONGEST = 64 * 1024
 _PATIENCE_S = 10.0
 """A client that does not read its replies for so long is dropped."""
@@ -85,7 +85,7 @@ class JsonServer:
             self._clients.append(client)
             self.watch(connection.fileno(), partial(self._read, client))
             if len(self._clients) > MOST_CLIENTS:
-                self._drop(self._clients[0])
+                self._drop(min(self._clients, key=lambda client: client.heard))
 
     def _read(self, client: _Client) -> None:
         try:
