@@ -6,6 +6,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from armcal.arm.assembly import shown_joint
 from armcal.arm.joints import Limits
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
@@ -26,7 +27,7 @@ MOST_LEVELS = 12
 class Suggestion:
     """A pose (channel to rad or m), its text, and the mean ratio of standard deviations once it has been measured.
 
-    ``beside`` are joints that should be moved too, nobody knows how far.
+    ``beside`` are joints that should be moved too; no limits say how far.
     """
 
     commands: dict[str, float]
@@ -64,9 +65,8 @@ def suggest(
     considered. There are none where the estimate is not finite; poses at which it gives nothing finite are left out.
     """
     ranges = {channel: limits for channel, limits in still.items() if limits is not None}
-    beside = tuple(channel for channel in joints if channel in still and channel not in ranges)
-    if len(problem.blueprint.arms) == 1:
-        beside = tuple(channel.partition(".")[2] for channel in beside)
+    arms = problem.blueprint.arms
+    beside = tuple(shown_joint(channel, arms) for channel in joints if channel in still and channel not in ranges)
     poses = _candidates(dataset, tuple(joints), seed, ranges)
     base = estimate.square_root_information * estimate.parameters.scales()
     scale = estimate.noise_scale or 1.0
