@@ -10,7 +10,8 @@ from typing import Any
 
 from armcal.devices.clock import SimulatedClock
 from armcal.devices.simulated import BOARD, CLOCK
-from armcal.errors import EXIT_BAD_INPUT, ArmcalError, ConfigError, InputError, Location, PluginError
+from armcal.errors import EXIT_BAD_INPUT, ArmcalError, ConfigError, InputError, PluginError
+from armcal.io.plain_files import writing
 from armcal.run.experiment import Experiment
 
 from armcal_bench.bench import SECTION, Bench
@@ -105,11 +106,8 @@ def make_bench_folder(folder: Path) -> None:
     Raises:
         InputError: it cannot be made.
     """
-    try:
+    with writing(folder, "Give a folder that can be written."):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as fault:
-        text = f"the folder cannot be made ({fault.strerror or fault})."
-        raise InputError(text, where=Location(str(folder)), hint="Give a folder that can be written.") from fault
 
 
 def _wait_for(process: subprocess.Popen[bytes], folder: Path) -> None:
