@@ -8,13 +8,17 @@ from typing import cast
 
 import numpy as np
 import pytest
+from armcal.cli.main import cli
 from armcal.diagnose.gross import Figure, figure_of
 from armcal.diagnose.gross_findings import computed_findings, size_findings
 from armcal.estimate.estimator import Estimate
 from armcal.run.experiment import Experiment
+from armcal.run.pipeline import calibrate
 from armcal.run.prepare import Prepared, Stopwatch, assemble
+from click.testing import CliRunner
 
-CONFIG = Path(__file__).resolve().parents[2] / "configs" / "so101" / "ruler.yaml"
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+CONFIG = CONFIGS / "so101" / "ruler.yaml"
 FREE = 'parameters.free=["arm.zeros.offset3", "arm.mdh.d[1-5]", "arm.mdh.a[1-5]"]'
 
 
@@ -61,3 +65,13 @@ def test_tips_that_are_computed_from_the_joints_are_named(
     findings = computed_findings(np.full(20, nominal_mm), np.append(np.full(9, judged_mm), np.nan), figure)
     assert [finding.grade for finding in findings] == [grade] * bool(grade)
     assert all(words in finding.text for finding in findings)
+
+
+def test_contacts_that_agree_to_a_micrometre_are_no_tips_that_were_computed(tmp_path: Path) -> None:
+    config, path = CONFIGS / "ball" / "demo.yaml", tmp_path / "data.csv"
+    exact = ("arms.arm.joint_noise_mrad=0.001", "measurements.sockets.noise_mm=0.001", "evaluator=interpreted")
+    flags = [word for text in exact for word in ("--set", text)]
+    made = CliRunner().invoke(cli, ["simulate", str(config), *flags, "--out", str(path)])
+    assert made.exit_code == 0, made.output
+    verdict = calibrate(Experiment.load(config, exact, path)).verdict
+    assert not any("computed from the joints" in finding.text for finding in verdict.findings)
