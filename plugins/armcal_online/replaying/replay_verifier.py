@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from armcal.io.journal.segment import Entry, Segment
 
+from armcal_online.evaluator import differences
 from armcal_online.running.state_replayer import Event, parsing
-from armcal_online.tracking.evaluator import differences
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.state import State
 from armcal_online.tracking.state_space import StateSpace

@@ -24,12 +24,12 @@ from armcal.estimate.validation import error_unit
 from armcal.measure.reader import ReadRequest
 from armcal.plugins import PluginRegistry, discover
 
+from armcal_online.evaluator import identity
 from armcal_online.sources.source import Incoming
 from armcal_online.tracking import events
 from armcal_online.tracking.belief import most_likely
 from armcal_online.tracking.decisions import EXPLAINED
 from armcal_online.tracking.directions import find_steps
-from armcal_online.tracking.evaluator import identity
 from armcal_online.tracking.health import nis_limit
 from armcal_online.tracking.hypotheses import GRADUAL, Recent, hypotheses, slow_changes
 from armcal_online.tracking.judge import Judge

@@ -23,7 +23,7 @@ def identity(problem: Problem, estimator: object) -> dict[str, Any]:
 
     A kernel's key covers its expression, the generator, the compiler and its flags, and the processor.
     """
-    sources = _sources(SOURCES, Path(__file__).parents[1], Path(inspect.getfile(type(estimator))).parent)
+    sources = _sources(SOURCES, Path(__file__).parent, Path(inspect.getfile(type(estimator))).parent)
     return {
         "armcal": __version__,
         "sources": sources[:12],
