@@ -357,7 +357,7 @@ def test_a_single_wrong_record_is_to_be_measured_again(lrm):
     found = large_errors_of(lrm, spoil)
     assert found.beyond == 1 and not found.configured and found.explained[0].record_id == "40"
     told = "; ".join(found.explained[0].reasons)
-    assert "along q2's own motion, as if 3.0 deg off" in told
+    assert "along q2's own motion, as if 3 deg off" in told
     assert "neighbours" not in told
 
 
