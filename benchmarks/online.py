@@ -77,7 +77,7 @@ def _compared(experiment: Experiment, parameters: Parameters, dataset: Dataset, 
     choices: tuple[EvaluatorChoice, ...] = ("compiled", "interpreted")
     cases = {choice: case_of(experiment, parameters, dataset, choice) for choice in choices}
     factor = cases["interpreted"].observer.problem.kernels[0].factor
-    plain = partial(_plain, cases["interpreted"], factor.pass_function(), factor.linearise_function())
+    plain = partial(_plain, cases["interpreted"], factor.pass_function, factor.linearise_function)
     contenders: dict[str, Callable[[], object]] = {name: case.run for name, case in cases.items()}
     contenders |= {f"{name}, again": partial(case.run, settings=ExtendedSettings()) for name, case in cases.items()}
     times = best_times({**contenders, "plain": plain}, repeats=10)
