@@ -7,7 +7,7 @@ from typing import Any
 
 from armcal.errors import ArmcalError, PluginError
 
-_DISTRIBUTIONS = {"cv2": "opencv-python-headless"}
+_DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow"}
 """Of modules that are called otherwise than the distribution that they come with."""
 
 

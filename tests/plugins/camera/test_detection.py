@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -185,6 +187,27 @@ def test_images_of_every_kind_are_read(kind: str) -> None:
 def test_what_is_no_image_is_refused(content: bytes) -> None:
     with pytest.raises(DataError, match=r"image: it is not an image"):
         grey_image(content, "image")
+
+
+@pytest.mark.parametrize("kind", [".png", ".jpg", ".tif", ".bmp", ".webp", ".pgm", ".ppm"])
+def test_an_image_with_too_many_pixels_is_refused_by_its_header(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is decoded: a PNG of one colour of a megabyte may be gigabytes then."""
+    image = np.full((100, 130) + ((3,) if kind == ".ppm" else ()), 90, np.uint8)
+    content = cv2.imencode(kind, image)[1].tobytes()
+    assert grey_image(content, "image").shape == (100, 130)
+    monkeypatch.setattr("armcal_camera.images.MOST_PIXELS", 12_999)
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(
+        DataError, match=r"image: found an image of more than 0\.012999 million pixels, expected at most"
+    ):
+        grey_image(content, "image")
+
+
+def test_a_header_of_30000_by_30000_pixels_is_refused() -> None:
+    header = b"IHDR" + struct.pack(">IIBBBBB", 30_000, 30_000, 8, 0, 0, 0, 0)
+    content = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+    with pytest.raises(DataError, match="more than 100 million pixels"):
+        grey_image(content + struct.pack(">I", 0) + b"IEND" + struct.pack(">I", zlib.crc32(b"IEND")), "image")
 
 
 def test_without_opencv_a_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
