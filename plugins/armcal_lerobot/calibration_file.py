@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,6 +20,14 @@ _LARGEST_ID = 252
 _NARROW_DEG, _BESIDE_DEG = 40.0, 20.0
 _EXPECTED = "a key a motor, each with " + ", ".join(_FIELDS)
 _CALIBRATE = "Run lerobot-calibrate again"
+PASSED_END = "the encoder passed its end as the range was recorded"
+IN_THE_MIDDLE = f"{_CALIBRATE}, with the joint in the middle of its range when it asks for that."
+_OLD = {"start_pos", "end_pos", "calib_mode", "motor_names"}
+_MOST_DEG, _SMALL_TURN = 360, 1023
+READS = (
+    "armcal reads files of Feetech STS servos (SO-100, SO-101, LeKiwi), and none of Dynamixel (Koch, OMX, ViperX), "
+    "Damiao or other motors: calibrate such an arm without its file (armcal new robot, armcal run)."
+)
 
 
 @dataclass(frozen=True)
@@ -69,9 +77,13 @@ def read_motors(path: Path) -> MotorFile:
     """
     hint = "Take the file that lerobot-calibrate wrote, whole."
     text, content = read_json(path, _MAX_BYTES, "a LeRobot calibration file (JSON)", hint)
+    _require_of_today(path, content)
     if not isinstance(content, dict) or not content:
         _refuse(path, "", f"found {_kind(content)}, expected {_EXPECTED}.", "Give LeRobot's calibration file.")
     motors = {name: _motor(path, name, entry) for name, entry in content.items()}
+    _require_counts(path, list(motors.values()))
+    for motor in motors.values():
+        _require_possible(path, motor)
     owners: dict[int, str] = {}
     for name, motor in motors.items():
         if (other := owners.setdefault(motor.id, name)) != name:
@@ -113,14 +125,41 @@ def _motor(path: Path, name: str, entry: Any) -> Motor:
             _refuse(path, f"{name}.{field}", "found nothing, expected a whole number.", f"{_CALIBRATE}.")
         if type(entry[field]) is not int:
             shown = json.dumps(entry[field])[:40]
-            hint = f"Write it without quotes or a fraction, or: {_CALIBRATE}."
+            hint = f"{_CALIBRATE}: it writes whole counts. {READS}"
             _refuse(path, f"{name}.{field}", f"found {shown}, expected a whole number.", hint)
     beyond = [key for key in entry if key not in _FIELDS]
     if beyond:
         _refuse(path, f"{name}.{beyond[0]}", f"found another field, expected {', '.join(_FIELDS)}.", "Remove it.")
-    motor = Motor(name, **{field: entry[field] for field in _FIELDS})
-    _require_possible(path, motor)
-    return motor
+    return Motor(name, **{field: entry[field] for field in _FIELDS})
+
+
+def _require_of_today(path: Path, content: Any) -> None:
+    """Refuse a file of a LeRobot before June 2025: lists over all motors, of one arm or of several."""
+    parts = list(content.values()) if isinstance(content, dict) else content if isinstance(content, list) else []
+    entries = [content, *parts]
+    if any(isinstance(e, dict) and (_OLD & e.keys() or isinstance(e.get("homing_offset"), list)) for e in entries):
+        text = f"found lists over all motors, as LeRobot wrote them before June 2025; expected {_EXPECTED}."
+        hint = (
+            f"{_CALIBRATE}, with a LeRobot of today. Its zeros are others: in old data sets of an SO-100 or SO-101 "
+            "shoulder_lift has its zero 90 deg off and is reversed, elbow_flex has its zero 90 deg off."
+        )
+        _refuse(path, "", text, hint)
+
+
+def _require_counts(path: Path, motors: Sequence[Motor]) -> None:
+    """Refuse a file whose numbers are degrees, counts of a smaller turn, or those of Dynamixel servos."""
+    ends = [count for motor in motors for count in (motor.range_min, motor.range_max)]
+    low, high, offset = min(ends), max(ends), max((motor.homing_offset for motor in motors), key=abs)
+    kind = f"counts of a turn of {_SMALL_TURN + 1}" if low >= 0 and high <= _SMALL_TURN and not offset else ""
+    if low >= -_MOST_DEG and high <= _MOST_DEG and (low < 0 or not offset):
+        kind = "degrees"
+    # LeRobot never writes these two for Feetech servos.
+    others = any(m.drive_mode or (m.turns_freely and m.name.endswith("shoulder_pan")) for m in motors)
+    if others and (low < 0 or high > LAST_COUNT or abs(offset) > LARGEST_OFFSET):
+        kind = "counts of several turns"
+    if kind:
+        text = f"found ranges of {low} to {high} and homing offsets of up to {offset}, expected counts of 0 to"
+        _refuse(path, "", f"{text} {LAST_COUNT}: these are {kind}, of an arm without Feetech STS servos.", READS)
 
 
 def _require_possible(path: Path, motor: Motor) -> None:
@@ -132,16 +171,15 @@ def _require_possible(path: Path, motor: Motor) -> None:
         _refuse(path, f"{name}.drive_mode", text, "Write 0, as LeRobot does.")
     if abs(motor.homing_offset) > LARGEST_OFFSET:
         text = f"found {motor.homing_offset}, expected -{LARGEST_OFFSET} to {LARGEST_OFFSET}: a servo stores a sign and"
-        _refuse(path, f"{name}.homing_offset", f"{text} 11 bits.", remount(motor.homing_offset))
+        _refuse(path, f"{name}.homing_offset", f"{text} 11 bits.", f"{remount(motor.homing_offset)} {READS}")
     for field in ("range_min", "range_max"):
         count = getattr(motor, field)
         if not 0 <= count <= LAST_COUNT:
-            text = f"found {count}, expected 0 to {LAST_COUNT}: the encoder passed its end as the range was recorded."
-            hint = f"{_CALIBRATE}, with the joint in the middle of its range when it asks for that."
-            _refuse(path, f"{name}.{field}", text, hint)
+            text = f"found {count}, expected 0 to {LAST_COUNT}: {PASSED_END}."
+            _refuse(path, f"{name}.{field}", text, f"{IN_THE_MIDDLE} {READS}")
     if motor.range_min >= motor.range_max:
-        text = f"found {motor.range_max}, expected more than range_min ({motor.range_min})."
-        _refuse(path, f"{name}.range_max", text, f"{_CALIBRATE}, and move the joint from end to end.")
+        text = f"found {motor.range_max}, expected more than range_min ({motor.range_min}): {PASSED_END}, or the joint"
+        _refuse(path, f"{name}.range_max", f"{text} was not moved.", IN_THE_MIDDLE)
 
 
 def _notes(motor: Motor) -> list[str]:

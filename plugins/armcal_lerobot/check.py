@@ -14,13 +14,14 @@ from armcal.arm.horn import teeth_text
 from armcal.base.arrays import Array
 from armcal.calibration.joint_zeros import Zero
 from armcal.cli.common import Console
-from armcal.errors import InputError, Location
+from armcal.errors import DataError, InputError, Location
 
-from armcal_lerobot.calibration_file import MotorFile, read_motors
+from armcal_lerobot.calibration_file import IN_THE_MIDDLE, PASSED_END, READS, MotorFile, read_motors
 from armcal_lerobot.comparison import poses_of
 from armcal_lerobot.gripper import Gripper, require_single, wiring_of
 from armcal_lerobot.motion import read_motion, require_motors
 from armcal_lerobot.motors import (
+    COUNTS_A_TURN,
     DEGREES_A_COUNT,
     LARGEST_OFFSET,
     Motor,
@@ -47,11 +48,11 @@ def check_content(
     """
     if other is not None:
         require_motors(other, list(file.motors))
-    content: dict[str, Any] = {"notes": [*file.notes, *_unswept(file, gripper)], "motors": {}}
+    content: dict[str, Any] = {"notes": [*file.notes, *_ranges(file, gripper)], "motors": {}}
     for name, motor in file.motors.items():
         content["motors"][name] = {**asdict(motor), "range_deg": 2 * motor.half_range_deg}
     if other is not None:
-        content["notes"] += [f"{other.path.name}: {text}" for text in other.notes]
+        content["notes"] += [f"{other.path.name}: {text}" for text in (*other.notes, *_ranges(other, gripper))]
         content["notes"] += _other_servos(file, other)
         for name, motor in file.motors.items():
             apart = zero_shift_deg(motor, other.motors[name])
@@ -116,28 +117,40 @@ def show_check(console: Console, content: Mapping[str, Any]) -> None:
 
 
 def sections(file: MotorFile, gripper: Gripper | None, model: str) -> str:
-    """Sections of a configuration: the joints of a servo bus, the limits of a plan, zeros and priors of a servo map."""
+    """Sections of a configuration: the joints of a servo bus, the limits of a plan, zeros and priors of a servo map.
+
+    Joints are planned within both the file's range and the model's own.
+
+    Raises:
+        DataError: the encoder of a joint passed its end as its range was recorded.
+    """
     arm = gripper.name if gripper else "arm"
     turned = [(name, name, 1) for name in file.motors if not is_gripper(name)]
     if gripper:
         turned = [(joint, *gripper.motor_of(joint)) for joint in gripper.joints]
+    own_ranges = gripper.ranges if gripper else {}
     lines = [f"# From {file.path.name}, LeRobot's motor calibration.", "bench:", "  device:"]
     lines += ["    type: servobus", "    port: /dev/ttyACM0", "    joints:"]
     limits, values, priors = [], [], []
     for number, (joint, name, sense) in enumerate(turned, start=1):
-        motor = file.motors[name]
-        low, high = (f"{end:.1f}" for end in motor.limits)
+        motor, zero = file.motors[name], round(file.motors[name].middle)
+        if motor.is_beyond(own_ranges.get(name)):
+            raise DataError(_passed(motor), where=Location(str(file.path), field=name), hint=IN_THE_MIDDLE)
+        ends = sorted(sense * (count - zero) * 360 / COUNTS_A_TURN for count in (motor.range_min, motor.range_max))
+        low, high = math.ceil(10 * ends[0]) / 10, math.floor(10 * ends[1]) / 10
         direction = "direction: -1, " if sense < 0 else ""
-        servo = f"id: {motor.id}, model: {model}, zero_count: {round(motor.middle)}, offset: {motor.homing_offset}"
+        servo = f"id: {motor.id}, model: {model}, zero_count: {zero}, offset: {motor.homing_offset}"
         lines.append(f"      {_key(f'{arm}.{joint}')}: {{{servo}, {direction}range_deg: [{low}, {high}]}}")
-        limits.append(f"    {_key(joint)}: [{low} deg, {high} deg]")
-        ends = gripper.limits[joint] if gripper else None
-        middle = math.degrees(sum(ends)) / 2 if ends and not motor.turns_freely else 0.0
-        unswept = abs(math.degrees(ends[1] - ends[0]) - 2 * motor.half_range_deg) / 2 if ends else 0.0
+        own = tuple(map(math.degrees, (gripper and gripper.limits[joint]) or ()))
+        middle = sum(own) / 2 if not motor.turns_freely else 0.0
+        unswept = abs(own[1] - own[0] - 2 * motor.half_range_deg) / 2 if own else 0.0
+        if own:
+            low, high = max(low, own[0] - middle), min(high, own[1] - middle)
+        limits.append(f"    {_key(joint)}: [{low:.1f} deg, {high:.1f} deg]")
         if abs(middle) > 0.05:
             values.append(f"    {arm}.zeros.offset{number}: {middle:.1f} deg")
         priors.append(f"    {arm}.zeros.offset{number}: {max(_PRIOR_DEG, unswept):.1f} deg")
-    lines += ["plan:", "  limits:", *limits]
+    lines += ["plan:", "  candidates: continuous", "  limits:", *limits]
     lines += ["# With an effect {type: servo_map, gains: one} called zeros:", "parameters:"]
     lines += ["  values:           # LeRobot's zero is the middle of the range", *values] if values else []
     return "\n".join([*lines, "  priors:", *priors, ""])
@@ -226,24 +239,34 @@ def show_zeros(
     console.table("What changes in the file", ("motor", "zero, deg", "sd", *fields), rows)
 
 
-def _unswept(file: MotorFile, gripper: Gripper | None) -> list[str]:
-    """Ranges that are another than the arm's own: the zero, their middle, is as wrong as half of the difference."""
-    notes: list[str] = []
-    if gripper is None:
-        return notes
-    for joint in gripper.joints:
-        name, ends = gripper.motor_of(joint)[0], gripper.limits[joint]
-        motor = file.motors[name]
-        if ends is None or motor.turns_freely:
-            continue
-        whole = math.degrees(ends[1] - ends[0])
-        missing = whole - 2 * motor.half_range_deg
-        if abs(missing) > _MOST_UNSWEPT_DEG:
+def _ranges(file: MotorFile, gripper: Gripper | None) -> list[str]:
+    """Ranges of which the encoder passed its end, or that are shorter than the joint's own.
+
+    The zero, their middle, is wrong with them. One that is longer has missed no end: models are often narrower than
+    what an arm does.
+    """
+    notes, own = [], gripper.ranges if gripper else {}
+    for name, motor in file.motors.items():
+        missing = own.get(name, 0.0) - 2 * motor.half_range_deg
+        if motor.is_beyond(own.get(name)):
+            notes.append(f"{_passed(motor)} {IN_THE_MIDDLE}")
+        elif _MOST_UNSWEPT_DEG < missing < math.inf:
             notes.append(
-                f"{name} has a range of {2 * motor.half_range_deg:.0f} deg, and the joint {joint} one of {whole:.0f} "
-                f"deg: if an end was not reached while it was recorded, its zero is off by {abs(missing) / 2:.0f} deg."
+                f"{name} has a range of {2 * motor.half_range_deg:.0f} deg, and its joint one of {own[name]:.0f} deg: "
+                f"if an end was not reached while it was recorded, its zero is off by {missing / 2:.0f} deg."
             )
     return notes
+
+
+def _passed(motor: Motor) -> str:
+    """That a motor's encoder passed its end, a sentence."""
+    text = (
+        f"{motor.name} has a range of {2 * motor.half_range_deg:.0f} deg, counts {motor.range_min} to "
+        f"{motor.range_max}: {PASSED_END}, and its zero, the middle of the range, is wrong with it."
+    )
+    if motor.turns_freely:
+        text += f" Or LeRobot wrote the whole turn, as it does for shoulder_pan of Dynamixel servos: {READS}"
+    return text
 
 
 def _moved(file: MotorFile, other: MotorFile, gripper: Gripper, angles: Array, units: Units) -> dict[str, Array]:

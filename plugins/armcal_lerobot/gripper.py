@@ -119,6 +119,14 @@ class Gripper:
         """The motor that turns a joint, and its sense."""
         return self._wiring[joint]
 
+    @property
+    def ranges(self) -> dict[str, float]:
+        """By motor, how far its joint goes by the model (deg); infinite where that turns freely."""
+        return {
+            self.motor_of(joint)[0]: float(np.degrees(ends[1] - ends[0])) if ends else np.inf
+            for joint, ends in self.limits.items()
+        }
+
     def angles(self, degrees: Mapping[str, Array]) -> Array:
         """Joint angles (n x N; rad) of motor angles (N each; deg)."""
         rows = [sense * degrees[motor] for motor, sense in (self._wiring[joint] for joint in self.joints)]
@@ -127,7 +135,8 @@ class Gripper:
     def poses(self, motors: Mapping[str, Motor]) -> Array:
         """Joint angles (n x N; rad) drawn evenly from the motors' ranges."""
         random = np.random.default_rng(_SEED)
-        return self.angles({name: random.uniform(*motor.limits, _POSES) for name, motor in motors.items()})
+        halves = {name: motor.half_range_deg for name, motor in motors.items()}
+        return self.angles({name: random.uniform(-half, half, _POSES) for name, half in halves.items()})
 
     def per_degree(self, angles: Array) -> dict[str, Cost]:
         """By joint, what one degree costs over poses (n x N; rad)."""

@@ -12,6 +12,10 @@ from typing import Literal
 from armcal.arm.horn import TOOTH_DEG, teeth_text
 
 _WITHIN_DEG = 2.0
+_FULL_TURN = ("wrist_roll", "forearm_roll", "wrist_rotate", "wheel")
+_AT_END = 34
+"""Counts, 3 deg: a range that comes so near to the encoder's end does not end there by chance."""
+_TURN_DEG, _LONGER_DEG, _SAME_DEG = 330.0, 60.0, 6.0
 Units = Literal["degrees", "percent"]
 
 LAST_COUNT = 4095
@@ -52,10 +56,17 @@ class Motor:
         """Whether the range is the whole turn, as LeRobot writes for wrist_roll."""
         return self.range_min == 0 and self.range_max == LAST_COUNT
 
-    @property
-    def limits(self) -> tuple[float, float]:
-        """Degrees at both ends of the range."""
-        return -self.half_range_deg, self.half_range_deg
+    def is_beyond(self, own_deg: float | None) -> bool:
+        """Whether no joint has this range: one that turns freely has any, by its model or by the name of its motor.
+
+        ``own_deg`` is the joint's by the model; None without one. Models are often narrower than what an arm does.
+        """
+        if any(name in self.name for name in _FULL_TURN) or (own_deg or 0.0) > _TURN_DEG:
+            return False
+        is_at_end = min(self.range_min, LAST_COUNT - self.range_max) < _AT_END
+        if own_deg is None:
+            return is_at_end or 2 * self.half_range_deg > _TURN_DEG
+        return 2 * self.half_range_deg > own_deg + (_SAME_DEG if is_at_end else _LONGER_DEG)
 
     def degrees_in(self, units: Units) -> float:
         """Degrees of one unit of a data set that was recorded with this file."""

@@ -117,9 +117,13 @@ class ServoJoint:
 
     @cached_property
     def count_range(self) -> tuple[int, int]:
-        """The lowest and the highest count of its range; beyond 0 or the last one where the range crosses the seam."""
-        ends = sorted(map(self.exact_count, self.settings.range))
-        return math.ceil(ends[0] - _SLACK), math.floor(ends[1] + _SLACK)
+        """The lowest and the highest count of its range; beyond 0 or the last one where the range crosses the seam.
+
+        One count beyond is none: a range of the whole turn, -180 to 180 deg, ends where it begins.
+        """
+        ends, last = sorted(map(self.exact_count, self.settings.range)), self.model.counts - 1
+        low, high = math.ceil(ends[0] - _SLACK), math.floor(ends[1] + _SLACK)
+        return (0 if low == -1 else low), (last if high == last + 1 else high)
 
     @property
     def crosses_seam(self) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from armcal.arm.assembly import Arm
 from armcal.base.dataset import Dataset
+from armcal.base.parameters import Parameters
 from armcal.errors import DataError
 from armcal.measure import checks
 from armcal.measure.checks import Layout, check_dataset, layout_of
@@ -167,7 +168,7 @@ def test_limits_are_told_of_records_that_have_the_joint() -> None:
 
     arm = Arm("arm", "planar", Limited(), {}, ())
     dataset = Dataset(("a", "b", "c"), {"arm.q1": np.array([NAN, 1.5, 0.1]), "arm.q2": np.zeros(3)})
-    (warning,) = warn_beyond_limits(dataset, {"arm": arm}).warnings
+    (warning,) = warn_beyond_limits(dataset, {"arm": arm}, Parameters(())).warnings
     assert "in 1 of 3 records, at worst 85.94" in warning
 
 

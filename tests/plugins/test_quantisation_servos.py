@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from armcal.arm.effects import JointCommand
 from armcal.arm.servo import PulseClock, PulseTable, quantised
 from armcal.base.config_text import ConfigText
 from armcal.config.servo_file import digest
+from armcal.run.experiment import Experiment
 from armcal_joints.quantisation import Quantisation
 from board_bench import JOINTS, LRM_PULSES_US, servo_file, written
 from pydantic import ValidationError
@@ -94,3 +97,18 @@ def test_a_joint_that_is_off_moves_the_tip_whatever_the_counts(lrm):
     (residual, slopes), (same, expected) = at_rest
     assert residual == pytest.approx(same, abs=1e-9) and slopes == pytest.approx(expected, abs=1e-6)
     assert np.abs(expected).max() > 0.1
+
+
+def test_records_beyond_the_pulse_tables_are_warned_of_and_no_others(tmp_path):
+    """Half a count beyond an end is how a board rounds; the shipped records and tables end at the same 100 deg."""
+    demo = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "demo.yaml"
+
+    def warned(*angles):
+        tables = {joint: {"angles_deg": [*angles], "pulses_us": [620, 1540, 2460]} for joint in ARM}
+        sets = [f"arms.arm.effects.counts={json.dumps({'type': 'quantisation', 'tables': tables})}"]
+        return Experiment.load(demo, sets).read().warnings
+
+    assert warned(-100, 0, 100) == () and warned(-99.9, 0, 99.9) == ()
+    (text,) = warned(0, 90, 180)
+    assert "q1 is beyond its pulse table 0 to 180 deg in 66 of 200 records, at worst -100 (-100 to 100 deg)" in text
+    assert "q6 is beyond" in text and "middle at 90" in text

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from armcal.arm.assembly import Arm
 from armcal.arm.loading import holding_efforts
 from armcal.arm.model import forward
 from armcal.base.dataset import Dataset
+from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.calibration.calibration_file import dump
 from armcal.config.system import build_system
 from armcal.config.yaml_source import load_config
@@ -20,6 +24,8 @@ from armcal.measure.layout import layout_of
 from armcal.measure.reader import requested_channels
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
+from armcal.run.plan_poses import stated_beyond
+from armcal_joints.servo_map import ServoMap
 from armcal_urdf.encoding import MAX_BYTES, decode, encode
 from armcal_urdf.model import UrdfModel, UrdfSettings
 from pydantic import ValidationError
@@ -290,14 +296,41 @@ def test_a_joint_that_follows_a_follower_follows_the_first():
 def test_records_beyond_limits_are_warned_of_by_joint_count_and_worst():
     channels = {"arm.turn": [0, 50.0, 0], "arm.bend": [0.0, 2.5, 2.0005], "arm.slide": [-0.3, 0.3, 0]}
     data = Dataset(("1", "2", "3"), {name: np.array(x, dtype=float) for name, x in channels.items()})
-    (text,) = warn_beyond_limits(data, {"arm": arm_of()}).warnings
+    (text,) = warn_beyond_limits(data, {"arm": arm_of()}, Parameters(())).warnings
     assert "bend is beyond its limits -57.3 to 114.6 deg in 1 of 3 records, at worst 143.2" in text
     assert "slide is beyond its limits -100 to 200 mm in 2 of 3 records, at worst -300" in text
     assert "level is beyond" in text
     assert "turn is" not in text
     assert text.endswith("check the joints' order, signs and units.")
     quiet = Dataset(("1",), {name: np.zeros(1) for name in channels})
-    assert warn_beyond_limits(quiet, {"arm": arm_of()}).warnings == ()
+    assert warn_beyond_limits(quiet, {"arm": arm_of()}, Parameters(())).warnings == ()
+
+
+def beyond(stated: dict, arm: Arm | None = None, *known: ParameterBlock) -> tuple[str, ...]:
+    system = SimpleNamespace(arms={"arm": arm or arm_of()})
+    return stated_beyond(SimpleNamespace(system=system, parameters=Parameters(known)), stated)  # type: ignore[arg-type]
+
+
+def test_stated_limits_beyond_the_models_are_told_by_joint():
+    deg = np.pi / 180
+    (text,) = beyond({"turn": (-7.0, 7.0), "bend": (-1.0, 114.5 * deg), "slide": (-0.1, 0.25)})
+    assert "limits of slide, -100 to 250 mm, go beyond those of the arm's model, -100 to 200 mm" in text
+    assert not beyond({"bend": (-57.33 * deg, 0.0)})  # rounded
+    (text,) = beyond({"bend": (-179.8 * deg, 0.0)})
+    assert "limits of bend, -179.8 to 0 deg, go beyond those of the arm's model, -57.3 to 114.6 deg" in text
+
+
+def test_limits_are_those_of_commands_where_a_zero_is_known():
+    """A joint that stands 60 deg beyond its command reaches its end stop so much before."""
+    effect = ServoMap(ServoMap.Settings.model_validate({"joints": ["bend"], "gains": "one"}), arm_of().joint_names)
+    arm, number = replace(arm_of(), effects={"zeros": effect}), effect.joints[0]
+    zero = ParameterBlock(f"arm.zeros.offset{number}", "rad", (np.pi / 3,))
+    assert not beyond({"bend": (-2.0, 0.9)}, arm, zero)
+    assert "-117.3 to 54.59 deg" in beyond({"bend": (-1.5, 1.9)}, arm, zero)[0]
+    commanded = {"arm.turn": [0.0, 0.0], "arm.bend": [-2.0, 1.9], "arm.slide": [0.0, 0.0]}
+    data = Dataset(("1", "2"), {name: np.array(x) for name, x in commanded.items()})
+    (text,) = warn_beyond_limits(data, {"arm": arm}, Parameters((zero,))).warnings
+    assert "bend is beyond its limits -117.3 to 54.59 deg in 1 of 2 records, at worst 108.9" in text
 
 
 def test_only_endless_joints_may_be_recorded_beyond_one_turn():

@@ -5,7 +5,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -46,6 +46,10 @@ class Console:
     def warn(self, text: str) -> None:
         """One warning line."""
         self.err.print(f"warning: {text}", style="yellow", soft_wrap=True)
+
+    def danger(self, text: str) -> None:
+        """A warning of what can break an arm: with -q too."""
+        replace(self, quiet=False).warn(text)
 
     def detail(self, text: str) -> None:
         """Only with -v."""
@@ -119,7 +123,7 @@ def speaking(command: F) -> F:
     """The options --json, -q and -v, handed on as ``console``."""
 
     @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on standard output.")
-    @click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
+    @click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors and dangers.")
     @click.option("-v", "--verbose", is_flag=True, help="Say more on standard error.")
     @click.pass_context
     def wrapped(ctx: click.Context, /, as_json: bool, quiet: bool, verbose: bool, **given: Any) -> Any:

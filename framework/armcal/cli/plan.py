@@ -19,7 +19,7 @@ from armcal.run.experiment import Experiment
 from armcal.run.iso_cube.iso_plan import IsoPlan, make_iso_plan
 from armcal.run.iso_cube.placement import NAMES
 from armcal.run.plan import PlanResult, make_plan
-from armcal.run.plan_poses import counts_text
+from armcal.run.plan_poses import counts_text, stated_beyond
 from armcal.run.settings import PlanSettings
 
 _SHOWN = 8
@@ -62,12 +62,14 @@ def plan(
         raise ConfigError(f"--out {out}: {text}.", hint="Give the path of a CSV in a directory that is there.")
     registry = console.registry()
     edge = _edge(given, count)
-    if given["iso_cube"]:
-        experiment = Experiment.load(config, overrides, registry=registry)
-        show_iso_plan(console, experiment, edge, out, given)
-        return
     chosen = [f"plan.{key}={given[key]}" for key in ("goal", "order") if given[key]]
     experiment = Experiment.load(config, (*overrides, *chosen), given["data"], registry)
+    settings = experiment.settings.plan or PlanSettings()
+    for text in stated_beyond(experiment, {**settings.limits, **settings.travel_limits}):
+        console.danger(text)
+    if given["iso_cube"]:
+        show_iso_plan(console, experiment, edge, out, given)
+        return
     assert count is not None
     with console.progress() as progress:
         result = make_plan(experiment, count, given["candidates"], given["given"], given["calibration"], progress)

@@ -7,7 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from armcal.arm.assembly import Arm, shown_joint
+from armcal.arm.joints import Limits
+from armcal.arm.servo import SteppedEffect
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
+from armcal.base.parameters import Parameters
 from armcal.base.units import display_unit, split_suffix, to_unit
 from armcal.errors import DataError, Location
 from armcal.measure.reader import ENVIRONMENT, RequestedChannel
@@ -68,25 +72,53 @@ TOLERANCE = {"angle": 1e-3, "length": 1e-4}
 """How far beyond a limit (rad, m) a command may be: limits are often rounded."""
 
 
-def warn_beyond_limits(dataset: Dataset, arms: Mapping[str, Arm]) -> Dataset:
-    """The dataset, with a warning for all joints that were commanded beyond their limits."""
-    texts = []
+def own_limits(arm: Arm, parameters: Parameters) -> dict[str, Limits]:
+    """The limits of the model, by joint, of its commands (rad or m): zeros that effects state are taken off."""
+    zeros = dict.fromkeys(arm.joint_names, 0.0)
+    for name, effect in arm.effects.items():
+        for parameter, number in effect.zeros().items():
+            zeros[arm.joint_names[number - 1]] += parameters[f"{arm.name}.{name}.{parameter}"].nominal[0]
+    known = {joint.name: joint.limits for joint in arm.nominal_chain.joints if joint.limits is not None}
+    return {joint: (low - zeros[joint], high - zeros[joint]) for joint, (low, high) in known.items()}
+
+
+def warn_beyond_limits(dataset: Dataset, arms: Mapping[str, Arm], parameters: Parameters) -> Dataset:
+    """The dataset, with warnings of all joints that were commanded beyond their limits, or their pulse tables."""
+    of_limits, of_tables = list[str](), list[str]()
     for name, arm in arms.items():
         if not len(dataset) or not all(map(dataset.has, arm.command_channels)):
             continue
         commands = arm.joint_commands([dataset.column(channel) for channel in arm.command_channels])
-        for joint, dimension, angles in zip(arm.nominal_chain.joints, arm.joint_dimensions, commands, strict=True):
-            if joint.limits is None:
-                continue
-            over = np.maximum(joint.limits[0] - angles, angles - joint.limits[1])  # below zero inside
-            over = np.nan_to_num(over, nan=-np.inf, neginf=-np.inf)
-            count, unit = int(np.sum(over > TOLERANCE[dimension])), display_unit(dimension).name
-            if count:
-                low, high, worst = (to_unit(x, unit) for x in (*joint.limits, float(angles[int(np.argmax(over))])))
-                shown = shown_joint(f"{name}.{joint.name}", arms)
-                beyond = f"{shown} is beyond its limits {low:.4g} to {high:.4g} {unit}"
-                texts.append(f"{beyond} in {count} of {len(dataset)} records, at worst {worst:.4g}")
-    if not texts:
-        return dataset
-    text = f"{'; '.join(texts)}: check the joints' order, signs and units."
-    return replace(dataset, warnings=(*dataset.warnings, text))
+        joints = dict(zip(arm.joint_names, zip(arm.joint_dimensions, commands, strict=True), strict=True))
+        for joint, ends in own_limits(arm, parameters).items():
+            shown, (dimension, angles) = shown_joint(f"{name}.{joint}", arms), joints[joint]
+            of_limits += _beyond(f"{shown} is beyond its limits", angles, ends, TOLERANCE[dimension], dimension)
+        stepped = [effect.servos() for effect in arm.effects.values() if isinstance(effect, SteppedEffect)]
+        for index, (table, clock) in (servo for servos in stepped for servo in servos.items()):
+            shown, ends = shown_joint(f"{name}.{arm.joint_names[index]}", arms), (table.angles[0], table.angles[-1])
+            half = clock.tick / table.least_slope / 2  # a board rounds to whole counts
+            of_tables += _beyond(f"{shown} is beyond its pulse table", commands[index], ends, half, "angle")
+    texts = [f"{'; '.join(of_limits)}: check the joints' order, signs and units."] if of_limits else []
+    if of_tables:
+        texts.append(
+            f"{'; '.join(of_tables)}: pulses there are guessed along a straight line. Check the zero of the servo file "
+            "(libraries that count from 0 to 180 deg have the middle at 90), or measure the table that far."
+        )
+    return replace(dataset, warnings=(*dataset.warnings, *texts))
+
+
+def _beyond(what: str, values: Array, ends: Limits, tolerance: float, dimension: str) -> list[str]:
+    """A sentence of values (rad or m) beyond ends by more than a tolerance; none where none are."""
+    over = np.maximum(ends[0] - values, values - ends[1])  # below zero inside
+    over = np.nan_to_num(over, nan=-np.inf, neginf=-np.inf)
+    if not (count := int(np.sum(over > tolerance))):
+        return []
+    worst = to_unit(float(values[int(np.argmax(over))]), display_unit(dimension).name)
+    spread = span_text((float(np.nanmin(values)), float(np.nanmax(values))), dimension)
+    return [f"{what} {span_text(ends, dimension)} in {count} of {len(values)} records, at worst {worst:.4g} ({spread})"]
+
+
+def span_text(ends: Limits, dimension: str) -> str:
+    """Two ends (rad or m) as people read them: ``-100 to 100 deg``."""
+    unit = display_unit(dimension).name
+    return " to ".join(f"{to_unit(end, unit):.4g}" for end in ends) + f" {unit}"

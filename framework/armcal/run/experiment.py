@@ -129,7 +129,7 @@ class Experiment:
                 hint="State what hung on the tool beyond the links: payload_g: 0 if nothing, or a column payload_g.",
             )
         require_conditions(dataset, request.channels)
-        dataset = warn_beyond_limits(noticed(dataset), self.system.arms)
+        dataset = warn_beyond_limits(noticed(dataset), self.system.arms, self.parameters)
         if text := self._heavy(dataset):
             dataset = replace(dataset, warnings=(*dataset.warnings, text))
         if not dataset.has("gravity_z"):

@@ -11,13 +11,14 @@ import numpy as np
 
 from armcal.arm.assembly import command_channels, shown_joint
 from armcal.arm.clearance import ClearanceCheck
-from armcal.arm.joints import by_dimension
+from armcal.arm.joints import Limits, by_dimension
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.calibration.compensation.finder import Allowed
 from armcal.config.system import build_component
 from armcal.errors import ConfigError, DataError, Location, ProblemError
 from armcal.io.plain_files import input_file
+from armcal.measure.environment import TOLERANCE, own_limits, span_text
 from armcal.measure.reader import MAX_ID_LIST_BYTES, Reader, read_ids
 from armcal.measure.returned import records_of
 from armcal.plugins import PluginRegistry
@@ -69,6 +70,21 @@ class JointSpace:
         """Lowest and highest command of each joint (joints x 2); infinite where none is given."""
         given = self.by_joint(settings.limits, settings.travel_limits, ("limits", "travel_limits"))
         return np.array([given.get(name, np.array([-np.inf, np.inf])) for name in self.names])
+
+
+def stated_beyond(experiment: Experiment, stated: Mapping[str, Limits]) -> tuple[str, ...]:
+    """A sentence for each joint whose stated limits (rad or m) go beyond those of its model."""
+    texts, arms = [], experiment.system.arms
+    own = {f"{n}.{j}": ends for n, arm in arms.items() for j, ends in own_limits(arm, experiment.parameters).items()}
+    for channel, dimension in command_channels(arms).items():
+        given, known = stated.get(shown_joint(channel, arms)), own.get(channel)
+        if given and known and max(known[0] - given[0], given[1] - known[1]) > TOLERANCE[dimension]:
+            texts.append(
+                f"The stated limits of {shown_joint(channel, arms)}, {span_text(given, dimension)}, go beyond those of "
+                f"the arm's model, {span_text(known, dimension)}: it may run into its end stop, or into itself. Narrow "
+                "them, or correct the model if the arm does go farther."
+            )
+    return tuple(texts)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from armcal.errors import ConfigError, DataError, Location
 from armcal.run.experiment import Experiment
 from armcal.run.plan_approaches import approach_channels
 from armcal.run.plan_clearance import clearance_check
-from armcal.run.plan_poses import JointSpace, commands_of, read_poses
+from armcal.run.plan_poses import JointSpace, commands_of, read_poses, stated_beyond
 
 from armcal_bench.acquisition.arrival import Arrival
 from armcal_bench.acquisition.heat import HeatModel, holding_torques
@@ -42,6 +42,7 @@ class Prepared:
         arrival: whether the arm stands where it was commanded to.
         sag: names a joint that gives way.
         judge: of what is dangerous in the first motions and the last.
+        warnings: of limits beyond the arm model's own.
     """
 
     bench: Bench
@@ -51,6 +52,7 @@ class Prepared:
     arrival: Arrival
     sag: SagJudge
     judge: HazardJudge
+    warnings: tuple[str, ...]
 
     @property
     def settings(self) -> AcquisitionSettings:
@@ -98,7 +100,9 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
     judge = HazardJudge(device.joint_names, device.joint_names, limits, heat.torques, park)
     arrival = Arrival(nominal_tools(arm, poses), settings.arrival)
     sag = SagJudge(device.joint_names, partial(nominal_tools, arm), heat.torques)
-    return Prepared(bench, device, commands, scheduler, arrival, sag, judge)
+    planned = experiment.settings.plan.limits if experiment.settings.plan else {}
+    warnings = stated_beyond(experiment, {**planned, **settings.limits})
+    return Prepared(bench, device, commands, scheduler, arrival, sag, judge, warnings)
 
 
 def _check_measures(experiment: Experiment, settings: AcquisitionSettings, device: JointDevice) -> None:

@@ -51,6 +51,8 @@ def acquire_command(
 ) -> None:
     """Drive a plan's poses with the bench of CONFIG, and measure each when the arm stands."""
     prepared = prepare(load(console, config, overrides), plan)
+    for text in prepared.warnings:
+        console.danger(text)
     forecast = schedule_forecast(prepared)
     if dry_run:
         _show_dry_run(console, prepared, forecast)

@@ -48,6 +48,8 @@ def rehearse(console: Console, config: Path, plan: Path, out: Path, overrides: t
     stated = load(console, config, overrides)
     simulated = (*overrides, *overrides_for(bench, part_with_port(stated)), *port_instead_of_adapter(stated))
     prepared = prepare(Experiment.load(config, simulated, registry=stated.registry), plan)
+    for text in prepared.warnings:
+        console.danger(text)
     check_folder(out, OURS)
     if not console.json:
         show_forecast(console, prepared, schedule_forecast(prepared))

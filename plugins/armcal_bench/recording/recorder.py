@@ -326,7 +326,8 @@ class Recorder:
                 sentence = f"posture {posture.name} is nearly posture {other.name} again: it adds little that is new."
                 messages.append(Message("warning", sentence, {"posture": posture.name, "alike": other.name}))
                 break
-        checked = warn_beyond_limits(dataset_of([posture]), self._experiment.system.arms)
+        experiment = self._experiment
+        checked = warn_beyond_limits(dataset_of([posture]), experiment.system.arms, experiment.parameters)
         return messages + [Message("warning", text, {"posture": posture.name}) for text in checked.warnings]
 
     def _apart(self, one: Mapping[str, float], other: Mapping[str, float]) -> float:

@@ -38,6 +38,38 @@ def test_what_a_servo_cannot_have_is_named(tmp_path: Path, changed: dict, field:
     assert text in str(refused.value)
 
 
+LISTS = {"homing_offset": [2048, -1012], "drive_mode": [0, 1], "start_pos": [2051, 3070], "end_pos": [3072, 2036]}
+OLD = [{**LISTS, "motor_names": ["a", "b"]}, {"main": LISTS, "left": LISTS}, [LISTS], {"homing_offset": [1], "id": [2]}]
+
+
+@pytest.mark.parametrize("content", OLD)
+def test_a_file_of_a_lerobot_before_june_2025_is_named_with_what_to_do(tmp_path: Path, content: object) -> None:
+    path = tmp_path / "arm.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(DataError, match=r"before June 2025.*LeRobot of today.*shoulder_lift.*reversed.*elbow_flex"):
+        read_motors(path)
+
+
+DEGREES = {"homing_offset": 0, "range_min": -90, "range_max": 90}
+OTHERS = [
+    ("degrees", dict.fromkeys(("shoulder_pan", "elbow_flex"), DEGREES)),
+    ("degrees", {"joint1": DEGREES, "gripper": {**DEGREES, "range_min": 0, "range_max": 270}}),
+    ("degrees", {"joint1": {**DEGREES, "homing_offset": 12}}),
+    ("counts of a turn of 1024", {"finger1": {**DEGREES, "range_min": 80, "range_max": 1020}}),
+    ("counts of several turns", {"shoulder_pan": {"range_min": 0, "range_max": 4095, "homing_offset": 3072}}),
+    ("counts of several turns", {"elbow_flex": {"range_min": -700, "range_max": 4000, "drive_mode": 1}}),
+]
+
+
+@pytest.mark.parametrize(("kind", "motors"), OTHERS)
+def test_files_of_other_motors_are_named_and_not_to_be_recorded_again(tmp_path: Path, kind: str, motors: dict) -> None:
+    path, whole = tmp_path / "arm.json", {"drive_mode": 0, "homing_offset": 5}
+    path.write_text(json.dumps({name: {"id": i, **whole, **entry} for i, (name, entry) in enumerate(motors.items())}))
+    with pytest.raises(DataError, match=f"{kind}, of an arm without Feetech STS servos") as refused:
+        read_motors(path)
+    assert "lerobot-calibrate again" not in str(refused.value)
+
+
 @pytest.mark.parametrize(
     "text", ["", "[]", "{}", '{"a": 3}', '{"a": {}}', '{"a": {"id": 1}, "a": {}}', "{", "[" * 9000]
 )

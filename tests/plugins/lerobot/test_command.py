@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from armcal.errors import ArmcalError, InputError
+from armcal.cli.main import cli
+from armcal.errors import ArmcalError, DataError, InputError
 from armcal.plugins import discover
 from armcal_lerobot.command import lerobot
 from armcal_lerobot.gripper import Gripper, wiring_of
 from armcal_lerobot.motors import Motor
+from armcal_servobus.joints import drivable
 from click.testing import CliRunner
 
 from tests.plugins.lerobot.planted import episodes, motor_entries, write_dataset, write_motors
@@ -107,9 +110,9 @@ def test_sections_are_a_configuration(tmp_path: Path) -> None:
         "zero_count": 2092,
         "offset": -50,
         "direction": -1,
-        "range_deg": [-96.0, 96.0],
+        "range_deg": [-96.0, 95.9],
     }
-    assert sections["plan"]["limits"]["shoulder_pan"] == ["-100.0 deg", "100.0 deg"]
+    assert sections["plan"]["limits"]["shoulder_pan"] == ["-100.0 deg", "99.9 deg"]
     for name in ("skeleton.yaml", "arm.yaml"):
         (tmp_path / name).write_bytes((CONFIGS / name).read_bytes())
     path, parameters = tmp_path / "plan.yaml", {**sections["parameters"], "free": ["arm.zeros.offset*"]}
@@ -127,24 +130,106 @@ def test_motors_of_any_name_give_sections_that_load(tmp_path: Path) -> None:
 
 
 def test_limits_of_the_arm_give_zeros_and_name_ranges_that_were_not_swept(tmp_path: Path) -> None:
-    import re
+    config, joints = limited_arm(tmp_path, -1.0, 1.4)
+    file, name = swept(tmp_path, joints, 2048 - 600, 2048 + 600), joints[0]  # 105 deg
+    notes = " ".join(json_of("check", file, "--arm", config)["notes"])
+    assert f"{name} has a range of 105 deg, and its joint one of 138 deg" in notes and "off by 16 deg" in notes
+    values = yaml.safe_load(called("joints", file, "--arm", config))["parameters"]["values"]
+    assert values["arm.zeros.offset1"] == "11.5 deg"
 
+
+def limited_arm(folder: Path, lower: float, upper: float, kind: str = "revolute") -> tuple[Path, list[str]]:
+    """The shipped arm of seven joints, all with these limits (rad)."""
     urdf = (CONFIGS.parent / "ball" / "arm7.urdf").read_text()
     joints = re.findall(r'<joint name="([^"]+)" type="revolute"', urdf)
-    name = joints[0]
-    limited = re.sub(r"<limit [^>]*/>", '<limit lower="-1.0" upper="1.4" effort="1" velocity="1"/>', urdf)
-    (tmp_path / "arm.urdf").write_text(limited)
-    tips = yaml.safe_load((CONFIGS.parent / "ball" / "demo.yaml").read_text())["arms"]["arm"]["model"].get("tip")
-    model = {"type": "urdf", "path": "arm.urdf", **({"tip": tips} if tips else {})}
-    (tmp_path / "arm.yaml").write_text(yaml.safe_dump({"arms": {"arm": {"model": model}}}))
-    swept = {"drive_mode": 0, "homing_offset": 0, "range_min": 2048 - 600, "range_max": 2048 + 600}  # 105 deg
-    entries = {joint: {"id": i, **swept} for i, joint in enumerate(joints)}
-    file = tmp_path / "one.json"
+    limits = f'<limit lower="{lower}" upper="{upper}" effort="1" velocity="1"/>'
+    text = re.sub(r"<limit [^>]*/>", limits if kind == "revolute" else "", urdf).replace('"revolute"', f'"{kind}"')
+    (folder / "arm.urdf").write_text(text)
+    tip = yaml.safe_load((CONFIGS.parent / "ball" / "demo.yaml").read_text())["arms"]["arm"]["model"].get("tip")
+    model = {"type": "urdf", "path": "arm.urdf", **({"tip": tip} if tip else {})}
+    (folder / "arm.yaml").write_text(yaml.safe_dump({"arms": {"arm": {"model": model}}}))
+    return folder / "arm.yaml", joints
+
+
+def swept(folder: Path, joints: list[str], low: int, high: int) -> Path:
+    """A file in which all motors have this range."""
+    entry = {"drive_mode": 0, "homing_offset": 7, "range_min": low, "range_max": high}
+    path = folder / "one.json"
+    path.write_text(json.dumps({joint: {"id": i, **entry} for i, joint in enumerate(joints)}))
+    return path
+
+
+@pytest.mark.parametrize("ends", [(3, 4093), (0, 4095), (3, 3301), (812, 4090), (90, 4000)])
+@pytest.mark.parametrize("motor", ["shoulder_pan", "elbow_flex"])
+def test_a_range_of_which_the_encoder_passed_its_end_is_named_and_never_driven(
+    tmp_path: Path, motor: str, ends: tuple[int, int]
+) -> None:
+    file = write_motors(tmp_path / "one.json", **{motor: dict(zip(("range_min", "range_max"), ends, strict=True))})
+    notes = " ".join(json_of("check", file)["notes"])
+    assert f"{motor} has a range of" in notes and "passed its end" in notes and "lerobot-calibrate again" in notes
+    assert ("Dynamixel" in notes) == (ends == (0, 4095))
+    with pytest.raises(DataError, match=rf"{motor} has a range of .*passed its end"):
+        called("joints", file)
+
+
+def test_sound_ranges_are_not_named_and_stay_within_the_model(tmp_path: Path) -> None:
+    """Of 200 files homed within 20 deg of the middle, with ranges up to 40 deg longer than the model's, none."""
+    random = np.random.default_rng(0)
+    for _ in range(200):
+        middle, half = 2047 + random.uniform(-20, 20) * 4096 / 360, random.uniform(45, 120) * 4096 / 360
+        motor = Motor("q", 1, 0, 0, round(middle - half), round(middle + half))
+        assert not motor.is_beyond(None) and not motor.is_beyond(2 * motor.half_range_deg - 40)
+    config, joints = limited_arm(tmp_path, -1.5, 1.5)
+    file = swept(tmp_path, joints, 800, 3300)
+    assert not json_of("check", file, "--arm", config)["notes"]
+    sections = yaml.safe_load(called("joints", file, "--arm", config))
+    assert sections["plan"]["limits"][joints[0]] == ["-85.9 deg", "85.9 deg"]
+    assert sections["bench"]["device"]["joints"][f"arm.{joints[0]}"]["range_deg"] == [-109.8, 109.8]
+
+
+def test_a_whole_turn_is_sound_where_the_joint_turns_freely(tmp_path: Path) -> None:
+    config, joints = limited_arm(tmp_path, 0, 0, "continuous")
+    file = swept(tmp_path, joints, 0, 4095)
+    assert not json_of("check", file, "--arm", config)["notes"]
+    device = yaml.safe_load(called("joints", file, "--arm", config))["bench"]["device"]
+    chosen = discover().find("device", device.pop("type")).load().Settings.model_validate(device)
+    drivable(chosen.chosen(joints).values())
+    assert not json_of("check", write_motors(tmp_path / "two.json"))["notes"]  # its wrist_roll is a whole turn
+
+
+def test_what_joints_writes_is_planned_and_accepted_by_acquire(tmp_path: Path) -> None:
+    """As it stands without a word; limits beyond the model's are told by both, however quiet they are to be."""
+    urdf, invoke = CONFIGS.parent / "ball" / "arm7.urdf", CliRunner().invoke
+    joints = re.findall(r'<joint name="([^"]+)" type="revolute"', urdf.read_text())
+    file, last = swept(tmp_path, joints, 800, 3300), joints[-1]
+    (tmp_path / "arm.urdf").write_bytes(urdf.read_bytes())
+    arm, tracker = {"model": {"type": "urdf", "path": "arm.urdf"}}, {"type": "tip_position", "noise_mm": 0.5}
+    (tmp_path / "arm.yaml").write_text(yaml.safe_dump({"arms": {"arm": arm}, "measurements": {"tracker": tracker}}))
+    entries = json.loads(file.read_text())
+    entries["wrist_roll"] = {**entries.pop(last), "range_min": 0, "range_max": 4095}
     file.write_text(json.dumps(entries))
-    notes = " ".join(json_of("check", file, "--arm", tmp_path / "arm.yaml")["notes"])
-    assert f"{name} has a range of 105 deg, and the joint {name} one of 138 deg" in notes and "off by 16 deg" in notes
-    values = yaml.safe_load(called("joints", file, "--arm", tmp_path / "arm.yaml"))["parameters"]["values"]
-    assert values["arm.zeros.offset1"] == "11.5 deg"
+    sections = yaml.safe_load(called("joints", file, "--arm", tmp_path / "arm.yaml", "--joint", f"wrist_roll={last}"))
+    sections["arms"] = {"arm": {"effects": {"zeros": {"type": "servo_map", "gains": "one"}}}}
+    sections["bench"] |= {"tracker": {"type": "dtrack", "port": 5000}, "bodies": {"base": "1", "tool": "2"}}
+    sections["parameters"]["free"] = ["arm.zeros.offset*"]
+    config, plan = tmp_path / "bench.yaml", str(tmp_path / "plan.csv")
+    quick = ["--set", "evaluator=interpreted", "--set", "plan.count=60", "--set", "plan.starts=1"]
+
+    def told() -> list[str]:
+        config.write_text(yaml.safe_dump({"extends": "arm.yaml", **sections}))
+        planned = invoke(cli, ["plan", str(config), "--poses", "6", "--out", plan, "-q", *quick])
+        driven = invoke(cli, ["acquire", str(config), "--plan", plan, "--dry-run", "-q"])
+        assert [planned.exit_code, driven.exit_code] == [0, 0], planned.output + driven.output
+        return [planned.output, driven.output]
+
+    assert told() == ["", ""]
+    sections["plan"]["limits"][joints[1]] = ["-168 deg", "100 deg"]
+    sections["bench"]["device"]["joints"][f"arm.{joints[1]}"] |= {"zero_count": 2048, "range_deg": [-168, 168]}
+    sections["bench"]["acquisition"] = {"limits": {last: ["-180 deg", "180 deg"]}}
+    by_plan, by_acquire = told()
+    text = f"limits of {joints[1]}, -168 to 100 deg, go beyond those of the arm's model, -114.6 to 114.6 deg"
+    assert text in by_plan and text in by_acquire
+    assert f"limits of {last}, -180 to 180 deg, go beyond those of the arm's model, -166.2 to 166.2" in by_acquire
 
 
 @pytest.mark.slow

@@ -54,6 +54,14 @@ def test_angles_out_of_range_are_refused(degrees):
         joint().count(math.radians(degrees))
 
 
+@pytest.mark.parametrize("zero", [2047, 2048])
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_whole_turn_can_be_driven(zero, direction):
+    whole = joint(zero_count=zero, range_deg=[-180, 180], direction=direction)
+    drivable([whole])
+    assert whole.count_range == (0, 4095) and {whole.count(-math.pi), whole.count(math.pi)} <= {0, 4095}
+
+
 def test_a_range_over_the_seam_cannot_be_driven():
     drivable([joint()])
     with pytest.raises(ValueError, match=r"counts -937 to 1337, expected 0 to 4095.*homing offsets"):
