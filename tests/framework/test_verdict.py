@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.cli.main import cli
-from armcal.diagnose.noise_findings import outlier_findings, suspicious_in_short
+from armcal.diagnose.noise_findings import outlier_findings, suspicious_in_short, suspicious_records
 from armcal.diagnose.verdict import _good_for
 from armcal.estimate.estimator import estimate
 from armcal.estimate.identifiability import POOR_CONDITION, analyse
@@ -119,9 +119,21 @@ def test_gross_errors_are_counted(tmp_path: Path) -> None:
 
     verdict = judged("validation.holdout=0", data=disturbed(tmp_path, spoil))["verdict"]
     assert any(
-        "five robust deviations of the training errors: 3 records, the worst" in f["text"] for f in verdict["findings"]
+        "3 training records lie farther from the fit than noise allows, the worst" in f["text"]
+        for f in verdict["findings"]
     )
     assert "3 of 200 training records are suspicious, by id: " in verdict["paragraph"]
+
+
+@pytest.mark.parametrize("count", [12, 20, 100, 300])
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_noise_alone_is_seldom_a_large_error_of_ranges_as_of_positions(rows: int, count: int) -> None:
+    """1 % of recordings is stated: of 1,000, 10 +- 3.1. A record that is off by twenty deviations mostly is one."""
+    drawn = np.linalg.norm(np.random.default_rng(rows).normal(size=(1000, count, rows)), axis=2)
+    alarms = sum(bool(suspicious_records(errors, rows, [""] * count, None)) for errors in drawn)
+    assert alarms <= 22
+    drawn[:, 7] = 20.0
+    assert sum("7" in suspicious_records(errors, rows, [*map(str, range(count))], None) for errors in drawn) > 950
 
 
 def test_an_id_does_not_read_as_a_number_of_records_and_many_suspects_are_none() -> None:

@@ -46,7 +46,7 @@ class PriorsAlone:
 class Evidence:
     """All of it; what was not looked at, or is not known, is None.
 
-    ``unit`` is that of all errors, mm or mrad; ``name`` what they are errors of.
+    ``unit`` is that of all errors, mm or mrad; ``name`` what they are errors of; ``rows`` how many numbers each is of.
     """
 
     structure: ResidualStructure | None = None
@@ -59,6 +59,7 @@ class Evidence:
     name: str = "Tip"
     rounding: Rounding | None = None
     elsewhere: Elsewhere | None = None
+    rows: int = 3
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json."""

@@ -10,7 +10,7 @@ from armcal.base.domains import Semidefinite, symmetric
 from armcal.base.parameters import ParameterBlock
 from armcal.base.units import digits, readable
 from armcal.diagnose.evidence import PriorsAlone
-from armcal.diagnose.large_errors import MEDIANS, LargeErrors
+from armcal.diagnose.large_errors import BY_CHANCE, LargeErrors
 from armcal.diagnose.noise_findings import Finding, Grade, first_few
 from armcal.diagnose.predictable import FEWEST_POSES, MOST_OF_MEDIAN, Predictable
 from armcal.diagnose.predictable import LEVEL as PREDICTED_LEVEL
@@ -295,7 +295,11 @@ def large_error_findings(large_errors: LargeErrors | None, unit: str = _MM) -> l
     """Records beyond the limit, each with what is unusual about it."""
     if large_errors is None:
         return []
-    limit = "validation.limit_mm" if large_errors.configured else f"{MEDIANS:g} times the median"
+    limit = (
+        "validation.limit_mm"
+        if large_errors.configured
+        else f"noise of their median size, {100 * BY_CHANCE:g} % over all"
+    )
     test = f"errors of {large_errors.judged} records by fits that did not see them, limit {limit}"
     if not large_errors.beyond:
         return [Finding("good", f"No judged record has an error above {readable(large_errors.limit_mm)} {unit}.", test)]

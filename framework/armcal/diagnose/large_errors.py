@@ -4,19 +4,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import betainc
+from scipy.special import betainc, fdtri, gammaincinv
 
 from armcal.arm.assembly import shown_joint
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.units import digits, display_unit, to_unit
 from armcal.estimate.estimator import Estimate
+from armcal.estimate.validation import error_rows
 from armcal.problem.motion import Motion
 from armcal.problem.problem import FactorRecords, Problem
 
-MEDIANS = 3.0
-"""The limit where none is configured, in medians of the judged errors: of three equal normal coordinates one record
-in several thousand lies beyond it."""
+BY_CHANCE = 0.01
+"""Of recordings in which noise alone puts any record beyond the limit, where none is configured."""
+_EFFICIENCY = 0.37
+"""Of a median as a measure of spread, against all numbers."""
 UNUSUAL = 0.95
 """What is above this share of all records is unusual."""
 MOST_EXPLAINED = 50
@@ -48,7 +50,7 @@ class LargeErrors:
 
     Attributes:
         limit_mm: the limit.
-        configured: whether it is a setting; else it is ``MEDIANS`` medians.
+        configured: whether it is a setting; else it is ``noise_limit``.
         judged: how many records were judged.
         beyond: how many lie beyond.
         explained: these, with reasons.
@@ -76,6 +78,16 @@ class Judged:
     position: Indices
 
 
+def noise_limit(errors: Array, rows: int) -> float:
+    """Beyond what equal normal noise seldom (``BY_CHANCE``) puts any of these errors, each of so many numbers.
+
+    Its size is known from their median; a range is seldom off by so little as a position is, so its medians count more.
+    """
+    numbers = len(errors) * rows
+    medians = fdtri(rows, _EFFICIENCY * numbers, 1 - BY_CHANCE / len(errors)) * rows / (2 * gammaincinv(rows / 2, 0.5))
+    return float(np.sqrt(medians) * np.median(errors))
+
+
 def large_errors(
     problem: Problem,
     records: Sequence[FactorRecords],
@@ -90,7 +102,7 @@ def large_errors(
     known = np.isfinite(errors)
     if not known.any():
         return None
-    limit = MEDIANS * float(np.median(errors[known])) if limit_mm is None else limit_mm
+    limit = noise_limit(errors[known], error_rows(problem, records)) if limit_mm is None else limit_mm
     beyond = np.flatnonzero(known & (errors > limit))
     beyond = beyond[np.argsort(-errors[beyond], kind="stable")]
     explained: tuple[Miss, ...] = ()

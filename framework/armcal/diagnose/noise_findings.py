@@ -7,15 +7,15 @@ from typing import Literal
 import numpy as np
 
 from armcal.base.arrays import Array
+from armcal.diagnose.large_errors import BY_CHANCE, noise_limit
 from armcal.estimate.variance import VarianceComponents
 from armcal.estimate.weighing import WeighedFit
 
 Grade = Literal["good", "note", "warning", "bad"]
 MOST_LISTED = 10
-DEVIATIONS = 5.0
 MOST_SUSPICIOUS = 0.2
 """Of the training records; more of them are no outliers."""
-_SMALLEST_SPREAD_MM = 1e-6
+_SMALLEST_MM = 5e-6
 _MOST_NAMED = 5
 _TOO_MANY = "their noise is larger than the others', or the model lacks something where they are"
 _SHOWN = {"rad": (180 / np.pi, " deg"), "m": (1000.0, " mm")}
@@ -62,26 +62,25 @@ def suspect_findings(fitted: WeighedFit, ids: Sequence[str]) -> list[Finding]:
     return findings
 
 
-def suspicious_records(errors_mm: Array, ids: Sequence[str], fitted: WeighedFit | None) -> list[str]:
-    """Ids of training records beyond their limit, the farthest first."""
+def suspicious_records(errors_mm: Array, rows: int, ids: Sequence[str], fitted: WeighedFit | None) -> list[str]:
+    """Ids of training records beyond their limit, the farthest first; each error is of so many numbers."""
     if fitted is not None and fitted.loss != "none":
         return list(dict.fromkeys(ids[suspect.record] for suspect in fitted.suspects))
-    middle = float(np.median(errors_mm))
-    spread = 1.4826 * float(np.median(np.abs(errors_mm - middle)))
-    beyond = np.flatnonzero(errors_mm > middle + DEVIATIONS * max(spread, _SMALLEST_SPREAD_MM))
+    beyond = np.flatnonzero(errors_mm > max(noise_limit(errors_mm, rows), _SMALLEST_MM))
     return [ids[i] for i in beyond[np.argsort(-errors_mm[beyond], kind="stable")]]
 
 
 def outlier_findings(suspicious: Sequence[str], ids: Sequence[str], fitted: WeighedFit | None) -> list[Finding]:
-    """Records beyond their limits if the loss sought them, else beyond five robust deviations of the errors."""
+    """Records beyond their limits if the loss sought them, else beyond what noise does to their errors."""
     if fitted is not None and fitted.loss != "none":
         action = "Look at them in residuals.csv, and measure them again."
         return [replace(f, action=action) if f.grade == "warning" else f for f in suspect_findings(fitted, ids)]
     if not suspicious:
         return []
     listed = ", ".join(suspicious[:_MOST_NAMED])
-    text = f"Beyond five robust deviations of the training errors: {len(suspicious)} records, the worst {listed}."
-    test = "median and median absolute deviation"
+    count = "1 training record lies" if len(suspicious) == 1 else f"{len(suspicious)} training records lie"
+    text = f"{count} farther from the fit than noise allows, the worst {listed}."
+    test = f"noise of their median size, {100 * BY_CHANCE:g} % over all"
     if len(suspicious) > MOST_SUSPICIOUS * len(ids):
         action = "Look in residuals.csv at what they have in common, and state their noise if it is known."
         return [Finding("warning", f"{text} So many are no outliers: {_TOO_MANY}.", test, action)]

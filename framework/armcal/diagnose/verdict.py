@@ -94,7 +94,7 @@ def judge(
     seen = evidence or Evidence()
     determined = determined_finding(estimate, seen.priors_alone, np.median(judged_mm) if len(judged_mm) else None)
     own, kept = [ids[i] for i in train], train if fitted is None else train[fitted.kept]
-    suspicious = suspicious_records(errors_mm[train], own, fitted)
+    suspicious = suspicious_records(errors_mm[train], seen.rows, own, fitted)
     noise = component_findings(fitted.components) if fitted and fitted.components else [_size(estimate, seen)]
     findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
     findings += [*shift_findings(estimate), *noise, *_freedom(estimate), *_causes(seen)]

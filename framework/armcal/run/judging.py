@@ -38,7 +38,7 @@ from armcal.diagnose.unseen import (
 from armcal.diagnose.verdict import Verdict, judge
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.start import certificates
-from armcal.estimate.validation import error_name, error_unit, record_errors
+from armcal.estimate.validation import error_name, error_rows, error_unit, record_errors
 from armcal.measure.measurement import StatesAccuracy
 from armcal.planning.candidates import deviations as deviations_of
 from armcal.planning.suggestion import Suggestion, suggest
@@ -180,7 +180,19 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     rounded = rounding(few, declared, estimate, own[0], own[1], seen.share if seen else 0.0)
     new = predictor(problem, run.fitted).new_recording(run.records, np.flatnonzero(np.isfinite(judged_mm)))
     away = elsewhere(problem, estimate, unseen_poses(training, motion.channels))
-    return Evidence(left, missed, alone, error_unit(problem), new, hidden, held, error_name(problem), rounded, away)
+    return Evidence(
+        left,
+        missed,
+        alone,
+        error_unit(problem),
+        new,
+        hidden,
+        held,
+        error_name(problem),
+        rounded,
+        away,
+        error_rows(problem, run.records),
+    )
 
 
 def _gross(

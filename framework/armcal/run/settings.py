@@ -24,7 +24,7 @@ class ValidationSettings(Settings):
     ``holdout`` is a fraction chosen by ``seed``; ``train_ids`` a CSV of record ids to train on (the rest judge);
     ``train_groups`` are the values of the text column ``group_by`` to train on (by default the first label of a
     measurement's groups); ``folds`` cross-validates over the training records. Judged records whose error is above
-    ``limit`` are listed and explained; without one, those above three times the median error.
+    ``limit`` are listed and explained; without one, those beyond what noise allows.
     """
 
     holdout: float = 0.0

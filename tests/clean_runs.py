@@ -1,0 +1,221 @@
+"""Sound recordings of six kinds of instrument, and what the verdict says of them: its false alarms.
+
+Each run draws a true arm and a recording of 20 to 300 records with the stated noise, and calibrates as a user would.
+Prints a table: ``python -m tests.clean_runs [RUNS] [KIND ...] [--first SEED] [--json FILE]``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from armcal.base.parameters import Parameters
+from armcal.base.units import shown_unit
+from armcal.cli.main import cli
+from armcal.config.yaml_source import load_config
+from armcal.errors import ArmcalError
+from armcal.estimate.simulation import SimulationRequest
+from armcal.measure.csv_writer import write_csv
+from armcal.measure.reader import requested_channels
+from armcal.plugin_files import use_plugins
+from armcal.run.experiment import Experiment
+from armcal.run.pipeline import calibrate
+from click.testing import CliRunner
+
+CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+FEWEST, MOST = 20, 300
+LENGTH_SD_M, ANGLE_SD_RAD = 0.001, 0.003
+"""How far a true arm is from its drawing."""
+INDUSTRIAL = """joint,alpha_deg,a_mm,theta_deg,d_mm
+q1,90,0,0,128
+q2,0,-612,0,0
+q3,0,-572,0,0
+q4,90,0,0,164
+q5,-90,0,0,116
+q6,0,0,0,92
+"""
+PLACED = {
+    **{"arm.mdh.base_x": 0.3, "arm.mdh.base_y": -0.2, "arm.mdh.base_z": 0.1, "arm.mdh.base_rz": 0.2},
+    **{"tracker.target_x": 0.06, "tracker.target_y": -0.04, "tracker.target_z": 0.03},
+}
+"""What no drawing states: where the arm stands, and where the target sits on the tool (m, rad)."""
+_SPAN = {f"q{i}": [-120, 120] for i in range(1, 7)}
+_RANDOM = {
+    "type": "elastic_arm",
+    "truth": "clean_truth.yaml",
+    "poses": {"kind": "random", "count": 1, "levels_deg": _SPAN},
+}
+
+
+@dataclass(frozen=True)
+class Kind:
+    """An instrument: ``config`` writes its configuration, ``counted`` overrides it for so many records."""
+
+    config: Callable[[Path], Path]
+    counted: Callable[[int], str] = "simulation.poses.count={}".format
+    fixed: Path | None = None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run made of a sound recording: ``grade`` is the worst finding's, or ``refused``."""
+
+    kind: str
+    seed: int
+    records: int
+    grade: str
+    said: tuple[str, ...]
+    seconds: float
+
+
+def _new(*words: str | Path) -> None:
+    made = CliRunner().invoke(cli, ["new", *map(str, words)])
+    assert made.exit_code == 0, made.output
+
+
+def _written(path: Path, content: Mapping[str, Any]) -> Path:
+    path.write_text(yaml.safe_dump({"evaluator": "interpreted", **content}, sort_keys=False), encoding="utf-8")
+    return path
+
+
+def _position(folder: Path) -> Path:
+    """As ``armcal new robot`` begins it from a table of lengths and angles; the tracker's noise is its data sheet's."""
+    (folder / "dh.csv").write_text(INDUSTRIAL, encoding="utf-8")
+    _new("robot", "arm", "--dh", folder / "dh.csv", "--convention", "standard", "--up", "z", "--out", folder / "arm")
+    return _written(
+        folder / "arm" / "clean.yaml",
+        {"extends": "calibrate.yaml", "noise": {"estimate": False}, "simulation": _RANDOM},
+    )
+
+
+def _pose(folder: Path) -> Path:
+    path = _position(folder)
+    arm = yaml.safe_load((folder / "arm" / "arm.yaml").read_text(encoding="utf-8"))
+    arm["measurements"]["tracker"] |= {"type": "tip_pose", "orientation_noise_deg": 0.02}
+    (folder / "arm" / "arm.yaml").write_text(yaml.safe_dump(arm), encoding="utf-8")
+    free = [block.name for block in Experiment.load(path).parameters.free]
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    return _written(path, {**content, "parameters": {"free": [*free, "tracker.target_rotation"]}})
+
+
+def _range(folder: Path) -> Path:
+    """One draw wire from a place that is roughly known, on an arm that stands where its drawing has it."""
+    _new("plugin", "draw-wire", "--kind", "measurement", "--out", folder / "wire")
+    use_plugins(folder / "wire" / "draw_wire.py")
+    table = [line.split(",") for line in INDUSTRIAL.splitlines()]
+    rows = [dict(zip(table[0][1:], map(float, row[1:]), strict=True)) for row in table[1:]]
+    return _written(
+        folder / "range.yaml",
+        {
+            "arms": {"arm": {"model": {"type": "mdh", "convention": "standard", "rows": rows}}},
+            "measurements": {"wire": {"type": "draw_wire", "noise_mm": 0.2, "anchor_mm": [900, 300, -400]}},
+            "parameters": {
+                "free": ["arm.mdh.theta[2-4]", "arm.mdh.a[23]", "wire.anchor_[xyz]"],
+                "priors": {"arm.mdh.theta*": "2 deg", "arm.mdh.a*": "10 mm", "wire.anchor_*": "10 mm"},
+            },
+            "data": {"type": "csv", "path": "data.csv"},
+            "validation": {"folds": 5},
+            "simulation": _RANDOM,
+        },
+    )
+
+
+def _shipped(config: Path) -> Callable[[Path], Path]:
+    """A configuration of the demos, with truths of its own."""
+
+    def written(folder: Path) -> Path:
+        shutil.copytree(config.parent, folder / config.parent.name)
+        simulation = {**load_config(config).data["simulation"], "truth": "clean_truth.yaml"}
+        return _written(folder / config.parent.name / "clean.yaml", {"extends": config.name, "simulation": simulation})
+
+    return written
+
+
+KINDS: Mapping[str, Kind] = {
+    "range": Kind(_range),
+    "position": Kind(_position),
+    "pose": Kind(_pose),
+    "pixels": Kind(_shipped(CONFIGS / "camera" / "demo.yaml"), fixed=CONFIGS / "camera" / "truth.yaml"),
+    "sockets": Kind(
+        _shipped(CONFIGS / "ball" / "demo.yaml"),
+        lambda count: f"simulation.count={max(6, count // 8)}",
+        CONFIGS / "ball" / "truth.yaml",
+    ),
+    "two arms": Kind(_shipped(CONFIGS / "frida" / "dual_known_clamp.yaml"), "simulation.count={}".format),
+}
+
+
+def _truth(parameters: Parameters, fixed: Path | None, random: np.random.Generator) -> dict[str, str]:
+    """True values: each free number off its drawing by chance, what ``fixed`` says of anything else as it is there."""
+    values: dict[str, str] = {} if fixed is None else dict(load_config(fixed).data)
+    for block in parameters.free:
+        if block.size > 1 or block.name in PLACED or block.unit not in ("m", "rad"):
+            continue
+        off = random.normal() * (LENGTH_SD_M if block.unit == "m" else ANGLE_SD_RAD)
+        if not (fixed is not None and block.name.startswith("camera.")):
+            values[block.name] = f"{(block.nominal[0] + off) * 1000:.6f} m{block.unit}"
+    placed = {name: shift for name, shift in PLACED.items() if name in parameters.names and parameters[name].free}
+    units = {name: shown_unit(parameters[name].unit) for name in placed}
+    return {**values, **{name: f"{units[name][0] * shift:.6f} {units[name][1]}" for name, shift in placed.items()}}
+
+
+def run(kind: str, seed: int, config: Path) -> Outcome:
+    """One recording, read from its CSV file and calibrated as ``config`` of this kind says."""
+    random, stated = np.random.default_rng([seed, *kind.encode()]), KINDS[kind]
+    count = int(np.exp(random.uniform(np.log(FEWEST), np.log(MOST))))
+    experiment = Experiment.load(config, [stated.counted(count), f"simulation.seed={seed}"])
+    truth = _truth(experiment.parameters, stated.fixed, random)
+    (config.parent / "clean_truth.yaml").write_text(yaml.safe_dump(truth), encoding="utf-8")
+    system, began = experiment.system, time.process_time()
+    request = SimulationRequest(system.arms, system.measurements, experiment.parameters, system.environment)
+    dataset = experiment.simulator().simulate(request)
+    data = config.parent / "clean.csv"
+    write_csv(data, dataset, list(requested_channels(system.arms, system.measurements, measured=True)))
+    try:
+        found = calibrate(Experiment.load(config, (), data)).verdict.findings
+    except ArmcalError as fault:
+        return Outcome(kind, seed, len(dataset), "refused", (str(fault),), time.process_time() - began)
+    told = [finding for finding in found if finding.grade in ("bad", "warning")]
+    grade = told[0].grade if told else "good"
+    said = tuple(f"{finding.grade}: {finding.text} [{finding.test}]" for finding in told)
+    return Outcome(kind, seed, len(dataset), grade, said, time.process_time() - began)
+
+
+def main() -> None:
+    """Print a table of grades by kind, and of the checks that warned."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("runs", nargs="?", type=int, default=200)
+    parser.add_argument("kinds", nargs="*", default=[*KINDS])
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--json", type=Path)
+    words = parser.parse_args()
+    outcomes: list[Outcome] = []
+    for kind in words.kinds:
+        with tempfile.TemporaryDirectory() as place:
+            config = KINDS[kind].config(Path(place))
+            for seed in range(words.first, words.first + words.runs):
+                outcomes.append(run(kind, seed, config))
+                if words.json:
+                    words.json.write_text(json.dumps([asdict(outcome) for outcome in outcomes]), encoding="utf-8")
+        own = [outcome for outcome in outcomes if outcome.kind == kind]
+        seconds = sum(outcome.seconds for outcome in own)
+        print(f"{kind:10} {dict(Counter(outcome.grade for outcome in own))} of {len(own)}, {seconds:.0f} s", flush=True)
+        said = Counter(
+            text[:90] for outcome in own for text in {"".join(c for c in s if not c.isdigit()) for s in outcome.said}
+        )
+        for text, count in said.most_common(12):
+            print(f"    {count:4} {text}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
