@@ -121,7 +121,7 @@ def _range(folder: Path) -> Path:
             "measurements": {"wire": {"type": "draw_wire", "noise_mm": 0.2, "anchor_mm": [900, 300, -400]}},
             "parameters": {
                 "free": ["arm.mdh.theta[2-4]", "arm.mdh.a[23]", "wire.anchor_[xyz]"],
-                "priors": {"arm.mdh.theta*": "2 deg", "arm.mdh.a*": "10 mm", "wire.anchor_*": "10 mm"},
+                "priors": {"arm.mdh.theta*": "2 deg", "arm.mdh.a[23]": "10 mm", "wire.anchor_*": "10 mm"},
             },
             "data": {"type": "csv", "path": "data.csv"},
             "validation": {"folds": 5},
