@@ -229,7 +229,7 @@ def command_rows(arm: ServedArm, commands: Commands, units: Units) -> list[Comma
             "error_deg": math.degrees(float(commands.turns[i])),
             "nearest_mm": float(commands.bounds[i]) * 1000,
             "approach": [round(side) for side in commands.approach[i].tolist()],
-            "tool": _tool(commands.base_T_tool[i]),
+            "tool": _tool(commands.base_T_point[i]),
         }
         for i in range(len(commands))
     ]

@@ -389,6 +389,11 @@ def test_the_nearest_commands_cannot_be_bettered(count: int) -> None:
         assert mine <= 1.001 * improved(found, cost, targets.positions[i], starts)
 
 
+def test_a_redundancy_that_is_none_is_refused() -> None:
+    with pytest.raises(ValueError, match="found the redundancy 'quickest', expected one of nearest, stiffest"):
+        Options(redundancy="quickest")  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("redundancy", ["stiffest", "least_sag", "coolest"])
 @pytest.mark.quick("least_sag")
 def test_what_redundancy_makes_small_cannot_be_made_much_smaller(redundancy: str) -> None:

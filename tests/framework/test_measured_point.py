@@ -13,6 +13,7 @@ import yaml
 from armcal.base.dataset import Dataset
 from armcal.calibration.measured_point import measured_point
 from armcal.cli.main import cli
+from armcal.errors import ConfigError
 from armcal.plugins import discover
 from armcal.run.compensate import Bench, commanded
 from armcal.run.correction_table import over_grid
@@ -128,6 +129,27 @@ def test_where_nobody_says_which_point_arrives_the_miss_is_named(tmp_path: Path)
     assert content["point"] == "tool" and np.linalg.norm(content["target_mm"]) == pytest.approx(1000 * known.distance)
     _, quiet = missed(tmp_path, found, "--point", "tool")
     assert "--point target" not in quiet.output
+
+
+@pytest.mark.parametrize("point", ["tcp", None, 42, "Target", ["tool"]])
+def test_a_point_that_is_none_is_refused_with_those_that_are(point: object) -> None:
+    with pytest.raises(ConfigError, match=r"found the point .*Expected one of 'tool', 'target'"):
+        calibration("three", OFF_MM).compensate(np.array([[0.3, 0.0, 0.2]]), point=point)  # type: ignore[arg-type]
+
+
+def test_commands_say_where_the_tool_is_whichever_point_arrives() -> None:
+    off = calibration("three", OFF_MM)
+    known = measured_point(off.system, "arm", off.parameters)
+    assert known is not None and known.distance > 0.02
+    start = np.array([0.2, 0.4, -0.3])
+    for point in ("tool", "target"):
+        compensator = off.compensator(point=point)
+        goal = compensator.forward(start[None])[:, :3, 3]
+        commands = compensator.solve(compensator.targets(goal), start)
+        assert commands.reached.all() and commands.base_T_point[:, :3, 3] == pytest.approx(goal, abs=1e-9)
+        assert commands.base_T_tool == pytest.approx(off.forward(commands.joint_angles), abs=1e-9)
+        away = np.linalg.norm(commands.base_T_tool[0, :3, 3] - commands.base_T_point[0, :3, 3])
+        assert away == pytest.approx(known.distance if point == "target" else 0.0, abs=1e-9)
 
 
 @pytest.mark.slow

@@ -221,6 +221,7 @@ def commands(counts: Any = None) -> Commands:
         joint_angles=np.array([[0.5, 0.02]]),
         counts=counts,
         base_T_tool=np.eye(4)[None],
+        base_T_point=np.eye(4)[None],
         distances=one + 1e-3,
         turns=one + np.pi / 180,
         reached=one > -1,

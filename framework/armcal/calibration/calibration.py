@@ -271,7 +271,7 @@ class Calibration:
 
         Raises:
             ValueError: no such arm.
-            ConfigError: no measurement reads the target.
+            ConfigError: there is no such point, or no measurement reads the target.
         """
         system, name = self.system, self._named(arm)
         tool_expression = arm_expression(system.arms[name], self.parameters, system.environment, conditions)
@@ -292,7 +292,7 @@ class Calibration:
 
         Raises:
             ValueError: no such arm, or limits of a joint that it does not have.
-            ConfigError: no measurement reads the target that shall arrive.
+            ConfigError: there is no such point, or no measurement reads the target that shall arrive.
         """
         return Compensator(self.expression(arm, conditions, point), self.parameters, options, **parts)
 
@@ -316,7 +316,7 @@ class Calibration:
         Raises:
             ValueError: no such arm, limits of a joint that it does not have, or arrays of other shapes.
             DataError: the arm is elastic and nothing says what hangs on the tool.
-            ConfigError: no measurement reads the target that shall arrive.
+            ConfigError: there is no such point, or no measurement reads the target that shall arrive.
         """
         self.require_payload(recorded.get("payload") is not None)
         compensator = self.compensator(arm, options, tuple(recorded.get("conditions") or ()), point)

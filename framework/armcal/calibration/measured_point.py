@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import casadi as ca
 import numpy as np
@@ -77,8 +77,12 @@ def pointed(expression: ToolExpression, point: Point, system: System, parameters
     """The arm with the measured target where the tool's frame is, if that is the point that arrives.
 
     Raises:
-        ConfigError: no measurement reads it.
+        ConfigError: there is no such point, or no measurement reads it.
     """
+    if point not in get_args(Point):
+        raise ConfigError(
+            f"found the point {point!r}.", hint=f"Expected one of {', '.join(map(repr, get_args(Point)))}."
+        )
     if point == "tool":
         return expression
     target = measured_point(system, expression.name, parameters)

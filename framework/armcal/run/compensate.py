@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,7 +39,6 @@ class Assessed:
         commands: found.
         nominal_distances: how far from its target the real arm is with the nominal arm's command (N; m); nan where the
             nominal arm has none.
-        tools: where the tool's frame is at the commands (N x 4 x 4), whichever point of it was brought to the targets.
         nominal_T_tool: where the nominal arm's would be (N x 4 x 4): what to command to a controller that takes the
             nominal arm for the real one.
         radii: of the ball about the expected place that holds a measurement of it with 95 % (N; m); None if unknown,
@@ -49,7 +47,6 @@ class Assessed:
 
     commands: Commands
     nominal_distances: Array
-    tools: Array
     nominal_T_tool: Array
     radii: Array | None
 
@@ -147,16 +144,9 @@ def assess(bench: Bench, compensator: Compensator, targets: Targets, commands: C
     return Assessed(
         commands=commands,
         nominal_distances=np.where(thought.reached & reached.settled, away, np.nan),
-        tools=_of_tool(compensator, commands.base_T_tool),
-        nominal_T_tool=_of_tool(nominal, nominal.forward(commands.joint_angles)),
+        nominal_T_tool=nominal.of_tool(nominal.forward(commands.joint_angles)),
         radii=_radii(bench.calibration, compensator, targets, commands) if bench.is_judged else None,
     )
-
-
-def _of_tool(compensator: Compensator, poses: Array) -> Array:
-    """base_T_tool (N x 4 x 4) for the poses of the point that the compensator brings to targets."""
-    tool_T_point = np.asarray(ca.evalf(ca.densify(compensator.expression.tool_T_point.matrix())).full())
-    return np.asarray(poses @ np.linalg.inv(tool_T_point))
 
 
 def commanded(compensator: Compensator, targets: Targets, commands: Commands) -> Dataset:
@@ -240,7 +230,7 @@ def _columns(compensator: Compensator, assessed: Assessed) -> Iterator[tuple[str
                 yield f"{joint}_counts", tuple(str(count) for count in commands.counts[:, i])
                 yield f"{joint}_pulse_us", short_texts(1e6 * tick * commands.counts[:, i])
     yield "reached", tuple(_ENGLISH[bool(reached)] for reached in commands.reached)
-    yield from _pose("tool", assessed.tools)
+    yield from _pose("tool", assessed.commands.base_T_tool)
     yield "error_mm", short_texts(1000 * commands.distances)
     yield "error_deg", short_texts(np.asarray(np.degrees(commands.turns)))
     if assessed.radii is not None:

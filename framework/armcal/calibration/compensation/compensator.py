@@ -11,6 +11,7 @@ import numpy as np
 from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.arrays import Array, Mask
 from armcal.base.parameters import Parameters
+from armcal.base.se3 import evaluated
 from armcal.calibration.compensation.counts import Rounding, ServoCounts
 from armcal.calibration.compensation.finder import Allowed, Finder, Seeds
 from armcal.calibration.compensation.path import PathFinder, with_sides
@@ -171,7 +172,7 @@ class Compensator:
         approach: Array | None = None,
         conditions: Mapping[str, Array | float] | None = None,
     ) -> Array:
-        """base_T_tool (N x 4 x 4) at commands (N x n) as they are, in elastic equilibrium.
+        """Where the point that is brought to targets is (N x 4 x 4) at commands (N x n) as they are, in equilibrium.
 
         ``acting`` is LOAD_CHANNELS x N, the calibration's without it; ``approach`` N x n; ``conditions`` as of targets.
 
@@ -190,7 +191,7 @@ class Compensator:
         return self._equilibrium.required(record)
 
     def exact(self, joint_angles: Array, acting: Array) -> Array:
-        """base_T_tool (N x 4 x 4) where joints stand at commands (N x n) to the last digit, as no board sets them.
+        """The same where joints stand at commands (N x n) to the last digit, as no board sets them.
 
         ``acting`` is LOAD_CHANNELS x N.
 
@@ -207,6 +208,10 @@ class Compensator:
         record = self._record(replace(targets, approach=approach.T))
         record[: len(self.joints)] = self._set(joint_angles.T)
         return self._equilibrium(record)
+
+    def of_tool(self, poses: Array) -> Array:
+        """base_T_tool (N x 4 x 4) for poses of the point that is brought to targets (N x 4 x 4)."""
+        return np.asarray(poses @ np.linalg.inv(evaluated(self.expression.tool_T_point.matrix())))
 
     def _commanded(self, given: Array, count: int) -> Array:
         """One row for all, or a row for each, as the searches take it (n x N)."""
@@ -249,11 +254,11 @@ class Compensator:
                 barred = solutions.there & ~self._allowed(record[:joints])
                 solutions.there[barred], solutions.forbidden[barred] = False, True
         standing = self._equilibrium(record, None if counts is not None else solutions.states)
-        tools, had = standing.base_T_tool, solutions.there & standing.settled
+        poses, had = standing.base_T_tool, solutions.there & standing.settled
         bounds = self.reach.bounds(targets.positions)
-        turns = np.zeros(len(tools))
+        turns = np.zeros(len(poses))
         if targets.rotations is not None:
-            turns = np.linalg.norm(turn_between(tools[:, :3, :3], targets.rotations), axis=1)
+            turns = np.linalg.norm(turn_between(poses[:, :3, :3], targets.rotations), axis=1)
         commands = record[:joints]
 
         def position_can_be_had(rows: Rows) -> Mask:
@@ -264,8 +269,9 @@ class Compensator:
             joints=self.joints,
             joint_angles=commands.T.copy(),
             counts=None if counts is None else counts.T.copy(),
-            base_T_tool=tools,
-            distances=np.linalg.norm(tools[:, :3, 3] - targets.positions, axis=1),
+            base_T_tool=self.of_tool(poses),
+            base_T_point=poses,
+            distances=np.linalg.norm(poses[:, :3, 3] - targets.positions, axis=1),
             turns=turns,
             reached=had,
             reasons=reasons,

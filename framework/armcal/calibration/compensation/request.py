@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,9 +73,10 @@ class Commands:
         joint_angles: what to command (N x n; rad, or m on sliding joints); of a target that cannot be reached, the
             nearest that was found.
         counts: what a servo board is told (N x n; 0 of joints without a pulse table); None for an arm without one.
-        base_T_tool: where the calibrated arm then is (N x 4 x 4), quantisation and elasticity included.
-        distances: from there to the target (N; m).
-        turns: from there to the target's rotation (N; rad); zeros where only positions count.
+        base_T_tool: where the calibrated arm's tool then is (N x 4 x 4), quantisation and elasticity included.
+        base_T_point: and the point that is brought to targets: the tool itself, or the target that was measured.
+        distances: from that point to the target (N; m).
+        turns: from its rotation to the target's (N; rad); zeros where only positions count.
         reached: whether the target is reached, up to what the counts leave (N).
         reasons: why not; empty for those that are reached (N).
         bounds: no command brings the arm nearer than this (N; m); zero where nothing is known.
@@ -87,6 +88,7 @@ class Commands:
     joint_angles: Array
     counts: NDArray[np.int64] | None
     base_T_tool: Array
+    base_T_point: Array
     distances: Array
     turns: Array
     reached: Mask
@@ -111,6 +113,9 @@ class Options:
         reach_m: targets of this size count as had (m).
         reach_rad: and of this size of turn (rad).
         seed: of the random starts.
+
+    Raises:
+        ValueError: there is no such redundancy.
     """
 
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -119,6 +124,12 @@ class Options:
     reach_m: float = 1e-9
     reach_rad: float = 1e-8
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.redundancy not in get_args(Redundancy):
+            raise ValueError(
+                f"found the redundancy {self.redundancy!r}, expected one of {', '.join(get_args(Redundancy))}"
+            )
 
 
 def _check(what: str, array: Array, shape: tuple[int, ...]) -> None:
