@@ -8,7 +8,7 @@ from armcal.base.parameters import ParameterBlock
 from armcal.base.poses import point_blocks, point_expression
 from armcal.base.settings import Length, Length3
 from armcal.measure.instrument import Instrument, InstrumentSettings
-from armcal.measure.measurement import Channel
+from armcal.measure.measurement import Channel, Mistake
 from pydantic import field_validator
 
 
@@ -39,6 +39,12 @@ class TipPosition(Instrument):
     def parameters(self) -> tuple[ParameterBlock, ...]:
         """The target on the tool (m)."""
         return point_blocks("target", self.settings.target)
+
+    def mistakes(self) -> tuple[Mistake, ...]:
+        """A target that came loose."""
+        again = "repeat some of the first poses now, fasten the target, and calibrate the records after it apart"
+        own = tuple(block.name for block in self.parameters())
+        return (Mistake("bump", "the target moves on the tool there", again, own, "once"),)
 
     def channels(self) -> tuple[Channel, ...]:
         """Three coordinates."""

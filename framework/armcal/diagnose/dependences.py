@@ -16,6 +16,8 @@ from armcal.arm.loading import SiteLoads
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.units import display_unit, to_unit
+from armcal.diagnose.held import Moves
+from armcal.estimate.freeing import candidates
 from armcal.problem.motion import Motion, recorded_order
 from armcal.problem.problem import Problem
 
@@ -40,7 +42,7 @@ class Dependence:
     """One thing that residuals might depend on.
 
     Attributes:
-        kind: ``offset``, ``order``, ``level``, ``approach``, ``coupling``, ``torque``, ``moment``, ``delay``,
+        kind: ``held``, ``order``, ``level``, ``approach``, ``coupling``, ``torque``, ``moment``, ``delay``,
             ``payload``, ``temperature``; of what is outside of the arm ``step``, ``slip``, ``gravity``, ``load``,
             ``scale``.
         subject: the joint or site, as a user names it; empty where it is none.
@@ -51,6 +53,7 @@ class Dependence:
         columns: raw residual by coefficient, one (n_r x N x k) array a factor.
         labels: what each coefficient is (k), for those that have a unit.
         unit: of the coefficients in SI (``rad``, ``m``, ``rad_per_Nm``; ``1`` for shares); empty if they have none.
+        jumps: whether it is a change at one place of the recording; the same change elsewhere is no other cause.
     """
 
     kind: str
@@ -62,6 +65,7 @@ class Dependence:
     columns: tuple[Array, ...]
     labels: tuple[str, ...] = ()
     unit: str = ""
+    jumps: bool = False
 
 
 @dataclass(frozen=True)
@@ -92,16 +96,10 @@ class Records:
         return tuple(parts)
 
 
-def dependences(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[Dependence]:
+def dependences(problem: Problem, motion: Motion, dataset: Dataset, moves: Moves) -> Iterator[Dependence]:
     """Everything that these records could show; what does not vary is left out."""
     arms, here = problem.blueprint.arms, Records(dataset, motion)
-    still, measure = np.ones((len(dataset), 1)), "any poses show this: free the parameter"
-    words = "a constant shift of what is measured"
-    yield Dependence("offset", "", "", words, "the base's position, if it is free", measure, here.axes(still))
-    for channel in motion.channels:
-        name, _, joint = channel.partition(".")
-        words, along = f"the zero of {joint}", here.along(channel, still)
-        yield Dependence("offset", joint, name, words, f"{words}, if it is free", measure, along)
+    yield from _of_held(problem, moves)
     yield from _of_order(here)
     for name, arm in arms.items():
         loads = motion.loads[name]
@@ -121,6 +119,16 @@ def dependences(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[
             columns = here.axes((feature - feature.mean())[:, None] / feature.std())
             measure = _SECOND_LOAD if channel == "payload" else "repeat some poses cold and warm"
             yield Dependence(channel, "", "", words, effect, measure, columns)
+
+
+def _of_held(problem: Problem, moves: Moves) -> Iterator[Dependence]:
+    """Parameters that the fit held, as ``armcal identify --fixed`` judges them."""
+    for name in candidates(problem.parameters):
+        block, columns = problem.parameters[name], moves[name]
+        words, measure = f"{name}, which is held", "armcal identify --fixed, which judges it on records held out"
+        one = block.domain.dof == 1
+        labels, unit = (("off by",), block.unit) if one else ((), "")
+        yield Dependence("held", name, "", words, f"free {name} (parameters.free)", measure, columns, labels, unit)
 
 
 def _of_order(here: Records) -> Iterator[Dependence]:

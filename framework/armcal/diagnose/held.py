@@ -5,7 +5,7 @@ corners of an image do: the deviation is that of sums over records, each residua
 left of it, and the t-test counts how few records bear it. [Bell2002]
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +20,8 @@ from armcal.estimate.estimator import Estimate
 from armcal.measure.measurement import HasScale, Mistake, NamesMistakes
 from armcal.problem.problem import FactorRecords, Problem
 
+Moves = Mapping[str, tuple[Array, ...]]
+"""How raw residuals move with each increment of a parameter, by its name (n_r x N x k a factor)."""
 MOST_RECORDS = 60
 MISTAKEN = 0.001
 """Level of each parameter that a mistake names."""
@@ -160,6 +162,17 @@ def freed(problem: Problem, names: Sequence[str]) -> Problem:
     pairs = zip(kernels, problem.kernels, strict=True)  # of the points that are looked at, which may be few
     same = (replace(k, factor=replace(k.factor, **{n: getattr(own.factor, n) for n in kept})) for k, own in pairs)
     return replace(problem, parameters=parameters, kernels=tuple(same), blueprint=plan)
+
+
+def moves_of(problem: Problem, values: Array, records: Sequence[FactorRecords], held: Sequence[str]) -> Moves:
+    """Of all free parameters and of held ones."""
+    wider = freed(problem, held)
+    bare = [replace(one, weight=np.sign(one.weight), whitening=None, correlation=None) for one in records]
+    chain, parts = wider.parameters.entries_jacobian(values), []
+    for kernel, block in zip(wider.kernels, wider.jacobians(values, bare), strict=True):
+        noise = np.array(kernel.factor.noise)[:, None, None]
+        parts.append(noise * np.einsum("rvn,vc->rnc", block, chain))
+    return {name: tuple(part[:, :, own] for part in parts) for name, own in wider.parameters.coordinates_of.items()}
 
 
 def contradiction_findings(contradictions: Sequence[Contradiction]) -> list[Finding]:

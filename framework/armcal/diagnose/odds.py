@@ -1,8 +1,9 @@
 """Which of several causes residuals speak for: odds among all that were tried, and something that was not.
 
-A cause is a set of columns; the logarithm of its odds against noise is that of the Schwarz criterion [Schwarz1978].
-A smooth function of the pose, or of time, stands for what is not among the causes, with the odds of its marginal
-likelihood. Several causes at once are judged one by one, each in the presence of the others.
+A cause is a set of columns; the logarithm of its odds against noise is that of the Schwarz criterion [Schwarz1978]. A
+smooth function of the pose, or of time, stands for what is not among the causes, with the odds of its marginal
+likelihood, and is as likely as a cause that leaves more than the declared noise. Several causes at once are judged one
+by one, each in the presence of the others.
 """
 
 from collections.abc import Sequence
@@ -10,16 +11,19 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.special import chdtri
 
 from armcal.base.arrays import Array, Indices
 from armcal.diagnose.dependences import Dependence
 from armcal.diagnose.score_tests import own_basis
 from armcal.diagnose.smooth import CLEAR, IMITATED, Kernels, smooth
 
-UNLISTED = "something smooth in the pose that is none of these"
+UNLISTED = "something that is none of these"
 CHANCE = "nothing: it may be chance"
+NOISE_LEVEL = 0.05
+NEGLIGIBLE = 0.1
+"""Of what causes take up: less than this may be what is not linear in them."""
 CHANGING = "something that changes with time and is none of these"
-_OVER_TIME = frozenset({"order", "step", "slip"})
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,7 @@ class Contest:
         """What stands for one cause: a jump is one wherever it is, a drift of the whole any function of time."""
         names = []
         for cause in self.causes:
-            once = f"{cause.kind} {cause.subject}" if cause.kind in ("step", "slip") else cause.words
+            once = f"{cause.kind} {cause.subject}" if cause.jumps else cause.words
             names.append(CHANGING if cause.kind == "order" and not cause.subject else once)
         return tuple(names)
 
@@ -92,10 +96,13 @@ class Contest:
         for words, kernels in ((UNLISTED, self.pose), (CHANGING, self.time)):
             evidence = independence * smooth(residual, basis, self.by_record, kernels).evidence
             shown[words] = max(shown.get(words, -np.inf), evidence)
-        # What is none of the causes cannot be excluded where what is left follows the pose, or poses were in order.
+        # What is none of the causes cannot be excluded where what is left is far from noise or follows the pose, or
+        # poses were in order.
         after, whole = self.beside([*others, cause])
-        left = smooth(after, whole, self.by_record, self.pose).evidence * independence > CLEAR
-        timely = self.causes[cause].kind in _OVER_TIME
+        beyond = float(after @ after) - chdtri(len(after) - whole.shape[1], NOISE_LEVEL)
+        left = beyond > NEGLIGIBLE * float(residual @ residual - after @ after)
+        left = left or smooth(after, whole, self.by_record, self.pose).evidence * independence > CLEAR
+        timely = self.causes[cause].jumps or self.causes[cause].kind == "order"
         if left or (timely and self.pose.imitate((residual - after)[self.by_record]) > IMITATED):
             shown[UNLISTED] = max(shown[UNLISTED], shown[mine])
         shown[CHANCE] = float(np.log(len(self.causes)))  # nothing is as likely beforehand as all causes together

@@ -7,8 +7,8 @@ import numpy as np
 from armcal.arm.assembly import shown_joint
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.parameters import ParameterBlock
 from armcal.diagnose.dependences import Dependence, Records
+from armcal.diagnose.held import Moves
 from armcal.measure.measurement import NamesMistakes
 from armcal.problem.motion import Motion, recorded_order
 from armcal.problem.problem import FactorRecords, Problem
@@ -17,8 +17,6 @@ _AXES = ("x", "y", "z")
 _MOST_STEPS, _MOST_SLIPS = 40, 12
 """Places at which something may have jumped are looked at: of all that is measured, and of each joint."""
 _FEWEST_APART = 4
-_STEP = 1e-4
-"""Of a typical change, in differences."""
 _LOAD_PARTS = (slice(0, 3), slice(3, 4), slice(4, 8))
 """Of the loads that motion knows slopes by: turns of gravity, its size, mass and place of a payload."""
 _STEP_MEASURE = "repeat some of the first poses now, and look at what was touched at that time"
@@ -29,12 +27,11 @@ def outside(
     motion: Motion,
     dataset: Dataset,
     positions: Sequence[Array],
-    values: Array,
-    records: Sequence[FactorRecords],
+    moves: Moves,
 ) -> Iterator[Dependence]:
-    """Everything that these records could show at a fit's values; ``positions`` are what instruments should read."""
+    """Everything that these records could show; ``positions`` are what instruments should read."""
     here = Records(dataset, motion)
-    yield from _of_mistakes(here, problem, values, records)
+    yield from _of_mistakes(here, problem, moves)
     if motion.by_load:
         by_load = [slope.transpose(0, 2, 1) for slope in motion.by_load]  # n_r x N x (gravity's turn, size, load)
         level = "level the base, or measure its tilt with a spirit level; gravity is stated in the instrument's frame"
@@ -48,7 +45,7 @@ def outside(
         words = "a load at the tool that is not stated"
         yield Dependence("load", "", "", words, "statics.payload_g", weigh, load)
     yield from _of_instrument(here, positions)
-    yield from _of_steps(here, problem)
+    yield from _of_steps(here, problem, positions)
 
 
 def _of_instrument(here: Records, read: Sequence[Array]) -> Iterator[Dependence]:
@@ -94,18 +91,24 @@ def predicted_positions(
     return tuple(positions)
 
 
-def _of_steps(here: Records, problem: Problem) -> Iterator[Dependence]:
+def _of_steps(here: Records, problem: Problem, read: Sequence[Array]) -> Iterator[Dependence]:
     """Something that moved once, between two records."""
     order = recorded_order(here.dataset)
     if np.ptp(order) <= 0:
         return
     ids = [here.dataset.ids[i] for i in np.argsort(order, kind="stable")]
     rank = np.argsort(np.argsort(order, kind="stable"), kind="stable")
+    turns = [np.zeros((size, len(rank), 3)) for size in here.sizes]
+    for part, own in zip(turns, read, strict=True):
+        part[: len(own)] = np.stack([np.cross(axis, own, axisc=0, axisb=0) for axis in np.eye(3)], 2) if len(own) else 0
     for place in _places(len(rank), _MOST_STEPS):
         after = (rank >= place).astype(float)[:, None]
         words = f"whether a record was measured before or after {ids[place]}: what is measured jumps there as a whole"
-        effect = "the records before and after as groups of their own"
-        yield Dependence("step", "", "", words, effect, _STEP_MEASURE, here.axes(after))
+        effect, shifts = "the records before and after as groups of their own", here.axes(after)
+        yield Dependence("step", "", "", words, effect, _STEP_MEASURE, shifts, jumps=True)
+        if any(map(np.any, turns)):
+            both = tuple(np.concatenate(p, axis=2) for p in zip(shifts, (t * after for t in turns), strict=True))
+            yield Dependence("step", "", "", f"{words}, and turns", effect, _STEP_MEASURE, both, jumps=True)
     for channel in here.motion.channels:
         arm, _, joint = channel.partition(".")
         shown = shown_joint(channel, problem.blueprint.arms)
@@ -113,55 +116,33 @@ def _of_steps(here: Records, problem: Problem) -> Iterator[Dependence]:
         for place in _places(len(rank), _MOST_SLIPS):
             along = here.along(channel, (rank >= place).astype(float)[:, None])
             words = f"whether a record was measured before or after {ids[place]}: {shown} slips there"
-            yield Dependence("slip", shown, arm, words, "", _STEP_MEASURE, along, ("slip",), si)
+            yield Dependence("slip", shown, arm, words, "", _STEP_MEASURE, along, ("slip",), si, jumps=True)
 
 
-def _of_mistakes(
-    here: Records, problem: Problem, values: Array, records: Sequence[FactorRecords]
-) -> Iterator[Dependence]:
+def _of_mistakes(here: Records, problem: Problem, moves: Moves) -> Iterator[Dependence]:
     """What instruments say may have gone wrong with them meanwhile."""
     order, many = recorded_order(here.dataset), len(problem.blueprint.measurements) > 1
     ranked = np.argsort(order, kind="stable")
     rank = np.argsort(ranked, kind="stable")
     for name, measurement in problem.blueprint.measurements.items():
         for one in measurement.mistakes() if isinstance(measurement, NamesMistakes) else ():
-            blocks = [problem.parameters[f"{name}.{p}"] for p in one.parameters]
-            if one.course == "always" or not all(block.free for block in blocks):
+            if one.course == "always":
                 continue
-            moves = _moves(problem, values, records, blocks, one.together)
+            blocks = [problem.parameters[f"{name}.{p}"] for p in one.parameters]
+            shares = [float(block.nominal[0]) if one.together else 1.0 for block in blocks]
+            own = [[share * part for part in moves[b.name]] for share, b in zip(shares, blocks, strict=True)]
+            columns = [np.concatenate(parts, axis=2) for parts in zip(*own, strict=True)]
+            moved = [part.sum(axis=2, keepdims=True) for part in columns] if one.together else columns
             subject, words = (name if many else ""), f"{name}: {one.words}" if many else one.words
             labels, unit = (("change",), "1") if one.together and one.course != "once" else ((), "")
             if np.ptp(order) > 0 and one.course == "slowly":
-                course = tuple(move * (rank / max(len(rank) - 1, 1) - 0.5)[:, None] for move in moves)
+                course = tuple(move * (rank / max(len(rank) - 1, 1) - 0.5)[:, None] for move in moved)
                 yield Dependence(one.kind, subject, "", words, "", one.measure, course, labels, unit)
             elif np.ptp(order) > 0:
                 for place in _places(len(rank), _MOST_SLIPS):
-                    jump = tuple(move * (rank >= place)[:, None] for move in moves)
+                    jump = tuple(move * (rank >= place)[:, None] for move in moved)
                     at = f"whether a record was measured before or after {here.dataset.ids[ranked[place]]}: {words}"
-                    yield Dependence(one.kind, subject, "", at, "", one.measure, jump)
-
-
-def _moves(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], blocks: Sequence[ParameterBlock], together: bool
-) -> tuple[Array, ...]:
-    """How raw residuals move with each increment of parameters, by central differences (n_r x N x k a factor).
-
-    ``together``: with all of them by the same share (one column).
-    """
-    steps = []
-    for block in blocks:
-        place = problem.parameters.entries_of(block.name)
-        size = _STEP * block.domain.increment_scale(block.scale)
-        for unit in np.eye(block.domain.dof):
-            parts = []
-            for sign in (1.0, -1.0):
-                there = values.copy()
-                there[place] = block.domain.retract(values[place], sign * size * unit)
-                parts.append(problem.residuals(there, records))
-            share = float(values[place][0]) if together else 1.0
-            steps.append([share * (one - other) / (2 * size) for one, other in zip(*parts, strict=True)])
-    columns = [np.stack(parts, axis=2) for parts in zip(*steps, strict=True)]
-    return tuple(part.sum(axis=2, keepdims=True) for part in columns) if together else tuple(columns)
+                    yield Dependence(one.kind, subject, "", at, "", one.measure, jump, jumps=True)
 
 
 def _places(count: int, most: int) -> list[int]:

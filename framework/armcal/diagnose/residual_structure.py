@@ -17,8 +17,9 @@ from armcal.base.dataset import Dataset
 from armcal.base.units import SMALLEST_SHOWN
 from armcal.diagnose.dependences import Dependence, Records, dependences
 from armcal.diagnose.fit_rows import FitRows
+from armcal.diagnose.held import moves_of
 from armcal.diagnose.noise_trend import NoiseTrend, noise_trend
-from armcal.diagnose.odds import Contest, Odds
+from armcal.diagnose.odds import NEGLIGIBLE, Contest, Odds
 from armcal.diagnose.outside import outside, predicted_positions
 from armcal.diagnose.predictable import Predictable, predictable
 from armcal.diagnose.score_tests import FamilyTest, Fit, family_test, linear_fit, own_basis
@@ -26,6 +27,7 @@ from armcal.diagnose.smooth import TimeOrPose, left_out, pose_kernels, smooth, t
 from armcal.estimate.bootstrap import automatic_block_length
 from armcal.estimate.combination import Measure
 from armcal.estimate.estimator import Estimate
+from armcal.estimate.freeing import candidates
 from armcal.problem.motion import Motion
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -37,8 +39,6 @@ FEWEST_RECORDS = 30
 _MOST_BLOCKS, _FEWEST_BLOCKS = 60, 30
 _FOLDS = 5
 _MM = 1000.0
-_NEGLIGIBLE = 0.1
-"""Of what the causes found so far take up: less than this may be what is not linear in them. Model them first."""
 _LIKELIER = 0.5
 """Where chance has more of the odds, a cause is none."""
 
@@ -140,8 +140,8 @@ def structure(
     fit, basis, block = _fit_of(rows, len(dataset), np.diff(position) == 1)
     motion = motion.subset(chosen)
     place = next((own for own in read if len(own)), np.zeros((0, len(dataset))))
-    others = outside(problem, motion, dataset, read, estimate.values, records)
-    causes = [*dependences(problem, motion, dataset), *others]
+    moves = moves_of(problem, estimate.values, records, candidates(problem.parameters))
+    causes = [*dependences(problem, motion, dataset, moves), *outside(problem, motion, dataset, read, moves)]
     columns = [rows.columns(one.columns) for one in causes]
     kernels = pose_kernels(problem, dataset), time_kernels(len(dataset))
     contest = Contest(causes, columns, fit.residual, basis, rows.by_record, fit.block * _FOLDS // fit.blocks, *kernels)
@@ -224,7 +224,7 @@ def _search(
         count = fit.blocks * fit.records.shape[1]
         unexplained = np.maximum(1 - test.share[significant], 1e-12)
         best = int(significant[np.argmin(count * np.log(unexplained) + sizes * np.log(count))])
-        if test.share[best] * now < _NEGLIGIBLE * (whole - now):
+        if test.share[best] * now < NEGLIGIBLE * (whole - now):
             break
         chosen.append(left[best][0])
         p_values.append(float(test.adjusted[best]))

@@ -176,9 +176,9 @@ class Mistake:
         kind: in a word, ``focus``.
         words: what residuals then depend on, as the end of a sentence; of what is there always, the sentence.
         measure: which measurement would show it, and what to do about it.
-        parameters: local names of what changes; it is looked for where all are free.
-        course: how it changes over the recording; ``always`` is no change, and looked for in those that are fixed
-            instead, each of one number.
+        parameters: local names of what changes.
+        course: how it changes over the recording; ``always`` is no change, and looked for in those that are fixed,
+            each of one number.
         together: whether all change by the same share, and not each by itself.
     """
 
