@@ -1,4 +1,4 @@
-"""The file of events, kept short and given up first when a disk is full; and how it is followed by who watches it."""
+"""The file of events, kept short; and how it is followed by who watches it."""
 
 import contextlib
 import os
@@ -57,12 +57,6 @@ class EventFile:
         self.close()
         if self._path.exists():
             os.replace(self._path, self._earlier)
-
-    def give_up(self) -> None:
-        """Make room: drop the older file and all that the present one holds."""
-        self.close()
-        for path in (self._earlier, self._path):
-            path.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Close the file."""

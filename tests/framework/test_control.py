@@ -7,7 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import pytest
 from armcal.cli.main import cli
 from armcal.errors import InputError
 from armcal.io.json_server import MOST_CLIENTS, JsonServer
+from armcal.io.unix_socket import short_address
 from armcal_online.running.control import SOCKET, answer, ask, control_server, joint_values
 from click.testing import CliRunner
 from fake_recalibrator import request
@@ -111,6 +112,29 @@ def test_a_request_without_an_end_is_refused_and_many_clients_do_no_harm(tmp_pat
         for connection in clients:
             connection.close()
         assert ask(tmp_path, {"command": "status"})["ok"]
+
+
+def test_requests_that_trickle_in_shut_nobody_out_and_have_to_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with serving(tmp_path), ExitStack() as opened, short_address(tmp_path / SOCKET) as address:
+        idle = opened.enter_context(socket.socket(socket.AF_UNIX))
+        idle.connect(address)
+        slow = [opened.enter_context(socket.socket(socket.AF_UNIX)) for _ in range(2 * MOST_CLIENTS)]
+        for one in slow:
+            one.connect(address)
+            one.send(b'{"comm')
+            time.sleep(0.002)
+        for one in slow:
+            with suppress(OSError):
+                one.send(b"a")  # those that are still there are heard of later than the idle one
+        assert ask(tmp_path, {"command": "status"}, 5.0)["ok"]
+        idle.sendall(b'{"command": "status"}\n')
+        idle.settimeout(5.0)
+        assert b'"ok": true' in idle.recv(1000)
+        monkeypatch.setattr("armcal.io.json_server._PATIENCE_S", 0.1)
+        slow[-1].settimeout(5.0)
+        assert slow[-1].recv(10) == b""
 
 
 def test_a_client_that_asks_on_and_never_reads_is_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,6 @@ from armcal.errors import DataError, InputError
 from armcal.io.journal.files import FileLayer, write_whole
 from armcal.io.journal.journal import Journal, JournalLimits
 from armcal.io.journal.reader import read_entries, read_newest, read_segments, read_until, verify
-from armcal.io.journal.room import BALLAST, BALLAST_BYTES
 from soak import shares
 
 HEADER = {"software": "1.2.3", "evaluator": {"kernel": "abc"}}
@@ -126,7 +125,7 @@ def test_a_segment_rotates_when_it_is_full_and_the_oldest_go(tmp_path: Path) -> 
     assert max(sizes) <= SMALL.total_bytes and len(sizes) > 20
     found = verify(tmp_path)
     assert found.segments >= 3 and found.last_sequence == journal_end(tmp_path) and found.first_sequence > 100
-    assert sorted(path.name for path in tmp_path.iterdir() if "journal" not in path.name) == ["ballast", "lock"]
+    assert sorted(path.name for path in tmp_path.iterdir() if "journal" not in path.name) == ["lock"]
 
 
 def journal_end(folder: Path) -> int:
@@ -311,12 +310,6 @@ def test_a_file_is_put_in_place_whole_or_not_at_all(tmp_path: Path, monkeypatch:
     with pytest.raises(OSError, match="No space"):
         write_whole(files, path, b"third")
     assert path.read_bytes() == b"2nd" and [p.name for p in tmp_path.iterdir()] == ["calibration.yaml"]
-
-
-def test_the_reserve_is_of_real_bytes(tmp_path: Path) -> None:
-    Journal.open(tmp_path, {}).close()
-    assert (tmp_path / BALLAST).stat().st_size == BALLAST_BYTES
-    assert (tmp_path / BALLAST).stat().st_blocks * 512 >= BALLAST_BYTES
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 from armcal.estimate.online import Gaussian, Linearised, kalman_update, log_likelihood
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.hypotheses import Hypothesis
-from armcal_online.tracking.process_noise import GaussMarkovStates, ProcessNoise
+from armcal_online.tracking.process_noise import GaussMarkovStates, ProcessNoise, shared_error
 from armcal_online.tracking.slow_changes import SlowChanges, SlowState
 from online_arm import World, begun, settings, told
 
@@ -152,3 +152,10 @@ def test_a_restored_state_goes_on_with_its_evidence() -> None:
     record = arm.record()
     assert session.take(record, 30) == other.take(record, 30)
     assert session.digest() == other.digest() and len(session.state.slow.tracks) == 1
+
+
+def test_where_no_step_of_a_joint_can_be_followed_errors_that_neighbours_share_pass_on_all_the_same() -> None:
+    """As with a calibration of springs alone, whose neighbouring records err alike: nothing slow is looked for."""
+    shared = GaussMarkovStates(tuple(shared_error("tracker", np.eye(3), 5.0, "record")))
+    nothing = SlowChanges((), ProcessNoise(np.zeros(7), shared), 1e-4)
+    assert nothing.passed(SlowState(), {"record": 1.0, "time": 15.0}) == SlowState()

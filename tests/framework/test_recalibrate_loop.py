@@ -250,30 +250,37 @@ def test_a_rollback_that_no_checkpoint_followed_is_made_again_after_a_restart(
         assert again.count == 11
 
 
-def test_records_wait_unacknowledged_while_the_journal_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("armcal_online.running.loop.FULL_WAIT_S", 0.0)
+def test_a_full_journal_stops_it_says_so_and_keeps_all_that_was_acknowledged(tmp_path: Path) -> None:
     files, fake, source, out = FullFiles(), FakeRecalibrator(), Listed(made(1, 9)), BytesIO()
     with opened(setup(tmp_path / "out", files=files, stream=out), fake, source) as going:
         steps(going, 3)
         files.full = {"journal-"}
-        steps(going, 5)
-        assert fake.count == 3 and len(source.acknowledged) == 3 and len(source.records) == 4
-        assert going.status()["journal"] == "full"
         with pytest.raises(JournalFullError):
             going.pause()
         digest = fake.digest()
         with pytest.raises(JournalFullError):
             going.roll_back(going.sequence - 1)
         assert fake.digest() == digest
-        files.full = set()
-        steps(going, 5)
-        assert fake.count == 8 and going.status()["journal"] == "good"
-    told = [json.loads(line).get("sentence", "") for line in out.getvalue().splitlines()]
-    assert sum("The journal is full, and records wait" in s for s in told) == 1
-    assert sum("has room again" in s for s in told) == 1
-    found = taken(tmp_path / "out")  # older entries gave room
-    assert found == [f"p{i}" for i in range(9 - len(found), 9)] and len(found) >= 4
+        with pytest.raises(JournalFullError, match="no room for an entry"):
+            going.run()
+    assert fake.count == 3 and [name for name, _ in source.acknowledged] == taken(tmp_path / "out")
+    status = json.loads((tmp_path / "out" / "status.json").read_text())
+    assert status["finished"] and "no room for an entry" in status["fault"] and "Make room" in status["fault"]
+    assert json.loads((tmp_path / "out" / "calibration.yaml").read_text())["count"] == 3
+    told = [json.loads(line) for line in out.getvalue().splitlines()]
+    assert [e["sentence"].startswith("It stopped: ") for e in told if e["event"] == "finished"] == [True]
+    fake = run(tmp_path / "out", Listed(made(1, 9)))
+    assert taken(tmp_path / "out") == [f"p{i}" for i in range(1, 9)]
     assert replayed(tmp_path / "out").digest() == fake.digest()
+
+
+def test_a_crash_is_told_to_whoever_watches_and_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with stepping(tmp_path / "out", Listed(made(1, 9))) as (going, fake):
+        monkeypatch.setattr(fake, "take", lambda incoming, sequence: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            going.run()
+    assert "division by zero" in json.loads((tmp_path / "out" / "status.json").read_text())["fault"]
+    assert "division by zero" in events(tmp_path / "out")[-1]["sentence"]
 
 
 def test_the_pace_of_what_is_written(tmp_path: Path) -> None:

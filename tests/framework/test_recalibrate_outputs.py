@@ -18,7 +18,7 @@ from recalibrations import (
 )
 
 
-def test_a_full_disk_costs_events_first_and_the_calibration_stays_whole(
+def test_on_a_full_disk_the_calibration_stays_whole_and_no_event_is_dropped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("armcal_online.running.outputs.RETRY_S", 0.0)
@@ -36,7 +36,8 @@ def test_a_full_disk_costs_events_first_and_the_calibration_stays_whole(
     outputs.status({"a": float("nan")})
     assert json.loads((tmp_path / "status.json").read_text()) == {"a": None}
     told = [json.loads(line).get("sentence", "") for line in out.getvalue().splitlines()]
-    for part in ("events of the past were dropped", "one before stands", "status is not", "written again"):
+    assert json.loads((tmp_path / "events.jsonl").read_text().splitlines()[0])["event"] == "record"
+    for part in ("one before stands", "status is not", "written again"):
         assert any(part in sentence for sentence in told), part
     assert len(told) < 10
     outputs.close()

@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from armcal.cli.main import cli
 from armcal_online.running.control import ask
+from click.testing import CliRunner
 from fake_recalibrator import row
 from recalibrations import (
     events,
@@ -167,9 +169,9 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         subprocess.run(["umount", "-l", place], check=True)
 
 
-@pytest.mark.slow
-def test_a_full_disk_does_not_stop_it(tmp_path: Path, small_disk: Path) -> None:
-    """It lives in what the events and older entries leave; the calibration and the newest entries are whole."""
+def test_a_full_disk_stops_it_tells_whoever_watches_and_loses_nothing_acknowledged(
+    tmp_path: Path, small_disk: Path
+) -> None:
     (tmp_path / "poses.csv").write_text(table(20))
     folder, out = small_disk / "out", tmp_path / "stdout"
     with out.open("wb") as stream:
@@ -178,16 +180,21 @@ def test_a_full_disk_does_not_stop_it(tmp_path: Path, small_disk: Path) -> None:
         with (small_disk / "filler").open("wb", buffering=0) as filler, pytest.raises(OSError):
             while True:
                 filler.write(b"x" * 4096)
-        (tmp_path / "new").write_text(table(3000))
+        (tmp_path / "new").write_text(table(500))
         with (tmp_path / "new").open() as new, (tmp_path / "poses.csv").open("a") as file:
             file.writelines([*new][21:])
-        ends = time.monotonic() + 60
-        while '"p3000"' not in out.read_text() and time.monotonic() < ends:
-            time.sleep(0.1)
-        assert going.poll() is None and ask(folder, {"command": "status"})["records"] == 3000
-        going.terminate()
-        assert going.wait(20) == 0
+        assert going.wait(60) == 1
+    assert going.stderr is not None and b"no room for an entry" in going.stderr.read()
+    acknowledged = [json.loads(line) for line in out.read_text().splitlines()]
     found = taken(folder)
-    assert found == [f"p{i}" for i in range(3001 - len(found), 3001)]
-    assert json.loads((folder / "calibration.yaml").read_text())["count"] == 3000
-    assert '"alarm"' in out.read_text()
+    assert found[:20] == [f"p{i}" for i in range(1, 21)] and len(found) < 500
+    assert [event["id"] for event in acknowledged if event["event"] == "record"] == found
+    assert json.loads((folder / "calibration.yaml").read_text())["count"] == len(found)
+    shown = CliRunner().invoke(cli, ["watch", str(folder), "--once"], env={"COLUMNS": "100"})
+    told = " ".join(shown.output.replace("\u2502", " ").split())
+    for words in ("not running", "no room for an entry", "Make room on the disk", "Start the recalibration again"):
+        assert words in told, words
+    assert "Go on." not in told
+    (small_disk / "filler").unlink()
+    going = process(folder, str(tmp_path / "poses.csv"), "stop")
+    assert going.wait(60) == 0 and taken(folder) == [f"p{i}" for i in range(1, 501)]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import socket
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -97,12 +99,57 @@ def test_a_page_that_nothing_is_new_to_is_answered_all_the_same(
     assert not idle["whole"] and idle["records"] == [] and idle["place"] == known["place"]
 
 
-def _free(served: Served) -> int:
-    """How many more connections could be made."""
-    places = [served.server.connections.acquire(blocking=False) for _ in range(MOST_CONNECTIONS)]
-    for _ in filter(None, places):
-        served.server.connections.release()
-    return sum(places)
+class Trickle:
+    """Connections that send a byte of a request now and then, and never its end."""
+
+    def __init__(self, served: Served, count: int) -> None:
+        self.sockets = [socket.create_connection(("127.0.0.1", served.server.server_port)) for _ in range(count)]
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._send, daemon=True)
+        self._thread.start()
+
+    def _send(self) -> None:
+        while not self._stop.wait(0.02):
+            for one in self.sockets:
+                with suppress(OSError):
+                    one.send(b"G" * 2)
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        for one in self.sockets:
+            one.close()
+
+
+def _until(holds: Callable[[], bool], seconds: float = 15.0) -> bool:
+    deadline = time.monotonic() + seconds
+    while not holds() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return holds()
+
+
+def test_connections_that_trickle_bytes_shut_nobody_out(served: Served) -> None:
+    """All places are taken by requests without an end, again and again."""
+    trickles = []
+    try:
+        for _ in range(2):
+            trickles.append(Trickle(served, MOST_CONNECTIONS + 5))
+            assert _until(lambda: len(served.server.due) == MOST_CONNECTIONS)
+            assert [served.ask(path)[0] for path in ("/", "/state")] == [200, 200]
+    finally:
+        for trickle in trickles:
+            trickle.close()
+
+
+def test_a_request_has_to_be_whole_in_its_time_however_often_a_byte_comes(tmp_path: Path) -> None:
+    served = Served(made_up_folder(tmp_path / "dir", 5), patience=0.3)
+    trickle = Trickle(served, 3)
+    try:
+        assert _until(lambda: len(served.server.due) == 3) and _until(lambda: not served.server.due)
+        assert served.ask("/")[0] == 200
+    finally:
+        trickle.close()
+        served.close()
 
 
 @pytest.mark.slow
@@ -114,13 +161,7 @@ def test_a_client_that_does_not_read_is_dropped(tmp_path: Path) -> None:
         stalled.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         stalled.connect(("127.0.0.1", served.server.server_port))
         stalled.sendall(b"GET /state HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        deadline = time.monotonic() + 15
-        while _free(served) == MOST_CONNECTIONS and time.monotonic() < deadline:
-            time.sleep(0.01)
-        assert _free(served) == MOST_CONNECTIONS - 1
-        while _free(served) < MOST_CONNECTIONS and time.monotonic() < deadline:
-            time.sleep(0.1)
-        assert _free(served) == MOST_CONNECTIONS
+        assert _until(lambda: len(served.server.due) == 1) and _until(lambda: not served.server.due)
         stalled.close()
     finally:
         served.close()

@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
 import random
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -291,12 +293,42 @@ def test_a_page_of_what_was_killed_is_silent_and_one_that_runs_shows_a_decision_
         browser.wait_for(f"document.getElementById('do').innerText === {json.dumps(ASK)}")
         browser.wait_for("document.getElementById('rollback').innerText.endsWith('rollback 9')")
         assert browser.value("document.getElementById('off').innerText") == "73 mm"
-        browser.value("Known.status = performance.now() - 3 * 3600e3; age()")
-        browser.wait_for("document.getElementById('connection').innerText === 'silent for 3 h'")
-        assert "may have been killed" in browser.value("document.getElementById('alive').innerText")
-        assert "live" not in browser.value("document.getElementById('connection').innerText")
+        os.utime(folder / "status.json", (1.9e9 - 1e9, 1.9e9 - 1e9))
+        browser.wait_for("document.getElementById('connection').innerText === 'silent'", 20.0)
+        browser.wait_for("document.getElementById('level').innerText === 'not running'")
+        assert "was killed, or hangs: its last sign came at 1998-07-09" in browser.value(
+            "document.getElementById('alive').innerText"
+        )
+        assert browser.value("document.getElementById('do').innerText") == f"{ASK} {AFTER_THE_END}"
     finally:
         served.close()
+
+
+@pytest.mark.parametrize(
+    ("status", "age_s", "life", "says"),
+    [
+        ({"finished": False}, 2, "live", ""),
+        ({"finished": False}, 60, "silent", "was killed, or hangs: its last sign came at 20"),
+        (None, 60, "silent", "was killed, or hangs: its last sign came at 20"),
+        ({"finished": True, "at": START, "fault": "no room. Make room."}, 60, "stopped", "UTC: no room. Make room."),
+        ({"finished": True, "at": START}, 60, "ended", "has ended at 2031-02-27 23:06:40 UTC."),
+    ],
+)
+def test_what_no_longer_runs_is_never_shown_as_nominal_and_go_on(
+    tmp_path: Path, status: dict[str, Any] | None, age_s: float, life: str, says: str
+) -> None:
+    """Killed before or after its first status, stopped by a fault, or ended: since when, and what to do."""
+    (tmp_path / "events.jsonl").write_text(written([record(n) for n in range(1, 4)]))
+    if status is not None:
+        (tmp_path / "status.json").write_text(json.dumps({"level": "nominal", **status}))
+    for path in tmp_path.iterdir():
+        os.utime(path, (time.time() - age_s, time.time() - age_s))
+    shown = CliRunner().invoke(cli, ["watch", str(tmp_path), "--once"], env={"COLUMNS": "120"}).output
+    told = " ".join(shown.replace("│", " ").split())
+    state = json.loads(CliRunner().invoke(cli, ["watch", str(tmp_path), "--once", "--json"]).output)
+    assert state["situation"]["life"] == life and says in (state["situation"]["over"] or "")
+    assert ("Go on." in told) == (life == "live") and (AFTER_THE_END in told) == (life != "live")
+    assert ("not running (it was nominal)" in told) == (life in ("silent", "stopped"))
 
 
 def test_a_status_with_the_last_good_record_serves_where_no_event_of_it_is_left(tmp_path: Path) -> None:

@@ -15,10 +15,10 @@ from armcal.errors import ArmcalError
 from armcal.io.unix_socket import listening
 
 MOST_CLIENTS = 64
-"""The one that was idle for longest has to go for another."""
+"""For another one a client has to go: one with half a request first, then the one that asked last the longest ago."""
 _LONGEST = 64 * 1024
 _PATIENCE_S = 10.0
-"""A client that does not read its replies for so long is dropped."""
+"""A client that does not read its replies, or does not end a request that it began, for so long is dropped."""
 
 Answer = Callable[[dict[str, Any]], Mapping[str, Any]]
 """The reply to a request; an exception becomes a reply with ``ok`` false and an ``error``."""
@@ -63,7 +63,7 @@ class JsonServer:
         for client in [*self._clients]:
             if client.replies:
                 self._write(client)
-            stuck = client.replies and time.monotonic() - client.heard > _PATIENCE_S
+            stuck = (client.replies or client.received) and time.monotonic() - client.heard > _PATIENCE_S
             if stuck or (client.ends and not client.replies):
                 self._drop(client)
 
@@ -85,7 +85,7 @@ class JsonServer:
             self._clients.append(client)
             self.watch(connection.fileno(), partial(self._read, client))
             if len(self._clients) > MOST_CLIENTS:
-                self._drop(min(self._clients, key=lambda client: client.heard))
+                self._drop(min(self._clients[:-1], key=lambda client: (not client.received, client.heard)))
 
     def _read(self, client: _Client) -> None:
         try:
@@ -94,9 +94,9 @@ class JsonServer:
             return
         except OSError:
             data = b""
-        if not client.replies:  # else it has to read first, however much it asks
-            client.heard = time.monotonic()
         *lines, rest = bytes(client.received + data).split(b"\n")
+        if (lines or not client.received) and not client.replies:  # else it has to end its request, or read first
+            client.heard = time.monotonic()
         client.received = bytearray(rest)
         for line in lines:
             client.replies += as_line(self._reply(line)).encode() + b"\n"

@@ -74,14 +74,15 @@ def _terminal(feed: Feed, stop: threading.Event) -> None:
                     pass
                 live.update(picture(feed.state(), console.width), refresh=True)
                 stop.wait(_REFRESH)
-    waiting: str | None = None
+    shown: str | None = None
     while not stop.is_set() and getattr(sys.stdout, "fault", None) is None:  # nobody reads lines after a fault
         messages = feed.step()
         for text in filter(None, map(line, messages)):
             say(text)
-        if feed.waiting and feed.waiting != waiting:
-            say(feed.waiting, err=True)
-        waiting = feed.waiting
+        standing = feed.waiting or feed.over
+        if standing and standing != shown:
+            say(standing, err=standing == feed.waiting)
+        shown = standing
         if not messages:
             sys.stdout.flush()
             stop.wait(_REFRESH)

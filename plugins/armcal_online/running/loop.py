@@ -2,6 +2,8 @@
 
 import os
 import time
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +20,6 @@ from armcal_online.tracking.recalibrator import Recalibrator
 
 WAIT_S = 0.1
 """How long a source is waited for before control and signals are looked at again."""
-FULL_WAIT_S = 1.0
-"""How long a record waits for room in the journal before it is tried again."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,6 @@ class Recalibration:
     ) -> None:
         self._source, self._journal, self.session = source, journal, session
         self._state_replayer, self._outputs, self._control, self._pace = state_replayer, outputs, control, pace
-        self._held: Incoming | None = None
-        self._held_until = 0.0
-        self._is_full = False
         self._is_written = False
         self._since_calibration = self._since_digest = 0
         self._since_checkpoint = since_checkpoint
@@ -79,45 +76,55 @@ class Recalibration:
         return self._state_replayer.progress.paused
 
     def run(self) -> None:
-        """Until the source ends, a signal comes, or a request to finish.
+        """Until the source ends, a signal comes, or a request to finish; whoever watches is told of a fault too.
 
         Raises:
-            JournalFailedError: the disk fails; what was acknowledged is safe.
+            JournalFullError, JournalFailedError: the disk is full or fails; what was acknowledged is safe.
         """
         with Signals() as signals:
-            self.write_calibration()
-            while not self.finishing:
-                self._control.serve()
-                if signals.finish:
-                    self.finishing = "It was asked to finish by a signal."
-                if signals.rotate:
-                    signals.rotate = False
-                    self._outputs.rotate()
-                if signals.status:
-                    signals.status = False
-                    self._write_status()
-                if not self.finishing:
-                    self.step(WAIT_S)
-            self._outputs.retry()
-            if self._since_checkpoint:
-                self._checkpoint()
-            if self._since_calibration or not self._is_written:
-                self.write_calibration()
-            sentence = f"{self.finishing} {self._state_replayer.progress.records} records were taken in all."
-            event = {"event": "finished", "sequence": self.sequence, "at": time.time(), "sentence": sentence}
-            self._outputs.event(event)
-            self._outputs.status({**self.status(), "finished": True})
+            try:
+                self._follow(signals)
+            except Exception as fault:
+                with suppress(Exception):  # what stopped it is raised
+                    self._outputs.make_room()
+                    self._end(f"It stopped: {fault}", {"fault": str(fault)})
+                    if isinstance(fault, JournalFullError):
+                        self.write_calibration()
+                raise
+            self._end(f"{self.finishing} {self._state_replayer.progress.records} records were taken in all.", {})
             self._control.serve()
+
+    def _follow(self, signals: Signals) -> None:
+        self.write_calibration()
+        while not self.finishing:
+            self._control.serve()
+            if signals.finish:
+                self.finishing = "It was asked to finish by a signal."
+            if signals.rotate:
+                signals.rotate = False
+                self._outputs.rotate()
+            if signals.status:
+                signals.status = False
+                self._write_status()
+            if not self.finishing:
+                self.step(WAIT_S)
+        self._outputs.retry()
+        if self._since_checkpoint:
+            self._checkpoint()
+        if self._since_calibration or not self._is_written:
+            self.write_calibration()
+
+    def _end(self, sentence: str, why: Mapping[str, str]) -> None:
+        """Say so to whoever watches: in the status first, for which room is reserved."""
+        self._outputs.status({**self.status(), "finished": True, **why})
+        event = {"event": "finished", "sequence": self.sequence, "at": time.time(), "sentence": sentence}
+        self._outputs.event(event)
 
     def step(self, wait_s: float) -> None:
         """Take one record, if there is one within the wait, and write what is due."""
-        if self._held is not None:
-            waits = time.monotonic() < self._held_until
-        else:
-            waits = self.paused and self._source.keeps_records
-        if waits:
+        if self.paused and self._source.keeps_records:
             time.sleep(wait_s)
-        elif (incoming := self._held or self._source.incoming(wait_s)) is not None:
+        elif (incoming := self._source.incoming(wait_s)) is not None:
             self._take(incoming)
         elif self._source.ended:
             self.finishing = "The source has ended."
@@ -162,7 +169,7 @@ class Recalibration:
             raise
         event = {**self.session.rolled_back_event(self.sequence, sequence), "at": time.time()}
         self._outputs.event(event)
-        self._checkpoint()
+        self._since_checkpoint = self._pace.checkpoint_records  # due at once; the entry alone is enough
         self.write_calibration()
         return str(event["sentence"])
 
@@ -173,7 +180,6 @@ class Recalibration:
             "sequence": self.sequence,
             "records": self._state_replayer.progress.records,
             "paused": self.paused,
-            "journal": "full" if self._is_full else "good",
             "at": time.time(),
             "process": os.getpid(),
         }
@@ -188,22 +194,12 @@ class Recalibration:
             self._outputs.event({"event": "calibration", "sequence": self.sequence, "at": time.time(), "path": path})
 
     def _take(self, incoming: Incoming) -> None:
-        self._held = None
         earlier = None if self._source.keeps_records else self._state_replayer.progress.repeated(incoming)
         if earlier is not None:
             self._source.acknowledge(incoming, earlier)
             return
         content = incoming.as_dict()
-        try:
-            self.sequence = self._journal.record(RECORD, content)
-        except JournalFullError as fault:
-            # The record is kept, unacknowledged, until there is room.
-            self._held, self._held_until = incoming, time.monotonic() + FULL_WAIT_S
-            self._lacks_room(fault)
-            return
-        if self._is_full:
-            self._is_full = False
-            self._outputs.alarm("The journal has room again.")
+        self.sequence = self._journal.record(RECORD, content)
         self._source.acknowledge(incoming, self.sequence)
         events = self._state_replayer.apply(self.sequence, RECORD, content)
         self._since_calibration += 1
@@ -216,17 +212,9 @@ class Recalibration:
         if noted or self._since_digest >= self._pace.digest_records:
             self._since_digest = 0
             note = {"after": self.sequence, "digest": self.session.digest(), "events": noted}
-            try:
-                self._journal.note(DECISION, note)
-            except JournalFullError as fault:
-                self._lacks_room(fault)
+            self._journal.note(DECISION, note)
         if any(event["event"] == "decision" for event in noted):
             self.write_calibration()
-
-    def _lacks_room(self, fault: JournalFullError) -> None:
-        if not self._is_full:
-            self._is_full = True
-            self._outputs.alarm(f"The journal is full, and records wait. {fault}")
 
     def _command(self, kind: str) -> None:
         self.sequence = self._journal.record(kind, {"at": time.time()})
@@ -234,12 +222,8 @@ class Recalibration:
         self._outputs.event({"event": "control", "sequence": self.sequence, "at": time.time(), "command": kind})
 
     def _checkpoint(self) -> None:
-        try:
-            self._journal.checkpoint(self._state_replayer.checkpoint())
-        except JournalFullError as fault:
-            self._lacks_room(fault)
-        else:
-            self._since_checkpoint = 0
+        self._journal.checkpoint(self._state_replayer.checkpoint())
+        self._since_checkpoint = 0
 
     def _write_status(self) -> None:
         self._status_written = time.monotonic()

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from armcal.base.config_text import as_line
-from armcal.io.journal.files import REAL_FILES, FileLayer, is_full, write_whole
+from armcal.io.journal.files import REAL_FILES, FileLayer, write_whole
 from armcal.io.lines import StandardOutput
 
 from armcal_online.event_file import EventFile
@@ -16,7 +16,7 @@ from armcal_online.event_file import EventFile
 CALIBRATION = "calibration.yaml"
 STATUS = "status.json"
 RESERVE = "calibration.reserve"
-"""As much room as a calibration needs: the journal would take all that is left of a disk."""
+"""As much room as a calibration and a status need: the journal would take all that is left of a disk."""
 RETRY_S = 10.0
 """What could not be written is tried again after so long."""
 _SENTENCES = {
@@ -33,7 +33,7 @@ _SENTENCES = {
 class Outputs:
     """Events to standard output and ``events.jsonl``; ``status.json`` and ``calibration.yaml``, replaced whole.
 
-    When a disk is full, events are given up first, then the status; the calibration is tried again later.
+    On a full disk a reserve has room for the last calibration and status; what has none is tried again later.
     """
 
     def __init__(self, folder: Path, stream: StandardOutput, events: EventFile, files: FileLayer = REAL_FILES) -> None:
@@ -62,19 +62,8 @@ class Outputs:
         return self._attempt("calibration", lambda: self._replace_calibration(text.encode()))
 
     def _replace_calibration(self, data: bytes) -> None:
+        write_whole(self._files, self.calibration_path, data)
         reserve = self._folder / RESERVE
-        try:
-            write_whole(self._files, self.calibration_path, data)
-        except OSError as fault:
-            if not is_full(fault):
-                raise
-            # Events and reserve make room.
-            with contextlib.suppress(OSError):
-                self._events.give_up()
-            self._failed("events", "The events of the past were dropped: the disk is full.")
-            with contextlib.suppress(OSError):
-                self._files.remove(reserve)
-            write_whole(self._files, self.calibration_path, data)
         with contextlib.suppress(OSError):
             # Somewhat larger than the calibration: the next one can be written in its place.
             if not reserve.exists() or self._files.size(reserve) < len(data):
@@ -92,6 +81,12 @@ class Outputs:
     def retry(self) -> None:
         """Try everything again that could not be written."""
         self._silent_until.clear()
+
+    def make_room(self) -> None:
+        """Give up the reserve, for what is written last."""
+        self.retry()
+        with contextlib.suppress(OSError):
+            self._files.remove(self._folder / RESERVE)
 
     def close(self) -> None:
         """Close the file of events."""

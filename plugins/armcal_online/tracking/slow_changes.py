@@ -85,7 +85,8 @@ class SlowChanges:
     def __init__(self, changes: Sequence[Hypothesis], process_noise: ProcessNoise, probability: float) -> None:
         self._changes, self._process_noise, self._probability = changes, process_noise, probability
         self._ends = np.cumsum([0, *(change.directions.shape[1] for change in changes)]).tolist()
-        whole = np.hstack([c.directions for c in changes]) if changes else np.zeros((0, 0))
+        n = len(process_noise.rates) + len(process_noise.gauss_markov)
+        whole = np.hstack([np.zeros((n, 0)), *(c.directions for c in changes)])
         is_gradual = np.repeat(np.array([c.kind in GRADUAL for c in changes], dtype=bool), np.diff(self._ends))
         self._at_once = whole * ~is_gradual
         self._in_a_second = whole * is_gradual / _DAY_S

@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from typing import Any
 
 LONGEST_TEXT = 600
@@ -56,6 +57,11 @@ def text(value: Any) -> str | None:
         return value
     cut = value if len(value) <= LONGEST_TEXT else value[: LONGEST_TEXT - 3] + "..."
     return "".join(c if c.isprintable() else " " if c.isspace() else _HOSTILE for c in cut)
+
+
+def when(at: float) -> str:
+    """A time in words: UTC where it may be one since 1970."""
+    return f"{datetime.fromtimestamp(at, UTC):%Y-%m-%d %H:%M:%S} UTC" if 1e8 < at < 1e11 else f"{at:g} s"
 
 
 def scalar(value: Any) -> bool | float | str | None:

@@ -16,6 +16,7 @@ from armcal_online.watch.events import VERDICTS, Message, named_record, numbers,
 from armcal_online.watch.history import History
 from armcal_online.watch.hours import MISSION, Truth, truth_beside
 from armcal_online.watch.shape import Shape
+from armcal_online.watch.situation import over
 
 STATUS, CALIBRATION = "status.json", "calibration.yaml"
 TIPS = 40
@@ -110,7 +111,7 @@ class Feed:
             since = int(number) if is_known else 0
             return {
                 **self.history.state(since),
-                "situation": self.history.situation(str(self.folder), self._status),
+                "situation": self.history.situation(str(self.folder), self._status, self._heard),
                 "over_time": self.history.over_time(self._truth, since),
                 "folder": str(self.folder),
                 "control": f"armcal control {shlex.quote(str(self.folder))}",
@@ -118,7 +119,6 @@ class Feed:
                 "too_long": self._tail.too_long,
                 "heard_s": self._since(self._event_at),
                 "status": self._status,
-                "status_s": self._since(self._status_time / 1e9) if self._status else None,
                 "arm": self._arm,
                 "tips": TIPS,
                 "whole": not is_known,
@@ -134,6 +134,18 @@ class Feed:
             return None
         missing = "there" if self.folder.is_dir() else "not there yet"
         return f"Waiting for a recalibration to begin: {self.folder} is {missing}, and no event is written."
+
+    @property
+    def over(self) -> str | None:
+        """That nothing follows the arm any more, as a sentence; None while a recalibration is live."""
+        return over(self._status, self.history.finished, self._heard)[1]
+
+    @property
+    def _heard(self) -> float | None:
+        """When the recalibration last gave a sign of life: by its status, or by its events before the first."""
+        if self._status:
+            return self._status_time / 1e9
+        return self._event_at if self._number else None
 
     @property
     def _place(self) -> str:

@@ -8,7 +8,7 @@ from armcal_online.tracking.decisions import LEVELS
 from armcal_online.watch.estimates import Estimates, Thinned
 from armcal_online.watch.events import VERDICTS, Message, message_of, number, record_of, shortened, text, whole
 from armcal_online.watch.hours import Hours, Truth, over_time
-from armcal_online.watch.situation import AFTER_THE_END, Trouble, situation
+from armcal_online.watch.situation import AFTER_THE_END, Trouble, over, situation
 
 RECENT_RECORDS = 2000
 """The newest records, kept whole."""
@@ -84,11 +84,14 @@ class History:
             self._listed.append({**message, "step": self.step})
         return [message]
 
-    def situation(self, folder: str, status: Mapping[str, Any]) -> dict[str, Any]:
-        """The first screen; ``status`` is the newest of the recalibration, or empty."""
+    def situation(self, folder: str, status: Mapping[str, Any], heard: float | None = None) -> dict[str, Any]:
+        """The first screen; ``status`` is the newest of the recalibration, or empty; see ``over`` for ``heard``."""
         level = self.level if self.level in LEVELS else str(status.get("level", "unknown"))
         known = situation(level, self.trouble, tuple(self._newest), self._good or status.get("last_good"), folder)
-        return {**known, "do": AFTER_THE_END} if level == "nominal" and status.get("finished") else known
+        life, ending = over(status, self.finished, heard)
+        if ending:
+            known["do"] = f"{known['do']} {AFTER_THE_END}" if level in LEVELS[2:] else AFTER_THE_END
+        return {**known, "life": life, "over": ending}
 
     def over_time(self, truth: Truth | None, since: int = 0) -> dict[str, Any]:
         """How far off, hour by hour; of the hours those after a step, and the truth with all of them."""

@@ -10,8 +10,7 @@ const address = (path, query = {}) => {
   return asked.size ? `${path}?${asked}` : path;
 };
 
-const SILENT_S = 15;
-const Known = { state: null, asked: Infinity, heard: 0, status: 0, due: new Set(), timer: null };
+const Known = { state: null, asked: Infinity, heard: 0, due: new Set(), timer: null };
 
 function ask(...parts) {
   for (const part of parts) Known.due.add(part);
@@ -32,11 +31,14 @@ function redraw() {
 }
 const redrawAll = () => ask("health", "hours", "innovations", "events", "arm", "parameters");
 
+// By a kill or a fault, and not because it was asked to end.
+const isGone = (now) => now.life === "stopped" || now.life === "silent";
+
 function drawHealth(state) {
   const status = state.status || {}, now = state.situation || {};
   const level = state.level === "unknown" && status.level ? status.level : state.level;
   byId("health").dataset.level = level;
-  say("level", level);
+  say("level", isGone(now) ? "not running" : level);
   say("do", now.do || "");
   say("sentence", now.what ? now.what : state.level_sentence || (status.level === level && status.why) || "");
   say("confirm", now.confirm ? `To confirm: ${now.confirm}` : now.earlier ? `The last decision: ${now.earlier}` : "");
@@ -45,7 +47,7 @@ function drawHealth(state) {
   say("folder", state.folder);
   drawOff(now, state.last || {}, level);
   drawCounts(state, status);
-  document.title = `${level}, armcal watch`;
+  document.title = `${isGone(now) ? "not running" : level}, armcal watch`;
 }
 
 function drawOff(now, last, level) {
@@ -130,7 +132,6 @@ function take(state) {
   }
   Known.state = state;
   Known.heard = performance.now() - 1000 * state.heard_s;
-  Known.status = performance.now() - 1000 * (state.status_s || 0);
 }
 
 async function follow() {
@@ -159,14 +160,6 @@ function connection(state, text) {
 
 const ago = (since) => span((performance.now() - since) / 1000);
 
-// Of the recalibration, not of the connection to this page's server.
-function life(state) {
-  const status = state.status || {};
-  if (status.finished) return "ended";
-  if (!Object.keys(status).length && !state.last && !state.events.length) return "waiting";
-  return Object.keys(status).length && performance.now() - Known.status > 1000 * SILENT_S ? "silent" : "live";
-}
-
 function age() {
   const state = Known.state, host = byId("connection");
   if (Known.connection === "live" && performance.now() - Known.asked > LATE_MS) connection("lost", "no answer; waiting for it");
@@ -174,25 +167,23 @@ function age() {
     say("connection", Known.connection || "loading");
     return;
   }
-  const now = life(state), known = state.last || state.events.length;
+  // Of the recalibration, not of the connection to this page's server.
+  const now = (state.situation || {}).life, known = state.last || state.events.length;
   host.dataset.state = now;
   const ended = state.finished ? ` ${when(state.finished.at)}` : "";
-  const words = { ended: `ended${ended}, level ${state.level}`, silent: `silent for ${ago(Known.status)}`, live: "live", waiting: "waiting" }[now];
+  const words = now === "ended" ? `ended${ended}, level ${state.level}` : now;
   say("connection", known && now === "live" ? `${words}; newest event ${ago(Known.heard)} ago` : words);
   byId("health").dataset.life = now;
-  say("level-when", { ended: `at its end${ended}`, silent: `${ago(Known.status)} ago; nothing was heard since`, live: "", waiting: "" }[now]);
+  say("level-when", now === "ended" ? `at its end${ended}` : isGone(state.situation) ? `the level was ${state.level}` : "");
   drawAlive(state);
   ask("health");
 }
 
 function drawAlive(state) {
-  const status = state.status || {}, now = life(state), parts = [];
-  const over = "nothing follows the arm until it is started again. Roll-back works all the same.";
-  if (now === "silent") say("alive", `No status for ${ago(Known.status)}: the recalibration may have been killed; then ${over}`);
-  else say("alive", now === "ended" ? `The recalibration has ended: ${over}` : "");
-  byId("alive").className = now === "silent" ? "stopped" : "";
+  const status = state.status || {}, now = state.situation || {}, parts = [];
+  say("alive", now.over || "");
+  byId("alive").className = isGone(now) ? "stopped" : "";
   if (status.paused) parts.push("It is paused: records are passed over.");
-  if (status.journal === "full") parts.push("Its journal is full: records wait.");
   if (state.written) parts.push(`Calibration last written at entry ${count(state.written.sequence)}, ${when(state.written.at)}.`);
   if (isNumber(status.records)) parts.push(`${count(status.records)} records taken in all.`);
   say("kept", parts.join(" "));

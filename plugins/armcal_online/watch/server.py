@@ -11,9 +11,11 @@ import hashlib
 import hmac
 import ipaddress
 import json
+import math
 import re
 import socket
-import threading
+import time
+from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -107,7 +109,10 @@ class WatchServer(ThreadingHTTPServer):
         feed: what is shown.
         host: the address to listen on; further than this machine, every request needs ``token``.
         port: 0 for any free one.
-        patience: how long a client may take to send a request or to take a part of an answer (s).
+        patience: how long a client may take to send the whole of a request, or to take an answer (s).
+
+    Attributes:
+        due: by connection, oldest first, until when its request has to be here (monotonic, s); no end once it is.
 
     Raises:
         InputError: the address cannot be listened on.
@@ -121,7 +126,7 @@ class WatchServer(ThreadingHTTPServer):
         self.feed, self.patience = feed, patience
         self.access = Access.of(host)
         self.page, self.policy = page()
-        self.connections = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        self.due: dict[Any, float] = {}
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
             super().__init__((host, port), _Handler)
@@ -148,18 +153,33 @@ class WatchServer(ThreadingHTTPServer):
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """One thread a connection, as long as there are not too many."""
-        if not self.connections.acquire(blocking=False):
+        """One thread a connection; of too many the oldest goes whose request is not here yet."""
+        if len(self.due) >= MOST_CONNECTIONS:
+            self._drop_unfinished(math.inf, 1)
+        if len(self.due) >= MOST_CONNECTIONS:
             self.shutdown_request(request)
             return
+        self.due[request] = time.monotonic() + self.patience
         super().process_request(request, client_address)
+
+    def service_actions(self) -> None:
+        """However slowly a request trickles in, its time ends."""
+        self._drop_unfinished(time.monotonic(), MOST_CONNECTIONS)
+
+    def _drop_unfinished(self, until: float, most: int) -> None:
+        """The oldest connections whose request had to be here by then; their threads read an end and leave."""
+        late = [request for request, due in [*self.due.items()] if due < until]
+        for request in late[:most]:
+            self.due.pop(request, None)
+            with suppress(OSError):
+                request.shutdown(socket.SHUT_RDWR)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         """Give the place back when a connection ends."""
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self.connections.release()
+            self.due.pop(request, None)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A client that went away is no fault."""
@@ -176,6 +196,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """The page, or the state: all of it, or what is new ``after`` the place of an earlier one."""
+        self.server.due[self.connection] = math.inf
         address = urlsplit(self.path)
         query = {key: values[-1] for key, values in parse_qs(address.query).items()}
         if not self.server.access.allows(self.headers.get("Host"), query.get("token")):

@@ -1,21 +1,48 @@
 """What whoever is called at night has to know: what to do, how far off, since when, and where to roll back to."""
 
 import shlex
+import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import Any
 
 from armcal_online.tracking.decisions import KINDS, LEVEL_ADVICE, LEVELS, sure_to
-from armcal_online.watch.events import Message
+from armcal_online.watch.events import Message, when
 
 _NEWEST = 20
 """So many of the last readings show how far off the predictions are now."""
 _MOST = 60
-AFTER_THE_END = "Start the recalibration again before the arm's next work."
-"""What to do once a recalibration has ended, and nothing was wrong."""
+AFTER_THE_END = "Start the recalibration again before the arm's next work: the same command goes on where it stopped."
+"""What to do once nothing follows the arm."""
+SILENT_S = 15.0
+"""A recalibration that wrote no status for so long does not run, or hangs."""
+_OVER = {
+    "ended": "The recalibration has ended",
+    "stopped": "The recalibration stopped",
+    "silent": "The recalibration was killed, or hangs: its last sign came",
+}
 _CALM = "some"
 """In the advice for a level for which no event stated how many records it takes."""
+
+
+def over(status: Mapping[str, Any], finished: Message | None, heard: float | None) -> tuple[str, str | None]:
+    """How a recalibration stands, and that nothing follows the arm any more, since when and why; None while one does.
+
+    ``waiting`` while nothing came, ``live``, ``ended``, ``stopped`` by a fault, or ``silent``. ``heard`` is the time of
+    its last sign of life (s since 1970).
+    """
+    fault = status.get("fault")
+    if status.get("finished"):
+        life, at = "stopped" if fault else "ended", (finished or status).get("at", heard)
+    else:
+        life, at = "live" if heard else "waiting", heard
+        life = "silent" if heard and time.time() - heard > SILENT_S else life
+    if life not in _OVER:
+        return life, None
+    began = f"{_OVER[life]} at {when(at)}" if at else _OVER[life]
+    why = f": {fault}" if life == "stopped" else "."
+    return life, f"{began}{why} Nothing follows the arm until it is started again; a roll-back works all the same."
 
 
 class Trouble:

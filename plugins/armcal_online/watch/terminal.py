@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
 from typing import Any
 
 from rich.console import Group, RenderableType
@@ -10,12 +9,13 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from armcal_online.watch.events import when
+
 LEVEL_STYLES = {"nominal": "green", "watch": "blue", "suspect": "yellow", "lost": "red"}
 VERDICT_STYLES = {"accepted": "cyan", "rejected": "red", "ignored": "dim"}
 _BARS = " ▁▂▃▄▅▆▇█"
 _BAND = 1.96
 _RECORDS, _PARAMETERS, _EVENTS = 6, 6, 6
-_SILENT_S = 15.0
 
 
 def picture(state: Mapping[str, Any], width: int = 80) -> RenderableType:
@@ -54,12 +54,14 @@ def _health(state: Mapping[str, Any]) -> Panel:
     level, counts, now = state["level"], state["status"].get("counts", state["counts"]), state["situation"]
     sentence = state["level_sentence"] or (state["status"].get("why") if state["status"].get("level") == level else "")
     style = LEVEL_STYLES.get(level, "dim")
-    if state["status"].get("finished"):
+    if now["over"]:
         style = "dim" if level == "nominal" else style  # no green for what nothing follows
+    if now["life"] in ("stopped", "silent"):
+        style, level = "red", f"not running (it was {level})"
     shown = Table.grid(padding=(0, 2))
     shown.add_column(style="dim")
     shown.add_column(overflow="fold")
-    shown.add_row("level", Text.assemble((level, f"bold {style}"), _life(state)))
+    shown.add_row("level", Text.assemble((level, f"bold {style}"), f"  {now['over'] or ''}"))
     for name, words in (
         ("do now", now["do"]),
         ("what", now.get("what") or sentence),
@@ -68,7 +70,7 @@ def _health(state: Mapping[str, Any]) -> Panel:
         ("off now", _off(now)),
         ("since", _known(now.get("since"))),
         ("last good", _known(now.get("last_good"))),
-        ("roll back", now.get("rollback") if level != "nominal" else None),
+        ("roll back", now.get("rollback") if state["level"] != "nominal" else None),
         ("newest", state["last"] and f"{_known(state['last'])}, heard {_span(state['heard_s'])} ago"),
         ("records", ", ".join(f"{count:,.0f} {verdict}" for verdict, count in counts.items())),
         ("at nominal", _off_at_nominal(state["over_time"])),
@@ -76,16 +78,6 @@ def _health(state: Mapping[str, Any]) -> Panel:
         if words:
             shown.add_row(name, Text(str(words), style="bold" if name == "do now" else ""))
     return Panel(shown, title=Text(str(state["folder"])), title_align="left", border_style=style)
-
-
-def _life(state: Mapping[str, Any]) -> str:
-    """Whether anything follows the arm, where nothing may."""
-    if state["status"].get("finished"):
-        ended = f" at {_when(state['finished'])}" if state.get("finished") else ""
-        return f"  The recalibration has ended{ended}: nothing follows the arm until it is started again."
-    if state["status"] and (state.get("status_s") or 0) > _SILENT_S:
-        return f"  No status for {_span(state['status_s'])}: the recalibration may have been killed."
-    return ""
 
 
 def _off(now: Mapping[str, Any]) -> str:
@@ -186,9 +178,7 @@ def _place(message: Mapping[str, Any]) -> str:
 
 def _when(message: Mapping[str, Any]) -> str:
     at = message.get("at")
-    if at is None or not 1e8 < at < 1e11:
-        return "" if at is None else f"at {at:g} s"
-    return f"{datetime.fromtimestamp(at, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    return "" if at is None else when(at)
 
 
 def _number(value: float | None) -> str:

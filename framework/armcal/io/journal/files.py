@@ -87,8 +87,8 @@ REAL_FILES = FileLayer()
 
 
 def is_full(fault: OSError) -> bool:
-    """Whether there is no room: a full disk or a quota."""
-    return fault.errno in (errno.ENOSPC, errno.EDQUOT)
+    """Whether there is no room: a full disk, a quota, or a limit of a file's size."""
+    return fault.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager

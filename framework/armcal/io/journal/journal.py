@@ -11,9 +11,8 @@ from armcal.errors import ArmcalError, DataError, InputError, Location
 from armcal.io.journal.files import REAL_FILES, FileLayer, Locking, WriterLock, is_full, lock_folder
 from armcal.io.journal.frames import payload_of
 from armcal.io.journal.reader import Newest, read_newest, segment_path
-from armcal.io.journal.room import JournalRoom, keep_cut
 from armcal.io.journal.segment import CHECKPOINT, HEADER, Cut, Entry, Link
-from armcal.io.journal.writer import SegmentBrokenError, SegmentWriter, remove_durably
+from armcal.io.journal.writer import SegmentBrokenError, SegmentWriter, keep_cut, remove_durably
 
 
 class JournalFullError(ArmcalError):
@@ -127,8 +126,8 @@ class Journal:
 
     @property
     def wants_checkpoint(self) -> bool:
-        """The segment is full, or the reserve of the disk was given up: a checkpoint frees what is before it."""
-        return self._writer.filled >= self._limits.segment_bytes or self._room.spent
+        """The segment is full: a checkpoint begins the next one."""
+        return self._writer.filled >= self._limits.segment_bytes
 
     def record(self, kind: str, content: Any) -> int:
         """Write an entry and return its sequence number once it would outlast a power loss.
@@ -139,7 +138,7 @@ class Journal:
             JournalFailedError: the disk fails.
         """
         payload = _entry(kind, {"content": content})
-        return self._with_room(lambda: self._writer.append_durably(payload))
+        return self._written(lambda: self._writer.append_durably(payload))
 
     def note(self, kind: str, content: Any) -> int:
         """Write an entry that a power loss may take, together with those after it, until the next ``record``.
@@ -148,7 +147,7 @@ class Journal:
             ValueError, TypeError, JournalFullError, JournalFailedError: see ``record``.
         """
         payload = _entry(kind, {"note": True, "content": content})
-        return self._with_room(lambda: self._writer.append(payload))
+        return self._written(lambda: self._writer.append(payload))
 
     def checkpoint(self, content: Any) -> int:
         """Begin a new segment with a full state, durable; the oldest segments go where all are above the limit.
@@ -157,9 +156,9 @@ class Journal:
             ValueError, TypeError, JournalFullError, JournalFailedError: see ``record``; the earlier segment goes on.
         """
         payload_of({"content": content})
-        sequence = self._with_room(lambda: self._begin_segment(content))
+        sequence = self._written(lambda: self._begin_segment(content))
         try:
-            self._room.trim(self._writer.tail.size, self._limits.total_bytes)
+            self._trim()
         except SegmentBrokenError as fault:
             self._failure = str(fault)  # the checkpoint is durable; the next entry is refused
         return sequence
@@ -182,27 +181,17 @@ class Journal:
             raise ValueError("the journal is closed.")
         return self._segment
 
-    def _with_room(self, write: Callable[[], int]) -> int:
-        """Write, and give up older segments and the ballast, one by one, while there is no room."""
-        while True:
-            if self._failure:
-                raise self._failed()
-            try:
-                return write()
-            except SegmentBrokenError as fault:
-                self._failure = str(fault)
-                raise self._failed() from fault
-            except OSError as fault:
-                if not is_full(fault):
-                    self._failure = str(fault)
-                    raise self._failed() from fault
-                try:
-                    gave_room = self._room.give_up_something()
-                except (SegmentBrokenError, OSError) as broken:
-                    self._failure = str(broken)
-                    raise self._failed() from broken
-                if not gave_room:
-                    raise _full(self._folder, fault) from fault
+    def _written(self, write: Callable[[], int]) -> int:
+        """What was written; a full disk refuses it and leaves the journal as it was, after another fault it is over."""
+        if self._failure:
+            raise self._failed()
+        try:
+            return write()
+        except (SegmentBrokenError, OSError) as fault:
+            if isinstance(fault, OSError) and is_full(fault):
+                raise _full(self._folder, fault) from fault
+            self._failure = str(fault)
+            raise self._failed() from fault
 
     def _failed(self) -> JournalFailedError:
         return JournalFailedError(
@@ -224,9 +213,16 @@ class Journal:
         except BaseException:  # it may be there: to go on in the old segment could fork the journal
             self._failure = "a checkpoint was interrupted"
             raise
-        self._room.older[old.number] = old.tail.size
+        self._older[old.number] = old.tail.size
         old.close()
         return self._writer.tail.sequence
+
+    def _trim(self) -> None:
+        """Drop segments from the oldest until all are within the limit, one by one: no power loss leaves a gap."""
+        while self._older and self._writer.tail.size + sum(self._older.values()) > self._limits.total_bytes:
+            number = next(iter(self._older))
+            remove_durably(self._files, segment_path(self._folder, number))
+            del self._older[number]
 
     def _recover(self, newest: Newest) -> None:
         segment, files = newest.segment, self._files
@@ -242,8 +238,7 @@ class Journal:
             self._segment = SegmentWriter.go_on(files, segment)
             state = segment.checkpoint
             self.recovered = Recovered(segment.header, state.content, state.sequence, segment.entries, cut)
-        self._room = JournalRoom(files, self._folder, newest.older)
-        self._room.make_ballast()
+        self._older = {number: files.size(segment_path(self._folder, number)) for number in newest.older}
 
 
 def _entry(kind: str, rest: Mapping[str, Any]) -> bytes:
@@ -256,7 +251,7 @@ def _full(folder: Path, fault: BaseException) -> JournalFullError:
     return JournalFullError(
         f"there is no room for an entry ({fault}); it was not written.",
         where=Location(str(folder)),
-        hint="Make room on the disk; older segments and the reserve were given up already.",
+        hint="Make room on the disk, then start again; what was acknowledged is kept.",
     )
 
 

@@ -1,14 +1,17 @@
 """The segment that is being written: frames appended, made durable, or taken back whole."""
 
+import re
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
-from armcal.io.journal.files import FileLayer
+from armcal.io.journal.files import FileLayer, is_full, write_whole
 from armcal.io.journal.frames import encode_frame, payload_of
-from armcal.io.journal.segment import CHECKPOINT, FORMAT, HEADER, Link, Segment
+from armcal.io.journal.segment import CHECKPOINT, FORMAT, HEADER, Cut, Link, Segment
+
+CUTS_KEPT = 8
 
 
 class SegmentBrokenError(Exception):
@@ -163,3 +166,20 @@ def remove_durably(files: FileLayer, path: Path, cause: BaseException | None = N
         files.sync_folder(path.parent)
     except OSError as fault:
         raise SegmentBrokenError(f"{path} could not be removed ({fault})") from (cause or fault)
+
+
+def keep_cut(files: FileLayer, folder: Path, cut: Cut) -> Cut:
+    """Keep what is cut off beside the journal, and the newest few of such files; on a full disk it is not kept."""
+    if not cut.data:
+        return cut
+    path = folder / f"cut-{cut.sequence}.bin"
+    try:
+        write_whole(files, path, cut.data)
+    except OSError as fault:
+        if not is_full(fault):
+            raise
+        return cut
+    names = [name for name in files.names(folder) if re.fullmatch(r"cut-\d+\.bin", name)]
+    for name in sorted(names, key=lambda name: int(name[4:-4]))[:-CUTS_KEPT]:
+        files.remove(folder / name)
+    return replace(cut, kept=path)
