@@ -6,14 +6,12 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import planted_mistakes
 import pytest
 from armcal.cli.main import cli
-from armcal.diagnose.evidence import Evidence
-from armcal.diagnose.gross_findings import gross_error, overfitted
+from armcal.diagnose.gross_findings import overfitted
 from armcal.planning.suggestion import Suggestion, is_worth_measuring
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
@@ -57,10 +55,12 @@ def test_an_error_beyond_3_percent_of_the_reach_is_bad(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_an_error_of_five_times_the_noise_is_bad_unless_it_is_explained(tmp_path: Path) -> None:
-    """0.5 mm of noise on an arm of 0.4 m is 0.2 % of its reach."""
-    code, verdict = ran(tmp_path, "measurements.tracker.noise_mm=0.07")
-    assert code == 3 and "times the declared noise; what was found in the residuals does not explain it" in bad(verdict)
+def test_the_stated_noise_grades_no_fit(tmp_path: Path) -> None:
+    """0.5 mm of noise on an arm of 0.4 m, stated as 0.07, 0.2 and 0.7 mm; then 3 mm that the pose predicts."""
+    for stated in (0.07, 0.2, 0.7):
+        code, verdict = ran(tmp_path, f"measurements.tracker.noise_mm={stated}")
+        size = [f for f in verdict["findings"] if "times the declared noise" in f["text"]]
+        assert code == 0 and (not size or ("mm on average" in size[0]["text"] and size[0]["grade"] != "bad"))
     angles = np.genfromtxt(CONFIGS / "demo.csv", delimiter=",", names=True)["q4_deg"]
     off = 3.0 * (np.abs(angles) > 50)[:, None] * [1, 0, 0]
     code, verdict = ran(tmp_path, "measurements.tracker.noise_mm=0.15", change=lambda points: points + off)
@@ -70,28 +70,14 @@ def test_an_error_of_five_times_the_noise_is_bad_unless_it_is_explained(tmp_path
 
 
 @pytest.mark.slow
-def test_what_time_predicts_excuses_no_error(tmp_path: Path) -> None:
-    """The tracker was bumped by 1.7 mm in the middle: 0.4 % of the reach; the mean of both halves is no arm."""
-    moved = 1.7 * (np.arange(200) >= 100)[:, None]
-    code, verdict = ran(tmp_path, "measurements.tracker.noise_mm=0.1", change=lambda points: points + moved)
+@pytest.mark.parametrize("stated", [0.1, 0.5, 1.0])
+def test_a_jump_that_makes_a_third_of_the_error_is_bad(tmp_path: Path, stated: float) -> None:
+    """The tracker was bumped by 5 mm in the middle: 1 % of the reach; the mean of both halves is no arm."""
+    moved = 5 * (np.arange(200) >= 100)[:, None]
+    code, verdict = ran(tmp_path, f"measurements.tracker.noise_mm={stated}", change=lambda points: points + moved)
+    assert code == 3 and "contradict" in bad(verdict)
     told = next(f for f in verdict["findings"] if f["grade"] == "bad")
-    assert code == 3 and "times the declared noise" in told["text"]
-    assert "the base, the tracker or the target moved" in told["action"]
-
-
-@pytest.mark.parametrize("off", ["one axis of all", "a few records"])
-def test_one_axis_of_all_records_counts_as_an_error_of_all_and_a_few_wild_records_do_not(off: str) -> None:
-    """A tracker that was bumped along x left two axes of three as the noise has them, and so was a warning."""
-    whitened = np.random.default_rng(0).normal(size=(3, 200))
-    if off == "one axis of all":
-        whitened[0] += 12 * np.where(np.arange(200) < 100, -1, 1)
-    else:
-        whitened[:, ::20] += 40
-    scale = np.sqrt(np.mean(whitened**2))
-    told = gross_error(
-        np.full(20, 0.5), SimpleNamespace(reach_mm=1000.0), SimpleNamespace(noise_scale=scale), Evidence(), whitened
-    )
-    assert scale > 5 and [finding.grade for finding in told] == (["bad"] if off == "one axis of all" else [])
+    assert "moved" in told["action"]
 
 
 @pytest.mark.slow
@@ -99,7 +85,7 @@ def test_a_noise_that_nobody_stated_is_estimated_and_said(tmp_path: Path) -> Non
     """No fault is found in 0.5 mm of noise where 0.07 mm was a guess; priors are weighed against 0.5 mm."""
     code, verdict = ran(tmp_path, "measurements.tracker.noise_mm=0.07", "noise.estimate=instruments")
     told = next(f for f in verdict["findings"] if "estimated from the residuals" in f["text"])
-    assert code == 0 and "times the declared noise" not in bad(verdict)
+    assert code == 0
     sd = float(told["text"].split("% (")[1].split()[0])
     assert sd == pytest.approx(0.5 / 0.07, rel=0.15) and "State it once you know it" in told["action"]
 

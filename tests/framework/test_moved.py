@@ -79,20 +79,20 @@ def test_few_records_say_nothing():
 
 
 def test_a_calibration_that_is_worse_than_none_is_told_by_the_records_that_judge():
-    judged, nominal = np.array([np.nan, 12.0, 9.0, 11.0, 10.0]), np.array([90.0, 6.0, 7.0, 6.0, 7.0])
+    judged, nominal = np.array([np.nan, 12.0, 9.0, 11.0, 10.0, 10.5]), np.array([90.0, 6.0, 7.0, 6.0, 7.0, 6.5])
     (finding,) = worse_than_nominal(judged, nominal)
     assert finding.grade == "bad" and "10.50 mm" in finding.text and "6.50" in finding.text
     assert worse_than_nominal(nominal / 2, nominal) == []
-    assert worse_than_nominal(np.full(5, np.nan), nominal) == []
+    assert worse_than_nominal(np.full(6, np.nan), nominal) == []
 
 
-def test_what_chance_makes_worse_than_nominal_is_a_warning() -> None:
-    """Paired differences of mean zero: about one set in twenty is graded bad, and a real loss always is."""
-    random, bad, warned = np.random.default_rng(5), 0, 0
+def test_what_chance_makes_worse_than_nominal_is_a_note() -> None:
+    """Paired differences of mean zero: about one set in a hundred is graded bad, and a real loss always is."""
+    random, bad, noted = np.random.default_rng(5), 0, 0
     for _ in range(400):
         nominal = np.abs(random.normal(2.0, 0.5, 40))
         for finding in worse_than_nominal(nominal + random.normal(0.0, 0.3, 40), nominal):
-            bad, warned = bad + (finding.grade == "bad"), warned + (finding.grade == "warning")
-    assert 8 <= bad <= 34 and warned > 120
+            bad, noted = bad + (finding.grade == "bad"), noted + (finding.grade == "note")
+    assert bad <= 10 and noted > 120
     (finding,) = worse_than_nominal(nominal + random.normal(0.3, 0.3, 40), nominal)
     assert finding.grade == "bad"

@@ -124,6 +124,8 @@ def result_of(
         before,
         after,
         position,
+        np.linalg.norm(before, axis=0),
+        np.linalg.norm(before, axis=0),
     )
     found = estimate_of(parameters or blocks(), freedom=max(3 * count - 28, 1), undetermined=undetermined)
     return RunResult(
@@ -291,7 +293,7 @@ def test_few_records(count: int) -> None:
     if not count:
         none = np.zeros(0)
         wide = np.zeros((3, 0))
-        errors = RecordErrors(none, none, none, wide, wide, wide)
+        errors = RecordErrors(none, none, none, wide, wide, wide, none, none)
         split = Split(np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp))
         data = Dataset((), {})
         result = replace(result, errors=errors, split=split, dataset=data, table=_table(errors, split))

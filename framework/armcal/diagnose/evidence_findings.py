@@ -29,6 +29,8 @@ _NO_NOISE = 0.01
 """Of the declared noise: residuals below it are a simulation's without noise, and how they vary means nothing."""
 NOTICEABLE_SD = 0.3
 """A shift by less than so many standard deviations is not reported."""
+WORSE, POWER = 0.01, 0.9
+"""Level of a loss against the nominal arm, and which share of losses of the size stated is found."""
 _MM = "mm"
 
 
@@ -105,26 +107,36 @@ def worse_than_declared(judged_mm: Array, declared_mm: Array, unit: str = _MM) -
     return [Finding("note", text, "paired differences, one-sided, 5 %, and 1 % of the error", action)]
 
 
-def _by_chance(differences: Array) -> float:
-    """A mean of so many differences that chance makes in one of twenty cases, one-sided."""
+def _by_chance(differences: Array, level: float = 0.05) -> float:
+    """A mean of so many differences that chance makes in so many cases, one-sided."""
     count = len(differences)
-    return float(stdtrit(count - 1, 0.95) * np.std(differences, ddof=1) / np.sqrt(count))
+    return float(stdtrit(count - 1, 1 - level) * np.std(differences, ddof=1) / np.sqrt(count))
 
 
-def worse_than_nominal(judged_mm: Array, nominal_mm: Array, unit: str = _MM) -> list[Finding]:
-    """Where records that did not train are missed by more than before calibration (N each; nan where not judged)."""
+def worse_than_nominal(judged_mm: Array, nominal_mm: Array, spent: float = 0.0, unit: str = _MM) -> list[Finding]:
+    """Where records that did not train are missed by more than by the nominal arm (N each; nan where not judged).
+
+    Parameters that spend p of m equations make errors sqrt(1 + p / (m - p - 1)) times as large [Breiman1983] though
+    nothing is wrong: ``spent`` is p / (m - 1). What is more than that, and more than chance, is worse.
+    """
     seen = np.isfinite(judged_mm) & np.isfinite(nominal_mm)
-    if not seen.any():
+    if np.count_nonzero(seen) < 2 or spent >= 1:
         return []
     after, before = float(np.mean(judged_mm[seen])), float(np.mean(nominal_mm[seen]))
     if after <= before:
         return []
-    which = f"on records that did not train it: {readable(after)} {unit} on average, {readable(before)} before."
-    more = judged_mm[seen] - nominal_mm[seen]
-    test = "paired differences, one-sided, 5 %"
-    if len(more) > 1 and after - before <= _by_chance(more):
-        action = "Nothing is gained by it on poses like these: keep the nominal arm, or look at what trained."
-        return [Finding("warning", f"No better than the nominal arm {which}", test, action)]
+    factor = 1 / np.sqrt(1 - spent)
+    more = judged_mm[seen] - factor * nominal_mm[seen]
+    least = _by_chance(more, WORSE) + _by_chance(more, 1 - POWER)
+    which = f"on {len(more)} records that did not train it: {readable(after)} {unit} on average, {readable(before)} of "
+    which += "the nominal arm, which the same records placed."
+    test = (
+        f"paired differences, one-sided, {100 * WORSE:g} %, beyond the {percent(factor - 1)} that so many parameters "
+        f"make; {100 * POWER:g} % of losses of {readable(least)} {unit} would show"
+    )
+    if np.mean(more) <= _by_chance(more, WORSE):
+        action = "Nothing is gained by it on poses like these: keep the nominal arm, or measure more poses."
+        return [Finding("note", f"No better than the nominal arm {which}", test, action)]
     action = "Do not use it. Look at what trained: too few postures, too much alike, or some of them wrong."
     return [Finding("bad", f"Worse than the nominal arm {which}", test, action)]
 

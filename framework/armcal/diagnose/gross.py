@@ -10,6 +10,7 @@ from scipy.special import stdtr
 
 from armcal.base.arrays import Array, Indices
 from armcal.base.domains import Pose, ScrewAxis
+from armcal.base.poses import NO_TURN
 from armcal.errors import NotConvergedError
 from armcal.estimate.combination import Measure
 from armcal.estimate.estimator import Estimate
@@ -147,7 +148,10 @@ def _places(problem: Problem, estimate: Estimate, poses: Sequence[FactorRecords]
 
 
 def displaced(problem: Problem, estimate: Estimate, records: Sequence[FactorRecords]) -> tuple[Displaced, ...]:
-    """Coordinates of geometry that are more than ``BEYOND`` prior standard deviations from their nominal values."""
+    """Coordinates of geometry that are more than ``BEYOND`` prior standard deviations from their nominal values.
+
+    What nobody configured is nowhere far from.
+    """
     parameters = problem.parameters
     moved = parameters.coordinates(parameters.local(estimate.values))
     blocks = parameters.coordinate_blocks
@@ -157,8 +161,10 @@ def displaced(problem: Problem, estimate: Estimate, records: Sequence[FactorReco
     far = []
     for i in np.flatnonzero(np.abs(moved) > BEYOND * sizes):
         block = blocks[i]
+        if unconfigured(problem, block.name):
+            continue
         amount, unit = Measure(block.unit, 1.0).shown(float(moved[i]))
-        placement = _only_places(problem, estimate.values, records, int(i))
+        placement = only_places(problem, estimate.values, records, int(i))
         times, name = abs(float(moved[i])) / sizes[i], parameters.coordinate_names[i]
         far.append(Displaced(name, amount, unit, float(times), block.prior_sd is not None, placement))
     return tuple(sorted(far, key=lambda coordinate: -coordinate.times))
@@ -173,7 +179,7 @@ def proportion(problem: Problem, estimate: Estimate, records: Sequence[FactorRec
         if block.unit == "m"
         and block.domain.dof == 1
         and nominal[parameters.entries_of(block.name)].all()
-        and not _only_places(problem, estimate.values, records, i)
+        and not only_places(problem, estimate.values, records, i)
     ]
     if len(chosen) < _FEWEST_LENGTHS:
         return None
@@ -181,7 +187,7 @@ def proportion(problem: Problem, estimate: Estimate, records: Sequence[FactorRec
     return Proportion.of(nominal[entries], estimate.values[entries], estimate.covariance[np.ix_(chosen, chosen)])
 
 
-def _only_places(problem: Problem, values: Array, records: Sequence[FactorRecords], coordinate: int) -> bool:
+def only_places(problem: Problem, values: Array, records: Sequence[FactorRecords], coordinate: int) -> bool:
     """Whether a coordinate only moves where the base stands or which point of the tool is meant; or no tool at all."""
     names = problem.parameters.coordinate_names
     if names[coordinate].partition(".")[0] not in problem.blueprint.arms:
@@ -190,3 +196,11 @@ def _only_places(problem: Problem, values: Array, records: Sequence[FactorRecord
     moves = along(problem, values, records, np.eye(len(names))[coordinate]).reshape(-1, 1)
     left = np.linalg.norm(apart_from(np.array(unseen_motions(at, axes)).T, moves))
     return bool(left <= _SAME_MOTION * np.linalg.norm(moves))
+
+
+def unconfigured(problem: Problem, name: str) -> bool:
+    """Whether a parameter of a measurement has no prior, and is left where a configuration that says nothing has it."""
+    block = problem.blueprint.parameters[name]
+    if block.name.partition(".")[0] in problem.blueprint.arms or block.prior_sd is not None:
+        return False
+    return tuple(block.nominal) in ((0.0,) * block.size, NO_TURN, (*NO_TURN, 0.0, 0.0, 0.0))

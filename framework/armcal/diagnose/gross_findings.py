@@ -3,29 +3,39 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.spatial.transform import Rotation as Turns
 
 from armcal.base.arrays import Array
+from armcal.base.dataset import Dataset
+from armcal.base.domains import Rotation
 from armcal.base.units import digits
 from armcal.diagnose.evidence import Evidence
-from armcal.diagnose.gross import AS_MUCH, BEYOND, BY_SHARES, FAR_BEYOND, Displaced, Figure
-from armcal.diagnose.majority import Minority
+from armcal.diagnose.gross import AS_MUCH, BEYOND, BY_SHARES, FAR_BEYOND, MOST_RECORDS, Displaced, Figure
+from armcal.diagnose.majority import FAR, Minority
 from armcal.diagnose.noise_findings import Finding, Grade, first_few
-from armcal.diagnose.residual_structure import ResidualStructure
-from armcal.diagnose.rounded import rounding_findings
-from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
+from armcal.diagnose.residual_structure import ResidualStructure, Structure
+from armcal.estimate.start import BETTER
+from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.rigid_alignment import hand_eye
+from armcal.problem.sighting import sighting_of, tools_of
 
 OF_REACH = 0.03
-"""An error beyond this share of the arm's reach is gross, whatever the arm."""
-UNEXPLAINED_OF_REACH, EXPLAINED_OF_REACH, TIMES_NOISE, EXPLAINED = 0.005, 0.02, 5.0, 1 / 3
-"""An error so many times the declared noise is gross where nothing explains a third of it; beyond the first share of
-the reach where other poses predict a third of it, but no cause is known; beyond the second one even where a structure
-in the residuals makes up a third of it, as gravity does of a printed arm whose base is rigid."""
+"""An error beyond this share of the arm's reach, or of a radian, is gross, whatever the arm and its instrument."""
+PREDICTED_OF_REACH, EXPLAINED_OF_REACH, EXPLAINED = 0.01, 0.02, 1 / 3
+"""Where other poses predict a third of the variance of the residuals, the model lacks what noise does not make: gross
+beyond the first share of the reach, or beyond the second where one structure makes up a third of the error, as gravity
+does of a printed arm whose base is rigid. A jump that makes up a third of the error is gross, however small."""
 OVERFITTED = 3.0
 """Times the noise that training records show, from which on errors of records that did not train are the fit's."""
 FEWEST_JUDGED = 10
-_NO_EXCUSE = frozenset({"order", "step", "slip", "scale"})
+_JUMPS = frozenset({"step", "slip"})
+_OVER_TIME = _JUMPS | {"order"}
+_NO_EXCUSE = _OVER_TIME | {"scale"}
 """Kinds of structure that explain no gross error: something may have moved, or a frame be wrong."""
+_LOOK = (
+    "Look at what is configured and held (armcal identify --fixed), and at how records and joints were paired: armcal "
+    "check says how well the nominal arm fits."
+)
 _MOVED = (
     "The error depends on when a record was measured: the base, the tracker or the target moved or drifted. Measure "
     "again what differs, or calibrate the records before and after by themselves. parameters.drift models a slow drift."
@@ -37,17 +47,8 @@ EXACT = 1e-5
 MOST_NAMED = 3
 
 
-def gross_error(
-    judged_mm: Array,
-    figure: Figure,
-    estimate: Estimate,
-    evidence: Evidence,
-    whitened: Array,
-) -> list[Finding]:
-    """Errors of records that did not train (N; nan where not judged) beside the reach and the noise.
-
-    ``whitened`` are residuals in units of the noise, nan outside of training: where some records alone are far off, and
-    named for it, the others are as the noise has it.
+def gross_error(judged_mm: Array, figure: Figure, evidence: Evidence) -> list[Finding]:
+    """Errors of records that did not train (N; nan where not judged) beside the reach, whatever noise was stated.
 
     Where nothing measured is a length, angles stand beside a radian (what the reach is at the distance of the reach),
     pixels beside a thousand. Forces and torques have no such size, and are not judged here.
@@ -57,53 +58,107 @@ def gross_error(
     wholes = {"mm": reach, "mrad": (1000.0, "a radian"), "px": (1000.0, "a thousand px")}
     if not len(seen) or figure.reach_mm <= 0 or unit not in wholes:
         return []
-    mean, scale, (whole, name) = float(np.mean(seen)), estimate.noise_scale, wholes[unit]
+    mean, (whole, name) = float(np.mean(seen)), wholes[unit]
     share = mean / whole
     error = f"The mean error of records that did not train is {digits(mean)} {unit}, {100 * share:.2g} % of {name}"
     if share > OF_REACH:
         test = f"mean, limit {100 * OF_REACH:g} % of {whole:.0f} {unit}"
-        return [Finding("bad", f"{error}: the values do not describe this arm.", test, CHECK_THE_DATA)]
-    explained, predicted = _explained(left)
-    limit = EXPLAINED_OF_REACH if explained >= EXPLAINED else UNEXPLAINED_OF_REACH if predicted >= EXPLAINED else 0.0
-    typical = _typical_size(whitened)
-    if share <= limit or min(scale, typical if limit == 0 else np.inf) <= TIMES_NOISE:
+        return [Finding("bad", f"{error}: the values do not describe this arm.", test, _LOOK)]
+    predicted = left.predictable if left is not None and left.is_predictable else None
+    if left is None or predicted is None or predicted.share < EXPLAINED:
         return []
-    rounded = rounding_findings(evidence.rounding, unit)
-    why = (
-        "rounding of the recorded joints would leave as much"
-        if rounded
-        else "what was found in the residuals does not explain it"
-    )
-    text = f"{error} and {scale:.0f} times the declared noise; {why}."
+    explained = max((_share(s, left) for s in left.worthwhile if s.kind not in _NO_EXCUSE), default=0.0)
+    limit = EXPLAINED_OF_REACH if explained >= EXPLAINED else PREDICTED_OF_REACH
+    if share <= limit:
+        return []
+    text = f"{error}, and other records predict {100 * predicted.share:.0f} % of its variance: the model misses it."
     test = (
-        f"limits {100 * limit:g} % and {TIMES_NOISE:g} times; one cause explains at most {100 * explained:.0f} % of "
-        f"it, other poses predict {100 * predicted:.0f} %"
+        f"limits {100 * limit:g} % and {100 * EXPLAINED:.0f} %; one cause explains {100 * explained:.0f} % of the error"
     )
-    action = f"The cause is not known: is the stated noise the instrument's? {CHECK_THE_DATA}"
-    action = _MOVED if _by_time(left) else action
-    return [Finding("bad", text, test, rounded[0].action if rounded else action)]
+    by_time = [carrier.kind for carrier in predicted.carriers[:1]] == ["time"]
+    return [Finding("bad", text, test, _MOVED if by_time else _LOOK)]
 
 
-def _typical_size(whitened: Array) -> float:
-    """That of the middle record, as a multiple of the noise: all its numbers count, for one axis alone may be off."""
-    trained, rows = np.isfinite(whitened).any(axis=0), len(whitened)
-    sizes = np.sqrt(np.nanmean(whitened[:, trained] ** 2, axis=0))
-    return float(np.median(sizes) / np.sqrt(chdtri(rows, 0.5) / rows))
+def jumped(left: ResidualStructure | None) -> list[Finding]:
+    """Records that contradict one another: a jump makes up a third of the error, and no order of the poses imitates it.
+
+    Of what depends on time the jump is the largest: a drift has a remedy of its own.
+    """
+    predicted = None if left is None or not left.is_predictable else left.predictable
+    if left is None or predicted is None or predicted.is_in_order:
+        return []
+    over_time = [s for s in left.worthwhile if s.kind in _OVER_TIME]
+    most = max(over_time, key=lambda s: s.falls_mm, default=None)
+    if most is None or most.kind not in _JUMPS or _share(most, left) < EXPLAINED:
+        return []
+    text = f"The records contradict one another: the residuals depend on {most.words}"
+    text += f"; without it the mean training error would be {100 * _share(most, left):.0f} % less."
+    test = f"score test; limit {100 * EXPLAINED:.0f} % of the error, poses in no order"
+    return [Finding("bad", text, test, _MOVED)]
 
 
-def _by_time(left: ResidualStructure | None) -> bool:
-    """Whether time is what predicts most of the residuals."""
-    seen = None if left is None or not left.is_predictable else left.predictable
-    return seen is not None and [carrier.kind for carrier in seen.carriers[:1]] == ["time"]
+def _share(structure: Structure, left: ResidualStructure) -> float:
+    """Of the mean error, what one structure makes up."""
+    return structure.falls_mm / max(left.mean_mm, 1e-12)
 
 
-def _explained(left: ResidualStructure | None) -> tuple[float, float]:
-    """Which shares of the error one cause makes up at most, and other poses predict, whatever the cause."""
-    if left is None:
-        return 0.0, 0.0
-    causes = [s.falls_mm for s in left.worthwhile if s.kind not in _NO_EXCUSE]
-    predicted = left.predictable.falls_beside_time if left.predictable is not None and left.is_predictable else 0.0
-    return max(causes, default=0.0) / max(left.mean_mm, 1e-12), predicted
+def turn_findings(judged_deg: Array, fitted_deg: Array, held: str) -> list[Finding]:
+    """Errors of orientations (N; nan where not judged) beside a radian, as those of lengths stand beside the reach.
+
+    Where no record judges, those that trained do (``fitted_deg``). ``held`` says what should have been free.
+    """
+    seen = judged_deg[np.isfinite(judged_deg)]
+    which, seen = ("that did not train", seen) if len(seen) else ("that trained", fitted_deg)
+    mean = float(np.mean(seen))
+    if not np.radians(mean) > OF_REACH:
+        return []
+    text = f"The mean orientation error of records {which} is {digits(mean)} deg: the values do not describe this arm."
+    test = f"mean, limit {100 * OF_REACH:g} % of a radian, {np.degrees(OF_REACH):.1f} deg"
+    return [Finding("bad", text, test, held or _LOOK)]
+
+
+def held_turn(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> str:
+    """What to free where measured bodies are turned on their tools and their rotations are held; empty if none is.
+
+    Bodies so mounted must turn as the nominal arm's tools do.
+    """
+    nominal = problem.parameters.nominal()
+    for number, kernel in enumerate(problem.kernels):
+        own = f"{kernel.factor.name}."
+        names = [b.name for b in problem.parameters.blocks if b.name.startswith(own) and isinstance(b.domain, Rotation)]
+        sighting = sighting_of(problem, records, dataset, number, MOST_RECORDS)
+        if sighting is None or sighting.turned is None or not names or problem.parameters[names[0]].free:
+            continue
+        tools = tools_of(problem, nominal, problem.subset(records, sighting.chosen)[number], number)
+        base, mounted = hand_eye(tools.rotations, sighting.turned)
+        left = np.swapaxes(base @ tools.rotations @ mounted, 1, 2) @ sighting.turned
+        turn, scatter = (float(np.median(Turns.from_matrix(t).magnitude())) for t in (mounted, left))
+        if turn > max(OF_REACH, BETTER * scatter):
+            return (
+                f"Free the target's rotation ({names[0]}), or state it: the measured body is turned by "
+                f"{digits(float(np.degrees(turn)), 2)} deg on the tool from where the configuration has it."
+            )
+    return ""
+
+
+def worse_than_aligned(judged_mm: Array, left_mm: float, spent: float, held: str) -> list[Finding]:
+    """Errors of records that did not train (N; nan where not judged) beside what was left before the fit (median).
+
+    Alignment has nine numbers, and parameters that spend p of m equations make errors 1 / sqrt(1 - p / (m - 1)) times
+    as large (``spent`` is the quotient).
+    """
+    seen = judged_mm[np.isfinite(judged_mm)]
+    spent += 3 / max(len(seen), 1)
+    after = float(np.median(seen)) if len(seen) else 0.0
+    if spent >= 1 or after <= BETTER * left_mm / np.sqrt(1 - spent):
+        return []
+    text = (
+        f"Far worse than the nominal arm as it was aligned before the fit: typically {digits(after)} mm on records "
+        f"that did not train, {digits(left_mm)} mm aligned."
+    )
+    test = f"medians, limit {BETTER / np.sqrt(1 - spent):.2g} times"
+    action = "Something that places the arm or its target is held, or has a prior, elsewhere: free it, or correct it."
+    return [Finding("bad", text, test, held or action)]
 
 
 def overfitted(trained_mm: Array, judged_mm: Array, equations: int, freedom: float, unit: str = "mm") -> list[Finding]:
@@ -140,7 +195,7 @@ def contradicting(minority: Minority | None, ids: Sequence[str]) -> list[Finding
         f"majority is off by {digits(minority.typical_mm, 2)} mm there, and by {digits(minority.far_mm)} mm in these"
     )
     listed = f"{', '.join(ids[i] for i in minority.far[:MOST_NAMED])}{', ...' if count > MOST_NAMED else ''}"
-    test = "sum of residual lengths minimised; far is beyond 8 times the lower quartile"
+    test = f"sum of residual lengths minimised; far is beyond {FAR:g} sd by the lower quartile"
     if minority.since is None:
         action = f"Find out what is different about them ({listed}): units, joints, the target, reflections."
         return [Finding("bad", f"{text}.", test, action)]

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtri
 
 from armcal.base.arrays import Array, Indices
 from armcal.base.units import digits
@@ -17,9 +18,9 @@ from armcal.problem.problem import FactorRecords, Problem
 
 LEAST_SHARE = 0.1
 """Of the records: fewer than these are outliers, which the other tests name one by one."""
-FAR, FAR_IN_NOISE = 8.0, 5.0
-"""Of the lower quartile of all residuals, and of the declared noise: what is far. Of three equal normal coordinates
-one record in 10^15 is."""
+FAR, FAR_IN_NOISE = 7.0, 5.0
+"""In standard deviations by the lower quartile of all residuals, and by the declared noise: what is far. Of three equal
+normal coordinates one record in 10^9 is."""
 LEAST_SCALE = 1.5
 """Residuals in units of the declared noise: a tenth of the records five standard deviations off make more."""
 _ROUNDS = 60
@@ -75,7 +76,9 @@ def minority(rows: FitRows, noise_scale: float, position: Indices) -> Minority |
         lengths = _lengths(rows, residual)
         floor = max(_SMALLEST, 0.1 * float(np.quantile(lengths, _QUARTILE)))
         weights[:data] = 1 / np.sqrt(np.maximum(lengths, floor))[rows.record_of]
-    limit = max(FAR * float(np.quantile(lengths[acting], _QUARTILE)), FAR_IN_NOISE)
+    numbers = min(3, max(1, round(data / len(lengths))))  # more share what the model misses of their record
+    sd = float(np.quantile(lengths[acting], _QUARTILE)) / float(np.sqrt(chdtri(numbers, 1 - _QUARTILE)))
+    limit = max(FAR * sd, FAR_IN_NOISE)
     far, near = acting[lengths[acting] > limit], acting[lengths[acting] <= limit]
     if len(far) < LEAST_SHARE * len(acting) or len(far) > len(near):
         return None

@@ -93,9 +93,9 @@ def judge(
     """
     seen = evidence or Evidence()
     determined = determined_finding(estimate, seen.priors_alone, np.median(judged_mm) if len(judged_mm) else None)
-    own, kept = [ids[i] for i in train], train if fitted is None else train[fitted.kept]
-    suspicious = suspicious_records(errors_mm[train], seen.rows, own, fitted)
-    noise = component_findings(fitted.components) if fitted and fitted.components else [_size(estimate, seen)]
+    own, kept, trained = [ids[i] for i in train], train if fitted is None else train[fitted.kept], errors_mm[train]
+    suspicious = suspicious_records(trained, seen.rows, own, fitted)
+    noise = component_findings(fitted.components) if fitted and fitted.components else [_size(estimate, trained, seen)]
     findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
     findings += [*shift_findings(estimate), *noise, *_freedom(estimate), *_causes(seen)]
     findings += structure_findings(seen.structure, seen.unit) if estimate.verdict.converged else []
@@ -245,7 +245,7 @@ def _bounds(estimate: Estimate) -> list[Finding]:
     return findings
 
 
-def _size(estimate: Estimate, seen: Evidence) -> Finding:
+def _size(estimate: Estimate, trained_mm: Array, seen: Evidence) -> Finding:
     """Are the residuals as large as the declared noise? Chi-square, two-sided, at 5 %."""
     freedom, ratio = max(1, estimate.degrees_of_freedom), estimate.noise_scale
     total, test = ratio**2 * freedom, "chi-square, 5 %"
@@ -258,7 +258,9 @@ def _size(estimate: Estimate, seen: Evidence) -> Finding:
             left = seen.structure
             is_seen = seen.contradictions or (left is not None and (left.structures or left.is_predictable))
             why += f"; {known if is_seen else 'none of the causes that were tested is in it'}"
-        text = f"Residuals are {ratio:.1f} times the declared noise: {why}. Intervals are widened to the residuals."
+        mean = f"{readable(float(np.nanmean(trained_mm)))} {seen.unit} on average"
+        text = f"Residuals are {ratio:.1f} times the declared noise, {mean}: {why}. "
+        text += "Intervals are widened to the residuals."
         action = (
             "Repeat some poses, each from elsewhere: the spread of the repeats is noise, the rest the model's error."
         )

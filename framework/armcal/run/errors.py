@@ -1,7 +1,7 @@
 """Errors of a run's records, nominal and calibrated, and their summaries."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -10,7 +10,7 @@ from armcal.base.arrays import Array
 from armcal.base.units import ERROR_UNITS
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import gave_up
-from armcal.estimate.nuisance import settled, untrained
+from armcal.estimate.nuisance import settled
 from armcal.estimate.validation import (
     CrossValidation,
     ErrorSummary,
@@ -21,20 +21,12 @@ from armcal.estimate.validation import (
     record_errors,
     summarise,
 )
-from armcal.estimate.weighing import WeighedFit
 from armcal.problem.drift import residuals
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.run.prepare import Prepared
+from armcal.run.placed import FittedRecords, nominal_errors
 
 _MM = 1000.0
 """Thousandths of m; of rad where errors are angles."""
-
-
-@dataclass(frozen=True)
-class FittedRecords(Prepared):
-    """A prepared problem, and the fit to its training records."""
-
-    fitted: WeighedFit = field(kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -44,6 +36,8 @@ class TurnErrors:
     nominal_deg: Array
     calibrated_deg: Array
     cross_validated_deg: Array
+    nominal_crossed_deg: Array
+    rival_deg: Array
 
 
 @dataclass(frozen=True)
@@ -51,7 +45,7 @@ class RecordErrors:
     """Error of each record of the dataset, in dataset order: in mm, or in ``unit`` where nothing measured is a length.
 
     Attributes:
-        nominal_mm: with nominal parameters (N).
+        nominal_mm: of the nominal arm, as ``NominalErrors`` has it (N).
         calibrated_mm: with the calibrated ones (N).
         cross_validated_mm: by the fold that did not train on it (N; nan outside of cross-validation).
         nominal_residual_mm: measured minus predicted, all factors stacked (n_r x N).
@@ -64,6 +58,7 @@ class RecordErrors:
         unit: of all errors, ``mm`` or ``mrad``.
         name: what they are errors of, ``Tip``.
         turns: of orientations, where they are measured beside lengths.
+        nominal_crossed_mm, rival_mm: as ``NominalErrors`` has them (N).
     """
 
     nominal_mm: Array
@@ -72,6 +67,8 @@ class RecordErrors:
     nominal_residual_mm: Array
     calibrated_residual_mm: Array
     position_mm: Array
+    nominal_crossed_mm: Array
+    rival_mm: Array
     failed_folds: int = 0
     at_rest_mm: Array | None = None
     cross_validated_at_rest_mm: Array | None = None
@@ -80,14 +77,6 @@ class RecordErrors:
     name: str = "Tip"
     turns: TurnErrors | None = None
 
-    def with_nominal(self, other: Self) -> Self:
-        """With the nominal errors of others, which were made without what was learned since."""
-        turns = self.turns
-        if turns is not None and other.turns is not None:
-            turns = replace(turns, nominal_deg=other.turns.nominal_deg)
-        nominal, residual = other.nominal_mm, other.nominal_residual_mm
-        return replace(self, nominal_mm=nominal, nominal_residual_mm=residual, turns=turns)
-
     def fold_warnings(self, folds: int) -> tuple[str, ...]:
         """That some of the folds did not converge."""
         if not self.failed_folds:
@@ -95,34 +84,38 @@ class RecordErrors:
         return (f"{self.failed_folds} of {folds} folds did not converge; their records are not cross-validated.",)
 
 
-def errors_of(run: FittedRecords, crossed: CrossValidation | None) -> RecordErrors:
-    """Errors of every record, with those of the folds of the training records."""
+def errors_of(
+    run: FittedRecords, crossed: tuple[CrossValidation, tuple[Split, ...]] | None, plain: FittedRecords
+) -> RecordErrors:
+    """Errors of every record, with those of the folds of the training records; ``plain`` has no pose residual yet."""
     problem, records, fitted, train = run.problem, run.records, run.fitted, run.split.train
-    unfitted, nominal, values = untrained(problem), problem.parameters.nominal(), fitted.estimate.values
+    values, (judged_by, splits) = fitted.estimate.values, crossed or (None, ())
     drifts = any(block.drift for block in problem.parameters.free)
     judged, judged_at_rest = np.full((2, len(run.dataset)), np.nan)
-    if crossed is not None:
-        judged[train], judged_at_rest[train] = crossed.errors * _MM, crossed.at_rest * _MM
+    if judged_by is not None:
+        judged[train], judged_at_rest[train] = judged_by.errors * _MM, judged_by.at_rest * _MM
     dimensions = [dimension for kernel in problem.kernels for dimension in kernel.factor.dimensions]
     columns = _columns(problem)
     try:
-        before, after = settled(unfitted, nominal, records), settled(problem, values, records)
-        nominal_errors, nominal_turns = errors_and_turns(unfitted, nominal, records)
+        before, after = nominal_errors(plain, splits), settled(problem, values, records)
         errors, turns = errors_and_turns(problem, values, records, fitted.records)
         turned = None
-        if nominal_turns is not None and turns is not None:
+        if turns is not None and before.turns is not None:
             judged_turns = np.full(len(turns), np.nan)
-            if crossed is not None and crossed.turns is not None:
-                judged_turns[train] = np.degrees(crossed.turns)
-            turned = TurnErrors(np.degrees(nominal_turns), np.degrees(turns), judged_turns)
+            if judged_by is not None and judged_by.turns is not None:
+                judged_turns[train] = np.degrees(judged_by.turns)
+            nominal, nominal_crossed, rival = (np.degrees(of) for of in before.turns)
+            turned = TurnErrors(nominal, np.degrees(turns), judged_turns, nominal_crossed, rival)
         return RecordErrors(
-            nominal_mm=nominal_errors * _MM,
+            nominal_mm=before.errors * _MM,
             calibrated_mm=errors * _MM,
             cross_validated_mm=judged,
-            nominal_residual_mm=_known(problem.residuals(before, records), records) * _MM,
+            nominal_residual_mm=_known(before.residual, records) * _MM,
             calibrated_residual_mm=_known(residuals(problem, after, records, fitted.records), records) * _MM,
             position_mm=problem.predict(values, records)[0].tools[0, 3] * _MM,
-            failed_folds=0 if crossed is None else crossed.failed_folds,
+            nominal_crossed_mm=before.crossed * _MM,
+            rival_mm=before.rival * _MM,
+            failed_folds=0 if judged_by is None else judged_by.failed_folds,
             at_rest_mm=record_errors(problem, values, records) * _MM if drifts else None,
             cross_validated_at_rest_mm=judged_at_rest if drifts else None,
             residual_columns=("dx_mm", "dy_mm", "dz_mm") if dimensions == ["length"] * 3 else columns,
@@ -168,11 +161,11 @@ class ErrorTable:
         at_rest = {}
         if errors.at_rest_mm is not None and errors.cross_validated_at_rest_mm is not None:
             at_rest = summaries(errors.at_rest_mm, errors.cross_validated_at_rest_mm)
-        nominal = summaries(errors.nominal_mm, errors.nominal_mm)
+        nominal = summaries(errors.nominal_mm, errors.nominal_crossed_mm)
         turns = None
         if errors.turns is not None:
             own = errors.turns
-            before = summaries(own.nominal_deg, own.nominal_deg)
+            before = summaries(own.nominal_deg, own.nominal_crossed_deg)
             turns = cls(before, summaries(own.calibrated_deg, own.cross_validated_deg))
         return cls(nominal, summaries(errors.calibrated_mm, errors.cross_validated_mm), at_rest, turns)
 

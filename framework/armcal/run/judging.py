@@ -17,8 +17,12 @@ from armcal.diagnose.gross_findings import (
     contradicting,
     displacement_findings,
     gross_error,
+    held_turn,
+    jumped,
     overfitted,
     size_findings,
+    turn_findings,
+    worse_than_aligned,
 )
 from armcal.diagnose.held import MOST_RECORDS as MOST_FOR_HELD
 from armcal.diagnose.held import contradictions, freed, held_scales
@@ -46,10 +50,11 @@ from armcal.problem.drift import residuals
 from armcal.problem.many_points import with_few_points
 from armcal.problem.motion import Motion, recorded_position
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.run.errors import FittedRecords, RecordErrors
+from armcal.run.errors import RecordErrors
 from armcal.run.intervals import IntervalResult
+from armcal.run.placed import FittedRecords
 from armcal.run.prepare import gravity_findings, same_pose_findings, still_findings, still_joints
-from armcal.run.settings import ExperimentSettings, PlanSettings
+from armcal.run.settings import ExperimentSettings, PlanSettings, ValidationSettings
 
 _MM = 1000.0
 _AT_REST = ", as in a new recording (its drift not known)"
@@ -79,7 +84,7 @@ def verdict_of(
     if estimate.verdict.converged:
         gross = _gross(run, acting, errors, judged, evidence)
         moved += moved_findings(moved_groups(problem, estimate.values, acting))
-    worse = _worse(run, errors, judged)
+    worse = _worse(run, errors, judged, settings.validation)
     verdict = judge(
         estimate,
         _whitened(run),
@@ -217,7 +222,8 @@ def _gross(
     places = errors.unit == "mm" and any(map(len, read))  # a contact reads none: it may agree with itself exactly
     return [
         *(computed_findings(errors.nominal_mm, judged_mm, figure) if places else []),
-        *gross_error(judged_mm, figure, estimate, evidence, _whitened(run)),
+        *gross_error(judged_mm, figure, evidence),
+        *jumped(evidence.structure),
         *contradicting(minority(rows, estimate.noise_scale, position), dataset.ids),
         *size_findings(figure),
         *displacement_findings(figure),
@@ -232,27 +238,43 @@ def _for_held(problem: Problem, acting: Sequence[FactorRecords]) -> tuple[Factor
     return problem.subset(acting, thinned(np.arange(acting[0].count), MOST_FOR_HELD))
 
 
-def _worse(run: FittedRecords, errors: RecordErrors, judged_mm: Array) -> list[Finding]:
+def _worse(run: FittedRecords, errors: RecordErrors, judged_mm: Array, settings: ValidationSettings) -> list[Finding]:
     """Where records that did not train are missed by more than before, or by more than those that did.
 
-    An arm of which no parameter is free is its nominal one: what was before is then the start, which all records gave.
     Of a pose residual it is not known how much freedom it takes up, and its own folds judged it.
     """
     problem, fitted, arms = run.problem, run.fitted, run.problem.blueprint.arms
-    moves = any(block.name.partition(".")[0] in arms for block in problem.parameters.free)
-    worse = worse_than_nominal(judged_mm, errors.nominal_mm, errors.unit) if moves else []
+    equations, freedom = problem.equations(fitted.records), fitted.estimate.degrees_of_freedom
+    trains = 1 - 1 / settings.folds if settings.folds else 1.0
+    spent = (equations - freedom) / max(trains * equations - 1, 1)
+    worse = worse_than_nominal(_unseen(run, errors), errors.rival_mm, spent, errors.unit)
+    worse += _misplaced(run, errors, judged_mm, spent)
     if fitted.as_declared is not None and len(run.split.holdout):
         declared_mm = record_errors(problem, fitted.as_declared, run.records) * _MM
         worse += worse_than_declared(judged_mm, declared_mm, errors.unit)
     if any(arm.residual is not None and arm.residual.is_learned for arm in arms.values()):
         return worse
     trained = (errors.calibrated_mm if errors.at_rest_mm is None else errors.at_rest_mm)[run.split.train]
-    spent = problem.equations(fitted.records), fitted.estimate.degrees_of_freedom
-    return worse + overfitted(trained, judged_mm, *spent, errors.unit)
+    return worse + overfitted(trained, judged_mm, equations, freedom, errors.unit)
 
 
-def _judged(run: FittedRecords, errors: RecordErrors) -> Array:
-    """Errors of the records that judge: held-out ones, else cross-validated ones (N; nan elsewhere).
+def _misplaced(run: FittedRecords, errors: RecordErrors, judged_mm: Array, spent: float) -> list[Finding]:
+    """Orientations that are grossly off, or positions far worse than those that were aligned before the fit."""
+    turns, start, held = errors.turns, run.start, run.split.holdout
+    free = "" if turns is None else held_turn(run.problem, run.records, run.dataset)
+    worse = list[Finding]()
+    if turns is not None:
+        unseen = turns.cross_validated_deg.copy()
+        unseen[held] = turns.calibrated_deg[held]
+        worse += turn_findings(unseen, turns.calibrated_deg[run.split.train], free)
+        worse += worse_than_nominal(unseen, turns.rival_deg, spent, "deg")
+    if start.alignment is None or errors.unit != "mm":
+        return worse
+    return worse + worse_than_aligned(judged_mm, start.alignment.left * _MM, spent, free)
+
+
+def _unseen(run: FittedRecords, errors: RecordErrors) -> Array:
+    """Errors of records by fits that did not see them: held-out and cross-validated ones (N; nan elsewhere).
 
     Where something drifts they are those of a new recording, as ``predict`` takes its poses to be: the drift of this
     one, which its neighbours show, is of no help there.
@@ -260,11 +282,17 @@ def _judged(run: FittedRecords, errors: RecordErrors) -> Array:
     after, crossed = errors.at_rest_mm, errors.cross_validated_at_rest_mm
     if after is None or crossed is None:
         after, crossed = errors.calibrated_mm, errors.cross_validated_mm
-    if not len(run.split.holdout):
-        return crossed
-    judged = np.full(len(run.dataset), np.nan)
-    judged[run.split.holdout] = after[run.split.holdout]
-    return judged
+    unseen = crossed.copy()
+    unseen[run.split.holdout] = after[run.split.holdout]
+    return unseen
+
+
+def _judged(run: FittedRecords, errors: RecordErrors) -> Array:
+    """Errors of the records that judge: held-out ones, else cross-validated ones (N; nan elsewhere)."""
+    unseen = _unseen(run, errors)
+    if len(run.split.holdout):
+        unseen[run.split.train] = np.nan
+    return unseen
 
 
 def _whitened(run: FittedRecords) -> Array:

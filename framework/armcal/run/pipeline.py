@@ -22,10 +22,11 @@ from armcal.io.parallel import Executor
 from armcal.plugins import PluginRegistry
 from armcal.problem.corrected import moved_by
 from armcal.problem.motion import recorded_position
-from armcal.run.errors import ErrorTable, FittedRecords, RecordErrors, errors_of
+from armcal.run.errors import ErrorTable, RecordErrors, errors_of
 from armcal.run.experiment import Experiment
 from armcal.run.intervals import IntervalResult, interval_result
 from armcal.run.judging import verdict_of
+from armcal.run.placed import FittedRecords
 from armcal.run.pose_residual import ResidualOutcome, layer_of, learned_residual
 from armcal.run.prepare import Prepared, Stopwatch, acting, folds_of, prepare
 from armcal.run.result import RunResult, SuspiciousRecord, noise_result, run_groups
@@ -197,7 +198,7 @@ def _validated(
     crossed: tuple[CrossValidation, tuple[Split, ...]] | None = None
     with context.watch.stage("validate"):
         if not run.fitted.estimate.verdict.converged:
-            return errors_of(run, None), IntervalResult()
+            return errors_of(run, None, before), IntervalResult()
         if outcome is not None and outcome.residual is not None and outcome.crossed is not None:
             crossed = outcome.crossed, outcome.splits
         elif experiment.settings.validation.folds:
@@ -206,8 +207,7 @@ def _validated(
             parts = (training, splits, estimator, start, context.progress, context.executor, fit_and_predict)
             crossed = cross_validate(problem, *parts), splits
         intervals = interval_result(problem, run.fitted, run.records, run.split, estimator, crossed, run.dataset)
-        errors = errors_of(run, crossed and crossed[0])
-        return errors if before.problem is problem else errors.with_nominal(errors_of(before, None)), intervals
+        return errors_of(run, crossed, before), intervals
 
 
 def _prediction(experiment: Experiment, run: FittedRecords, intervals: IntervalResult) -> PredictionRecord | None:

@@ -23,9 +23,10 @@ from armcal.estimate.variance import VarianceComponents
 from armcal.estimate.weighing import WeighedFit
 from armcal.measure.groups import Groups
 from armcal.problem.problem import Problem
-from armcal.run.errors import ErrorTable, FittedRecords, RecordErrors
+from armcal.run.errors import ErrorTable, RecordErrors
 from armcal.run.experiment import Experiment
 from armcal.run.intervals import IntervalResult
+from armcal.run.placed import FittedRecords
 from armcal.run.pose_residual import ResidualOutcome
 from armcal.run.prepare import group_texts, label_of
 
