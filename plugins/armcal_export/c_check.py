@@ -9,6 +9,7 @@ from pathlib import Path
 from armcal.calibration.tool_expression import ToolExpression
 from armcal.errors import ProblemError
 from armcal.functions.compiler import find_compiler
+from armcal.io.plain_files import writing
 
 from armcal_export.c_text import c_number, c_row, filled
 from armcal_export.reference import Reference
@@ -36,7 +37,8 @@ def compiled_and_run(sources: Mapping[str, bytes], files: FileNames) -> list[str
     compiler = find_compiler()
     if compiler is None:
         return ["not compiled and not compared here: no C compiler was found (cc, gcc or clang)"]
-    with tempfile.TemporaryDirectory(prefix="armcal-c-") as directory:
+    place = writing(Path("the temporary folder"), "Make room in it, or set TMPDIR to one with room.")
+    with place, tempfile.TemporaryDirectory(prefix="armcal-c-") as directory:
         for name, content in sources.items():
             Path(directory, name).write_bytes(content)
         program = str(Path(directory, "test-program"))

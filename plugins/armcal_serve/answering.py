@@ -204,7 +204,13 @@ def _targets(arm: ServedArm, request: CompensateRequest) -> Targets:
     for i, target in enumerate(targets):
         if target.approach is not None:
             approach[:, i : i + 1] = arm.approach(target, 1)
-    return Targets(positions, rotations, arm.acting(request, count, targets), approach)
+    acting, farthest = arm.acting(request, count, targets), 1000 * arm.compensator.reach.farthest
+    try:
+        return Targets(positions, rotations, acting, approach)
+    except ValueError as fault:
+        reach = f"; this arm reaches {farthest:.0f} mm from its mount at most" if math.isfinite(farthest) else ""
+        hint = f"Give places of the base frame in mm (position_mm){reach}."
+        raise DataError(f"{fault}.", where=Location(field="targets"), hint=hint) from fault
 
 
 def _rotation(target: TargetRequest, index: int) -> Array:

@@ -2,7 +2,6 @@
 
 import gc
 import json
-import tempfile
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -14,7 +13,7 @@ from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import lost_calibration
 from armcal.calibration.compensation.request import Options
 from armcal.calibration.recorded_range import PAYLOAD, RecordedRange
-from armcal.errors import ArmcalError, ConfigError, InputError, Location
+from armcal.errors import ConfigError, InputError, Location
 
 from armcal_serve.answering import Answerer
 from armcal_serve.order import Order
@@ -33,7 +32,7 @@ def loaded(order: Order, data: bytes) -> Answerer:
     Raises:
         ArmcalError: they are no calibration, one of another arm, or one that cannot be used.
     """
-    calibration = _read(order, data)
+    calibration = Calibration.load(order.shown, accept=order.accept or order.sequence > 1, content=data)
     calibration_file = calibration.record
     identity = calibration_file.identity.get("arm", "")
     if order.arm and identity != order.arm:
@@ -61,20 +60,6 @@ def loaded(order: Order, data: bytes) -> Answerer:
     gc.freeze()
     lost = calibration_file.level == "lost" and not order.accept
     return replace(answerer, fault=lost_calibration(calibration_file, order.shown)) if lost else answerer
-
-
-def _read(order: Order, data: bytes) -> Calibration:
-    """From a file of its own; messages name the one that the user knows."""
-    with tempfile.TemporaryDirectory(prefix="armcal-serve-") as folder:
-        path = Path(folder) / "calibration.yaml"
-        path.write_bytes(data)
-        try:
-            return Calibration.load(path, accept=order.accept or order.sequence > 1)
-        except ArmcalError as fault:
-            where, own, shown = fault.where, str(path), order.shown
-            where = where and replace(where, file=(where.file or "").replace(own, shown) or None)
-            message, hint = fault.message.replace(own, shown), fault.hint.replace(own, shown)
-            raise type(fault)(message, where=where, hint=hint) from fault
 
 
 def _arm(calibration: Calibration, name: str, order: Order) -> ServedArm:

@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,6 +25,19 @@ DEMO = str(ROOT / "configs" / "lrm_arm" / "demo.yaml")
 FAST = ("--set", "validation.folds=0", "--set", "evaluator=interpreted")
 OURS = ("notes.txt", "table.csv", "page.html", "result.yaml")
 CALLS = ("rename", "mkdir", "rmdir", "unlink", "fsync", "open", "chmod", "rmtree", "change_places")
+
+
+def test_a_run_asks_nothing_of_the_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full one ended in a traceback after the fit, and nothing was written."""
+
+    def full(*given: object, **more: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(tempfile, "gettempdir", full)
+    monkeypatch.setattr(tempfile, "TemporaryDirectory", full)
+    ran = CliRunner().invoke(cli, ["run", DEMO, "--out", str(tmp_path / "run"), "-q", *FAST])
+    assert ran.exit_code == 0, ran.output
+    assert (tmp_path / "run" / "calibration.yaml").exists()
 
 
 def texts(mark: str, names: tuple[str, ...] = OURS) -> dict[str, str]:

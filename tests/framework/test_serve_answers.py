@@ -158,6 +158,7 @@ def test_a_path_is_followed_and_what_is_out_of_reach_is_told(answerer: Answerer,
         ({"do": "compensate", "targets": [HERE, HERE | {"rpy_deg": [0, 0, 0]}]}, "targets.0", "all of one kind"),
         ({"do": "compensate", "targets": HERE, "units": "counts"}, "units", "no pulse tables"),
         ({"do": "compensate", "targets": HERE, "start_deg": [1]}, "start", "expected 6"),
+        ({"do": "compensate", "targets": [{"position_mm": [1e12, 0, 0]}]}, "targets", "this arm reaches 421 mm"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_named_with_its_field(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 import subprocess
 from dataclasses import replace
@@ -374,6 +376,17 @@ def test_without_a_compiler_the_code_is_written_and_that_is_said(monkeypatch):
     monkeypatch.setattr("armcal_export.c_check.find_compiler", lambda: None)
     request = request_of(made_calibration(LRM / "arm.yaml"), None, "arm.c")
     assert "not compiled" in CExporter(CExportSettings()).export(request).remarks[0]
+
+
+def test_without_room_to_compile_the_temporary_folder_is_named(monkeypatch):
+    def full(*given, **more):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("armcal_export.c_check.find_compiler", lambda: "cc")
+    monkeypatch.setattr("armcal_export.c_check.tempfile.TemporaryDirectory", full)
+    request = request_of(made_calibration(LRM / "arm.yaml"), None, "arm.c")
+    with pytest.raises(InputError, match=r"the temporary folder: it cannot be written .*set TMPDIR"):
+        CExporter(CExportSettings()).export(request)
 
 
 @pytest.mark.slow

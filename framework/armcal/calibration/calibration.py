@@ -59,10 +59,17 @@ class Calibration:
     record: CalibrationFile
 
     @classmethod
-    def load(cls, path: str | Path, registry: PluginRegistry | None = None, accept: bool = False) -> Self:
+    def load(
+        cls,
+        path: str | Path,
+        registry: PluginRegistry | None = None,
+        accept: bool = False,
+        content: bytes | None = None,
+    ) -> Self:
         """Read a calibration; a ``CalibrationWarning`` for what its user should know of it.
 
-        ``accept``: even one whose recalibration found that it no longer holds.
+        ``accept``: even one whose recalibration found that it no longer holds; ``content`` is what the file holds,
+        where it need not be there.
 
         Raises:
             ConfigError: not a calibration, of another schema, damaged, changed since it was written, lost, of a bad
@@ -70,7 +77,7 @@ class Calibration:
             PluginError: it needs a plugin that is not there.
         """
         registry = registry or discover()
-        loaded = cls.built(read_record(path)[0], path, registry)
+        loaded = cls.built(read_record(path, content=content)[0], path, registry)
         if loaded.record.level == "lost" and not accept:
             raise lost_calibration(loaded.record, path)
         for notice in loaded.notices(path, registry):

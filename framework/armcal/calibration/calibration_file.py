@@ -146,8 +146,10 @@ def sealed(content: Mapping[str, Any]) -> str:
     return f"{text}{_LAST_LINE}{_hash(text)}\n"
 
 
-def read_record(path: str | Path, changed: bool = False) -> tuple[ConfigSource, bool]:
+def read_record(path: str | Path, changed: bool = False, content: bytes | None = None) -> tuple[ConfigSource, bool]:
     """A calibration's content, and whether it is as armcal wrote it; if it must be, ``changed`` is false.
+
+    ``content`` is what the file holds, where it need not be there.
 
     Raises:
         ConfigError: it cannot be read, is not a calibration of this schema, or was changed since it was written.
@@ -162,7 +164,7 @@ def read_record(path: str | Path, changed: bool = False) -> tuple[ConfigSource, 
             reason = "its content is not what armcal wrote: it was edited or damaged."
             raise ConfigError(reason, where=Location(str(path)), hint=_CHANGED_HINT)
 
-    source = load_config(path, check=look)
+    source = load_config(path, check=look, content=content)
     schema = source.data.get("armcal_calibration")
     if schema != SCHEMA:
         raise ConfigError(

@@ -1,6 +1,5 @@
 """Where a chain to convert comes from, and whether what it was converted to is the same arm."""
 
-import tempfile
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -83,10 +82,9 @@ def reload(text: str, registry: PluginRegistry) -> Chain:
         ConfigError: it is refused.
         PluginError: no plugin offers its type.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "converted.yaml"
-        path.write_text("arms:\n  arm:\n" + textwrap.indent(text, "    "), encoding="utf-8")
-        model = build_component(load_config(path), registry, "model", ("arms", "arm", "model"))[0]
+    content = ("arms:\n  arm:\n" + textwrap.indent(text, "    ")).encode()
+    source = load_config("converted.yaml", content=content)
+    model = build_component(source, registry, "model", ("arms", "arm", "model"))[0]
     return numeric_chain(model, nominal_values(model))
 
 

@@ -90,6 +90,7 @@ def load_config(
     overrides: Sequence[str] = (),
     root: Path | None = None,
     check: Callable[[str], object] | None = None,
+    content: bytes | None = None,
 ) -> ConfigSource:
     """Read a YAML config with all that it extends, and apply overrides.
 
@@ -99,12 +100,14 @@ def load_config(
             (``rows.2.d_mm=3``), null removes a key, and a key that holds a dot is put in double quotes.
         root: what no path in a config may leave; the directory of the config unless given.
         check: is given the text of the config before anything is made of it, and may raise.
+        content: what the config file holds, where it need not be there; such a config names no other file.
 
     Raises:
         ConfigError: what was found, where, and the mend.
     """
     path = Path(path)
-    reader = Reader(root_of(path, root), check)
+    # Nothing lies below a file.
+    reader = Reader(root_of(path, root if content is None else path), check, content)
     tree = reader.tree(path, ())
     for text in overrides:
         tree = override(tree, text)
@@ -129,9 +132,9 @@ def _refuse_file(path: Path, message: str, hint: str) -> NoReturn:
     raise ConfigError(message, where=Location(str(path)), hint=hint)
 
 
-def _read_text(path: Path) -> str:
+def _read_text(path: Path, content: bytes | None = None) -> str:
     try:
-        raw = input_bytes(path, MAX_BYTES, "a YAML file", ConfigError)
+        raw = input_bytes(path, MAX_BYTES, "a YAML file", ConfigError) if content is None else content
     except ConfigError as fault:
         near = difflib.get_close_matches(path.name, sorted(p.name for p in path.parent.glob("*.y*ml")), n=1)
         if near and isinstance(fault.__cause__, FileNotFoundError):
@@ -151,12 +154,13 @@ class Reader:
 
     root: Path
     check: Callable[[str], object] | None = None
+    content: bytes | None = None
     files: list[Path] = field(default_factory=list)
     done: dict[Path, Node] = field(default_factory=dict)
 
     def tree(self, path: Path, chain: tuple[Path, ...]) -> Node:
         """The merged tree of a file; ``chain`` is who extends it, resolved."""
-        text = _read_text(path)
+        text = _read_text(path, None if chain else self.content)
         if self.check and not chain:
             self.check(text)
         resolved = path.resolve()

@@ -1,6 +1,5 @@
 """What a run leaves behind: a directory that explains itself, written so that a crash leaves the old one whole."""
 
-import tempfile
 import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -218,12 +217,9 @@ def read_back(text: str, registry: PluginRegistry) -> Calibration:
     Raises:
         ArmcalError: it is none.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "calibration.yaml"
-        path.write_text(text, encoding="utf-8")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CalibrationWarning)
-            return Calibration.load(path, registry)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CalibrationWarning)
+        return Calibration.load("calibration.yaml", registry, content=text.encode())
 
 
 def _noise(result: RunResult) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """What a journal keeps of a recalibration: its calibration, its settings, and its entries as far as they are whole."""
 
 import hashlib
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -141,10 +140,7 @@ def kept_calibration(header: Mapping[str, Any], folder: Path, registry: PluginRe
     if hashlib.sha256(text.encode()).hexdigest() != header.get("calibration"):
         hint = "Nothing can be replayed from it: take another copy of the journal."
         raise DataError("the calibration in the journal is not whole.", where=Location(str(folder)), hint=hint)
-    with tempfile.TemporaryDirectory(prefix="armcal-") as held:
-        path = Path(held) / "calibration.yaml"
-        path.write_bytes(text.encode())
-        return Calibration.load(path, registry)
+    return Calibration.load("calibration.yaml", registry, content=text.encode())
 
 
 @contextmanager
@@ -169,7 +165,5 @@ def kept_settings(header: Mapping[str, Any], overrides: Sequence[str] = ()) -> R
     Raises:
         ConfigError: this version does not know one, or an override is refused.
     """
-    with tempfile.TemporaryDirectory(prefix="armcal-") as held:
-        path = Path(held) / "journal.yaml"
-        path.write_text(yaml.safe_dump(dict(header.get("settings") or {})), encoding="utf-8")
-        return load_settings(path, overrides)
+    stated = yaml.safe_dump(dict(header.get("settings") or {}))
+    return load_settings(Path("journal.yaml"), overrides, stated.encode())

@@ -140,8 +140,10 @@ class RecalibrateSettings(Settings):
     evaluator: Literal["auto", "compiled", "interpreted"] = "compiled"
 
 
-def load_settings(path: str | Path | None, overrides: Sequence[str] = ()) -> RecalibrateSettings:
-    """The settings in a file, checked; the default ones without a file.
+def load_settings(
+    path: str | Path | None, overrides: Sequence[str] = (), content: bytes | None = None
+) -> RecalibrateSettings:
+    """The settings in a file, or its ``content``, checked; the default ones without a file.
 
     Raises:
         ConfigError: no such file, not YAML, or a setting is refused, with file, line and field.
@@ -153,7 +155,7 @@ def load_settings(path: str | Path | None, overrides: Sequence[str] = ()) -> Rec
                 hint="Give the file with --config; it may be empty but for a comment.",
             )
         return RecalibrateSettings()
-    source = load_config(path, overrides)
+    source = load_config(path, overrides, content=content)
     if SECTION not in source.data:
         return validate(RecalibrateSettings, source)
     elsewhere = next((text for text in overrides if not text.strip().startswith((f"{SECTION}.", f"{SECTION}="))), None)
