@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 from typing import Any, ClassVar
 
+from armcal.arm.joints import joint_limits
 from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.settings import Settings
 from armcal.calibration.exporter import Exported, ExportRequest, changed_numbers
@@ -47,6 +48,7 @@ class CExporter:
     Settings: ClassVar[type[CExportSettings]] = CExportSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"prefix": "left"}
     holds_residual: ClassVar[bool] = True
+    holds_couplings: ClassVar[bool] = True
 
     def __init__(self, settings: CExportSettings) -> None:
         self._settings = settings
@@ -103,7 +105,7 @@ def _places(request: ExportRequest, e: ToolExpression, files: FileNames, prefix:
     functions = arm_functions(e, prefix)
     conditions = e.channels[e.channels.index(LOAD_CHANNELS[-1]) + 1 :]
     size, listed = f"{prefix.upper()}_CONDITIONS", in_comment(", ".join(conditions))
-    limits = [joint.limits or (-math.inf, math.inf) for joint in e.arm.nominal_chain.joints if not joint.mimic]
+    limits = [own or (-math.inf, math.inf) for own in joint_limits(e.arm.nominal_chain).values()]
     return {
         "title": in_comment(f"The arm {request.name}, as calibrated: {request.origin.experiment or 'no name'}."),
         "about": _about(request, e, limits),

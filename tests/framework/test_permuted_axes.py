@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.cli.main import cli
-from armcal.diagnose.permuted_axes import _within, find_permuted_axes
+from armcal.diagnose.permuted_axes import find_permuted_axes
+from armcal.diagnose.readings import within
 from armcal.errors import DataError, NotConvergedError
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
@@ -129,6 +130,52 @@ def test_a_travel_in_another_unit_is_named(tmp_path: Path) -> None:
         prepared(10.0)
 
 
+FLAT = """
+arms: {arm: {model: {type: mdh, convention: standard, rows: [{a_mm: 300}, {a_mm: 200}]}}}
+measurements: {tracker: {type: tip_position, noise_mm: 0.1}}
+data: {type: csv, path: flat.csv}
+parameters: {free: ["arm.mdh.theta?", "arm.mdh.a?"]}
+"""
+
+
+@pytest.mark.parametrize("factor", [1.0, 3.0])
+def test_a_reading_that_flattens_what_was_measured_hides_it_and_is_none(tmp_path: Path, factor: float) -> None:
+    """An arm that moves in a plane, and heights that mean nothing: a thousandth of them would fit any such arm."""
+    random = np.random.default_rng(0)
+    first, second = random.uniform([[-1.0], [-1.5]], [[1.0], [1.5]], (2, 40))
+    x, y = (0.3 * turn(first + 0.01) + 0.2 * turn(first + second) for turn in (np.cos, np.sin))
+    positions = np.array([x, y, random.normal(0, 0.03 * factor, 40)]) + random.normal(0, 1e-4, (3, 40))
+    np.savetxt(
+        tmp_path / "flat.csv",
+        np.array([*np.degrees([first, second]), *(1e3 * positions)]).T,
+        delimiter=",",
+        header="q1_deg,q2_deg,x_mm,y_mm,z_mm",
+        comments="",
+    )
+    (tmp_path / "flat.yaml").write_text(FLAT)
+    ready = assemble(Experiment.load(tmp_path / "flat.yaml"), Stopwatch(), accept=True)
+    assert told(ready, ready.dataset) == ()
+
+
+@pytest.mark.parametrize(("joint", "other", "sign"), [("q3", "q2", "+"), ("q3", "q2", "-"), ("q5", "q4", "+")])
+def test_coupled_joints_are_named_with_what_to_state(demo: Prepared, joint: str, other: str, sign: str) -> None:
+    read = demo.dataset.column(f"arm.{joint}") - float(f"{sign}1") * demo.dataset.column(f"arm.{other}")
+    (first, *_) = told(demo, replace(demo.dataset, channels={**demo.dataset.channels, f"arm.{joint}": read}))
+    stated = f"couplings: {{{joint}: {{{other}: {'-' * (sign == '-')}1}}}}"
+    assert first.startswith(f"{joint} {sign} {other} taken for {joint}") and stated in first
+
+
+def test_what_no_reading_explains_is_named_by_none(demo: Prepared) -> None:
+    """A zero that no convention has: it was named as another one. And half of a coupling."""
+    data = demo.dataset
+    wrong = [
+        {"arm.q2": data.column("arm.q2") + np.radians(60)},
+        {"arm.q3": data.column("arm.q3") + 0.5 * data.column("arm.q2")},
+    ]
+    for columns in wrong:
+        assert told(demo, replace(data, channels={**data.channels, **columns})) == ()
+
+
 @pytest.mark.quick("q3--90")
 @pytest.mark.parametrize(("joint", "turn"), [("q2", 180), ("q3", -90), ("q5", 90)])
 def test_a_zero_a_quarter_or_half_a_turn_off_is_named(demo: Prepared, joint: str, turn: int) -> None:
@@ -202,7 +249,7 @@ def test_steps_within_a_radius_are_the_best_there() -> None:
     random = np.random.default_rng(3)
     along, sizes = random.normal(size=5), random.uniform(0.1, 2.0, 5)
     for radius in (0.1, 1.0, 5.0):
-        found = _within(along, sizes, radius)
+        found = within(along, sizes, radius)
         inside = {"type": "ineq", "fun": lambda z, r=radius: r**2 - z @ z}
         best = minimize(lambda z: np.sum((along - sizes * z) ** 2), np.zeros(5), constraints=[inside], tol=1e-12)
         assert np.linalg.norm(found) <= radius * (1 + 1e-9)

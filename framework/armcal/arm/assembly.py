@@ -15,7 +15,7 @@ from armcal.arm.environment import Environment
 from armcal.arm.model import ArmModel, Chain, chain_fault, forward
 from armcal.arm.pose_residual import OF_TOOL, SURROUNDINGS, PoseResidual, Postures, corrected, correction_names
 from armcal.arm.statics import Load, MassSpec, joint_efforts, wrenches
-from armcal.base.arrays import Array
+from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock, declared, scalar
 from armcal.base.poses import pose_transform
@@ -81,6 +81,7 @@ class Arm:
             the two are the same.
         joint_noise: standard deviation of what a turning joint reads against where it stands (rad).
         residual: what corrects joints and tool where the rest leaves an error, once it is learned.
+        couplings: by joint, how many times the commands of others its own angle contains beside its own command.
     """
 
     name: str
@@ -91,6 +92,7 @@ class Arm:
     placement: tuple[ParameterBlock, ...] = ()
     joint_noise: float = 0.0
     residual: PoseResidual | None = None
+    couplings: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -104,8 +106,12 @@ class Arm:
         return {joint.name: dimension for joint, dimension in joints if joint.mimic is None}
 
     def joint_commands(self, commands: Sequence[Any]) -> list[Any]:
-        """What every joint is told (rad or m), from the ``commanded`` ones' commands."""
-        content = dict(zip(self.commanded, commands, strict=True))
+        """What every joint is told (rad or m), couplings added, from the ``commanded`` ones' commands."""
+        stated = dict(zip(self.commanded, commands, strict=True))
+        content = {
+            joint: sum((factor * stated[other] for other, factor in self.couplings.get(joint, {}).items()), own)
+            for joint, own in stated.items()
+        }
         return [
             content[joint.name]
             if joint.mimic is None
@@ -177,6 +183,9 @@ class Arm:
         chain = self.model.chain(scoped(values, self._scope(self.model_name)))
         if fault := chain_fault(chain, self.joint_names):
             refuse(self.model.chain, *fault)
+        if self.couplings:
+            joints = (replace(joint, couplings=self.couplings.get(joint.name, {})) for joint in chain.joints)
+            chain = replace(chain, joints=tuple(joints))
         if not self.placement:
             return chain
         base_T_model = pose_transform(PLACEMENT, scoped(values, f"{self.name}."))
@@ -309,6 +318,18 @@ def scoped(values: Mapping[str, Expression], scope: str) -> LocalValues:
 def command_channels(arms: Mapping[str, Arm]) -> dict[str, str]:
     """The ``command_channels`` of all arms."""
     return {channel: dimension for arm in arms.values() for channel, dimension in arm.command_channels.items()}
+
+
+def within_couplings(arms: Iterable[Arm], commands: Array) -> Mask:
+    """Which commands of all arms (n x N) keep the angles of coupled joints within the model's limits (N)."""
+    within, first = np.ones(commands.shape[1], dtype=bool), 0
+    for arm in arms:
+        own = commands[first : first + len(arm.commanded)]
+        first += len(own)
+        for joint, angles in zip(arm.nominal_chain.joints, arm.joint_commands([*own]), strict=True):
+            if joint.couplings and joint.limits is not None:
+                within &= (angles >= joint.limits[0]) & (angles <= joint.limits[1])
+    return within
 
 
 def shown_joint(channel: str, arms: Collection[str]) -> str:

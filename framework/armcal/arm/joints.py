@@ -3,7 +3,10 @@
 from collections.abc import Collection, Iterable, Mapping
 from typing import TypeVar
 
+import numpy as np
+
 from armcal.arm.model import Chain
+from armcal.base.arrays import Array
 from armcal.errors import ConfigError, Location
 
 V = TypeVar("V")
@@ -49,13 +52,43 @@ def by_dimension(
 
 
 def joint_limits(chain: Chain, *stated: Mapping[str, Limits]) -> dict[str, Limits | None]:
-    """Limits of each commanded joint, in order: those stated first, else the model's; None where nothing limits it.
+    """Limits of each joint's command, in order: those stated first, else the model's; None where nothing limits it.
+
+    Where joints are coupled, the model's are of their own angles: commands go as far as some of these let them, and
+    ``within_couplings`` says which of them do.
 
     Raises:
         ValueError: limits are stated of a joint that is not there.
     """
     model = {joint.name: joint.limits for joint in chain.joints if joint.mimic is None}
+    if any(joint.couplings for joint in chain.joints):
+        own = np.array([ends or (-np.inf, np.inf) for ends in model.values()])
+        for joint, row in zip(model, np.linalg.inv(coupling_matrix(chain)), strict=True):
+            low, high = np.sort(row[row != 0, None] * own[row != 0], axis=1).sum(axis=0).tolist()
+            model[joint] = (low, high) if np.isfinite([low, high]).all() else None
     for limits in stated:
         if fault := unknown_joint(limits, model):
             raise ValueError(fault)
     return {joint: next((limits[joint] for limits in stated if joint in limits), own) for joint, own in model.items()}
+
+
+def require_couplings(joints: Mapping[str, str], couplings: Mapping[str, Mapping[str, float]]) -> None:
+    """Couplings of commanded joints (``angle`` or ``length``) must be of others, of their kind, and have an inverse.
+
+    Raises:
+        ValueError: what is wrong.
+    """
+    for joint, others in couplings.items():
+        if fault := unknown_joint([joint, *others], joints, "commanded "):
+            raise ValueError(fault)
+        if wrong := [other for other in others if other == joint or joints[other] != joints[joint]]:
+            raise ValueError(f"{joint} is coupled with {wrong[0]}, expected another joint that moves alike")
+    rows = [[float(one == other) + couplings.get(one, {}).get(other, 0.0) for other in joints] for one in joints]
+    if not np.isfinite(rows).all() or np.linalg.matrix_rank(rows) < len(rows):
+        raise ValueError("no commands belong to some angles of the joints that are coupled so")
+
+
+def coupling_matrix(chain: Chain) -> Array:
+    """From the commands of the commanded joints to their angles (n x n)."""
+    joints = [joint for joint in chain.joints if joint.mimic is None]
+    return np.array([[float(one is other) + one.couplings.get(other.name, 0.0) for other in joints] for one in joints])

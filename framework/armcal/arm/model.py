@@ -39,11 +39,12 @@ class Joint:
         angular: the axis of a revolute joint (unit, in its own frame); zeros for a prismatic one.
         linear: the direction of a prismatic joint; zeros for a revolute one.
         offset: displacement (rad or m) at zero angle.
-        limits: of its command (rad or m); None where none are known.
+        limits: of its displacement less ``offset`` (rad or m); None where none are known.
         endless: whether it may turn on and on, so that its angle may be of any size.
         mimic: the joint that it follows; records have no column of one that does.
         twist: what it moves along instead, of any pitch and length: angular and linear part (3x1 each) in its own
             frame, not far from the axis, which still says whether it turns or slides; None for the axis itself.
+        couplings: how many times the commands of other joints its displacement contains beside its own command.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Joint:
     endless: bool = False
     mimic: Mimic | None = None
     twist: tuple[Expression, Expression] | None = None
+    couplings: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def is_revolute(self) -> bool:

@@ -125,7 +125,7 @@ def _described(
     left = [f"{key} ({', '.join(map(str, part))})" for key, part in parts.items()]
     if isinstance(model, MassiveModel) and model.masses():
         left.append(f"masses ({', '.join(mass.name for mass in model.masses())})")
-    left += [key for key in arm if str(key).startswith(("placement", "joint_noise", "residual"))]
+    left += [key for key in arm if str(key).startswith(("placement", "joint_noise", "residual", "couplings"))]
     used = [link.get("frame") for link in parts.get("links", {}).values() if isinstance(link, dict)]
     named = [frame for frame in chain.frames if frame in used]
     left += [f"frames ({', '.join(named)})"] if named else []

@@ -12,6 +12,7 @@ import numpy as np
 
 from armcal.arm.assembly import Arm
 from armcal.arm.environment import STATICS, Environment
+from armcal.arm.joints import joint_limits
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock, Parameters
@@ -132,7 +133,8 @@ class Exporter(Protocol):
 
     One whose files hold what was learned of the pose residual, as those of ``request.expression`` do, has the class
     attribute ``holds_residual = True``. Of any other ``armcal export`` says that it is left out, and how far that moves
-    the tool.
+    the tool. One whose files take commands has ``holds_couplings = True``; any other is given the arm by its joints
+    angles.
     """
 
     def export(self, request: ExportRequest) -> Exported:
@@ -183,13 +185,22 @@ def random_commands(arm: Arm, count: int = POSES, seed: int = 1) -> Array:
     """Commands of the commanded joints within their limits (joints x N; rad or m), up to a half turn without any."""
     random = np.random.default_rng(seed)
     rows = []
-    for joint in arm.nominal_chain.joints:
-        if joint.mimic is None:
-            kind = arm.commanded[joint.name]
-            low, high = joint.limits or (-_FARTHEST[kind], _FARTHEST[kind])
-            widest = _WIDEST[kind]
-            rows.append(random.uniform(max(low, -widest), min(high, widest), count))
+    for joint, limits in joint_limits(arm.nominal_chain).items():
+        kind = arm.commanded[joint]
+        low, high = limits or (-_FARTHEST[kind], _FARTHEST[kind])
+        widest = _WIDEST[kind]
+        rows.append(random.uniform(max(low, -widest), min(high, widest), count))
     return np.array(rows)
+
+
+def by_own_angles(request: ExportRequest) -> tuple[ExportRequest, str]:
+    """The arm by its joints' own angles, without couplings, and what whoever uses its file should know."""
+    sums = []
+    for joint, others in request.arm.couplings.items():
+        parts = "".join(f" {'-' if f < 0 else '+'} {f'{abs(f):g} ' * (abs(f) != 1)}{o}" for o, f in others.items() if f)
+        sums.append(f"{joint} = {joint}{parts} as commanded")
+    remark = f"the file takes the joints' own angles: {', '.join(sums)}"
+    return replace(request, arm=replace(request.arm, couplings={})), remark
 
 
 def rigid_tools(arm: Arm, values: Mapping[str, Array], commands: Array) -> Array:

@@ -15,6 +15,7 @@ from armcal.calibration.exporter import (
     Exported,
     Exporter,
     ExportRequest,
+    by_own_angles,
     effects_reach,
     leaves_residual_out,
     request_of,
@@ -110,8 +111,11 @@ def export(
         if not force:
             require_new([out])
     loaded = Calibration.load(calibration, registry, accept)
-    request = request_of(loaded, arm, out.name)
+    request, remark = request_of(loaded, arm, out.name), ""
+    if request.arm.couplings and not getattr(exporter, "holds_couplings", False):
+        request, remark = by_own_angles(request)
     exported = exporter.export(request)
+    exported = replace(exported, remarks=(*exported.remarks, remark)) if remark else exported
     exported, moved_m = _with_what_is_left_out(exporter, loaded, request, exported)
     files = _files(out, exported, calibration)
     (write_over if force else write_new)(unwritten(files))  # several exports may share a schema

@@ -11,6 +11,8 @@ from typing_extensions import get_protocol_members, is_protocol
 from armcal import plugin_files
 from armcal.arm.assembly import PLACEMENT, Arm, MassiveModel, prefixed
 from armcal.arm.environment import STATICS, Environment, gravity_tilt
+from armcal.arm.joints import require_couplings
+from armcal.arm.servo import SteppedEffect
 from armcal.arm.statics import MassSpec, frame_names
 from armcal.base.parameters import FIT_NAME, ParameterBlock, Parameters, declared
 from armcal.base.poses import PoseSettings
@@ -48,6 +50,7 @@ class ArmSettings(Settings):
     ``placement`` is the pose of the model's base in the common base frame, for arms that stand side by side.
     ``joint_noise`` is the standard deviation of what a turning joint reads against where it stands: of contacts, whose
     only readings are the joints', it is most of the noise. ``residual`` learns what all that leaves of the tool's pose.
+    ``couplings: {q3: {q2: 1}}`` says that the angle of q3 is its command plus that of q2, as on a Fanuc's pendant.
     """
 
     model: dict[str, Any]
@@ -56,6 +59,7 @@ class ArmSettings(Settings):
     effects: dict[str, dict[str, Any]] = Field(default_factory=dict)
     links: dict[str, LinkSettings] = Field(default_factory=dict)
     residual: dict[str, Any] | None = None
+    couplings: dict[str, dict[str, float]] = Field(default_factory=dict)
 
 
 class StaticsSettings(Settings):
@@ -227,21 +231,28 @@ def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm
     if settings.residual is not None:
         place = (*at, "residual")
         residual, described_residual = build_component(source, registry, "residual", place, model.joint_names)
-    parts = (model, effects, masses, placement, settings.joint_noise, residual)
+    parts = (model, effects, masses, placement, settings.joint_noise, residual, settings.couplings)
     _part_names(source, (*at, "model"), "joint", model.joint_names)
     _part_names(source, (*at, "effects"), "effect", effects, (described_model["type"], "links"))
     _part_names(source, (*at, "links"), "link", [mass.name for mass in masses])
     arm = _refusable(source, at, lambda: Arm(name, described_model["type"], *parts))
+    _refusable(source, (*at, "couplings"), lambda: require_couplings(arm.commanded, arm.couplings))
     _refusable(source, (*at, "effects"), lambda: surroundings({name: arm}))
     known = _refusable(source, at, lambda: frame_names(arm.nominal_chain))
     for link, stated in settings.links.items():
         _check_link(source, (*at, "links", link), stated, known, len(arm.joint_names))
     links = {link: stated.to_config() for link, stated in settings.links.items()}
+    for stepped in (effect for effect in effects.values() if isinstance(effect, SteppedEffect)):
+        for index in (i for i in stepped.servos() if model.joint_names[i] in settings.couplings):
+            text = f"{model.joint_names[index]} is coupled, and a pulse table counts its servo's angle alone."
+            source.refuse((*at, "couplings"), text, "Leave the pulse table out, or the coupling.")
     described: dict[str, Any] = {"model": described_model, "effects": described_effects, "links": links}
     if settings.joint_noise:
         described["joint_noise_rad"] = settings.joint_noise
     if described_residual is not None:
         described["residual"] = described_residual
+    if settings.couplings:
+        described["couplings"] = settings.couplings
     if settings.placement:
         described["placement"] = settings.placement.to_config()
     return arm, described

@@ -2,12 +2,12 @@
 
 Single changes are tried first; where none explains the data, the base elsewhere, then several at once. Each reading of
 the data is given the same chance: where the base may stand anywhere, it and the target are found anew, and what counts
-is what is left of its residuals once all free parameters have adapted to first order. A right reading leaves little, a
-wrong one cannot be mended by any parameters.
+is what is left of its residuals once all free parameters have adapted to first order. The likeliest are then fitted: a
+right reading leaves little, a wrong one cannot be mended by any parameters.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
@@ -19,9 +19,12 @@ from armcal.base.dataset import Dataset
 from armcal.base.units import digits
 from armcal.diagnose.readings import (
     LEFT_HANDED,
+    Adapting,
     Wires,
     apart_in_groups,
+    coupled_joints,
     is_place,
+    kept_spread,
     rewired,
     scaled_positions,
     several_joints,
@@ -31,25 +34,26 @@ from armcal.diagnose.readings import (
 )
 from armcal.errors import NotConvergedError
 from armcal.estimate.placing import Placing, placings
+from armcal.estimate.polish import descended
 from armcal.problem.factor_records import subset
+from armcal.problem.posed import PosedProblem
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.rigid_alignment import nearest
-from armcal.problem.sighting import Sighting, sighting_of, tools_of
+from armcal.problem.rigid_alignment import Tools, nearest
+from armcal.problem.sighting import Sighting, shown_instead, sighting_of, tools_of
 from armcal.problem.tool_motion import rigid_fit, spread_of, tools
 
 MUCH_BETTER = 3.0
 """A permutation leaves so many times less than the data as they stand."""
-FITS, MISSES = 0.1, 0.01
-"""Of the spread of the positions: what a right reading leaves at most, what is worth a look."""
-_ROUGHLY_FITS, _FAR_BETTER = 0.15, 6.0
-"""Where none does: what a single one leaves at most of a poor arm, and how many times less than the data as given."""
+FITS, MISSES = 0.15, 0.01
+"""Of the spread of the positions: what a right reading leaves at most to first order, what is worth a look."""
+_EXPLAINS, _FAR_BETTER, _NOISE = (0.03, 0.08), 10.0, 3.0
+"""What it leaves at most once fitted: times the noise, or of the spread, the more the worse the data as given fit."""
+_FITTED, _FIT_STEPS, _FIT_DAMPING = 5, 25, 1e-3
 _MOST_RECORDS = 300
 _EQUATIONS = 2.0
 """So many numbers a parameter are needed to separate readings."""
 _ALIKE = 1.5
-_TURNED = 0.05
 _SMALLEST = 1e-9
-_FAR, _HALVINGS = 3.0, 60
 _ROUGHLY = 2.0
 _SEVERAL_RECORDS, _MOST_NAMED = 100, 3
 _MM = 1000.0
@@ -78,11 +82,13 @@ class PermutedAxes:
 
 @dataclass(frozen=True)
 class _Reading:
-    """What is left of one reading (m)."""
+    """What is left of one reading (m), how channels and positions (3 x n) are read; None where nothing is fitted."""
 
     left: float
     words: str
     of_joints: bool
+    read_as: Wires = field(default_factory=dict)
+    measured: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -94,6 +100,7 @@ class _Seen:
         records: of its kernel alone, their noise as declared.
         rows: what was measured a row before and a row after, in words (3 x n each, m).
         placing: what places the arm; None where its base may not stand anywhere.
+        noise: declared, of each axis (3, m).
         ids: of the records (n).
     """
 
@@ -101,6 +108,7 @@ class _Seen:
     records: FactorRecords
     rows: tuple[tuple[str, Array], ...]
     placing: Placing | None
+    noise: Array
     ids: tuple[str, ...] = ()
 
     @property
@@ -114,51 +122,6 @@ class _Seen:
         rows = tuple((words, positions[:, every]) for words, positions in self.rows)
         (records,) = subset([self.records], every)
         return replace(self, sighting=self.sighting.subset(every), records=records, rows=rows)
-
-
-@dataclass(frozen=True)
-class _Positions:
-    """Predicted positions (3 x N, m), and how the free parameters, in typical scales, move them: U S V' (3N x n)."""
-
-    predicted: Array
-    ways: Array
-    sizes: Array
-
-    def left(self, measured: Array, enough: float = np.inf) -> float:
-        """Root mean square distance once the free parameters have adapted to first order, not too far (m).
-
-        Where more than ``enough`` is left however far they adapt, that is given.
-        """
-        return float(self.left_of_each(measured[None], enough)[0])
-
-    def left_of_each(self, measured: Array, enough: float) -> Array:
-        """The same of several readings (k x 3 x N) of what was measured (k)."""
-        off = (measured - self.predicted).transpose(0, 2, 1).reshape(len(measured), -1)
-        along, unit = off @ self.ways, 3 / max(1, off.shape[1] - len(self.sizes))
-        left = np.sum(off**2, axis=1) - np.sum(along**2, axis=1)
-        for i in np.flatnonzero(unit * left <= enough**2):
-            fitted = self.sizes * _within(along[i], self.sizes, _FAR * np.sqrt(len(self.sizes)))
-            left[i] += np.sum((along[i] - fitted) ** 2)
-        return np.asarray(np.sqrt(unit * np.maximum(left, 0.0)))
-
-    def can_move(self, turn: Array, shift: Array) -> bool:
-        """Whether the free parameters move all positions as the beginning of a motion of the base would."""
-        moved = (np.cross(Rotation.from_matrix(turn).as_rotvec(), self.predicted.T) + shift).ravel()
-        along = self.ways.T @ moved
-        return float(moved @ moved - along @ along) <= _TURNED**2 * float(moved @ moved)
-
-
-def _within(along: Array, sizes: Array, radius: float) -> Array:
-    """The steps (n) that come nearest to ``along`` times ``sizes``, no longer than a radius. [Nocedal2006]"""
-    steps = along / sizes
-    if np.linalg.norm(steps) <= radius:
-        return np.asarray(steps)
-    low, high = 0.0, float(np.linalg.norm(along * sizes)) / radius
-    for _ in range(_HALVINGS):
-        damping = (low + high) / 2
-        steps = along * sizes / (sizes**2 + damping)
-        low, high = (damping, high) if np.linalg.norm(steps) > radius else (low, damping)
-    return np.asarray(steps)
 
 
 def find_permuted_axes(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> PermutedAxes | None:
@@ -190,21 +153,23 @@ def _of_contact(
         return None
 
     def left(read_as: Wires) -> float:
-        """A reading's."""
+        """A reading's, as many times more as it moves tools less."""
+        read = rewired(kernel.factor.channels, own, read_as)
         try:
-            return apart_in_groups(problem, number, rewired(kernel.factor.channels, own, read_as), nominal)
+            others = [*records[:number], read, *records[number + 1 :]]
+            smaller = reach / max(spread_of(tools(problem, nominal, others)[0][0]), _SMALLEST)
+            return apart_in_groups(problem, number, read, nominal) * max(1.0, smaller)
         except NotConvergedError:
             return np.inf
 
-    reach, as_given = spread_of(tools(problem, nominal, records)[0][0]), left({})
+    reach = spread_of(tools(problem, nominal, records)[0][0])
+    as_given = left({})
     if not MISSES * reach < as_given < np.inf:
         return None
-    # Another unit of angles would put all tools near one place, whatever they touch.
     readings = [
         _Reading(left(wires), words if len(arms) == 1 else f"{words} ({arm.name})", True)
         for arm in arms
-        for words, wires in single_joints(arm)
-        if all(abs(factor) == 1 for _, factor, _ in wires.values())
+        for words, wires in [*single_joints(arm), *coupled_joints(arm)]
     ]
     best, *others = sorted(readings, key=lambda reading: reading.left)
     if best.left > min(FITS * reach, as_given / MUCH_BETTER):
@@ -226,7 +191,8 @@ def _seen(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, 
     if 3 * len(sighting.chosen) < _EQUATIONS * max(problem.increments, 6):
         return None
     own = replace(problem.subset(records, sighting.chosen)[number], whitening=None, correlation=None)
-    return _Seen(sighting, own, rows, None, tuple(dataset.ids[i] for i in sighting.chosen))
+    noise = np.array(problem.kernels[number].factor.noise[:3])
+    return _Seen(sighting, own, rows, None, noise, tuple(dataset.ids[i] for i in sighting.chosen))
 
 
 def _neighbours(
@@ -259,7 +225,8 @@ def _of(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, arm: Ar
         return None
     enough = min(FITS * spread, as_given / MUCH_BETTER)
     readings = [*_single(problem, seen, arm, straight, enough), *_in_two_frames(problem, seen)]
-    if min(reading.left for reading in readings) > enough:
+    explained = _explained(problem, records, seen, readings, enough)
+    if not explained:
         if seen.placing is None:
             turn, shift = rigid_fit(straight.predicted, seen.measured)
             angle = float(np.rad2deg(np.linalg.norm(Rotation.from_matrix(turn).as_rotvec())))
@@ -268,25 +235,66 @@ def _of(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, arm: Ar
             left = straight.left(turn.T @ (seen.measured - shift[:, None]))
             if left <= enough and straight.can_move(turn, shift):
                 return None  # the fit moves the base there by itself
-            readings = [_Reading(left, words, False)] if left <= enough else []
-        if seen.placing is not None or not readings:
+            read = _Reading(left, words, False, {}, turn.T @ (seen.measured - shift[:, None]))
+            explained = _explained(problem, records, seen, [read], enough)
+        if not explained:
             few = seen.thinned(_SEVERAL_RECORDS)
             if _left(problem, few, {}, few.measured, np.inf) <= MISSES * spread:
                 return None  # as they stand, the records that are looked at fit: a few others are off
-            readings = list(_several(problem, seen, arm, enough))
-    if min((reading.left for reading in readings), default=np.inf) > enough:
-        enough = min(_ROUGHLY_FITS * spread, as_given / _FAR_BETTER)
-        readings = list(_single(problem, seen, arm, straight, enough, _ROUGHLY_FITS))
-    best = min(readings, key=lambda reading: reading.left, default=None)
-    if best is None or best.left > enough:
+            explained = _explained(problem, records, few, list(_several(problem, few, arm, enough)), enough)
+    if not explained:
         return None
-    alike = [r for r in readings if r.left <= _ALIKE * best.left and r.of_joints == best.of_joints]
-    likeliest = tuple(reading.words for reading in sorted(alike, key=lambda reading: reading.left)[:_MOST_NAMED])
-    name = problem.kernels[seen.sighting.kernel].factor.name
-    return PermutedAxes(name, likeliest, as_given * _MM, best.left * _MM, best.of_joints)
+    (best, left), name = explained[0], problem.kernels[seen.sighting.kernel].factor.name
+    alike = [r.words for r, _ in explained if r.left <= _ALIKE * best.left and r.of_joints == best.of_joints]
+    return PermutedAxes(name, tuple(alike[:_MOST_NAMED]), as_given * _MM, left * _MM, best.of_joints)
 
 
-def _positions(problem: Problem, seen: _Seen, read_as: Wires, values: Array) -> _Positions | None:
+def _explained(
+    problem: Problem, records: Sequence[FactorRecords], seen: _Seen, readings: Sequence[_Reading], enough: float
+) -> list[tuple[_Reading, float]]:
+    """Readings that explain the records once they are fitted, the likeliest first, and what each then leaves (m).
+
+    Where a fit of the data as given comes nearly as near, none is needed.
+    """
+    likely = sorted((r for r in readings if r.left <= enough), key=lambda reading: reading.left)[:_FITTED]
+    if not likely:
+        return []
+    noise, explained = float(np.linalg.norm(seen.noise)), []
+    given, fitted = spread_of(seen.measured), _fitted(problem, records, seen, {}, seen.measured)
+    for reading in likely:
+        measured = reading.measured
+        left = reading.left if measured is None else _fitted(problem, records, seen, reading.read_as, measured)
+        spread = kept_spread(seen.measured if measured is None else measured, seen.measured)
+        # A fit may give the arm the size of positions in another unit; what it leaves then says nothing.
+        needed = (fitted if np.isclose(spread, given) else np.inf) / given / MUCH_BETTER
+        near = max(_NOISE * noise, spread * float(np.clip(fitted / given / _FAR_BETTER, *_EXPLAINS)))
+        if left <= min(near, needed * spread):
+            explained.append((reading, left))
+    return explained
+
+
+def _fitted(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, read_as: Wires, measured: Array) -> float:
+    """What a short fit of a reading typically leaves of its positions (median, m)."""
+    number = seen.sighting.kernel
+    values, measured, _ = _placed(problem, seen, read_as, measured)
+    beside = problem.subset(records, seen.sighting.chosen)
+    some = [replace(one, weight=0 * one.weight, whitening=None, correlation=None) for one in beside]
+    own = rewired(problem.kernels[number].factor.channels, seen.records, read_as)
+    turned = np.tile(np.eye(3), (own.count, 1, 1))
+    rows = np.zeros(len(problem.kernels[number].factor.noise))
+    rows[:3] = 1 / seen.noise
+    whitening = np.tile(np.diag(rows)[:, :, None], len(own.weight))
+    some[number] = replace(shown_instead(problem, own, number, Tools(measured, turned)), whitening=whitening)
+    posed = PosedProblem(problem, some)
+    try:
+        if problem.increments:
+            values = posed.values(descended(posed, posed.x(values), _FIT_STEPS, _FIT_DAMPING, 1e-3))
+        return float(np.median(np.linalg.norm(problem.residuals(values, some)[number][:3], axis=0)))
+    except NotConvergedError:
+        return np.inf
+
+
+def _positions(problem: Problem, seen: _Seen, read_as: Wires, values: Array) -> Adapting | None:
     """At these values, channels read as others, times a factor; None where a record has no equilibrium."""
     number, parameters = seen.sighting.kernel, problem.parameters
     records = rewired(problem.kernels[number].factor.channels, seen.records, read_as)
@@ -294,33 +302,38 @@ def _positions(problem: Problem, seen: _Seen, read_as: Wires, values: Array) -> 
         blocks = list(problem.grouped[number].linearised(values, records))
     except NotConvergedError:
         return None
-    noise, count = np.array(problem.kernels[number].factor.noise[:3])[:, None], records.count
+    noise, count = seen.noise[:, None], records.count
     slopes, residual = (np.concatenate(parts, axis=-1)[:3, ..., :count] for parts in zip(*blocks, strict=True))
     rows = (slopes * noise[:, :, None]).transpose(2, 0, 1).reshape(3 * count, -1)
     rows = rows @ parameters.entries_jacobian(values) * parameters.scales()
     basis, triangle = np.linalg.qr(rows)
     ways, sizes, _ = np.linalg.svd(triangle, full_matrices=False)
     kept = sizes > _SMALLEST * sizes.max(initial=0.0)
-    return _Positions(seen.measured - residual * noise, basis @ ways[:, kept], sizes[kept])
+    return Adapting(seen.measured - residual * noise, basis @ ways[:, kept], sizes[kept])
+
+
+def _placed(problem: Problem, seen: _Seen, read_as: Wires, measured: Array) -> tuple[Array, Array, float]:
+    """Values and positions in the base frame (3 x n) of a reading, base and target found anew, and what is left (m)."""
+    # As configured: where records that are mixed up put base and target says nothing of another reading of them.
+    placing, number, nominal = seen.placing, seen.sighting.kernel, problem.blueprint.parameters.nominal()
+    if placing is None:
+        return nominal, measured, 0.0
+    as_read = rewired(problem.kernels[number].factor.channels, seen.records, read_as)
+    alignment = nearest(tools_of(problem, nominal, as_read, number), measured, placing.basis)
+    values = placing.with_target(problem.parameters, nominal, alignment.offset)
+    return values, alignment.back(measured), alignment.left
 
 
 def _left(problem: Problem, seen: _Seen, read_as: Wires, measured: Array, enough: float) -> float:
     """What a reading leaves where base and target are found anew: roughly, if that is far more than enough (m)."""
-    # As configured: where records that are mixed up put base and target says nothing of another reading of them.
-    placing, number, nominal = seen.placing, seen.sighting.kernel, problem.blueprint.parameters.nominal()
-    if placing is None:
-        positions = _positions(problem, seen, read_as, nominal)
-        return np.inf if positions is None else positions.left(measured, enough)
-    as_read = rewired(problem.kernels[number].factor.channels, seen.records, read_as)
-    alignment = nearest(tools_of(problem, nominal, as_read, number), measured, placing.basis)
-    if alignment.left > _ROUGHLY * enough:
-        return alignment.left
-    values = placing.with_target(problem.parameters, nominal, alignment.offset)
+    values, measured, left = _placed(problem, seen, read_as, measured)
+    if left > _ROUGHLY * enough:
+        return left
     positions = _positions(problem, seen, read_as, values)
-    return np.inf if positions is None else positions.left(alignment.back(measured), enough)
+    return np.inf if positions is None else positions.left(measured, enough)
 
 
-def _of_axes(seen: _Seen, straight: _Positions) -> Iterator[tuple[str, Array]]:
+def _of_axes(seen: _Seen, straight: Adapting) -> Iterator[tuple[str, Array]]:
     """All exchanges and signs of axes, but turns that the fit makes by itself; other units; a row early or late."""
     if seen.placing is not None:
         yield LEFT_HANDED, np.diag([1.0, 1.0, -1.0]) @ seen.measured
@@ -333,17 +346,15 @@ def _of_axes(seen: _Seen, straight: _Positions) -> Iterator[tuple[str, Array]]:
     yield from seen.rows
 
 
-def _single(
-    problem: Problem, seen: _Seen, arm: Arm, straight: _Positions, enough: float = np.inf, fits: float = FITS
-) -> Iterator[_Reading]:
-    smaller = _Smaller(spread_of(straight.predicted), fits)
+def _single(problem: Problem, seen: _Seen, arm: Arm, straight: Adapting, enough: float = np.inf) -> Iterator[_Reading]:
+    smaller = _Smaller(spread_of(straight.predicted))
     for words, measured in _of_axes(seen, straight):
         left = straight.left(measured) if seen.placing is None else _left(problem, seen, {}, measured, enough)
-        yield _Reading(smaller.left(left, spread_of(measured)), words, False)
+        yield _Reading(smaller.left(left, kept_spread(measured, seen.measured)), words, False, {}, measured)
     spread = spread_of(seen.measured)
-    for words, read_as in single_joints(arm):
+    for words, read_as in [*single_joints(arm), *coupled_joints(arm)]:
         left = _left(problem, seen, read_as, seen.measured, enough)
-        yield _Reading(smaller.left(left, spread), words, True)
+        yield _Reading(smaller.left(left, spread), words, True, read_as, seen.measured)
 
 
 def _in_two_frames(problem: Problem, seen: _Seen) -> Iterator[_Reading]:
@@ -360,22 +371,21 @@ def _in_two_frames(problem: Problem, seen: _Seen) -> Iterator[_Reading]:
 
 def _several(problem: Problem, seen: _Seen, arm: Arm, enough: float) -> Iterator[_Reading]:
     """Signs of several joints, joints in another order, and either or one joint's permutation beside one of axes."""
-    seen = seen.thinned(_SEVERAL_RECORDS)
     straight = _positions(problem, seen, {}, problem.parameters.nominal())
     if straight is None:
         return
     axes = [("", seen.measured), *((f" and {own}", moved) for own, moved in _of_axes(seen, straight))]
     axes = axes if seen.placing is None else axes[:2]
-    smaller, measured = _Smaller(spread_of(straight.predicted), FITS), np.array([moved for _, moved in axes])
-    spreads = [spread_of(moved) for moved in measured]
+    smaller, measured = _Smaller(spread_of(straight.predicted)), np.array([moved for _, moved in axes])
+    spreads = [kept_spread(moved, seen.measured) for moved in measured]
     for words, read_as in [*single_joints(arm), *several_joints(arm)]:
         if seen.placing is not None:
             lefts = [_left(problem, seen, read_as, moved, enough) for moved in measured]
         else:
             positions = _positions(problem, seen, read_as, problem.parameters.nominal())
             lefts = [] if positions is None else positions.left_of_each(measured, enough).tolist()
-        for left, spread, (own, _) in zip(lefts, spreads, axes, strict=False):
-            yield _Reading(smaller.left(left, spread), f"{words}{own}", True)
+        for left, spread, (own, moved) in zip(lefts, spreads, axes, strict=False):
+            yield _Reading(smaller.left(left, spread), f"{words}{own}", True, read_as, moved)
 
 
 @dataclass(frozen=True)
@@ -383,9 +393,8 @@ class _Smaller:
     """How far the arm's positions are spread (m): measured ones near one point are near those of any arm."""
 
     size: float
-    fits: float
 
     def left(self, left: float, spread: float) -> float:
         """What a reading leaves, as many times more as its positions are spread less; infinite where it is no fit."""
         spread = max(spread, _SMALLEST)
-        return np.inf if left > self.fits * spread else left * max(1.0, self.size / spread)
+        return np.inf if left > FITS * spread else left * max(1.0, self.size / spread)

@@ -8,20 +8,24 @@ from dataclasses import dataclass, replace
 from itertools import combinations, permutations, product
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from armcal.arm.assembly import Arm
 from armcal.base.arrays import Array
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.rigid_alignment import Tools, nearest
 
-Wires = Mapping[str, tuple[str, float, float]]
-"""Channels, each read as another one times a factor, and a summand."""
+Wires = Mapping[str, tuple[Mapping[str, float], float]]
+"""Channels, each read as a sum of channels times factors, and a summand."""
 _DEGREES, _TURN, _MRAD = 180 / np.pi, 360.0, 1000 * np.pi / 180
 _ZEROS_DEG = (180, 90, -90)
 """What the zero of a joint is off by: half the counts of a servo, or where another convention has it."""
 _MOST_SIGNS = 8
 _AXES = "xyz"
 _INCH = 25.4
+_ROUNDED = 1e-6
+_TURNED = 0.05
+_FAR, _HALVINGS = 3.0, 60
 FEWEST_IN_PART = 8
 """Records in a part: an alignment has nine numbers."""
 _PARTS, _ROUNDS = (0.25, 0.5, 0.75), 3
@@ -50,6 +54,18 @@ def single_joints(arm: Arm) -> list[tuple[str, Wires]]:
     for joint, turn in product(angles, _ZEROS_DEG):
         readings.append((f"{turn} deg added to {joint}", _wires(arm, {joint: joint}, 1.0, np.radians(turn))))
     return readings
+
+
+def coupled_joints(arm: Arm) -> Iterator[tuple[str, Wires]]:
+    """Each joint's reading taken for its own less, or plus, that of another of its kind."""
+    for joint, other in permutations(arm.commanded, 2):
+        for sign in (1.0, -1.0) if arm.commanded[joint] == arm.commanded[other] else ():
+            factor = arm.couplings.get(joint, {}).get(other, 0.0) + sign
+            stated = f"state couplings: {{{joint}: {{{other}: {factor:g}}}}}" if factor else f"do not couple {joint}"
+            words = f"{joint} {'+' if sign > 0 else '-'} {other} taken for {joint}"
+            why = "(coupled joints, as the pendant of a Fanuc and the links of a palletiser have them: "
+            channels = {f"{arm.name}.{joint}": 1.0, f"{arm.name}.{other}": sign}
+            yield f"{words} {why}{stated})", {f"{arm.name}.{joint}": (channels, 0.0)}
 
 
 def several_joints(arm: Arm) -> Iterator[tuple[str, Wires]]:
@@ -83,7 +99,7 @@ def axes_words(order: Sequence[int], signs: Sequence[float]) -> str:
 def _wires(arm: Arm, joints: Mapping[str, str], factor: float, added: float = 0.0) -> Wires:
     """Commands and approaches of some joints read as those of others, times a factor; of approaches, times its sign."""
     return {
-        f"{arm.name}.{part}{joint}": (f"{arm.name}.{part}{other}", scale, summand)
+        f"{arm.name}.{part}{joint}": ({f"{arm.name}.{part}{other}": scale}, summand)
         for joint, other in joints.items()
         for part, scale, summand in (("", factor, added), ("approach.", float(np.sign(factor)), 0.0))
     }
@@ -145,12 +161,68 @@ def two_frames(tools: Tools, measured: Array, basis: Array) -> TwoFrames | None:
 
 
 def rewired(channels: Sequence[str], own: FactorRecords, read_as: Wires) -> FactorRecords:
-    """Records with channels read as others, times a factor, and a summand."""
+    """Records with channels read as sums of others, times factors, and a summand."""
     read = own.record.copy()
-    for channel, (other, factor, added) in read_as.items():
-        if channel in channels and other in channels:
-            read[channels.index(channel)] = factor * own.record[channels.index(other)] + added
+    for channel, (others, added) in read_as.items():
+        if channel in channels and all(other in channels for other in others):
+            parts = (factor * own.record[channels.index(other)] for other, factor in others.items())
+            read[channels.index(channel)] = sum(parts, np.asarray(added))
     return replace(own, record=read, state=np.zeros_like(own.state))
+
+
+def kept_spread(read: Array, measured: Array) -> float:
+    """How far positions are spread as they are read (3 x N, m); as in their thinnest direction where that grew thinner.
+
+    A reading that flattens what was measured hides anything in the direction in which it does.
+    """
+    own, given = (np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(p, bias=True)), 0.0)) for p in (read, measured))
+    flattened = own[0] * np.linalg.norm(given) < (1 - _ROUNDED) * given[0] * np.linalg.norm(own)
+    return float(np.sqrt(len(own)) * own[0] if flattened else np.linalg.norm(own))
+
+
+@dataclass(frozen=True)
+class Adapting:
+    """Predicted positions (3 x N, m), and how the free parameters, in typical scales, move them: U S V' (3N x n)."""
+
+    predicted: Array
+    ways: Array
+    sizes: Array
+
+    def left(self, measured: Array, enough: float = np.inf) -> float:
+        """Root mean square distance once the free parameters have adapted to first order, not too far (m).
+
+        Where more than ``enough`` is left however far they adapt, that is given.
+        """
+        return float(self.left_of_each(measured[None], enough)[0])
+
+    def left_of_each(self, measured: Array, enough: float) -> Array:
+        """The same of several readings (k x 3 x N) of what was measured (k)."""
+        off = (measured - self.predicted).transpose(0, 2, 1).reshape(len(measured), -1)
+        along, unit = off @ self.ways, 3 / max(1, off.shape[1] - len(self.sizes))
+        left = np.sum(off**2, axis=1) - np.sum(along**2, axis=1)
+        for i in np.flatnonzero(unit * left <= enough**2):
+            fitted = self.sizes * within(along[i], self.sizes, _FAR * np.sqrt(len(self.sizes)))
+            left[i] += np.sum((along[i] - fitted) ** 2)
+        return np.asarray(np.sqrt(unit * np.maximum(left, 0.0)))
+
+    def can_move(self, turn: Array, shift: Array) -> bool:
+        """Whether the free parameters move all positions as the beginning of a motion of the base would."""
+        moved = (np.cross(Rotation.from_matrix(turn).as_rotvec(), self.predicted.T) + shift).ravel()
+        along = self.ways.T @ moved
+        return float(moved @ moved - along @ along) <= _TURNED**2 * float(moved @ moved)
+
+
+def within(along: Array, sizes: Array, radius: float) -> Array:
+    """The steps (n) that come nearest to ``along`` times ``sizes``, no longer than a radius. [Nocedal2006]"""
+    steps = along / sizes
+    if np.linalg.norm(steps) <= radius:
+        return np.asarray(steps)
+    low, high = 0.0, float(np.linalg.norm(along * sizes)) / radius
+    for _ in range(_HALVINGS):
+        damping = (low + high) / 2
+        steps = along * sizes / (sizes**2 + damping)
+        low, high = (damping, high) if np.linalg.norm(steps) > radius else (low, damping)
+    return np.asarray(steps)
 
 
 def is_place(names: Sequence[str]) -> bool:

@@ -114,10 +114,13 @@ def bounded_step(model: NormalEquations, lower: Array, upper: Array) -> Array | 
     return np.asarray(np.clip(np.select(held, [lower, upper], solution.x / size), lower, upper))
 
 
-def hopeless(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, start: Array) -> Solution | None:
+def hopeless(
+    problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, start: Array, named: bool = False
+) -> Solution | None:
     """The start, if a short search over some of the records says that no search leads on from there; else None.
 
-    Asked of measurements of positions in the base frame alone; ``records`` are those of the dataset, which train.
+    Asked of measurements of positions in the base frame alone; ``records`` are those of the dataset, which train. Where
+    no other reading was ``named`` that explains them, the status says so.
     """
     began = time.perf_counter()
     chosen = np.arange(0, len(dataset), max(1, -(-len(dataset) // _MOST_RECORDS)))
@@ -133,6 +136,8 @@ def hopeless(problem: Problem, records: Sequence[FactorRecords], dataset: Datase
     if off <= HOPELESS:
         return None
     status = f"stopped early: position errors stay at {100 * off:.0f} % of the spread of the positions"
+    if not named:
+        status += ", and no single order, sign, unit or zero of axes and joints was found that explains them"
     seconds = time.perf_counter() - began
     return Solution(start, SolverVerdict("the first search", status, False, _SEARCH_STEPS, seconds))
 

@@ -128,7 +128,7 @@ def _fitted(context: RunContext, ready: Prepared) -> WeighedFit:
     estimator = spread(context.experiment.estimator, context.executor)
     with context.watch.stage("fit"):
         starts = ready.start.values(problem)
-        given_up = [hopeless(problem, ready.training, data, start) for start in starts]
+        given_up = [hopeless(problem, ready.training, data, start, bool(ready.findings)) for start in starts]
         left = [start for start, hopeless_from in zip(starts, given_up, strict=True) if hopeless_from is None]
         if not left:
             return plain_fit(problem, ready.training, next(given for given in given_up if given is not None))

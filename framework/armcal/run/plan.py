@@ -137,7 +137,7 @@ def make_plan(
     plan, refined = _chosen(task, settings, parameters), 0
     if pool.kind == "continuous" and settings.sweeps:
         progress("refinement", 0.5)
-        allowed = (lambda q: np.ones(q.shape[1], dtype=bool)) if check is None else (lambda q: check(q).allowed)
+        allowed = (lambda q: np.ones(q.shape[1], dtype=bool)) if check is None else check
         task, plan, pool, refined = _refined(context, task, plan, pool, allowed)
     progress("bound", 0.8)
     return _result(context, task, _between(context, task, plan, pool), pool, refined)

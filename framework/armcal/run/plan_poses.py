@@ -3,14 +3,14 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 
-from armcal.arm.assembly import command_channels, shown_joint
-from armcal.arm.clearance import ClearanceCheck
+from armcal.arm.assembly import command_channels, shown_joint, within_couplings
 from armcal.arm.joints import Limits, by_dimension
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
@@ -31,6 +31,7 @@ _MOST_GRID = 2_000_000
 _MOST_TRIED = 64
 _POWER = 12
 _SAME_POSE = 1e-9
+_BARRED = "too little clearance"
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,12 @@ class JointSpace:
 def stated_beyond(experiment: Experiment, stated: Mapping[str, Limits]) -> tuple[str, ...]:
     """A sentence for each joint whose stated limits (rad or m) go beyond those of its model."""
     texts, arms = [], experiment.system.arms
-    own = {f"{n}.{j}": ends for n, arm in arms.items() for j, ends in own_limits(arm, experiment.parameters).items()}
+    own = {
+        f"{name}.{joint}": ends
+        for name, arm in arms.items()
+        for joint, ends in own_limits(arm, experiment.parameters).items()
+        if joint not in arm.couplings  # theirs are of other angles than commands, and poses are left out by them
+    }
     for channel, dimension in command_channels(arms).items():
         given, known = stated.get(shown_joint(channel, arms)), own.get(channel)
         if given and known and max(known[0] - given[0], given[1] - known[1]) > TOLERANCE[dimension]:
@@ -109,16 +115,19 @@ class Pool:
         return replace(self, dataset=self.dataset.subset(np.flatnonzero(~faulty)), left_out=left_out)
 
 
-def clearance_of(experiment: Experiment) -> ClearanceCheck | None:
-    """The check of its plan's clearance; None where none is stated."""
-    plan = experiment.settings.plan
-    if plan is None or plan.clearance is None:
-        return None
-    return clearance_check(plan.clearance, experiment.system.arms, experiment.source)
+def clearance_of(experiment: Experiment) -> Allowed | None:
+    """The check of its plan's clearance, and of coupled joints' own limits; None where there is neither."""
+    plan, arms = experiment.settings.plan, experiment.system.arms
+    clearance = None if plan is None else plan.clearance
+    check = None if clearance is None else clearance_check(clearance, arms, experiment.source)
+    if not any(arm.couplings for arm in arms.values()):
+        return None if check is None else lambda poses: check(poses).allowed
+    within = partial(within_couplings, arms.values())
+    return within if check is None else lambda poses: check(poses).allowed & within(poses)
 
 
 def pool_of(
-    experiment: Experiment, settings: PlanSettings, space: JointSpace, listed: Path | None, check: ClearanceCheck | None
+    experiment: Experiment, settings: PlanSettings, space: JointSpace, listed: Path | None, check: Allowed | None
 ) -> Pool:
     """Every candidate that lies within limits and keeps its clearance.
 
@@ -137,7 +146,7 @@ def pool_of(
     outside = np.any((angles < limits[:, :1] - _SAME_POSE) | (angles > limits[:, 1:] + _SAME_POSE), axis=0)
     pool = pool.without(outside, "beyond joint limits")
     if check is not None:
-        pool = pool.without(~check(pool.dataset.stacked(space.channels)).allowed, "too little clearance")
+        pool = pool.without(~check(pool.dataset.stacked(space.channels)), _BARRED)
     if not len(pool.dataset):
         raise ProblemError(
             f"none of the candidates is left ({counts_text(pool.left_out)}).",
@@ -214,7 +223,7 @@ def same_poses(first: Array, second: Array) -> Mask:
     return np.array([tuple(c) in keys for c in np.round(first.T / _SAME_POSE).astype(np.int64).tolist()], dtype=bool)
 
 
-def spread(settings: PlanSettings, space: JointSpace, limits: Array, check: ClearanceCheck | None) -> Pool:
+def spread(settings: PlanSettings, space: JointSpace, limits: Array, check: Allowed | None) -> Pool:
     """Poses spread evenly between limits, by a scrambled Sobol sequence, after the corners of joint space."""
     from scipy.stats import qmc
 
@@ -233,11 +242,11 @@ def spread(settings: PlanSettings, space: JointSpace, limits: Array, check: Clea
             drawn = np.array(list(product(levels, repeat=len(limits))))
     while kept < settings.count and tried <= _MOST_TRIED * settings.count:
         poses = (limits[:, 0] + drawn * (limits[:, 1] - limits[:, 0])).T
-        allowed = np.ones(poses.shape[1], dtype=bool) if check is None else check(poses).allowed
+        allowed = np.ones(poses.shape[1], dtype=bool) if check is None else check(poses)
         kept_poses.append(poses[:, allowed])
         kept, tried = kept + int(allowed.sum()), tried + poses.shape[1]
         drawn = sequence.random(2**_POWER)
-    left_out = {"too little clearance": tried - kept} if tried > kept else {}
+    left_out = {_BARRED: tried - kept} if tried > kept else {}
     if not kept:
         raise ProblemError(f"none of {tried} poses keeps its clearance.", hint="Check plan.clearance.")
     return Pool("continuous", dataset_of(np.hstack(kept_poses)[:, : settings.count], space), left_out)
@@ -302,5 +311,4 @@ def workspace_of(path: Path, joints: Sequence[str], registry: PluginRegistry) ->
         )
     stated = zip(space.names, space.limits(plan), strict=True)
     limits = {name: (float(low), float(high)) for name, (low, high) in stated if np.isfinite([low, high]).any()}
-    check = clearance_of(experiment)
-    return Workspace(limits, None if check is None else lambda commands: check(commands).allowed)
+    return Workspace(limits, clearance_of(experiment))

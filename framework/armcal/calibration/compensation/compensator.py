@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
+from armcal.arm.assembly import within_couplings
 from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.arrays import Array, Mask
 from armcal.base.parameters import Parameters
@@ -57,7 +58,8 @@ class Compensator:
             ValueError: limits of a joint that is not there, or in falling order.
         """
         self.expression, self.options = expression, options or Options()
-        self._allowed = allowed
+        coupled = partial(within_couplings, [expression.arm]) if expression.arm.couplings else None
+        self._allowed = (lambda q: allowed(q) & coupled(q)) if allowed and coupled else allowed or coupled
         self._held = held_joints(expression, self.options.held)
         self.limits = command_limits(expression, self.options.limits)
         self.reach: Reach = reach_of(expression.arm, parameters, self.limits, expression.tool_T_point)
@@ -264,7 +266,8 @@ class Compensator:
         def position_can_be_had(rows: Rows) -> Mask:
             return self._positions.finder(record[:, rows], targets.positions[rows].T, commands[:, rows]).there
 
-        reasons = why_not(self.joints, self.limits, commands, targets, solutions, had, bounds, position_can_be_had)
+        why = "are too near to something" + ", or turn a coupled joint too far" * bool(self.expression.arm.couplings)
+        parts = (self.joints, self.limits, commands, targets, solutions, had, bounds, position_can_be_had, why)
         return Commands(
             joints=self.joints,
             joint_angles=commands.T.copy(),
@@ -274,7 +277,7 @@ class Compensator:
             distances=np.linalg.norm(poses[:, :3, 3] - targets.positions, axis=1),
             turns=turns,
             reached=had,
-            reasons=reasons,
+            reasons=why_not(*parts),
             bounds=np.where(had, 0.0, bounds),
             approach=record[joints : 2 * joints].T.copy(),
         )

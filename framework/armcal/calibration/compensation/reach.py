@@ -125,6 +125,7 @@ def why_not(
     had: Mask,
     bounds: Array,
     position_can_be_had: Callable[[Rows], Mask],
+    barred: str = "are too near to something",
 ) -> tuple[str, ...]:
     """A sentence for each target that is not had; empty for the others.
 
@@ -137,6 +138,7 @@ def why_not(
         had: which are reached.
         bounds: how near the arm can come at most (N; m).
         position_can_be_had: from targets' rows to whether their positions can be reached with any rotation.
+        barred: why commands that reach a target are not allowed.
     """
     lost = np.flatnonzero(~had)
     turned = np.zeros(len(had), dtype=bool)
@@ -145,19 +147,26 @@ def why_not(
         turned[near] = position_can_be_had(near)
     said = [""] * len(had)
     for row in lost.tolist():
-        said[row] = _sentence(joints, limits, commands[:, row], solutions, bounds[row], bool(turned[row]), row)
+        said[row] = _sentence(joints, limits, commands[:, row], solutions, bounds[row], bool(turned[row]), row, barred)
     return tuple(said)
 
 
 def _sentence(
-    joints: Sequence[str], limits: Array, commands: Array, solutions: Solutions, bound: float, turned: bool, row: int
+    joints: Sequence[str],
+    limits: Array,
+    commands: Array,
+    solutions: Solutions,
+    bound: float,
+    turned: bool,
+    row: int,
+    barred: str,
 ) -> str:
     if solutions.there[row]:
         return "the load is more than the springs hold there"
     if bound > 0:
         return f"out of reach: no command comes nearer than {1000 * bound:.1f} mm"
     if solutions.forbidden[row]:
-        return "all commands found that reach it are too near to something"
+        return f"all commands found that reach it {barred}"
     held = [
         joint
         for joint, q, (low, high) in zip(joints, commands, limits, strict=True)

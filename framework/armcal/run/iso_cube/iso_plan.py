@@ -142,7 +142,7 @@ def make_iso_plan(
         arm_expression(plain, parameters, experiment.system.environment),
         parameters,
         Options(limits={name: (low, high) for name, (low, high) in zip(space.names, limits.tolist(), strict=True)}),
-        None if check is None else lambda commands: check(commands).allowed,
+        check,
     )
     pool = spread(settings.model_copy(update={"count": _POSTURES}), space, limits, check)
     chosen = placed(compensator, pool.dataset.stacked(space.channels), size)
