@@ -310,18 +310,18 @@ def large_error_findings(large_errors: LargeErrors | None, unit: str = _MM) -> l
     limit = (
         "validation.limit_mm"
         if large_errors.configured
-        else f"noise of their median size, {100 * BY_CHANCE:g} % over all"
+        else f"what noise and uncertain parameters do, {100 * BY_CHANCE:g} % over all"
     )
     test = f"errors of {large_errors.judged} records by fits that did not see them, limit {limit}"
     if not large_errors.beyond:
-        return [Finding("good", f"No judged record has an error above {readable(large_errors.limit_mm)} {unit}.", test)]
+        return [Finding("good", f"No judged record has an error {large_errors.in_words(unit)}.", test)]
     listed = "; ".join(
         f"{miss.record_id} ({readable(miss.error_mm)} {unit}: {', '.join(miss.reasons)})"
         for miss in large_errors.explained[:MOST_TOLD]
     )
     more = f"; and {large_errors.beyond - MOST_TOLD} more, in the report" if large_errors.beyond > MOST_TOLD else ""
     records = _plural(large_errors.beyond, "record has", "records have")
-    text = f"{records} an error above {readable(large_errors.limit_mm)} {unit}: "
+    text = f"{records} an error {large_errors.in_words(unit)}: "
     advice = "; or ".join(dict.fromkeys(miss.advice for miss in large_errors.explained[:MOST_TOLD]))
     return [Finding("warning", f"{text}{listed}{more}.", test, f"{advice.capitalize()}.")]
 

@@ -9,7 +9,7 @@ from scipy.special import betainc, fdtri, gammaincinv
 from armcal.arm.assembly import shown_joint
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.units import digits, display_unit, to_unit
+from armcal.base.units import digits, display_unit, readable, to_unit
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.validation import error_rows
 from armcal.problem.motion import Motion
@@ -49,7 +49,7 @@ class LargeErrors:
     """All records beyond the limit, the farthest first; at most ``MOST_EXPLAINED`` of them are explained.
 
     Attributes:
-        limit_mm: the limit.
+        limit_mm: the limit; the median one, where it grows with how uncertain a record's prediction is.
         configured: whether it is a setting; else it is ``noise_limit``.
         judged: how many records were judged.
         beyond: how many lie beyond.
@@ -61,6 +61,11 @@ class LargeErrors:
     judged: int
     beyond: int
     explained: tuple[Miss, ...]
+
+    def in_words(self, unit: str) -> str:
+        """Beyond what."""
+        stated = f"{readable(self.limit_mm)} {unit}"
+        return f"above {stated}" if self.configured else f"beyond what noise explains ({stated} for most records)"
 
 
 @dataclass(frozen=True)
@@ -102,16 +107,22 @@ def large_errors(
     known = np.isfinite(errors)
     if not known.any():
         return None
-    limit = noise_limit(errors[known], error_rows(problem, records)) if limit_mm is None else limit_mm
-    beyond = np.flatnonzero(known & (errors > limit))
+    variance = _leverage(problem, records, estimate)
+    if limit_mm is None:
+        sizes = np.sqrt(1 + variance / sum(len(kernel.factor.noise) for kernel in problem.kernels))
+        limits = sizes * noise_limit(errors[known] / sizes[known], error_rows(problem, records))
+    else:
+        limits = np.full(len(errors), limit_mm)
+    beyond = np.flatnonzero(known & (errors > limits))
     beyond = beyond[np.argsort(-errors[beyond], kind="stable")]
     explained: tuple[Miss, ...] = ()
     if len(beyond):
-        leverage = _above(_leverage(problem, records, estimate))
+        leverage = _above(variance)
         efforts = {name: _above(np.abs(loads.efforts)) for name, loads in motion.loads.items()}
         explained = tuple(
             _miss(int(i), problem, dataset, motion, judged, leverage, efforts) for i in beyond[:MOST_EXPLAINED]
         )
+    limit = float(np.median(limits[known]))
     return LargeErrors(limit, limit_mm is not None, int(known.sum()), len(beyond), explained)
 
 

@@ -30,8 +30,6 @@ _HIDDEN = 0.5
 _LEAST_SHARE = 0.1
 """A parameter that takes up less of it is not named."""
 _MOST_NAMED = 3
-_MISLEADING = 2.0
-"""A tool that is known so many times worse than contacts disagree is off by more than their error says."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +60,11 @@ class Elsewhere:
     rms_mm: float
     poses: int
     up_to: str
+
+    @property
+    def in_words(self) -> str:
+        """How well."""
+        return f"Away from the contacts the tool is known to {readable(self.rms_mm)} mm (root mean square)"
 
 
 def scale_deviation(problem: Problem, rows: FitRows, positions: Sequence[Array], noise_scale: float) -> float | None:
@@ -149,16 +152,12 @@ def hidden_payload_findings(hidden: HiddenPayload | None) -> list[Finding]:
     return [Finding("note", text, test, "Weigh what hangs on the tool, and state it: statics.payload_g.")]
 
 
-def elsewhere_findings(away: Elsewhere | None, judged_mm: Array) -> list[Finding]:
-    """What the verdict says of it beside the errors of records that did not train (none, where all did)."""
+def elsewhere_findings(away: Elsewhere | None) -> list[Finding]:
+    """What the verdict says of it."""
     if away is None:
         return []
-    text = f"Away from the contacts the tool is known to {readable(away.rms_mm)} mm (root mean square)"
-    mean = float(np.mean(judged_mm)) if len(judged_mm) else np.inf
-    misleading = away.rms_mm > _MISLEADING * mean
-    if misleading:
-        text += f": the error of {readable(mean)} mm is only by how much postures at one place disagree"
+    text = f"{away.in_words}: the error of contacts is only by how much postures at one place disagree."
     test = f"from the parameters' covariance, at {away.poses} poses of recorded joint positions"
     test += f", up to {away.up_to}" if away.up_to else ""
-    action = "Train on more places, farther apart, with the joints turned as far as they go." if misleading else ""
-    return [Finding("warning" if misleading else "note", f"{text}.", test, action)]
+    action = "If that is too little: train on more places, farther apart, with the joints turned as far as they go."
+    return [Finding("note", text, test, action)]

@@ -105,6 +105,9 @@ def judge(
     ranked = tuple(sorted(findings, key=lambda finding: _ORDER[finding.grade]))
     headline = _errors_text(judged_mm, judged_on, seen)
     first = _good_for(judged_mm, judged_on, seen.unit, seen.new_recording)
+    if seen.elsewhere is not None:
+        agree = _good_for(judged_mm, judged_on, claim="Postures at one place agree within")
+        first = f"{seen.elsewhere.in_words}. {agree}"
     if ranked[0].grade == "bad":
         headline, first = f"{DO_NOT_USE}. {headline}", f"{DO_NOT_USE}: {ranked[0].text}"
     short = _in_short(first, estimate, determined, seen, suspicious_in_short(suspicious, len(own)), suggestions)
@@ -122,7 +125,9 @@ def _errors_text(judged_mm: Array, judged_on: str, seen: Evidence) -> str:
     )
 
 
-def _good_for(judged_mm: Array, judged_on: str, unit: str = "mm", new: NewRecording | None = None) -> str:
+def _good_for(
+    judged_mm: Array, judged_on: str, unit: str = "mm", new: NewRecording | None = None, claim: str = "Good for"
+) -> str:
     """Below what 95 % of unseen poses lie, with 95 % confidence, by order statistics. [Wilks1941]
 
     In a new recording a drift is another one: errors are scaled to it, and the limit is as much wider as an upper
@@ -142,7 +147,7 @@ def _good_for(judged_mm: Array, judged_on: str, unit: str = "mm", new: NewRecord
         correlated, independent = (freedom / chdtri(freedom, 1 - LEVEL) for freedom in (new.freedom, new.independent))
         limit *= float(np.sqrt(correlated / independent))
     return (
-        f"Good for +- {readable(limit)} {unit} on unseen poses like these: 95 % of them, with 95 % confidence "
+        f"{claim} +- {readable(limit)} {unit} on unseen poses like these: 95 % of them, with 95 % confidence "
         f"({judged_on})."
     )
 
@@ -166,7 +171,7 @@ def _in_short(
         ids = ", ".join(miss.record_id for miss in missed.explained[:MOST_TOLD])
         more = f" and {missed.beyond - MOST_TOLD} more" if missed.beyond > MOST_TOLD else ""
         named = "the record" if missed.beyond == 1 else f"{missed.beyond} records"
-        sentences.append(f"Error above {readable(missed.limit_mm)} {seen.unit} in {named}, by id: {ids}{more}.")
+        sentences.append(f"Error {missed.in_words(seen.unit)} in {named}, by id: {ids}{more}.")
     sentences.append(suspicious)
     sentences += _left(seen)
     if is_worth_measuring(suggestions):

@@ -229,7 +229,7 @@ def _gross(
         *displacement_findings(figure),
         *scale_findings(figure, scale_deviation(problem, rows, read, estimate.noise_scale), scales),
         *hidden_payload_findings(evidence.hidden_payload),
-        *elsewhere_findings(evidence.elsewhere, judged_mm[np.isfinite(judged_mm)]),
+        *elsewhere_findings(evidence.elsewhere),
     ]
 
 
