@@ -56,6 +56,9 @@ _RANDOM = {
     "poses": {"kind": "random", "count": 1, "levels_deg": _SPAN},
 }
 
+_BOARD = {"camera": {"board": {"type": "chessboard", "columns": 5, "rows": 4, "square_mm": 40}}}
+"""Of few corners: what a run costs grows with their square."""
+
 
 @dataclass(frozen=True)
 class Kind:
@@ -130,13 +133,14 @@ def _range(folder: Path) -> Path:
     )
 
 
-def _shipped(config: Path) -> Callable[[Path], Path]:
+def _shipped(config: Path, **changes: Any) -> Callable[[Path], Path]:
     """A configuration of the demos, with truths of its own."""
 
     def written(folder: Path) -> Path:
         shutil.copytree(config.parent, folder / config.parent.name)
         simulation = {**load_config(config).data["simulation"], "truth": "clean_truth.yaml"}
-        return _written(folder / config.parent.name / "clean.yaml", {"extends": config.name, "simulation": simulation})
+        content = {"extends": config.name, "simulation": simulation, **changes}
+        return _written(folder / config.parent.name / "clean.yaml", content)
 
     return written
 
@@ -145,7 +149,9 @@ KINDS: Mapping[str, Kind] = {
     "range": Kind(_range),
     "position": Kind(_position),
     "pose": Kind(_pose),
-    "pixels": Kind(_shipped(CONFIGS / "camera" / "demo.yaml"), fixed=CONFIGS / "camera" / "truth.yaml"),
+    "pixels": Kind(
+        _shipped(CONFIGS / "camera" / "demo.yaml", measurements=_BOARD), fixed=CONFIGS / "camera" / "truth.yaml"
+    ),
     "sockets": Kind(
         _shipped(CONFIGS / "ball" / "demo.yaml"),
         lambda count: f"simulation.count={max(6, count // 8)}",

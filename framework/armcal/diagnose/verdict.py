@@ -30,6 +30,7 @@ from armcal.diagnose.noise_findings import (
     suspicious_records,
 )
 from armcal.diagnose.rounded import rounding_findings
+from armcal.diagnose.unseen import Elsewhere
 from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
 from armcal.estimate.identifiability import POOR_CONDITION, bound_together, correlated_pairs
 from armcal.estimate.prediction import NewRecording
@@ -104,10 +105,7 @@ def judge(
     findings += [*outlier_findings(suspicious, own, fitted), *_next(estimate, suggestions)]
     ranked = tuple(sorted(findings, key=lambda finding: _ORDER[finding.grade]))
     headline = _errors_text(judged_mm, judged_on, seen)
-    first = _good_for(judged_mm, judged_on, seen.unit, seen.new_recording)
-    if seen.elsewhere is not None:
-        agree = _good_for(judged_mm, judged_on, claim="Postures at one place agree within")
-        first = f"{seen.elsewhere.in_words}. {agree}"
+    first = _good_for(judged_mm, judged_on, seen.unit, seen.new_recording, seen.elsewhere)
     if ranked[0].grade == "bad":
         headline, first = f"{DO_NOT_USE}. {headline}", f"{DO_NOT_USE}: {ranked[0].text}"
     short = _in_short(first, estimate, determined, seen, suspicious_in_short(suspicious, len(own)), suggestions)
@@ -126,7 +124,11 @@ def _errors_text(judged_mm: Array, judged_on: str, seen: Evidence) -> str:
 
 
 def _good_for(
-    judged_mm: Array, judged_on: str, unit: str = "mm", new: NewRecording | None = None, claim: str = "Good for"
+    judged_mm: Array,
+    judged_on: str,
+    unit: str = "mm",
+    new: NewRecording | None = None,
+    elsewhere: Elsewhere | None = None,
 ) -> str:
     """Below what 95 % of unseen poses lie, with 95 % confidence, by order statistics. [Wilks1941]
 
@@ -146,6 +148,7 @@ def _good_for(
     if new is not None:
         correlated, independent = (freedom / chdtri(freedom, 1 - LEVEL) for freedom in (new.freedom, new.independent))
         limit *= float(np.sqrt(correlated / independent))
+    claim = "Good for" if elsewhere is None else f"{elsewhere.in_words}. Postures at one place agree within"
     return (
         f"{claim} +- {readable(limit)} {unit} on unseen poses like these: 95 % of them, with 95 % confidence "
         f"({judged_on})."
