@@ -129,7 +129,7 @@ def worse_than_nominal(judged_mm: Array, nominal_mm: Array, spent: float = 0.0, 
     more = judged_mm[seen] - factor * nominal_mm[seen]
     least = _by_chance(more, WORSE) + _by_chance(more, 1 - POWER)
     which = f"on {len(more)} records that did not train it: {readable(after)} {unit} on average, {readable(before)} of "
-    which += "the nominal arm, which the same records placed."
+    which += "the nominal arm, placed by the records that trained as far as it may move."
     test = (
         f"paired differences, one-sided, {100 * WORSE:g} %, beyond the {percent(factor - 1)} that so many parameters "
         f"make; {100 * POWER:g} % of losses of {readable(least)} {unit} would show"
@@ -264,7 +264,7 @@ def neighbour_findings(structure: ResidualStructure | None, estimate: Estimate, 
     if structure.lag_after_p > structure.level:
         return [Finding("note", f"{text}; what was found above explains it.", test)]
     after = f", by {structure.lag_after:.2f} still beside what was found" if structure.structures else ""
-    text += f"{after}: they are not noise. {what_neighbours_cost(estimate)}"
+    text += f"{after}: they are not noise. {_what_neighbours_cost(estimate)}"
     alike = structure.alike
     if alike is None:
         return [Finding("warning", text, test, _TELL_APART["open"])]
@@ -279,7 +279,7 @@ def neighbour_findings(structure: ResidualStructure | None, estimate: Estimate, 
     return [Finding("warning", f"{text}.", test, _TELL_APART[alike.cause])]
 
 
-def what_neighbours_cost(estimate: Estimate) -> str:
+def _what_neighbours_cost(estimate: Estimate) -> str:
     """What correlated neighbours do to the intervals of the parameters."""
     factors = estimate.widened
     if not factors:

@@ -16,7 +16,7 @@ from armcal.diagnose.noise_findings import Finding, Grade, first_few
 from armcal.diagnose.residual_structure import ResidualStructure, Structure
 from armcal.estimate.start import BETTER
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.rigid_alignment import hand_eye
+from armcal.problem.rigid_alignment import FEWEST, hand_eye
 from armcal.problem.sighting import sighting_of, tools_of
 
 OF_REACH = 0.03
@@ -127,7 +127,9 @@ def held_turn(problem: Problem, records: Sequence[FactorRecords], dataset: Datas
         own = f"{kernel.factor.name}."
         names = [b.name for b in problem.parameters.blocks if b.name.startswith(own) and isinstance(b.domain, Rotation)]
         sighting = sighting_of(problem, records, dataset, number, MOST_RECORDS)
-        if sighting is None or sighting.turned is None or not names or problem.parameters[names[0]].free:
+        if sighting is None or sighting.turned is None or len(sighting.chosen) < FEWEST:
+            continue
+        if not names or problem.parameters[names[0]].free:
             continue
         tools = tools_of(problem, nominal, problem.subset(records, sighting.chosen)[number], number)
         base, mounted = hand_eye(tools.rotations, sighting.turned)

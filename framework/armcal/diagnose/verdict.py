@@ -18,7 +18,6 @@ from armcal.diagnose.evidence_findings import (
     predicted_in_short,
     shift_findings,
     structure_findings,
-    what_neighbours_cost,
 )
 from armcal.diagnose.held import contradiction_findings
 from armcal.diagnose.noise_findings import (
@@ -67,7 +66,6 @@ class Verdict:
 
 def judge(
     estimate: Estimate,
-    whitened: Array,
     errors_mm: Array,
     train: Indices,
     judged_mm: Array,
@@ -82,7 +80,6 @@ def judge(
 
     Args:
         estimate: what was found.
-        whitened: residuals in units of the declared noise, in recorded order (n_r x N).
         errors_mm: calibrated error of each record (N).
         train: which records trained.
         judged_mm: errors of records that did not train, or of cross-validation (``judged_on``, in words); or empty.
@@ -94,13 +91,13 @@ def judge(
     """
     seen = evidence or Evidence()
     determined = determined_finding(estimate, seen.priors_alone, np.median(judged_mm) if len(judged_mm) else None)
-    own, kept, trained = [ids[i] for i in train], train if fitted is None else train[fitted.kept], errors_mm[train]
+    own, trained = [ids[i] for i in train], errors_mm[train]
     suspicious = suspicious_records(trained, seen.rows, own, fitted)
     noise = component_findings(fitted.components) if fitted and fitted.components else [_size(estimate, trained, seen)]
     findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
     findings += [*shift_findings(estimate), *noise, *_freedom(estimate), *_causes(seen)]
     findings += structure_findings(seen.structure, seen.unit) if estimate.verdict.converged else []
-    findings += neighbour_findings(seen.structure, estimate, seen.unit) or _neighbours(whitened, kept, estimate)
+    findings += neighbour_findings(seen.structure, estimate, seen.unit)
     findings += [*_correlated(estimate), *predicted, *large_error_findings(seen.large_errors, seen.unit)]
     findings += [*outlier_findings(suspicious, own, fitted), *_next(estimate, suggestions)]
     ranked = tuple(sorted(findings, key=lambda finding: _ORDER[finding.grade]))
@@ -292,21 +289,6 @@ def _freedom(estimate: Estimate) -> list[Finding]:
     )
     action = "Measure more poses: three to five times as many numbers as free parameters; or free fewer parameters."
     return [Finding("warning", text, f"equations less parameters, at least {FEWEST_FREEDOM}", action)]
-
-
-def _neighbours(whitened: Array, train: Indices, estimate: Estimate) -> list[Finding]:
-    """Do training records that follow one another correlate? Against independence, two-sided, at 5 %."""
-    first = train[:-1][np.diff(train) == 1]
-    spread = float(np.mean(whitened[:, train] ** 2))
-    if len(first) < 10 or not spread:
-        return []
-    products = whitened[:, first] * whitened[:, first + 1]
-    lag_one, test = float(np.mean(products)) / spread, "lag-one correlation, 5 %"
-    if abs(lag_one) < ndtri(1 - LEVEL / 2) / np.sqrt(products.size):
-        return [Finding("good", "Residuals of neighbouring records do not correlate.", test)]
-    text = f"Residuals of neighbouring records correlate by {lag_one:.2f}: they are not noise."
-    text += f" {what_neighbours_cost(estimate)}" if estimate.widened is not None else ""
-    return [Finding("warning", text, test, "Repeat one pose at the start, in the middle and at the end.")]
 
 
 def _correlated(estimate: Estimate) -> list[Finding]:

@@ -46,7 +46,6 @@ from armcal.estimate.validation import error_name, error_rows, error_unit, recor
 from armcal.measure.measurement import StatesAccuracy
 from armcal.planning.candidates import deviations as deviations_of
 from armcal.planning.suggestion import Suggestion, suggest
-from armcal.problem.drift import residuals
 from armcal.problem.many_points import with_few_points
 from armcal.problem.motion import Motion, recorded_position
 from armcal.problem.problem import FactorRecords, Problem
@@ -87,7 +86,6 @@ def verdict_of(
     worse = _worse(run, errors, judged, settings.validation)
     verdict = judge(
         estimate,
-        _whitened(run),
         errors.calibrated_mm,
         train,
         judged[np.isfinite(judged)],
@@ -293,14 +291,3 @@ def _judged(run: FittedRecords, errors: RecordErrors) -> Array:
     if len(run.split.holdout):
         unseen[run.split.train] = np.nan
     return unseen
-
-
-def _whitened(run: FittedRecords) -> Array:
-    """Residuals in units of their noise times the record's weight (n_r x N); not a number outside of training."""
-    problem, fitted = run.problem, run.fitted
-    raw = residuals(problem, fitted.solution.values, fitted.records, fitted.records)
-    parts = problem.whitened(raw, fitted.records)
-    own = np.vstack([part * weight for part, weight in zip(parts, fitted.weights, strict=True)])
-    whole = np.full((len(own), len(run.dataset)), np.nan)
-    whole[:, run.split.train] = own
-    return whole
