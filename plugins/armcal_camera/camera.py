@@ -27,7 +27,6 @@ from armcal_camera.render import rendered_records
 
 _PIXELS_SCALE, _DISTORTION_SCALE, _SCALE_SCALE, _BEND_SCALE_M = 0.01, 0.05, 0.01, 1e-3
 _NEAREST_M, _LEAST_FACING, _FEWEST_POINTS = 0.02, 0.3, 4
-_NORMAL_95 = 1.96
 _POSITIVE = Interval(1e-6, np.inf)
 
 
@@ -285,17 +284,11 @@ class Camera(PointInstrument):
         """Places in an image."""
         return ("image",) * len(self.noise())
 
-    def accuracy(self, deviations: Mapping[str, float]) -> str:
-        """How well the camera's pose is known (95 %)."""
-        place = [deviations.get(f"camera_{axis}") for axis in "xyz"]
-        turn = [deviations.get(f"camera_rotation<r{axis}>") for axis in "xyz"]
-        if any(sd is None for sd in (*place, *turn)):
-            return ""
-        mm, deg = (_NORMAL_95 * float(np.linalg.norm(np.array(sds, dtype=float))) for sds in (place, turn))
-        where = {BASE_FRAME: "beside the arm", TOOL_FRAME: "on the hand"}.get(
-            self.camera_frame, f"on {self.camera_frame}"
-        )
-        return f"its place {where} is known to {1000 * mm:.2g} mm and {np.rad2deg(deg):.2g} deg (95 %)."
+    @property
+    def place(self) -> tuple[str, str]:
+        """The camera's, beside the arm or on what carries it."""
+        words = {BASE_FRAME: "beside the arm", TOOL_FRAME: "on the hand"}
+        return "camera", words.get(self.camera_frame, f"on {self.camera_frame}")
 
     def mistakes(self) -> Sequence[Mistake]:
         """Boards that are not flat, another lens, a camera that was bumped, a lens that focuses by itself."""

@@ -17,6 +17,7 @@ from armcal.diagnose.predictable import LEVEL as PREDICTED_LEVEL
 from armcal.diagnose.residual_structure import FEWEST_RECORDS, WORTHWHILE, ResidualStructure, Structure
 from armcal.diagnose.smooth import IMITATED
 from armcal.estimate.estimator import AT_BOUND, Estimate
+from armcal.estimate.validation import Halves
 
 MOST_TOLD = 5
 FEW_NAMED = 2
@@ -32,6 +33,7 @@ NOTICEABLE_SD = 0.3
 WORSE, POWER = 0.01, 0.9
 """Level of a loss against the nominal arm, and which share of losses of the size stated is found."""
 _MM = "mm"
+_VALUES_BY_DECLARED = "Leave out noise.estimate for the values, and use it to learn where the noise comes from."
 
 
 def determined_finding(estimate: Estimate, alone: PriorsAlone | None, typical_mm: float | None) -> Finding:
@@ -103,8 +105,38 @@ def worse_than_declared(judged_mm: Array, declared_mm: Array, unit: str = _MM) -
         f"Estimated variances make predictions worse: held-out records have an error of "
         f"{readable(before + float(np.mean(more)))} {unit} on average, {readable(before)} {unit} by the declared noise."
     )
-    action = "Leave out noise.estimate for the values, and use it to learn where the noise comes from."
-    return [Finding("note", text, "paired differences, one-sided, 5 %, and 1 % of the error", action)]
+    test = "paired differences, one-sided, 5 %, and 1 % of the error"
+    return [Finding("note", text, test, _VALUES_BY_DECLARED)]
+
+
+def steadier_weights(name: str, estimated: Halves, declared: Halves, unit: str) -> list[Finding]:
+    """Which weights keep the pose of a measurement nearer between halves of the records, where joints err most.
+
+    Residuals are then the joints' errors, which the pose takes up: smaller ones are no sign of a better pose.
+    """
+    ours, others = estimated.apart[name], declared.apart[name]
+    seen = np.isfinite(ours).all(axis=1) & np.isfinite(others).all(axis=1)
+    if seen.sum() < 2:
+        return []
+    more = ours[seen] - others[seen]
+    for sign, action in ((1, _VALUES_BY_DECLARED), (-1, "Keep noise.estimate.")):
+        mm, deg = sign * more.T
+        if np.mean(mm) <= max(_by_chance(mm), WORTHWHILE * np.mean(others[seen, 0])) or np.mean(deg) <= 0:
+            continue
+        parts = [
+            f"{readable(float(pose[0]))} mm and {readable(float(pose[1]))} deg ({readable(float(error))} {unit})"
+            for pose, error in (
+                (np.mean(halves.apart[name][seen], axis=0), np.mean(halves.errors[seen]))
+                for halves in (estimated, declared)
+            )
+        ]
+        text = (
+            f"{name}: its pose differs between halves of the records by {parts[0]} with estimated variances, by "
+            f"{parts[1]} with the declared noise; in brackets the error of records by the fit to the other half, "
+            "which is the joints' and does not rank poses."
+        )
+        return [Finding("note", text, f"{seen.sum()} divisions, paired differences, one-sided, 5 %, and 1 %", action)]
+    return []
 
 
 def _by_chance(differences: Array, level: float = 0.05) -> float:

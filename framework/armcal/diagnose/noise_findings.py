@@ -111,14 +111,14 @@ def component_findings(components: VarianceComponents) -> list[Finding]:
         text = f"The noise is not stated but estimated from the residuals, and priors are weighed against it: {listed}."
         action = "State it once you know it: only then do residuals show that the model lacks something."
         return [Finding("note", text, "restricted maximum likelihood", action)]
-    whose = "the joints" if joints > 0.5 else "the instruments"
-    share = joints if joints > 0.5 else 1 - joints
+    mostly = components.mostly_joints
+    whose, share = ("the joints", joints) if mostly else ("the instruments", 1 - joints)
     meaning = (
         " A joint's part is what acts like an angle that is off, repeatable or not: an effect that the model lacks "
         "looks the same. Poses measured twice would separate the two."
     )
     text = f"Most of the residual variance comes from {whose} ({100 * share:.0f} %): {listed}."
-    findings = [Finding("note", text + (meaning if joints > 0.5 else ""))]
+    findings = [Finding("note", text + (meaning if mostly else ""))]
     if components.inseparable:
         pairs = ", ".join(f"{a} and {b} ({r:+.2f})" for a, b, r in components.inseparable)
         findings.append(Finding("warning", f"These poses hardly separate some variances: {pairs}."))

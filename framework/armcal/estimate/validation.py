@@ -16,6 +16,7 @@ from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.estimator import Estimator, Progress, Solution, no_progress
 from armcal.estimate.nuisance import restricted, settled
 from armcal.io.parallel import Executor, Sequential
+from armcal.measure.measurement import Placed
 from armcal.problem.drift import residuals
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -23,6 +24,7 @@ Recording = Literal["same", "new"]
 """Whether what is predicted lies within the recording of the fit, whose drift is known, or in another one."""
 
 FEWEST_FOR_P95 = 20
+_HALVINGS, _FEWEST_HALVED = 6, 10
 
 
 @dataclass(frozen=True)
@@ -241,6 +243,7 @@ class JudgedFit:
             none where no predictions were asked for.
         unknown: covariance of these by what a pose residual did not know (N x n_r x n_r each); None without one.
         without: the errors ``at_rest`` without the pose residual that the fit learned; None where it learns none.
+        values: of the fit; None if it did not converge.
     """
 
     errors: Array
@@ -251,6 +254,7 @@ class JudgedFit:
     held_residuals: Mapping[Recording, tuple[Array, ...]] = field(default_factory=dict)
     unknown: tuple[Array, ...] | None = None
     without: Array | None = None
+    values: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -291,7 +295,7 @@ def judged_fit(
     at_rest = record_errors(task.problem, solution.values, held)
     if not solution.verdict.converged:
         return failed_fit(task, began)
-    return JudgedFit(judged, at_rest, turns, True, time.perf_counter() - began)
+    return JudgedFit(judged, at_rest, turns, True, time.perf_counter() - began, values=solution.values)
 
 
 def failed_fit(task: FitTask, began: float) -> JudgedFit:
@@ -320,3 +324,43 @@ def cross_validate(
         turns[split.holdout] = np.nan if fit.turns is None else fit.turns
     failed = sum(not fit.converged for fit in fits)
     return CrossValidation(errors, at_rest, turns if measures_turns(problem) else None, failed, tuple(fits))
+
+
+@dataclass(frozen=True)
+class Halves:
+    """What fits to either half of the records say, of several divisions; nan where one did not converge.
+
+    Attributes:
+        apart: how far the pose of each measurement that is ``Placed`` differs between the two (mm, deg; K x 2).
+        errors: of records by the fit to the other half, on average (K; thousandths, as errors are shown).
+    """
+
+    apart: Mapping[str, Array]
+    errors: Array
+
+
+def halves(problem: Problem, records: Sequence[FactorRecords], estimator: Estimator, start: Array) -> Halves | None:
+    """Fits to halves of records as these weigh; None where no such pose is free, or the records are few."""
+    named = {n: f"{n}.{m.place[0]}" for n, m in problem.blueprint.measurements.items() if isinstance(m, Placed)}
+    free, count = set(problem.parameters.coordinate_names), records[0].count
+    placed = {name: pose for name, pose in named.items() if f"{pose}_x" in free}
+    if not placed or count < _FEWEST_HALVED:
+        return None
+    apart, errors = {name: np.full((_HALVINGS, 2), np.nan) for name in placed}, np.full(_HALVINGS, np.nan)
+    for number in range(_HALVINGS):
+        crossed = cross_validate(problem, records, folds(count, 2, number), estimator, start)
+        one, other = (fit.values for fit in crossed.fits)
+        if one is None or other is None:
+            continue
+        parameters, errors[number] = problem.parameters.with_nominal(one), 1000 * np.nanmean(crossed.errors)
+        steps = dict(zip(parameters.coordinate_names, parameters.coordinates(parameters.local(other)), strict=True))
+        for name, pose in placed.items():
+            apart[name][number] = pose_size(steps, pose)
+    return Halves(apart, errors)
+
+
+def pose_size(coordinates: Mapping[str, float], pose: str) -> tuple[float, float]:
+    """Lengths of the parts of a pose (mm, deg) by the names of its coordinates; nan where one is not among them."""
+    place = [coordinates.get(f"{pose}_{axis}", np.nan) for axis in "xyz"]
+    turn = [coordinates.get(f"{pose}_rotation<r{axis}>", np.nan) for axis in "xyz"]
+    return 1000 * float(np.linalg.norm(place)), float(np.degrees(np.linalg.norm(turn)))

@@ -80,6 +80,11 @@ class VarianceComponents:
         """Of all components of a kind."""
         return sum(c.share for c in self.components if c.kind == kind)
 
+    @property
+    def mostly_joints(self) -> bool:
+        """Whether most of the residuals' variance is that of joints."""
+        return self.share("joint") > 0.5
+
     def close_to(self, other: VarianceComponents) -> bool:
         """Whether another estimate differs by less than a tenth of its standard deviations."""
         if [c.name for c in self.components] != [c.name for c in other.components]:

@@ -144,15 +144,12 @@ class Borrowing(Protocol):
 
 
 @runtime_checkable
-class StatesAccuracy(Protocol):
-    """What a measurement may provide beside the rest if its own parameters are what a user wants to know."""
+class Placed(Protocol):
+    """What a measurement may provide beside the rest if a pose of its own is what a user wants to know."""
 
-    def accuracy(self, deviations: Mapping[str, float]) -> str:
-        """How well they are known, as a sentence; empty if none is free.
-
-        Args:
-            deviations: standard deviations of free coordinates by local name (``camera_x``, ``camera_rotation<rx>``).
-        """
+    @property
+    def place(self) -> tuple[str, str]:
+        """What the names of the pose's parameters begin with (``camera``), and where it is, in words."""
 
 
 @runtime_checkable

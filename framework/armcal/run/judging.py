@@ -9,7 +9,7 @@ from armcal.base.arrays import Array
 from armcal.config.system import System
 from armcal.diagnose.coverage import predictor
 from armcal.diagnose.evidence import Evidence, elsewhere, priors_alone, unseen_poses
-from armcal.diagnose.evidence_findings import worse_than_declared, worse_than_nominal
+from armcal.diagnose.evidence_findings import steadier_weights, worse_than_declared, worse_than_nominal
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.gross import MOST_RECORDS, figure_of, thinned
 from armcal.diagnose.gross_findings import (
@@ -40,10 +40,11 @@ from armcal.diagnose.unseen import (
     scale_findings,
 )
 from armcal.diagnose.verdict import Verdict, judge
-from armcal.estimate.estimator import Estimate
+from armcal.estimate.estimator import Estimate, Estimator
 from armcal.estimate.start import certificates
-from armcal.estimate.validation import error_name, error_rows, error_unit, record_errors
-from armcal.measure.measurement import StatesAccuracy
+from armcal.estimate.validation import Halves, error_name, error_rows, error_unit, halves, pose_size, record_errors
+from armcal.estimate.weighing import Weighing
+from armcal.measure.measurement import Placed
 from armcal.planning.candidates import deviations as deviations_of
 from armcal.planning.suggestion import Suggestion, suggest
 from armcal.problem.many_points import with_few_points
@@ -56,6 +57,7 @@ from armcal.run.prepare import gravity_findings, same_pose_findings, still_findi
 from armcal.run.settings import ExperimentSettings, PlanSettings, ValidationSettings
 
 _MM = 1000.0
+_NORMAL_95 = 1.96
 _AT_REST = ", as in a new recording (its drift not known)"
 
 
@@ -65,6 +67,7 @@ def verdict_of(
     intervals: IntervalResult,
     system: System,
     settings: ExperimentSettings,
+    estimator: Estimator,
 ) -> tuple[Verdict, Evidence]:
     """The verdict on a fit, and what it rests on.
 
@@ -73,17 +76,21 @@ def verdict_of(
         errors, intervals: of every record; whether prediction intervals cover their share.
         system: the arms.
         settings: from what error on a record is explained, and limits of joints that a plan keeps.
+        estimator: of the fit, for fits to halves of its records.
     """
     problem, fitted, train, held = run.problem, run.fitted, run.split.train, len(run.split.holdout)
     estimate, acting = fitted.estimate, run.problem.weighted(fitted.records, fitted.weights)
     judged = _judged(run, errors)
     evidence = gather(run, judged, system, settings.validation.limit)
     drifts = _AT_REST if any(block.drift is not None for block in problem.parameters.free) else ""
-    gross, moved = list[Finding](), _accuracies(run)
+    inner = estimator.inner if isinstance(estimator, Weighing) else estimator
+    parts = halves(problem, acting, inner, estimate.values) if estimate.verdict.converged else None
+    gross, moved = list[Finding](), _accuracies(run, parts)
     if estimate.verdict.converged:
         gross = _gross(run, acting, errors, judged, evidence)
         moved += moved_findings(moved_groups(problem, estimate.values, acting))
     worse = _worse(run, errors, judged, settings.validation)
+    worse += _by_weights(run, errors, judged, inner, parts)
     verdict = judge(
         estimate,
         errors.calibrated_mm,
@@ -124,25 +131,33 @@ def _of_records(system: System, run: FittedRecords) -> list[Finding]:
     return [*still, *same_pose_findings(system, run.dataset, run.split), *gravity_findings(system, run.dataset)]
 
 
-def _accuracies(run: FittedRecords) -> list[Finding]:
-    """How well the parameters of measurements are known that are what a user wants to know."""
+def _accuracies(run: FittedRecords, parts: Halves | None) -> list[Finding]:
+    """How well the poses of measurements are known that are what a user wants to know."""
     estimate = run.fitted.estimate
     if not estimate.verdict.converged or not estimate.names:
         return []
     problem, train = run.problem, run.split.train
     shown = certificates(problem, estimate.values, problem.subset(run.records, train), run.dataset.subset(train))
-    texts = [*known_accuracies(problem, estimate), *(f"{name}: {text}" for name, text in shown.items())]
+    texts = [*known_accuracies(problem, estimate, parts), *(f"{name}: {text}" for name, text in shown.items())]
     return [Finding("note", text) for text in texts]
 
 
-def known_accuracies(problem: Problem, estimate: Estimate) -> list[str]:
-    """How well measurements' own parameters are known, a sentence each."""
-    stated = {
-        name: measurement.accuracy(own_deviations(estimate, name))
-        for name, measurement in problem.blueprint.measurements.items()
-        if isinstance(measurement, StatesAccuracy)
-    }
-    return [f"{name}: {text}" for name, text in stated.items() if text]
+def known_accuracies(problem: Problem, estimate: Estimate, parts: Halves | None = None) -> list[str]:
+    """How well measurements' own poses are known, a sentence each."""
+    texts = []
+    for name, measurement in problem.blueprint.measurements.items():
+        if not isinstance(measurement, Placed):
+            continue
+        pose, where = measurement.place
+        mm, deg = (_NORMAL_95 * size for size in pose_size(own_deviations(estimate, name), pose))
+        if np.isnan(mm + deg):
+            continue
+        text = f"{name}: its place {where} is known to {mm:.2g} mm and {deg:.2g} deg (95 %)"
+        if parts is not None and np.isfinite(parts.apart[name]).any():
+            mm, deg = np.nanmean(parts.apart[name], axis=0)
+            text += f", and differs by {mm:.2g} mm and {deg:.2g} deg between halves of the records"
+        texts.append(f"{text}.")
+    return texts
 
 
 def own_deviations(estimate: Estimate, instance: str) -> dict[str, float]:
@@ -247,13 +262,30 @@ def _worse(run: FittedRecords, errors: RecordErrors, judged_mm: Array, settings:
     spent = (equations - freedom) / max(trains * equations - 1, 1)
     worse = worse_than_nominal(_unseen(run, errors), errors.rival_mm, spent, errors.unit)
     worse += _misplaced(run, errors, judged_mm, spent)
-    if fitted.as_declared is not None and len(run.split.holdout):
-        declared_mm = record_errors(problem, fitted.as_declared, run.records) * _MM
-        worse += worse_than_declared(judged_mm, declared_mm, errors.unit)
     if any(arm.residual is not None and arm.residual.is_learned for arm in arms.values()):
         return worse
     trained = (errors.calibrated_mm if errors.at_rest_mm is None else errors.at_rest_mm)[run.split.train]
     return worse + overfitted(trained, judged_mm, equations, freedom, errors.unit)
+
+
+def _by_weights(
+    run: FittedRecords, errors: RecordErrors, judged_mm: Array, estimator: Estimator, estimated: Halves | None
+) -> list[Finding]:
+    """Whether the declared noise gives better values than estimated variances do.
+
+    Where a pose is to be known and most of the residuals is the joints', by how far fits to halves have it apart.
+    """
+    problem, fitted = run.problem, run.fitted
+    if fitted.components is None or fitted.as_declared is None:
+        return []
+    if estimated is not None and fitted.components.mostly_joints:
+        declared = halves(problem, problem.weighted(run.training, fitted.weights), estimator, fitted.as_declared)
+        assert declared is not None
+        return [f for name in estimated.apart for f in steadier_weights(name, estimated, declared, errors.unit)]
+    if not len(run.split.holdout):
+        return []
+    declared_mm = record_errors(problem, fitted.as_declared, run.records) * _MM
+    return worse_than_declared(judged_mm, declared_mm, errors.unit)
 
 
 def _misplaced(run: FittedRecords, errors: RecordErrors, judged_mm: Array, spent: float) -> list[Finding]:

@@ -81,7 +81,7 @@ def _judged(
         system = outcome.system(system)
     with context.watch.stage("judge"):
         context.progress("judging", 0.0)
-        verdict, evidence = verdict_of(run, errors, intervals, system, experiment.settings)
+        verdict, evidence = verdict_of(run, errors, intervals, system, experiment.settings, experiment.estimator)
         context.progress("judging", 1.0)
     return RunResult(
         name=experiment.name,
