@@ -99,7 +99,7 @@ def read_json(path: Path, most: int, expected: str, hint: str) -> tuple[str, Any
     Raises:
         DataError: it cannot be read, is not JSON, or has a key twice.
     """
-    text = text_of(input_bytes(path, most, expected), path, "Save it as UTF-8 text.")
+    text = text_of(input_bytes(path, most, expected), path, hint)
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         names = [name for name, _ in pairs]

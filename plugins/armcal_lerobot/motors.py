@@ -15,7 +15,9 @@ _WITHIN_DEG = 2.0
 _FULL_TURN = ("wrist_roll", "forearm_roll", "wrist_rotate", "wheel")
 _AT_END = 34
 """Counts, 3 deg: a range that comes so near to the encoder's end does not end there by chance."""
-_TURN_DEG, _LONGER_DEG, _SAME_DEG = 330.0, 60.0, 6.0
+_FARTHEST_DEG = 300.0
+"""No joint of an arm that LeRobot drives by these servos goes so far, but those that turn freely."""
+_LONGER_DEG, _SAME_DEG = 60.0, 6.0
 Units = Literal["degrees", "percent"]
 
 LAST_COUNT = 4095
@@ -61,11 +63,11 @@ class Motor:
 
         ``own_deg`` is the joint's by the model; None without one. Models are often narrower than what an arm does.
         """
-        if any(name in self.name for name in _FULL_TURN) or (own_deg or 0.0) > _TURN_DEG:
+        if any(name in self.name for name in _FULL_TURN) or (own_deg or 0.0) > _FARTHEST_DEG:
             return False
         is_at_end = min(self.range_min, LAST_COUNT - self.range_max) < _AT_END
         if own_deg is None:
-            return is_at_end or 2 * self.half_range_deg > _TURN_DEG
+            return is_at_end or 2 * self.half_range_deg > _FARTHEST_DEG
         return 2 * self.half_range_deg > own_deg + (_SAME_DEG if is_at_end else _LONGER_DEG)
 
     def degrees_in(self, units: Units) -> float:
