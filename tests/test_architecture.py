@@ -15,7 +15,7 @@ FRAMEWORK = ROOT / "framework" / "armcal"
 PLUGINS = ROOT / "plugins"
 
 ROOMS = (
-    ("version", "errors", "extras", "hooks", "hook_trace", "plugin_files", "registration", "plugins", "plugin_faults"),
+    ("version", "errors", "extras", "hooks", "plugin_files", "registration", "plugins", "plugin_faults"),
     ("base",),
     ("io",),
     ("functions",),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import sys
-import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -18,7 +17,6 @@ import pluggy
 from armcal import plugin_files
 from armcal.errors import Location, PluginError
 from armcal.extras import extra_of, missing_library
-from armcal.hook_trace import Answer, HookTrace
 from armcal.registration import Loaded, registered, said
 
 
@@ -87,7 +85,6 @@ class PluginRegistry:
     plugins: tuple[PluginInfo, ...]
     components: tuple[Component, ...]
     manager: pluggy.PluginManager = field(repr=False, compare=False)
-    trace: HookTrace = field(default_factory=lambda: HookTrace(active=False), repr=False, compare=False)
 
     @property
     def faults(self) -> tuple[PluginInfo, ...]:
@@ -133,16 +130,12 @@ class PluginRegistry:
 
     def notify(self, event: str, **what: Any) -> list[str]:
         """Tell every observer of an event; gives what went wrong in those that failed, which stops nothing."""
-        faults, answers, began = [], [], time.perf_counter()
+        faults = []
         for observer in getattr(self.manager.hook, event).get_hookimpls():
-            start, raised = time.perf_counter(), ""
             try:
                 observer.function(*[what[name] for name in observer.argnames])
             except Exception as fault:  # an observer must not cost anybody a calibration
-                raised = type(fault).__name__
-                faults.append(f"plugin {observer.plugin_name}: {event} raised {raised}: {fault}.")
-            answers.append(Answer(observer.plugin_name, time.perf_counter() - start, raised))
-        self.trace.write(event, what, answers, time.perf_counter() - began)
+                faults.append(f"plugin {observer.plugin_name}: {event} raised {type(fault).__name__}: {fault}.")
         return faults
 
 
@@ -167,18 +160,14 @@ def discover(points: Iterable[EntryPoint] | None = None) -> PluginRegistry:
     """Load every registration module.
 
     A plugin that fails to import, or has a hook that armcal does not know, is listed with its fault and breaks nothing
-    else; one that ``use_plugins`` (``--plugin``) names must load. Calls are traced as the environment variable
-    ``ARMCAL_TRACE_HOOKS`` asks now.
+    else; one that ``use_plugins`` (``--plugin``) names must load.
 
     Raises:
-        ConfigError: that variable names a file that cannot be written.
         PluginError: a plugin's file is not there, does not load or registers nothing, or has another plugin's name; or
             a plugin that is to be left out is not there.
     """
-    trace = HookTrace.from_environment()
     chosen = _chosen(_installed(tuple(map(_state, sys.path))) if points is None else points)
-    ask = registered if trace.active else _registered_before  # calls that are traced are made
-    manager, outcomes = ask(tuple(map(Loaded.of, chosen)), trace)
+    manager, outcomes = registered(tuple(map(Loaded.of, chosen)))
     plugins, components = [], []
     for point, outcome in zip(chosen, outcomes, strict=True):
         if isinstance(point, plugin_files.FilePoint) and (outcome.fault or not outcome.works):
@@ -192,11 +181,7 @@ def discover(points: Iterable[EntryPoint] | None = None) -> PluginRegistry:
             )
             for announcement in outcome.announced
         ]
-    return PluginRegistry(tuple(plugins), tuple(components), manager, trace)
-
-
-_registered_before = lru_cache(maxsize=8)(registered)
-"""Of the same modules: a command, its experiment and its calibration each look for plugins."""
+    return PluginRegistry(tuple(plugins), tuple(components), manager)
 
 
 def _state(folder: str) -> tuple[str, int]:

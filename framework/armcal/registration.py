@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import traceback
 from dataclasses import dataclass, field
+from functools import lru_cache
 from importlib.metadata import EntryPoint
 from typing import Any, Self
 
@@ -12,7 +13,6 @@ import pluggy
 
 from armcal import hooks
 from armcal.errors import ArmcalError
-from armcal.hook_trace import HookTrace
 
 
 @dataclass(frozen=True)
@@ -74,10 +74,10 @@ class Loaded:
         return cls(name, id(module), "", module)
 
 
-def registered(plugins: tuple[Loaded, ...], trace: HookTrace) -> tuple[pluggy.PluginManager, tuple[Registration, ...]]:
+@lru_cache(maxsize=8)  # a command, its experiment and its calibration each look for plugins
+def registered(plugins: tuple[Loaded, ...]) -> tuple[pluggy.PluginManager, tuple[Registration, ...]]:
     """A manager of all plugins, and what became of each; one that fails in any way is left out, and says why."""
     manager, alone = new_manager(), new_manager()
-    trace.watch(alone)
     return manager, tuple(_registered(manager, alone, plugin) for plugin in plugins)
 
 

@@ -159,7 +159,7 @@ parallel = click.option(
     default="auto",
     metavar="N|BACKEND",
     callback=lambda ctx, option, text: parse_executor(text),
-    help="Processes for independent fits: N, threading:N, dask:ADDRESS, ray [default: auto].",
+    help="Processes for independent fits: N, threading:N, dask:ADDRESS [default: auto].",
 )
 
 

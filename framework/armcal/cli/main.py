@@ -59,10 +59,6 @@ class LazyGroup(click.Group):
         target, _ = COMMANDS.get(cmd_name) or _plugin_commands().get(cmd_name, ("", ""))
         if not target:
             return None
-        if ctx.resilient_parsing:
-            from armcal.cli.completion import options_of
-
-            return options_of(target)
         module, _, attribute = target.partition(":")
         try:
             command: click.Command = getattr(import_module(module), attribute)

@@ -26,7 +26,7 @@ WORTH_WORKERS_S = 6.0
 _SAFE_PATH = "PYTHONSAFEPATH"
 _DASK_TIMEOUT = "10s"
 _OPTION = Location("--parallel")
-_FORMS = "a number of processes, loky:N, threading:N, dask:ADDRESS, ray or ray:ADDRESS"
+_FORMS = "a number of processes, loky:N, threading:N or dask:ADDRESS"
 
 
 def unreported(fraction: float) -> None:
@@ -82,9 +82,9 @@ class Workers:
     """A joblib backend.
 
     Attributes:
-        backend: ``loky`` (processes), ``threading``, ``dask`` or ``ray``.
+        backend: ``loky`` (processes), ``threading`` or ``dask``.
         count: how many at once; as many as there are processors, or the cluster's own number, if None.
-        address: of a dask scheduler or ray head.
+        address: of a dask scheduler.
     """
 
     backend: str = "loky"
@@ -130,8 +130,6 @@ class Workers:
         options: dict[str, Any] = {"backend": self.backend, "n_jobs": count}
         if self.backend == "loky":
             options["inner_max_num_threads"] = 1
-        if self.backend == "ray":
-            _join_ray(self.address)
         if self.backend == "dask":
             with _dask_client(self.address) as client, joblib.parallel_config(**options, client=client):
                 yield
@@ -163,7 +161,7 @@ def parse_executor(text: str) -> Executor:
         backend, rest = "loky", backend
     if backend in ("loky", "threading") and rest.isdecimal() and 1 <= int(rest) <= 1024:
         return Sequential() if int(rest) == 1 else Workers(backend, int(rest))
-    if (backend == "dask" and rest) or backend == "ray":
+    if backend == "dask" and rest:
         return Workers(backend, address=rest)
     raise InputError(f"found {text!r}, expected {_FORMS}.", where=_OPTION, hint="For example --parallel 4.")
 
@@ -191,17 +189,3 @@ def _dask_client(address: str) -> Iterator[Any]:
         raise InputError(f"no dask scheduler answers at {address} ({fault}).", where=_OPTION, hint=hint) from fault
     with client:
         yield client
-
-
-def _join_ray(address: str) -> None:
-    try:
-        import ray
-        from ray.util.joblib import register_ray
-    except ImportError as fault:
-        hint = "Install it: pip install ray."
-        raise InputError(f"ray is not there ({fault}).", where=_OPTION, hint=hint) from fault
-    try:
-        ray.init(address=address or None, ignore_reinit_error=True, log_to_driver=False)
-    except (ConnectionError, ValueError, RuntimeError) as fault:
-        raise InputError(f"no ray cluster answers ({fault}).", where=_OPTION, hint="Check its address.") from fault
-    register_ray()
