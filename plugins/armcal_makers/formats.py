@@ -56,20 +56,6 @@ class MakersArm:
         return float(np.linalg.norm(apart, axis=1).max())
 
 
-def read_maker(path: Path, robot: str | None = None) -> MakersArm:
-    """An arm from a maker's file.
-
-    Args:
-        path: of the file.
-        robot: which arm it is (``ur5e``); needed for calibration.conf, which holds only what differs from the nominal
-            arm. Elsewhere the nearest arm, and a stated one is checked.
-
-    Raises:
-        DataError: what was found, what was expected, the line, and what to do.
-    """
-    return read_text(text_in(path), path, robot)
-
-
 def text_in(path: Path) -> str:
     """The text of a maker's file.
 
@@ -80,7 +66,17 @@ def text_in(path: Path) -> str:
 
 
 def read_text(text: str, path: Path, robot: str | None = None) -> MakersArm:
-    """As ``read_maker``, of the content of a file; ``path`` names it in messages."""
+    """An arm from the text of a maker's file.
+
+    Args:
+        text: what the file holds.
+        path: names it in messages.
+        robot: which arm it is (``ur5e``); needed for calibration.conf, which holds only what differs from the nominal
+            arm. Elsewhere the nearest arm, and a stated one is checked.
+
+    Raises:
+        DataError: what was found, what was expected, the line, and what to do.
+    """
     arms = nominal_arms()
     if _SECTION.search(text):
         return _of_conf(text, path, robot, arms)

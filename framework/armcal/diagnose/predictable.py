@@ -101,17 +101,7 @@ class Predictable:
     @property
     def falls(self) -> float:
         """By which share the root mean square error would fall without what is predicted."""
-        return _fall(self.share)
-
-    @property
-    def falls_beside_time(self) -> float:
-        """The same without what time adds: what moved or drifted is not the arm's."""
-        return _fall(self.share - sum(carrier.share for carrier in self.carriers if carrier.kind == "time"))
-
-
-def _fall(share: float) -> float:
-    """Of a root mean square, without a share of the squares."""
-    return 1 - float(np.sqrt(max(0.0, 1 - max(share, 0.0))))
+        return 1 - float(np.sqrt(max(0.0, 1 - max(self.share, 0.0))))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from armcal.calibration.rigid_chain import tool_poses
 from armcal.cli.main import cli
 from armcal.errors import InputError
 from armcal.plugins import discover
-from armcal_makers.formats import read_maker
+from armcal_makers.formats import read_text, text_in
 from armcal_makers.frames import at_zero, tips
 from armcal_makers.nominal import nominal_arms, ur_rows
 from click.testing import CliRunner
@@ -45,7 +45,7 @@ def armcal(*arguments):
 
 def read(folder, text, name="file.yaml", robot=None):
     (folder / name).write_text(text)
-    return read_maker(folder / name, robot)
+    return read_text(text_in(folder / name), folder / name, robot)
 
 
 def urdf_tips(path, q):
@@ -157,7 +157,7 @@ def test_wrong_files_are_refused_and_named(tmp_path, case):
     path = tmp_path / "wrong.yaml"
     path.write_text(text)
     with pytest.raises(InputError) as refused:
-        read_maker(path, robot)
+        read_text(text_in(path), path, robot)
     assert expected in str(refused.value) and "wrong.yaml" in str(refused.value)
 
 
