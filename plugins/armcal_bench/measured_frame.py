@@ -28,6 +28,9 @@ _LEVER_M = 0.1
 _GAIN_OFF, _LEAST_GAIN = 2.0, 1e-6
 _ROUGHLY = 3.0
 """A gain shows in each distance, a reflection in all of them together."""
+_LEAST_MOTION, _FAR_MOTION = 0.05, 0.5
+"""Of the reach: sag, play, the target's place and axes that are not as drawn are no gain where the model moves the tool
+by less, and the target moves by less."""
 _TINY = 1e-9
 
 
@@ -79,8 +82,11 @@ def frame_mistake(expected: Array, seen: Array) -> FrameMistake | None:
     """
     if len(seen) < FEWEST:
         return None
-    expected, seen = expected[-_MOST:], seen[-_MOST:]
-    spread = spread_of(expected[:, :3, 3].T)
+    some = np.unique(np.linspace(0, len(seen) - 1, _MOST).astype(int))  # the last alone may hardly move the tool
+    expected, seen = expected[some], seen[some]
+    spread, reach = spread_of(expected[:, :3, 3].T), float(np.linalg.norm(expected[:, :3, 3], axis=1).max())
+    moved = spread_of(seen[:, :3, 3].T)
+    shows_gain = spread > _LEAST_MOTION * reach or moved > _FAR_MOTION * reach
     straight = {with_rotations: _fitted(expected, seen, _Reading(1.0, 1.0, with_rotations)) for with_rotations in _BOTH}
     if straight[True].left <= MISSES * spread:
         return None
@@ -89,8 +95,9 @@ def frame_mistake(expected: Array, seen: Array) -> FrameMistake | None:
         if reading.is_possible(seen):
             other = _fitted(expected, seen, reading)
             enough = min(FITS * spread, straight[reading.with_rotations].left / MUCH_BETTER)
-            no_gain = other.gain <= _LEAST_GAIN or 1 / _GAIN_OFF < other.gain < _GAIN_OFF
-            if reading.gain is None and no_gain:
+            gains = (other.gain, moved / spread if spread else np.inf)
+            is_gain = other.gain > _LEAST_GAIN and not any(1 / _GAIN_OFF < gain < _GAIN_OFF for gain in gains)
+            if reading.gain is None and not (shows_gain and is_gain):
                 continue
             if other.left <= enough * (1 if other.is_mirrored else _ROUGHLY):
                 fitting.append(other)

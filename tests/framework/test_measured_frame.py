@@ -11,7 +11,9 @@ from armcal.base.arrays import Array
 from armcal.base.units import length_mistake
 from armcal.calibration.rigid_chain import nominal_tools
 from armcal.run.experiment import Experiment
+from armcal_bench.bench import Bench
 from armcal_bench.measured_frame import frame_mistake, frame_of
+from armcal_bench.servo.nominal import NominalArm
 from scipy.spatial.transform import Rotation
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "bench.yaml"
@@ -100,3 +102,75 @@ def test_what_servos_do_is_not_called_a_frame(tools, seed: int, fault: str) -> N
 def test_the_units_of_a_gain_are_those_of_the_table(gain: float, names: tuple[str, str] | None) -> None:
     found = length_mistake(gain)
     assert found == names or (names == ("inch", "m") and found is not None)
+
+
+def drawn(nominal: NominalArm, seed: int) -> tuple[Array, Array, bool]:
+    """Poses of a plan, or of sweeps that may end with a joint that hardly moves the tip; of an arm not as drawn."""
+    random = np.random.default_rng(seed)
+    stated, off = nominal.parameters, np.deg2rad(3)
+    values = {n: tuple(v + random.normal(0, off) for v in stated[n].nominal) for n in nominal.angles}
+    values |= {n: (nominal.compliance(n) * random.uniform(0, 3),) for n in nominal.compliances}
+    true = nominal.with_values(values, {j: random.normal(0, np.deg2rad(4)) for j in nominal.joints})
+    gains, limits = random.uniform(0.8, 1.2, 6), dict(zip(nominal.joints, LIMITS, strict=True))
+    base, swept = {j: random.uniform(-0.5, 0.5) * size for j, size in limits.items()}, seed % 3
+    if swept:
+        own = random.permutation(nominal.joints)[: 6 if swept == 1 else 1]
+        poses = [{**base, j: float(a)} for j in own for a in np.arange(-limits[j], limits[j], np.deg2rad(12))]
+    else:
+        poses = [{j: random.uniform(-size, size) for j, size in limits.items()} for _ in range(12)]
+    stood = [{j: p[j] * g + random.normal(0, 0.009) for j, g in zip(p, gains, strict=True)} for p in poses]
+    seen, seat = true.tools(stood), random.normal(0, 0.03, 3)
+    seen[:, :3, 3] += seen[:, :3, :3] @ seat
+    if random.random() < 0.4:
+        seen[:, :3, :3] = np.nan
+    return np.array([nominal.tool(p) for p in poses]), seen, bool(swept)
+
+
+@pytest.mark.parametrize("draws", [12, pytest.param(400, marks=pytest.mark.slow)])
+def test_of_arms_not_as_drawn_one_in_a_hundred_at_most_is_said_to_be_measured_in_other_units(draws: int) -> None:
+    """Springs up to 3 times the model's, axes off by 3 deg, zeros by 4, gains by 20 %, the target 50 mm elsewhere."""
+    experiment = Experiment.load(CONFIG)
+    nominal = NominalArm.of(Bench.of(experiment).arm, experiment.parameters, experiment.system.environment)
+    wrong, missed = [], []
+    for seed in range(draws):
+        expected, seen, swept = drawn(nominal, seed)
+        for count in (3, 6, len(seen)):
+            for gain in (1.0, 1000.0, 0.001) if count == len(seen) and seed % 3 < 2 else (1.0,):
+                scaled = seen[:count].copy()
+                scaled[:, :3, 3] *= gain
+                mistake = frame_mistake(expected[:count], scaled)
+                far = mistake is not None and not 1 / 8 < mistake.frame.gain < 8
+                if gain == 1.0 and (far if swept else mistake is not None):
+                    wrong.append((seed, count))
+                if gain != 1.0 and not far:
+                    missed.append((seed, gain))
+    assert len(wrong) <= draws / 100, wrong
+    assert len(missed) <= draws / 10, missed  # where axes and gains are off by far more than the mean
+
+
+def test_a_joint_that_hardly_moves_the_tip_shows_no_gain_by_itself_nor_after_the_others() -> None:
+    """The model has the last joint turn the tool on the spot; 30 mm beside its axis the target goes round."""
+    angles = np.deg2rad(np.arange(-75, 80, 5))
+    turned, swung = (np.tile(np.eye(4), (len(angles), 1, 1)) for _ in range(2))
+    turned[:, :3, :3] = Rotation.from_euler("z", angles[:, None]).as_matrix()
+    turned[:, :3, 3] = [0.001, 0.0, 0.5]
+    turned[:, 0, 3] += 0.001 * np.cos(angles)
+    turned[:, 1, 3] += 0.001 * np.sin(angles)
+    swung[:, :3, :3] = Rotation.from_euler("y", angles[:, None]).as_matrix()
+    swung[:, :3, 3] = 0.5 * swung[:, :3, 2]
+    both = np.concatenate([swung, turned])
+    tilt = np.eye(4)
+    tilt[:3, :3] = Rotation.from_euler("x", 3, degrees=True).as_matrix()
+    for expected in (turned, both):
+        seen = tilt @ expected
+        seen[:, :3, 3] += seen[:, :3, :3] @ [0.03, 0.0, 0.0]
+        seen[:, :3, :3] = np.nan
+        for count in range(3, len(expected) + 1, 4):
+            mistake = frame_mistake(expected[:count], seen[:count])
+            assert mistake is None or 1 / 8 < mistake.frame.gain < 8, (count, mistake)
+
+
+@pytest.mark.parametrize("sagging", [1.115, 0.85])
+def test_a_gain_that_sag_made_more_or_less_of_is_named_by_its_units(sagging: float) -> None:
+    assert length_mistake(0.001 * sagging) == ("m", "mm") and length_mistake(1000 * sagging) == ("mm", "m")
+    assert length_mistake(100 * sagging) == ("cm", "m") and length_mistake(sagging / 25.4) == ("inch", "mm")

@@ -114,7 +114,8 @@ _WRITTEN: Mapping[str, str] = MappingProxyType(
     {name: spelling for spelling, name in reversed(tuple(_SPELLINGS.items())) if "_" in name} | {"1": ""}
 )
 """Units whose names, made for keys of a file, are not how people write them: their first spelling."""
-_NEAR_UNIT = 0.1
+_NEAR_UNIT = 1.24
+"""What sag and play may make of a gain. The nearest two, of inches in metres and in millimetres, are 1.55 apart."""
 SMALLEST_SHOWN = 0.0001
 """Of sizes in mm, px and other thousandths: no instrument reads less."""
 _LONGEST_FIRST = tuple(sorted((n for n in UNITS if n != "1"), key=len, reverse=True))
@@ -162,13 +163,13 @@ def shown_unit(si_unit_name: str) -> tuple[float, str]:
 def length_mistake(gain: float) -> tuple[str, str] | None:
     """Which lengths were taken for which others where values came out so many times too large.
 
-    ``("mm", "m")`` for 1000: millimetres for metres. None where no two units of length explain it within a tenth.
+    ``("mm", "m")`` for 1000: millimetres for metres. None where no two units of length explain it within a quarter.
     """
     names = ("m", "mm", "inch", "cm", "um")
     for expected in names:
         for given in names:
             ratio = gain * UNITS[given].factor / UNITS[expected].factor
-            if given != expected and abs(ratio - 1) < _NEAR_UNIT:
+            if given != expected and 1 / _NEAR_UNIT < ratio < _NEAR_UNIT:
                 return given, expected
     return None
 
