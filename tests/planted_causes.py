@@ -157,10 +157,13 @@ def experiment(folder: Path) -> Experiment:
     return Experiment.load(folder / "six.yaml")
 
 
-def recording(base: Experiment, cause: Cause, seed: int, noise: float = NOISE_M, count: int = COUNT) -> Dataset:
-    """Random poses of an arm whose free parameters differ from nominal, with the cause in them."""
+def recording(
+    base: Experiment, cause: Cause, seed: int, q: np.ndarray | None = None, noise: float = NOISE_M
+) -> Dataset:
+    """Random poses, or ``q``, of an arm whose free parameters differ from nominal, with the cause in them."""
     random, system = np.random.default_rng(seed), base.system
-    q = random.uniform(-1, 1, (count, 6)) * LIMITS
+    q = random.uniform(-1, 1, (COUNT, 6)) * LIMITS if q is None else q
+    count = len(q)
     offs = {n: random.normal(scale=0.001 if "theta" not in n and "alpha" not in n else 0.003) for n in FREE[:10]}
     offs |= SPRINGS | {"arm.mdh.base_x": 0.002 * random.normal(), "tracker.target_y": 0.001 * random.normal()}
     sign = random.choice([-1.0, 1.0])

@@ -143,15 +143,20 @@ def test_what_is_not_among_the_causes_is_not_given_the_name_of_one(smooth):
 
 def test_in_short_nothing_is_left_only_where_no_function_of_the_pose_is(smooth):
     found = smooth
-    sure = SimpleNamespace(verdict=SimpleNamespace(converged=True), identifiability=SimpleNamespace(undetermined=()))
+    solved = {"verdict": SimpleNamespace(converged=True), "identifiability": SimpleNamespace(undetermined=())}
 
-    def short(predicted):
+    def short(predicted, times=1.0):
+        sure = SimpleNamespace(**solved, noise_scale=times, degrees_of_freedom=100)
         left = replace(found, structures=(), lag_after_p=1.0, predictable=predicted)
         return " ".join(_in_short("", sure, Finding("good", ""), Evidence(left), "", ()))
 
     assert "is not noise: other records predict it" in short(found.predictable)
     assert "nothing" not in short(found.predictable) and "nothing" not in short(None)
-    assert "nothing that was recorded predicts them" in short(replace(found.predictable, p_value=0.5))
+    chance = replace(found.predictable, p_value=0.5)
+    assert "nothing that was recorded predicts them" in short(chance)
+    assert "look like noise" not in short(chance, 37.0) and "yet they are 37.0 times the declared" in short(
+        chance, 37.0
+    )
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from armcal.base.units import digits, readable
 from armcal.diagnose.evidence import PriorsAlone
 from armcal.diagnose.large_errors import BY_CHANCE, LargeErrors
 from armcal.diagnose.noise_findings import Finding, Grade, first_few
+from armcal.diagnose.noise_trend import TIMES_REPEATS
 from armcal.diagnose.predictable import FEWEST_POSES, MOST_OF_MEDIAN, Predictable
 from armcal.diagnose.predictable import LEVEL as PREDICTED_LEVEL
 from armcal.diagnose.residual_structure import FEWEST_RECORDS, WORTHWHILE, ResidualStructure, Structure
@@ -190,7 +191,7 @@ def structure_findings(structure: ResidualStructure | None, unit: str = _MM) -> 
     if kept and structure.more:
         text = "Residuals depend on more than these; model them first, then look again."
         findings.append(Finding("note", text, test))
-    return [_predictable_finding(structure), *findings, *_scatter(structure)]
+    return [_predictable_finding(structure), *findings, *_scatter(structure), *repeat_findings(structure, unit)]
 
 
 def _predictable_finding(structure: ResidualStructure) -> Finding:
@@ -210,7 +211,10 @@ def _predictable_finding(structure: ResidualStructure) -> Finding:
     listed = ", ".join(f"{carrier.words} ({percent(carrier.share)})" for carrier in predicted.carriers)
     text = f"{predicted_in_short(predicted)} Of it: {listed}."
     if predicted.is_in_order:
-        text += f" The poses were visited in an order: time alone predicts {percent(predicted.by_time)} as well."
+        text += (
+            f" The poses were visited in an order, and time alone predicts {percent(predicted.by_time)}: these data "
+        )
+        text += "do not show which of them is the cause."
     named = sum(s.falls_mm for s in structure.worthwhile) / max(structure.mean_mm, 1e-12)
     first = "Model what is named beside this, then look again. " if named > predicted.falls / 2 else ""
     return Finding(grade, text, test, first + " ".join(_remedies(predicted)))
@@ -227,11 +231,14 @@ def predicted_in_short(predicted: Predictable) -> str:
 def _remedies(predicted: Predictable) -> Iterator[str]:
     """What takes up what each kind of carrier predicts."""
     kinds = {carrier.kind for carrier in predicted.carriers}
+    if predicted.is_in_order:
+        yield _TELL_APART["open"]
+        return
     if "joint" in kinds and predicted.learnable:
         yield "Learn it: arms.NAME.residual: {type: gaussian_process}; or free what armcal identify --fixed recommends."
     elif "joint" in kinds:
         yield "Free what armcal identify --fixed recommends, or add effects to these joints; more poses show more."
-    if "time" in kinds or predicted.is_in_order:
+    if "time" in kinds:
         yield "Let the base drift (parameters.drift); record the temperature, and repeat one pose from time to time."
     if "temperature" in kinds:
         yield "Add thermal_length, or measure at one temperature."
@@ -261,7 +268,7 @@ def _structure_finding(s: Structure, structure: ResidualStructure, unit: str, te
     text = f"Residuals still depend on {'; or on '.join(named[:MOST_TOLD])}"
     text += f"; or on {more} more (metrics.json). " if more > 0 else ". "
     text += f"These data do not identify which. Modelled as {s.words}, which has {_share(s.odds)} of the odds, {falls}."
-    model = f" Then model it: {s.effect}." if s.effect else ""
+    model = f" Then model it: {s.effect}." if s.effect and s.kind not in ("order", "step") else ""
     return Finding("warning", text, test, f"To find out: {s.measure}.{model}")
 
 
@@ -282,6 +289,26 @@ def _scatter(structure: ResidualStructure) -> list[Finding]:
         "Repeat a pose at both ends of it: if repeats spread equally, the model is the cause; else state noise by "
         "record."
     )
+    return [Finding("warning", text, test, action)]
+
+
+def repeat_findings(structure: ResidualStructure, unit: str) -> list[Finding]:
+    """What repeats say of the rest."""
+    repeats = structure.repeats
+    if repeats is None or not repeats.exceeded:
+        return []
+    text = (
+        f"Repeats of a pose scatter by {readable(repeats.scatter_mm)} {unit}, residuals are "
+        f"{readable(repeats.left_mm)} {unit} (root mean squares): "
+    )
+    test = f"lack of fit, F over {repeats.records} records of {repeats.poses} poses, p {_p(repeats.p_value)}, and "
+    test += f"{TIMES_REPEATS:g} times"
+    if repeats.shared or structure.is_predictable or structure.worthwhile:
+        text += "the model lacks something, which poses nearby share."
+        action = "Free what armcal identify --fixed recommends, add effects, and state masses for what sags."
+    else:
+        text += "the rest is no noise of the instrument, but the model's error, or what differs from stop to stop."
+        action = "Drive to some poses again, from elsewhere: what then differs is the arm's."
     return [Finding("warning", text, test, action)]
 
 
@@ -331,7 +358,7 @@ _WHY = {
 _TELL_APART = {
     "time": "Let the base drift (parameters.drift); repeat one pose at the start, in the middle and at the end.",
     "pose": "The model lacks an effect of pose; visiting the poses in random order would show it plainly.",
-    "open": "Repeat one pose at the start, in the middle and at the end; visit the others in random order.",
+    "open": "Repeat some of the first poses at the end: only time changes them. Visit others in random order.",
 }
 
 

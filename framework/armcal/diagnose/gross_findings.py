@@ -28,10 +28,10 @@ does of a printed arm whose base is rigid. A jump that makes up a third of the e
 OVERFITTED = 3.0
 """Times the noise that training records show, from which on errors of records that did not train are the fit's."""
 FEWEST_JUDGED = 10
-_JUMPS = frozenset({"step", "slip"})
+_JUMPS = frozenset({"step", "slip", "bump"})
 _OVER_TIME = _JUMPS | {"order"}
-_NO_EXCUSE = _OVER_TIME | {"scale"}
-"""Kinds of structure that explain no gross error: something may have moved, or a frame be wrong."""
+_NO_EXCUSE = _OVER_TIME | {"scale", "held"}
+"""Kinds of structure that explain no gross error: something may have moved, a frame or what is held be wrong."""
 _LOOK = (
     "Look at what is configured and held (armcal identify --fixed), and at how records and joints were paired: armcal "
     "check says how well the nominal arm fits."
@@ -75,7 +75,7 @@ def gross_error(judged_mm: Array, figure: Figure, evidence: Evidence) -> list[Fi
     test = (
         f"limits {100 * limit:g} % and {100 * EXPLAINED:.0f} %; one cause explains {100 * explained:.0f} % of the error"
     )
-    by_time = [carrier.kind for carrier in predicted.carriers[:1]] == ["time"]
+    by_time = not predicted.is_in_order and [carrier.kind for carrier in predicted.carriers[:1]] == ["time"]
     return [Finding("bad", text, test, _MOVED if by_time else _LOOK)]
 
 

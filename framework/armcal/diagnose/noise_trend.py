@@ -8,14 +8,20 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, fdtrc
 
 from armcal.base.arrays import Array, Indices
 from armcal.diagnose.dependences import Records
-from armcal.diagnose.smooth import CLEAR
+from armcal.diagnose.fit_rows import FitRows
+from armcal.diagnose.smooth import CLEAR, Kernels, smooth
 from armcal.problem.motion import recorded_order
 
 LEVEL = 0.05
+LACK = 0.01
+TIMES_REPEATS = 3.0
+"""How many times what repeats scatter residuals are, for the rest to be worth a word: no model is perfect."""
+_FEWEST_REPEATS = 5
+_MM = 1000.0
 
 
 @dataclass(frozen=True)
@@ -76,3 +82,63 @@ def _features(here: Records, place: Array) -> Iterator[tuple[str, Array]]:
     for loads in here.motion.loads.values():
         for number, effort in enumerate(loads.efforts, start=1):
             yield f"the load on joint {number}", np.abs(np.nan_to_num(effort))
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """What records of one pose say of noise.
+
+    Attributes:
+        scatter_mm: of a record about the mean of its pose (root mean square).
+        left_mm: of all residuals (root mean square).
+        records, poses: how many repeats there are, and of how many poses.
+        p_value: that residuals are as repeats have them.
+        shared: whether the means of poses nearby miss alike.
+    """
+
+    scatter_mm: float
+    left_mm: float
+    records: int
+    poses: int
+    p_value: float
+    shared: bool
+
+    @property
+    def exceeded(self) -> bool:
+        """Whether residuals are more than noise, by chance and by size."""
+        return self.p_value < LACK and self.left_mm > TIMES_REPEATS * self.scatter_mm
+
+
+def repeats_of(residual: Array, basis: Array, rows: FitRows, pose: Indices, kernels: Kernels) -> Repeats | None:
+    """Of a fit's residual (rows), which took up a basis (rows x n); None where hardly a ``pose`` (N) was repeated."""
+    by_record, size = rows.by_record, np.bincount(pose)
+    again = int(np.sum(size - 1))
+    if again < _FEWEST_REPEATS:
+        return None
+    means = np.zeros((len(size), len(pose)))
+    means[pose, np.arange(len(pose))] = 1 / size[pose]
+    own, off = means @ residual[by_record], np.zeros_like(residual)
+    off[by_record] = residual[by_record] - own[pose]
+    acting = int(np.sum(np.any(residual[by_record] != 0, axis=0)))
+    spare, pure = again * acting, float(off @ off)
+    lacking = len(pose) * acting - basis.shape[1] - spare
+    lack = max(float(np.sum(residual[by_record] ** 2)) - pure, 0.0)
+    ratio = lack / max(lacking, 1) / max(pure / spare, 1e-300)
+    return Repeats(
+        float(np.sqrt(np.sum(rows.errors(off) ** 2) / again)) * _MM,
+        float(np.sqrt(np.mean(rows.errors(residual) ** 2))) * _MM,
+        again + int(np.sum(size > 1)),
+        int(np.sum(size > 1)),
+        float(fdtrc(lacking, spare, ratio)) if lacking > 0 else 1.0,
+        _shared(own, np.einsum("gn,nrc->grc", means, basis[by_record]), pose, kernels),
+    )
+
+
+def _shared(own: Array, taken_up: Array, pose: Indices, kernels: Kernels) -> bool:
+    """Whether means of poses (G x r) miss as those nearby do, freed of what the fit takes up of them (G x r x n)."""
+    within, first = np.linalg.qr(taken_up.reshape(own.size, -1))[0], np.unique(pose, return_index=True)[1]
+    if within.shape[1] >= own.size:
+        return False
+    left, places = own.ravel() - within @ (within.T @ own.ravel()), np.arange(own.size).reshape(own.shape)
+    of_poses = Kernels(tuple(kernel[np.ix_(first, first)] for kernel in kernels.kernels))
+    return bool(smooth(left, within, places, of_poses).evidence > CLEAR)

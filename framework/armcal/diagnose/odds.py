@@ -81,6 +81,11 @@ class Contest:
         added = basis[:, self.basis.shape[1] :]
         return self.residual - added @ (added.T @ self.residual), basis
 
+    def time_imitated(self) -> float:
+        """Which share of the function of time that the residual follows the pose predicts."""
+        over_time = smooth(self.residual, self.basis, self.by_record, self.time).function
+        return self.pose.imitate(over_time[self.by_record])
+
     def likeliest(self, others: Sequence[int], independence: float) -> int:
         """Which cause has the most odds beside others in the model."""
         return int(np.argmax(self._gains(*self.beside(others), others, independence)))

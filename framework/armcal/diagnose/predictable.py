@@ -23,6 +23,8 @@ from armcal.arm.assembly import shown_joint
 from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.dataset import Dataset
 from armcal.diagnose.fit_rows import FitRows
+from armcal.diagnose.smooth import IMITATED
+from armcal.measure.groups import pose_numbers
 from armcal.problem.motion import Motion, recorded_order
 from armcal.problem.problem import Problem
 
@@ -77,6 +79,7 @@ class Predictable:
         poses: how many distinct ones.
         by_time: share that time alone predicts.
         learnable: whether a pose residual could learn it: tools are measured, and none was asked for yet.
+        imitated: which share of the function of time that residuals follow the pose predicts.
     """
 
     share: float
@@ -87,6 +90,7 @@ class Predictable:
     poses: int
     by_time: float
     learnable: bool
+    imitated: float = 0.0
 
     @property
     def above_chance(self) -> bool:
@@ -95,8 +99,9 @@ class Predictable:
 
     @property
     def is_in_order(self) -> bool:
-        """Whether time, which adds nothing to the rest, alone predicts half of it: poses were visited in an order."""
-        return self.by_time > self.share / 2 and all(carrier.kind != "time" for carrier in self.carriers)
+        """Whether time or the pose may be the cause, as poses were visited in an order: the pose tells the time."""
+        by_time = self.by_time > self.share / 2 or any(carrier.kind == "time" for carrier in self.carriers)
+        return by_time and self.imitated > IMITATED
 
     @property
     def falls(self) -> float:
@@ -129,8 +134,7 @@ class _Input:
 
 def predictable(problem: Problem, rows: FitRows, basis: Array, motion: Motion, dataset: Dataset) -> Predictable | None:
     """Of the residuals of a fit, free of what it takes up (``basis``); None where the poses are too few to judge."""
-    commands = np.nan_to_num(np.round(dataset.stacked(motion.channels), 9)).T
-    pose = np.unique(commands, axis=0, return_inverse=True)[1].astype(np.intp).ravel()
+    pose = pose_numbers(dataset, motion.channels)
     count = int(pose.max(initial=-1)) + 1
     if count < FEWEST_POSES:
         return None

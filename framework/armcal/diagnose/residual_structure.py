@@ -8,7 +8,7 @@ what is not among them: it is named alone only where it is clearly the likeliest
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from armcal.base.units import SMALLEST_SHOWN
 from armcal.diagnose.dependences import Dependence, Records, dependences
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.held import moves_of
-from armcal.diagnose.noise_trend import NoiseTrend, noise_trend
+from armcal.diagnose.noise_trend import NoiseTrend, Repeats, noise_trend, repeats_of
 from armcal.diagnose.odds import NEGLIGIBLE, Contest, Odds
 from armcal.diagnose.outside import outside, predicted_positions
 from armcal.diagnose.predictable import Predictable, predictable
@@ -28,6 +28,7 @@ from armcal.estimate.bootstrap import automatic_block_length
 from armcal.estimate.combination import Measure
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.freeing import candidates
+from armcal.measure.groups import pose_numbers
 from armcal.problem.motion import Motion
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -83,6 +84,7 @@ class ResidualStructure:
         alike: why neighbours resemble each other even then; None if they do not.
         predictable: what other records predict of them, whatever the cause; None where poses are too few.
         noise: what their scatter depends on; None if on nothing.
+        repeats: what records of one pose say of noise; None where too few are.
         mean_mm: mean residual of the training records.
         tested: how many dependences were tested.
         records: how many records were looked at.
@@ -99,6 +101,7 @@ class ResidualStructure:
     alike: TimeOrPose | None
     predictable: Predictable | None
     noise: NoiseTrend | None
+    repeats: Repeats | None
     mean_mm: float
     tested: int
     records: int
@@ -147,20 +150,18 @@ def structure(
     contest = Contest(causes, columns, fit.residual, basis, rows.by_record, fit.block * _FOLDS // fit.blocks, *kernels)
     structures, first, last = _search(rows, fit, contest, modelled)
     residual, whole = contest.beside(tuple(structures))
+    predicted = predictable(problem, rows, basis, motion, dataset)
+    lags = first.lag_one, first.lag_adjusted, last.lag_one, last.lag_adjusted
     return ResidualStructure(
         tuple(structures.values()),
         bool(np.any(last.adjusted <= LEVEL)),
-        first.lag_one,
-        first.lag_adjusted,
-        last.lag_one,
-        last.lag_adjusted,
+        *lags,
         _alike(residual, whole, rows, contest) if last.lag_adjusted <= LEVEL else None,
-        predictable(problem, rows, basis, motion, dataset),
+        predicted and replace(predicted, imitated=contest.time_imitated()),
         noise_trend(residual, whole, rows.by_record, Records(dataset, motion), place),
+        repeats_of(fit.residual, basis, rows, pose_numbers(dataset, motion.channels), contest.pose),
         rows.mean_error(fit.residual) * _MM,
-        len(first.adjusted),
-        len(dataset),
-        block,
+        *(len(first.adjusted), len(dataset), block),
     )
 
 

@@ -16,6 +16,7 @@ from armcal.diagnose.evidence_findings import (
     large_error_findings,
     neighbour_findings,
     predicted_in_short,
+    repeat_findings,
     shift_findings,
     structure_findings,
 )
@@ -173,7 +174,7 @@ def _in_short(
         named = "the record" if missed.beyond == 1 else f"{missed.beyond} records"
         sentences.append(f"Error {missed.in_words(seen.unit)} in {named}, by id: {ids}{more}.")
     sentences.append(suspicious)
-    sentences += _left(seen)
+    sentences += _left(seen, estimate)
     if is_worth_measuring(suggestions):
         sentences.append(f"Measure these poses next: {in_words(suggestions)}.")
     return sentences
@@ -184,11 +185,12 @@ def _causes(seen: Evidence) -> list[Finding]:
     return [*contradiction_findings(seen.contradictions), *rounding_findings(seen.rounding, seen.unit)]
 
 
-def _left(seen: Evidence) -> list[str]:
+def _left(seen: Evidence, estimate: Estimate) -> list[str]:
     """What is left in the residuals; that nothing was found only where all that was looked at says so."""
     left, sentences = seen.structure, [finding.text for finding in _causes(seen)]
     if left is None:
         return sentences or ["Whether the model lacks anything is not known: the training records are too few."]
+    sentences += [finding.text for finding in repeat_findings(left, seen.unit)]
     if left.predictable is not None and left.is_predictable:
         sentences.append(predicted_in_short(left.predictable))
     if left.worthwhile:
@@ -202,9 +204,18 @@ def _left(seen: Evidence) -> list[str]:
         sentences.append(f"{text}{left.lag_after:.2f}.")
     elif left.predictable is None:
         sentences.append("None of the tested causes explains the residuals; for others the poses are too few.")
+    elif not sentences and _is_beyond_noise(estimate):
+        text = "Nothing that was recorded predicts the residuals, yet they are "
+        sentences.append(f"{text}{estimate.noise_scale:.1f} times the declared noise.")
     elif not sentences:
         sentences.append("The residuals look like noise: nothing that was recorded predicts them.")
     return sentences
+
+
+def _is_beyond_noise(estimate: Estimate) -> bool:
+    """Chi-square, one-sided."""
+    freedom = max(1, estimate.degrees_of_freedom)
+    return bool(estimate.noise_scale**2 * freedom > chdtri(freedom, LEVEL / 2))
 
 
 def _convergence(estimate: Estimate) -> Finding:
@@ -254,7 +265,7 @@ def _size(estimate: Estimate, trained_mm: Array, seen: Evidence) -> Finding:
     """Are the residuals as large as the declared noise? Chi-square, two-sided, at 5 %."""
     freedom, ratio = max(1, estimate.degrees_of_freedom), estimate.noise_scale
     total, test = ratio**2 * freedom, "chi-square, 5 %"
-    if total > chdtri(freedom, LEVEL / 2):
+    if _is_beyond_noise(estimate):
         why = "the model's error or the instrument's, which this test cannot separate"
         if seen.rounding is not None:
             why = "rounding of the recorded joints would leave as much, see below"
