@@ -82,3 +82,9 @@ def test_a_socket_that_no_record_has_is_told(tmp_path):
     ran = armcal("check", DEMO, "--set", change)
     assert "states something of */hole_9, to which no record belongs" in ran.stderr
     assert "hole_0, to which" not in ran.stderr
+
+
+def test_what_an_error_of_the_known_distance_does_is_noted(metrics):
+    """1 % of it passed as a good calibration without a word: no residual shows it where lengths are free."""
+    (note,) = [f["text"] for f in metrics["verdict"]["findings"] if "rests on the known distances alone" in f["text"]]
+    assert "1 % of them is 1 % of all its lengths (" in note and "mm at the arm's reach)" in note

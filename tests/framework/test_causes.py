@@ -177,7 +177,7 @@ def test_how_large_an_unseen_scale_may_be_is_not_a_matter_of_chance(lrm):
         problem, records, start = posed(lrm, q, points, oracle.OPTION_1)
         estimate = fit(problem, records, IpoptEstimator(IpoptEstimator.Settings()), start).estimate
         read = predicted_positions(problem, estimate.values, records, lrm.dataset(q, points))
-        found.append(scale_deviation(problem, FitRows.of(problem, records, estimate), read, 1.0))
+        found.append(scale_deviation(problem, FitRows.of(problem, records, estimate), read, 1.0, estimate.values))
     assert found[1] == pytest.approx(found[0], rel=0.15)
 
 

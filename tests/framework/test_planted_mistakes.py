@@ -12,11 +12,12 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
+from armcal.diagnose.readings import check_reach
 from armcal.errors import ConfigError
 from armcal.estimate.validation import folds, hold_out
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
-from armcal.run.prepare import Stopwatch, assemble, check_reach
+from armcal.run.prepare import Stopwatch, assemble
 from click.testing import CliRunner
 from planted_mistakes import (
     DEMO,

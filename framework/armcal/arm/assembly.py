@@ -19,7 +19,7 @@ from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock, declared, scalar
 from armcal.base.poses import pose_transform
-from armcal.base.se3 import Expression, Transform, column
+from armcal.base.se3 import Expression, Transform, column, evaluated
 from armcal.errors import ConfigError, DataError, Location
 from armcal.plugin_faults import refuse
 
@@ -161,6 +161,12 @@ class Arm:
     def nominal_chain(self) -> Chain:
         """The chain at nominal parameters."""
         return self.chain(self._nominal)
+
+    @cached_property
+    def length(self) -> float:
+        """From joint to joint, and to the tool (m)."""
+        steps = [*(joint.parent_T_joint for joint in self.nominal_chain.joints), self.nominal_chain.tool.joint_T_frame]
+        return float(sum(np.linalg.norm(evaluated(step.translation)) for step in steps))
 
     @cached_property
     def _nominal(self) -> dict[str, Expression]:

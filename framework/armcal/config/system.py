@@ -1,5 +1,6 @@
 """The arms, measurements and statics that a configuration (or a calibration) describes, built from plugins."""
 
+import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from pkgutil import resolve_name
@@ -92,6 +93,8 @@ class SystemSettings(Settings):
     statics: StaticsSettings = Field(default_factory=StaticsSettings)
 
 
+_FARTHEST_LENGTHS, _FARTHEST_M = 1.5, 0.5
+"""A centre of mass is no farther from its frame: in lengths of the arm from joint to joint, and beyond (m)."""
 ASSUMED_GRAVITY = (0.0, 0.0, -9.80665)
 """m/s^2, on the earth with z up, where it is not stated. [Williams2024]"""
 
@@ -238,9 +241,8 @@ def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm
     arm = _refusable(source, at, lambda: Arm(name, described_model["type"], *parts))
     _refusable(source, (*at, "couplings"), lambda: require_couplings(arm.commanded, arm.couplings))
     _refusable(source, (*at, "effects"), lambda: surroundings({name: arm}))
-    known = _refusable(source, at, lambda: frame_names(arm.nominal_chain))
-    for link, stated in settings.links.items():
-        _check_link(source, (*at, "links", link), stated, known, len(arm.joint_names))
+    _refusable(source, at, lambda: arm.nominal_chain)
+    _check_masses(source, (*at, "links"), settings.links, arm)
     links = {link: stated.to_config() for link, stated in settings.links.items()}
     for stepped in (effect for effect in effects.values() if isinstance(effect, SteppedEffect)):
         for index in (i for i in stepped.servos() if model.joint_names[i] in settings.couplings):
@@ -270,6 +272,19 @@ def _check_lender(source: ConfigSource, at: Path, borrower: Borrowing, measureme
     if isinstance(lender, Borrowing) and lender.lender is not None:
         source.refuse(at, f"{borrower.lender} has the parameters of {lender.lender} itself.", f"Name {lender.lender}.")
     _refusable(source, at, lambda: borrower.check_lender(lender))
+
+
+def _check_masses(source: ConfigSource, at: Path, links: Mapping[str, LinkSettings], arm: Arm) -> None:
+    """Refuse links that cannot be, and centres of mass farther out than any of such an arm."""
+    for link, stated in links.items():
+        _check_link(source, (*at, link), stated, frame_names(arm.nominal_chain), len(arm.joint_names))
+    for mass in arm.masses:
+        away, farthest = math.hypot(*mass.com), _FARTHEST_LENGTHS * arm.length + _FARTHEST_M
+        if away > farthest:
+            text = f"the centre of mass of {mass.name} is {away:.3g} m from the origin of {mass.frame}"
+            text += f", expected at most {farthest:.3g} m of an arm of {arm.length:.3g} m from joint to joint."
+            place = (*at, mass.name) if mass.name in links else (*at[:-1], "model")
+            source.refuse(place, text, "Are these millimetres? Write com_mm, or correct the URDF's inertial.")
 
 
 def _check_link(source: ConfigSource, at: Path, link: LinkSettings, known: Mapping[str, int], joints: int) -> None:

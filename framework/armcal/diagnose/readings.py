@@ -11,7 +11,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from armcal.arm.assembly import Arm
-from armcal.base.arrays import Array
+from armcal.base.arrays import Array, Mask
+from armcal.base.dataset import Dataset
+from armcal.base.units import digits
+from armcal.errors import DataError, Location
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.rigid_alignment import Tools, nearest
 
@@ -24,6 +27,12 @@ _MOST_SIGNS = 8
 _AXES = "xyz"
 _INCH = 25.4
 _ROUNDED = 1e-6
+_REACH_RATIO = 10.0
+_ALIKE = 0.35
+"""In powers of ten: so alike are two distances of one unit."""
+_FEWEST_ROWS, _NEARLY_ALL, _NEAREST = 3, 0.95, 1e-6
+_NEAR = 0.2
+"""Of their distance from the base: so near are positions to where the nominal arm has them."""
 _TURNED = 0.05
 _FAR, _HALVINGS = 3.0, 60
 FEWEST_IN_PART = 8
@@ -128,6 +137,62 @@ def unit_mistaken(factor: float) -> str:
     """Which unit, taken for which other, makes lengths so many times as large as they are."""
     pairs = product(_UNITS.items(), repeat=2)
     return next(f"{own} among {other}" for (own, size), (other, taken) in pairs if np.isclose(taken / size, factor))
+
+
+def check_reach(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> None:
+    """Positions ten times farther out, or nearer, than the model's: a unit is wrong, of all records or of some.
+
+    Raises:
+        DataError: which, and as which unit they are read.
+    """
+    shown = problem.predict(problem.parameters.nominal(), records)
+    for kernel, own in zip(problem.kernels, shown, strict=True):
+        channels = kernel.factor.output_channels
+        if [channel.rpartition(".")[2] for channel in channels] != ["x", "y", "z"]:
+            continue
+        name, measured = kernel.factor.name, dataset.stacked(channels)
+        factor, wrong = _in_another_unit(measured, own.outputs[:3])
+        if wrong.any():
+            first, count = int(np.argmax(wrong)), int(wrong.sum())
+            which, more = f"the position of record {dataset.ids[first]} is", ""
+            if count > 1:
+                which, more = f"{count} of {len(dataset)} positions are", f" (the first: record {dataset.ids[first]})"
+            raise DataError(
+                f"{name}: {which} about {digits(factor)} times as far from the base frame "
+                f"as the model's tip, the others as far{more}: {unit_mistaken(factor)}?",
+                where=Location(dataset.source, row=dataset.rows[first] if dataset.rows else None),
+                hint="Write all rows in the unit of the column names.",
+            )
+        far, distances = (float(np.median(np.linalg.norm(x, axis=0))) for x in (own.outputs[:3], measured))
+        if distances > _REACH_RATIO * far or far > _REACH_RATIO * distances:
+            raise DataError(
+                f"{name}: positions are typically {distances:.4g} m from the base frame, the model's tip {far:.4g} m.",
+                where=Location(dataset.source),
+                hint="Check the unit in the column names (x_mm or x_m) and the frame of the measurements.",
+            )
+
+
+def _in_another_unit(measured: Array, shown: Array) -> tuple[float, Mask]:
+    """Positions so many times as far out as the model's (3 x N each, m), where the others are as far; or none.
+
+    Many are known by their distances alone, as where half of them spoil the place of the base. Few are where the model
+    has them once they are divided by that, and the others are typically where it has them.
+    """
+    far, distances, missed = (np.linalg.norm(x, axis=0) for x in (shown, measured, measured - shown))
+    far = np.maximum(far, _NEAREST)
+    orders = np.log10(np.where(distances > 0, distances, np.nan) / far)
+    right = np.abs(orders) < _ALIKE
+    # Near the origin any factor comes about by a little that the nominal arm is off.
+    far_off = (missed > _NEAR * np.median(far)) & (np.nanmedian(missed / far) < _NEAR)
+    best = np.inf, 1.0, np.zeros(len(far), dtype=bool)
+    for factor in LENGTHS:
+        off = np.abs(orders - np.log10(factor))
+        wrong = off < _ALIKE
+        if min(right.sum(), wrong.sum()) < _FEWEST_ROWS or np.mean(right | wrong) < _NEARLY_ALL:
+            wrong = (np.linalg.norm(measured / factor - shown, axis=0) < _NEAR * far) & far_off
+        if wrong.any():
+            best = min(best, (float(np.median(off[wrong])), factor, wrong), key=lambda one: one[0])
+    return best[1:]
 
 
 @dataclass(frozen=True)

@@ -67,30 +67,54 @@ class Elsewhere:
         return f"Away from the contacts the tool is known to {readable(self.rms_mm)} mm (root mean square)"
 
 
-def scale_deviation(problem: Problem, rows: FitRows, positions: Sequence[Array], noise_scale: float) -> float | None:
-    """Standard deviation of an instrument's scale if it were free beside the parameters; None without positions.
+def scale_deviation(
+    problem: Problem, rows: FitRows, positions: Sequence[Array], noise_scale: float, values: Array
+) -> float | None:
+    """Standard deviation of an instrument's scale, or of all known distances', if it were free beside the parameters.
+
+    None with neither positions nor distances.
 
     Args:
         problem: of the fit.
         rows: of the fit, priors among them.
         positions: what each factor should read (3 x N, or 0 x N; m), in the same records.
         noise_scale: residuals in units of the declared noise.
+        values: of the fit.
     """
-    if not any(map(len, positions)):
-        return None
-    raw = [np.zeros((len(k.factor.noise), len(rows.by_record), 1)) for k in problem.kernels]
+    raw, tied = (
+        [np.zeros((len(k.factor.noise), len(rows.by_record), 1)) for k in problem.kernels],
+        problem.tie_rows(values),
+    )
     for column, position in zip(raw, positions, strict=True):
         column[: len(position), :, 0] = position
-    left = float(np.linalg.norm(apart_from(rows.slopes, rows.columns(raw))))
+    scaled = rows.columns(raw)
+    if not any(map(len, positions)):
+        if not len(tied.residual):
+            return None
+        # A distance of places is what it changes by as these grow in proportion [Euler's theorem].
+        own = slice(len(rows.record_of), len(rows.record_of) + len(tied.residual))
+        scaled[own, 0] = tied.jacobian @ values[list(problem.parameters.free_entries)] - tied.residual
+    left = float(np.linalg.norm(apart_from(rows.slopes, scaled)))
     return noise_scale / left if left > 0 else float("inf")
 
 
 def scale_findings(
-    figure: Figure, instrument_sd: float | None, held: Sequence[tuple[HeldParameter, str]]
+    figure: Figure, instrument_sd: float | None, held: Sequence[tuple[HeldParameter, str]], by_distances: bool = False
 ) -> list[Finding]:
-    """In which frame the answer is, which error of a scale would not show, and which held scale the data contradict."""
+    """In which frame the answer is, which error of a scale would not show, and which held scale the data contradict.
+
+    ``by_distances``: no instrument has a scale, but known distances have.
+    """
     findings = []
-    if instrument_sd is not None:
+    if instrument_sd is not None and by_distances:
+        text = (
+            "The arm's size rests on the known distances alone: 1 % of them is 1 % of all its lengths "
+            f"({digits(0.01 * figure.reach_mm, 2)} mm at the arm's reach), and an error of them "
+            f"{_unseen(instrument_sd, figure)}."
+        )
+        action = "Measure these distances again, by other means; or train on a longer one."
+        findings.append(Finding("note", text, "two standard deviations of a scale beside the parameters", action))
+    elif instrument_sd is not None:
         text = (
             f"The answer is in the instrument's frame: in it the arm stands {digits(figure.moved_mm)} mm and "
             f"{digits(figure.turned_deg, 2)} deg from where the configuration has it. An error of the instrument's "

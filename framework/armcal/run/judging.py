@@ -232,6 +232,7 @@ def _gross(
     dataset = run.dataset.subset(looked_at)
     position = recorded_position(run.dataset)[looked_at]
     read = predicted_positions(problem, estimate.values, acting, dataset)
+    scale_sd = scale_deviation(problem, rows, read, estimate.noise_scale, estimate.values)
     places = errors.unit == "mm" and any(map(len, read))  # a contact reads none: it may agree with itself exactly
     return [
         *(computed_findings(errors.nominal_mm, judged_mm, figure) if places else []),
@@ -240,7 +241,7 @@ def _gross(
         *contradicting(minority(rows, estimate.noise_scale, position), dataset.ids),
         *size_findings(figure),
         *displacement_findings(figure),
-        *scale_findings(figure, scale_deviation(problem, rows, read, estimate.noise_scale), scales),
+        *scale_findings(figure, scale_sd, scales, by_distances=not any(map(len, read))),
         *hidden_payload_findings(evidence.hidden_payload),
         *elsewhere_findings(evidence.elsewhere),
     ]

@@ -128,7 +128,8 @@ def _fitted(context: RunContext, ready: Prepared) -> WeighedFit:
     estimator = spread(context.experiment.estimator, context.executor)
     with context.watch.stage("fit"):
         starts = ready.start.values(problem)
-        given_up = [hopeless(problem, ready.training, data, start, bool(ready.findings)) for start in starts]
+        named = any(finding.grade == "bad" for finding in ready.findings)
+        given_up = [hopeless(problem, ready.training, data, start, named) for start in starts]
         left = [start for start, hopeless_from in zip(starts, given_up, strict=True) if hopeless_from is None]
         if not left:
             return plain_fit(problem, ready.training, next(given for given in given_up if given is not None))

@@ -8,13 +8,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from armcal.arm.assembly import command_channels, shown_joint
-from armcal.base.arrays import Array, Mask
+from armcal.arm.effects import JointEffect
+from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.dataset import Dataset
 from armcal.base.units import digits, to_unit
 from armcal.config.system import System
 from armcal.diagnose.noise_findings import Finding, first_few
 from armcal.diagnose.permuted_axes import MUCH_BETTER, find_permuted_axes
-from armcal.diagnose.readings import LENGTHS, unit_mistaken
+from armcal.diagnose.readings import check_reach
 from armcal.errors import ConfigError, DataError, Location, ProblemError, noted
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.nuisance import mislabelled, restricted, started
@@ -36,14 +37,10 @@ _MEND = {
     True: "the order, the directions or the zeros of the joints in the model",
     False: "how the tracker's frame lies",
 }
-_REACH_RATIO = 10.0
-_ALIKE = 0.35
-"""In powers of ten: so alike are two distances of one unit."""
 _STILL = {"angle": ("deg", 1.0), "length": ("mm", 1.0)}
 """A joint that moved by less stood still, but for the noise of its reading."""
-_FEWEST_ROWS, _NEARLY_ALL, _NEAREST = 3, 0.95, 1e-6
-_NEAR = 0.2
-"""Of their distance from the base: so near are positions to where the nominal arm has them."""
+_DENSEST, _SHORTEST = 200.0, 0.4
+"""kg for each cubic metre of an arm's length (industrial arms and palletisers: 5 to 90); m, what shorter arms count."""
 
 
 @dataclass(frozen=True)
@@ -135,6 +132,8 @@ def _assembled(experiment: Experiment, dataset: Dataset, watch: Stopwatch, accep
         records = acting(problem, records, dataset)
     with watch.stage("check"):
         unlearned(system)
+        require_loads(experiment, dataset)
+        heavy = mass_findings(system)
         mixed_up, named = check_permuted_axes(problem, records, dataset, accept), mislabelled(problem, records, dataset)
         check_reach(problem, records, dataset)
         split = split_of(experiment, dataset)
@@ -146,8 +145,8 @@ def _assembled(experiment: Experiment, dataset: Dataset, watch: Stopwatch, accep
             raise ConfigError("found a length, and nothing measured is a length.", where=where, hint=hint)
         problem = restricted(problem, problem.subset(records, split.train))
         profiled(problem, experiment.settings.uncertainty.profile)
-    texts = (*experiment.warnings, *dataset.warnings, *start.warnings, *named)
-    ready = Prepared(dataset, problem, records, split, texts, start, tuple(mixed_up))
+    texts = (*experiment.warnings, *dataset.warnings, *start.warnings, *named, *(one.text for one in heavy))
+    ready = Prepared(dataset, problem, records, split, texts, start, (*mixed_up, *heavy))
     if experiment.settings.validation.folds:
         folds_of(experiment, ready)  # refused before the fit rather than after it
     return ready
@@ -222,62 +221,6 @@ def group_texts(dataset: Dataset, label: str) -> tuple[str, ...]:
     return tuple(text.strip() for text in dataset.extra[label])
 
 
-def check_reach(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> None:
-    """Positions ten times farther out, or nearer, than the model's: a unit is wrong, of all records or of some.
-
-    Raises:
-        DataError: which, and as which unit they are read.
-    """
-    shown = problem.predict(problem.parameters.nominal(), records)
-    for kernel, own in zip(problem.kernels, shown, strict=True):
-        channels = kernel.factor.output_channels
-        if [channel.rpartition(".")[2] for channel in channels] != ["x", "y", "z"]:
-            continue
-        name, measured = kernel.factor.name, dataset.stacked(channels)
-        factor, wrong = _in_another_unit(measured, own.outputs[:3])
-        if wrong.any():
-            first, count = int(np.argmax(wrong)), int(wrong.sum())
-            which, more = f"the position of record {dataset.ids[first]} is", ""
-            if count > 1:
-                which, more = f"{count} of {len(dataset)} positions are", f" (the first: record {dataset.ids[first]})"
-            raise DataError(
-                f"{name}: {which} about {digits(factor)} times as far from the base frame "
-                f"as the model's tip, the others as far{more}: {unit_mistaken(factor)}?",
-                where=Location(dataset.source, row=dataset.rows[first] if dataset.rows else None),
-                hint="Write all rows in the unit of the column names.",
-            )
-        far, distances = (float(np.median(np.linalg.norm(x, axis=0))) for x in (own.outputs[:3], measured))
-        if distances > _REACH_RATIO * far or far > _REACH_RATIO * distances:
-            raise DataError(
-                f"{name}: positions are typically {distances:.4g} m from the base frame, the model's tip {far:.4g} m.",
-                where=Location(dataset.source),
-                hint="Check the unit in the column names (x_mm or x_m) and the frame of the measurements.",
-            )
-
-
-def _in_another_unit(measured: Array, shown: Array) -> tuple[float, Mask]:
-    """Positions so many times as far out as the model's (3 x N each, m), where the others are as far; or none.
-
-    Many are known by their distances alone, as where half of them spoil the place of the base. Few are where the model
-    has them once they are divided by that, and the others are typically where it has them.
-    """
-    far, distances, missed = (np.linalg.norm(x, axis=0) for x in (shown, measured, measured - shown))
-    far = np.maximum(far, _NEAREST)
-    orders = np.log10(np.where(distances > 0, distances, np.nan) / far)
-    right = np.abs(orders) < _ALIKE
-    # Near the origin any factor comes about by a little that the nominal arm is off.
-    far_off = (missed > _NEAR * np.median(far)) & (np.nanmedian(missed / far) < _NEAR)
-    best = np.inf, 1.0, np.zeros(len(far), dtype=bool)
-    for factor in LENGTHS:
-        off = np.abs(orders - np.log10(factor))
-        wrong = off < _ALIKE
-        if min(right.sum(), wrong.sum()) < _FEWEST_ROWS or np.mean(right | wrong) < _NEARLY_ALL:
-            wrong = (np.linalg.norm(measured / factor - shown, axis=0) < _NEAR * far) & far_off
-        if wrong.any():
-            best = min(best, (float(np.median(off[wrong])), factor, wrong), key=lambda one: one[0])
-    return best[1:]
-
-
 def check_permuted_axes(
     problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, accept: bool = False
 ) -> list[Finding]:
@@ -345,6 +288,49 @@ def same_pose_findings(system: System, dataset: Dataset, split: Split) -> list[F
         "how good the model is elsewhere."
     )
     return [Finding("warning", text, "poses alike in all joints, under the same load", "Hold out other poses.")]
+
+
+def require_loads(experiment: Experiment, dataset: Dataset) -> None:
+    """Free springs need something that loads them: a link's mass, a payload, a force or a torque.
+
+    Raises:
+        ConfigError: nothing does.
+    """
+    statics, channels = experiment.system.statics, LOAD_CHANNELS[3:]
+    stated = statics.payload or any((*statics.force, *statics.torque))
+    if stated or any(dataset.has(channel) and dataset.column(channel).any() for channel in channels):
+        return
+    free = [block.name for block in experiment.parameters.free]
+    for name, arm in experiment.system.arms.items():
+        elastic = {effect for effect, one in arm.effects.items() if type(one).springs is not JointEffect.springs}
+        springs = [own for own in free if own.startswith(f"{name}.") and own.split(".")[1] in elastic]
+        weigh = any(mass.mass for mass in arm.masses) or any(own.startswith(f"{name}.links.") for own in free)
+        if springs and arm.deflection_size and not weigh:
+            raise ConfigError(
+                f"the springs of {name} are free ({first_few(springs)}), and nothing loads them: no link has a mass, "
+                "and no payload, force or torque is stated.",
+                where=experiment.source.where(("arms", name, "effects")),
+                hint=f"State masses (arms.{name}.links: mass, com and frame of each) or statics.payload_g; or take the "
+                "springs out. Without loads what bends is taken for lengths.",
+            )
+
+
+def mass_findings(system: System) -> list[Finding]:
+    """A warning of masses that no arm of that size has: grams that were read as kilograms."""
+    findings = []
+    for name, arm in system.arms.items():
+        total, size = sum(mass.mass for mass in arm.masses), max(arm.length, _SHORTEST)
+        limit = _DENSEST * size**3
+        if total > limit:
+            worst = max(arm.masses, key=lambda mass: mass.mass)
+            text = (
+                f"The links of {name} weigh {digits(total)} kg ({worst.name}: {digits(worst.mass)} kg), and the arm is "
+                f"{digits(arm.length)} m long from joint to joint: no arm of that length weighs more than "
+                f"{digits(limit)} kg. Are these grams?"
+            )
+            test = f"limit {_DENSEST:g} kg for each cubic metre of the length, {_SHORTEST:g} m at least"
+            findings.append(Finding("warning", text, test, f"Correct the masses: arms.{name}.links, or the URDF's."))
+    return findings
 
 
 def gravity_findings(system: System, dataset: Dataset) -> list[Finding]:

@@ -7,6 +7,7 @@ from typing import Literal, get_args
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.quaternions import nearest_turn, rotation_matrix
+from armcal.diagnose.readings import check_reach
 from armcal.errors import DataError, Location, NotConvergedError
 from armcal.estimate.placing import placings
 from armcal.estimate.start import BETTER, FAR, pose_words
@@ -14,7 +15,6 @@ from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.rigid_alignment import FEWEST, Tools, alignments, undetermined
 from armcal.problem.sighting import Sighting, sighting_of, tools_of
 from armcal.report.numbers import plural
-from armcal.run.prepare import check_reach
 from scipy.spatial.transform import Rotation
 
 from armcal_capability.acceptance.records import COMMANDED, COMMANDED_TURN, Visits
