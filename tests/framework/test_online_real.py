@@ -150,6 +150,52 @@ def test_a_tenth_of_the_records_exchanged_is_no_change_of_the_arm(halves: Halves
     assert rejected >= 1.8 * count
 
 
+COARSE = 'parameters.free=["arm.mdh.theta[1-6]","arm.mdh.base_[xyz]"]'
+"""No springs: this arm sags by as much as a joint that slipped by several degrees."""
+OWN_ERROR = ", or the model's own error"
+
+
+@pytest.fixture(scope="module")
+def coarse(poses: Path, tmp_path_factory: pytest.TempPathFactory) -> Halves:
+    found = calibrated("option1", poses, tmp_path_factory.mktemp("coarse"), COARSE)
+    experiment = Experiment.load(ROOT / "configs" / "lrm_arm" / "option1.yaml", data=poses)
+    return Halves(found, experiment.read(), experiment)
+
+
+def some_of(halves: Halves, missing: float, seed: int, joint: str = "q2", step_deg: float = 0.0) -> list[dict]:
+    """Decisions on the records in order, a part of them missing; from the 150th on a joint has slipped."""
+    session, records, events = Recalibrator(halves.calibration, RecalibrateSettings()), halves.even, []
+    kept = np.flatnonzero(np.random.default_rng(seed).random(len(records)) >= missing)
+    for k, i in enumerate(kept.tolist()):
+        channels = {name: float(values[i]) for name, values in records.channels.items()}
+        channels[f"arm.{joint}"] += math.radians(step_deg) if k >= 150 else 0.0
+        events += session.take(Incoming(records.ids[i], channels, {}, 0.0), k + 1)
+    return [event for event in events if event["event"] == "decision"]
+
+
+def test_what_a_coarse_model_makes_look_like_a_slip_is_named_beside_the_models_own_error(coarse: Halves) -> None:
+    (decision,) = some_of(coarse, 0.3, 0)
+    assert decision["kind"] == "joint_slipped" and OWN_ERROR in decision["sentence"]
+    assert "standard deviations of what the calibration's residuals" in decision["why"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("missing", [0.3, 0.5])
+def test_no_healthy_joint_is_accused_alone(coarse: Halves, missing: float, seed: int) -> None:
+    assert all(OWN_ERROR in d["sentence"] for d in some_of(coarse, missing, seed) if "joint" in d or "measurement" in d)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("step_deg", "within", "may_be_the_model"), [(5.0, 6, True), (25.0, 6, False)])
+def test_a_slip_is_found_as_soon_and_named_alone_where_no_model_error_is_as_large(
+    coarse: Halves, step_deg: float, within: int, may_be_the_model: bool
+) -> None:
+    found = next(d for d in some_of(coarse, 0.3, 0, "q2", step_deg) if d["sequence"] > 150)
+    assert (found["kind"], found["joint"]) == ("joint_slipped", "arm.q2") and found["sequence"] - 150 <= within
+    assert (OWN_ERROR in found["sentence"]) == may_be_the_model
+
+
 @pytest.mark.slow
 def test_without_gate_and_process_noise_the_filter_ends_where_a_batch_over_all_does(
     poses: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

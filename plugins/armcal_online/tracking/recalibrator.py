@@ -27,8 +27,8 @@ from armcal.plugins import PluginRegistry, discover
 from armcal_online.evaluator import identity
 from armcal_online.sources.source import Incoming
 from armcal_online.tracking import events
-from armcal_online.tracking.belief import most_likely
-from armcal_online.tracking.decisions import EXPLAINED
+from armcal_online.tracking.belief import Belief, most_likely
+from armcal_online.tracking.decisions import EXPLAINED, Decision
 from armcal_online.tracking.directions import find_steps
 from armcal_online.tracking.health import nis_limit
 from armcal_online.tracking.hypotheses import GRADUAL, Recent, hypotheses, slow_changes
@@ -36,8 +36,9 @@ from armcal_online.tracking.judge import Judge
 from armcal_online.tracking.net import Net
 from armcal_online.tracking.observer import Reading
 from armcal_online.tracking.refit import NetRecord
+from armcal_online.tracking.sentences import beside_model_error
 from armcal_online.tracking.settings import RecalibrateSettings
-from armcal_online.tracking.sizes import tip_error
+from armcal_online.tracking.sizes import in_model_errors, tip_error
 from armcal_online.tracking.slow_changes import SlowChanges
 from armcal_online.tracking.start import filter_setup
 from armcal_online.tracking.state import Arrival, State, Tick, advanced, remembering, ticked, troubled
@@ -181,6 +182,7 @@ class Recalibrator:
             )
             state, taken_over = self._net.after(state, record, before, passed, corrected)
             decisions = (*decisions, *taken_over)
+        decisions = tuple(self._beside_model_error(decision, gated, state.belief) for decision in decisions)
         health, level = self._judge.health(gated, decisions, first), self.state.health.level
         record_events = [events.judged(incoming, state, recent, first, limit, self.setup)]
         is_good = not recent.rejected and not decisions and health.level == "nominal"
@@ -198,6 +200,16 @@ class Recalibrator:
         if decisions or (state.counts["accepted"] % every == 0 and not recent.rejected):
             record_events.append(events.estimated(self.state, self.estimate))
         return tuple(record_events)
+
+    def _beside_model_error(self, decision: Decision, gated: State, after: Belief) -> Decision:
+        """A decision that names something, with the model's own error considered too."""
+        if not (decision.subject or decision.candidates or decision.kind == "general_change"):
+            return decision
+        since = [record for record in gated.recent if record.sequence >= decision.since]
+        first = since[0].before if since and since[0].sequence == decision.since else None
+        before = first or self.state.before_change or gated.belief
+        moved = in_model_errors(self.setup.observer, self.setup.model_errors, since, before, after)
+        return beside_model_error(decision, *moved, self.settings.changes)
 
     def _gated(
         self, state: State, readings: tuple[Reading, ...], passed: Mapping[str, float]

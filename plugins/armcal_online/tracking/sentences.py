@@ -1,12 +1,16 @@
 """What was decided, in words: a clause of what happened, and one of the evidence."""
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 
+import numpy as np
 from scipy.special import logsumexp
 
 from armcal_online.tracking.decisions import Decision, log_odds_of, per_cent
 from armcal_online.tracking.directions import CAUSES, Steps, spoken
 from armcal_online.tracking.hypotheses import Explanation, Hypothesis
+from armcal_online.tracking.settings import ChangeSettings
 from armcal_online.tracking.sizes import Size
 from armcal_online.tracking.state import State
 
@@ -120,6 +124,22 @@ def no_longer_fits(state: State, steps: Steps, why: str, log_odds: float, since:
     unfollowed = f"; steps of {', '.join(steps.unfollowed)} cannot be followed" if steps.unfollowed else ""
     first = _first_rejected(state) if since is None else since
     return Decision("model_no_longer_fits", "The model no longer fits the records", why + unfollowed, log_odds, first)
+
+
+def beside_model_error(decision: Decision, far: float, log_likelihood: float, settings: ChangeSettings) -> Decision:
+    """A decision whose odds are over the model's own error too, which is named beside it where it may be that.
+
+    How ``far`` the change moves the readings and the log likelihood of that are of ``sizes.in_model_errors``. The
+    model's own error needs no event to be there; a change is as rare as ``settings`` have it.
+    """
+    log_odds = log_likelihood - math.log(settings.probability)
+    if log_odds < -math.log(settings.naming_odds):
+        return replace(decision, log_odds=-float(np.logaddexp(-decision.log_odds, log_odds)))
+    why = (
+        f"it moves the readings by {far:.1f} standard deviations of what the calibration's residuals, which poses near "
+        "each other share, and its parameters leave open"
+    )
+    return replace(decision, what=f"{decision.what}, or the model's own error", why=f"{decision.why}; {why}")
 
 
 def _against(alike: Sequence[Explanation], others: Sequence[Explanation]) -> float:

@@ -1,12 +1,13 @@
 """How large a change is that a belief has followed, in numbers and words, and how far off the tip was before it."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.errors import ArmcalError
+from armcal.estimate.online import log_density
 from armcal.estimate.validation import error_dimension, error_unit
 
 from armcal_online.tracking.belief import Belief
@@ -169,3 +170,42 @@ def _sizes(observer: Observer, record: Recent, old: Array, new: Array | None) ->
             continue
         sizes.append(float(np.linalg.norm(miss[rows])))
     return sizes
+
+
+@dataclass(frozen=True)
+class ModelError:
+    """The covariance of what a model itself errs by (n_r x n_r), and degrees of freedom with which it is known."""
+
+    covariance: Array
+    freedom: float
+
+
+def in_model_errors(
+    observer: Observer, errors: Mapping[str, ModelError], records: Sequence[Recent], before: Belief, after: Belief
+) -> tuple[float, float]:
+    """How far predictions of records move between beliefs, in standard deviations of what was open before.
+
+    That is the model's own error, and what its parameters leave.
+
+    Returns:
+        the root mean square, and the log density of an error as large against that of none; infinitely far where the
+        model has no error of its own.
+    """
+    space, squares, densities = observer.space, [], []
+    n = len(space.scales)
+    own = before.gaussian.covariance[:n, :n]
+    old, new = (space.inside(belief.values(space)) for belief in (before, after))
+    for reading in (reading for record in records for reading in record.readings):
+        error = errors.get(observer.problem.kernels[reading.factor].factor.name)
+        if error is None:
+            return math.inf, -math.inf
+        try:
+            innovation, slope = observer.linearise(old, reading)
+            moved = innovation - observer.linearise(new, reading)[0]
+        except ArmcalError:
+            continue
+        covariance = error.covariance + slope @ own @ slope.T
+        square, about = float(moved @ np.linalg.solve(covariance, moved)), (0.0, len(moved), error.freedom)
+        squares.append(square)
+        densities.append(log_density(square, *about) - log_density(0.0, *about))
+    return (math.sqrt(np.mean(squares)), float(np.mean(densities))) if squares else (math.inf, -math.inf)

@@ -30,9 +30,12 @@ from armcal_online.tracking.process_noise import (
     variance_rates,
 )
 from armcal_online.tracking.settings import RecalibrateSettings
+from armcal_online.tracking.sizes import ModelError
 from armcal_online.tracking.state_space import StateSpace
 
 _VECTORS = ("gravity", "payload", "force", "torque")
+_SIGNIFICANT_SD = 3.0
+"""Residuals above the stated noise by less are chance's."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,7 @@ class FilterSetup:
         request: what a source should look for.
         left_out: measurements that cannot be taken one record at a time.
         held: parameters that are as they were calibrated until a decision opens them.
+        model_errors: what the model itself errs by, by measurement; those that err by no more than noise are left out.
     """
 
     problem: Problem
@@ -57,7 +61,8 @@ class FilterSetup:
     process_noise: ProcessNoise
     request: ReadRequest
     left_out: tuple[str, ...]
-    held: frozenset[str] = frozenset()
+    held: frozenset[str]
+    model_errors: Mapping[str, ModelError]
 
 
 def filter_setup(
@@ -81,17 +86,16 @@ def filter_setup(
     parts = (parameters, system.environment, _full_record(calibration, measurements), settings.evaluator)
     problem = Problem.build(system.arms, measurements, *parts, groups=calibration.record.groups)
     follows = shares and settings.model_error == "calibrated"
-    white, shared = _white_and_shared_noise(calibration, measurements, follows)
+    white, shared, model_errors = _noise_and_model_errors(calibration, measurements, follows)
     drifts = _drifts(calibration, space)
     followed = GaussMarkovStates((*drifts, *shared) if follows else ())
+    noise = (white, _freedoms(calibration, white), _defaults(calibration))
     observer = Observer(
         problem,
         space,
         followed,
         GaussMarkovStates(() if follows else drifts),
-        white,
-        _freedoms(calibration, white),
-        _defaults(calibration),
+        *noise,
         {block.name for block in calibration.parameters.nuisances if block.free} - _calibrated(calibration),
         _noise_scale(calibration),
     )
@@ -104,6 +108,7 @@ def filter_setup(
         ReadRequest(system.arms, measurements, requested_channels(system.arms, measurements, measured=True)),
         tuple(sorted(set(system.measurements) - set(measurements))),
         frozenset(block.name for block in parameters.free) - _calibrated(calibration) - set(opened),
+        model_errors,
     )
 
 
@@ -161,26 +166,37 @@ def _initial_belief(calibration: Calibration, space: StateSpace, opened: Mapping
     return Belief(values, Gaussian(mean, of_all))
 
 
-def _white_and_shared_noise(
+def _noise_and_model_errors(
     calibration: Calibration, measurements: Mapping[str, Measurement], follows: bool
-) -> tuple[dict[str, Array], list[GaussMarkovState]]:
-    """Each measurement's own error from record to record (n_r x n_r), and what neighbours share if that is followed."""
+) -> tuple[dict[str, Array], list[GaussMarkovState], dict[str, ModelError]]:
+    """Each measurement's own error from record to record (n_r x n_r), and what neighbours share if that is followed.
+
+    And the model's own error, which poses near each other share: as much of the residuals as neighbours were seen to
+    share, or as is above the stated noise. What neighbours share was seen as often as there are stretches of them.
+    """
     variances: Mapping[str, Any] = calibration.record.noise.get("scatter") or {}
     white: dict[str, Array] = {}
     shared: list[GaussMarkovState] = []
+    model_errors: dict[str, ModelError] = {}
+    freedoms = _freedoms(calibration, measurements)
     for name, measurement in measurements.items():
         # Where joints are noisy the residuals vary with the pose: their noise is carried over to each record.
         is_noisy = any(calibration.system.arms[arm].joint_noise for arm in measurement.arms)
         residuals = None if is_noisy else variances.get(name)
-        covariance = np.diag((np.array(measurement.noise()) * _noise_scale(calibration)) ** 2)
+        stated, share, over, channel = np.diag(np.array(measurement.noise()) ** 2), 0.0, 1.0, "record"
+        covariance = stated * _noise_scale(calibration) ** 2
         if residuals is not None:
-            covariance, share = np.array(residuals["covariance"]), residuals["share"]
-            if follows and share > 0:
-                channel = residuals.get("channel", "record")
-                shared += shared_error(name, share * covariance, residuals["over"], channel)
-                covariance = (1 - share) * covariance
+            covariance, share, over = np.array(residuals["covariance"]), residuals["share"], residuals["over"]
+            channel = residuals.get("channel", channel)
+        above = 1 - float(np.trace(np.linalg.solve(covariance, stated))) / len(stated)
+        by_chance = _SIGNIFICANT_SD * np.sqrt(2 / (len(stated) * freedoms[name]))
+        if (own := max(share, above if above > by_chance else 0.0)) > 0:
+            model_errors[name] = ModelError(own * covariance, freedoms[name] / (1 + 2 * share * over))
+        if follows and share > 0:
+            shared += shared_error(name, share * covariance, over, channel)
+            covariance = (1 - share) * covariance
         white[name] = covariance
-    return white, shared
+    return white, shared, model_errors
 
 
 def _freedoms(calibration: Calibration, names: Iterable[str]) -> dict[str, float]:
