@@ -207,6 +207,7 @@ def main() -> None:
     words = parser.parse_args()
     outcomes: list[Outcome] = []
     for kind in words.kinds:
+        use_plugins()
         with tempfile.TemporaryDirectory() as place:
             config = KINDS[kind].config(Path(place))
             for seed in range(words.first, words.first + words.runs):
