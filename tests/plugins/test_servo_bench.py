@@ -439,6 +439,19 @@ class TestFaults:
         with pytest.raises(ValueError, match="fault"):
             make().world.answer({"fault": fault})
 
+    @pytest.mark.parametrize(
+        ("fault", "said"),
+        [
+            ({"kind": "unplg", "at": 5}, "kind 'unplg', .* did you mean unplug"),
+            ({"kind": "lost", "body": "tol"}, "body 'tol', .* did you mean tool"),
+            ({"kind": "brown_out", "joint": "qq3"}, "joint 'qq3', .* did you mean q3"),
+            ({"kind": "jam", "joint": "q3"}, "kind 'jam', .* expected one of drop"),
+        ],
+    )
+    def test_a_misspelt_fault_is_refused_with_the_nearest_name(self, make: Make, fault: Any, said: str) -> None:
+        with pytest.raises(ValueError, match=said):
+            make().world.answer({"fault": fault})
+
     def test_the_board_parks_the_arm_slowly_when_its_host_is_silent(self, make: Make) -> None:
         host = make()
         host.energise()

@@ -1,7 +1,8 @@
 """Faults of a simulated bench as requests name them: checked, and kept until their time."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
+from difflib import get_close_matches
 from heapq import heappop, heappush
 from typing import Annotated, Any, Literal
 
@@ -10,12 +11,6 @@ from pydantic import Field, ValidationError
 
 Count = Annotated[int, Field(ge=0, le=1_000_000)]
 Seconds = Annotated[float, Field(ge=0)]
-Kind = Literal[
-    "drop", "duplicate", "reorder", "flip", "split", "late",
-    "unplug", "replug", "reset", "brown_out", "nack", "stuck",
-    "disconnect", "connect", "jam", "free", "heat", "put",
-    "lost", "silent", "frozen", "skew", "seen",
-]  # fmt: skip
 
 
 class FaultRequest(Settings):
@@ -37,7 +32,7 @@ class FaultRequest(Settings):
         ppm: ``skew``: how much the tracker's clock gains.
     """
 
-    kind: Kind
+    kind: str
     at: Seconds | None = None
     after: Count = 0
     count: Annotated[int, Field(ge=1, le=1_000_000)] = 1
@@ -53,10 +48,15 @@ class FaultRequest(Settings):
 
 
 class FaultCalendar:
-    """Faults that wait for their time (s)."""
+    """Faults that wait for their time (s); ``known`` are the kinds, joints and bodies that the bench has."""
 
-    def __init__(self, clock: Callable[[], float], apply: Callable[[FaultRequest], None]) -> None:
-        self._clock, self._apply = clock, apply
+    def __init__(
+        self,
+        clock: Callable[[], float],
+        apply: Callable[[FaultRequest], None],
+        known: Mapping[str, Collection[str]],
+    ) -> None:
+        self._clock, self._apply, self._known = clock, apply, known
         self._waiting: list[tuple[float, int, FaultRequest]] = []
         self._planned = 0
 
@@ -66,6 +66,11 @@ class FaultCalendar:
         Raises:
             ValueError: it is none.
         """
+        for key, names in self._known.items() if isinstance(content, dict) else ():
+            if (name := content.get(key)) is not None and name not in names:
+                near = get_close_matches(str(name), names, n=1)
+                mend = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(names)}."
+                raise ValueError(f"fault: found the {key} {name!r}, which this bench does not have: {mend}")
         try:
             fault = FaultRequest.model_validate(content)
         except ValidationError as refused:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from armcal.base.arrays import Array
@@ -32,6 +32,7 @@ LONGEST_ADVANCE_S = 86400.0
 _TAKEN = "another simulated bench is running here.", "Stop it first, or give another folder."
 _LOOK_UP_S = 0.25
 """How often it is looked whether the end was asked for."""
+_FAULTS = ("unplug", "replug", "lost", "silent", "frozen", "skew", "seen")
 
 
 class BenchWorld(ABC):
@@ -43,6 +44,7 @@ class BenchWorld(ABC):
         now: simulated seconds since the bench began.
         stopped: a client has asked for the end.
         split: gives messages on the line.
+        faults: kinds of its own, beside those of line and tracker.
 
     Args:
         settings: the truth.
@@ -53,6 +55,7 @@ class BenchWorld(ABC):
     """
 
     split: Split
+    faults: ClassVar[tuple[str, ...]]
 
     def __init__(
         self,
@@ -69,7 +72,12 @@ class BenchWorld(ABC):
         self.physics = physics_of(settings, tracked, servos, self._track)
         self.safety = Safety(settings.safety, bounds, self.physics.servos, appended_to(folder / LOG))
         self.physics.on_failure = self.safety.failed
-        self._faults = FaultCalendar(self.clock, self._fail)
+        known = {
+            "kind": (*LINE_FAULTS, *_FAULTS, *self.faults),
+            "joint": tuple(self.physics.servos),
+            "body": tuple(settings.tracker.bodies),
+        }
+        self._faults = FaultCalendar(self.clock, self._fail, known)
         self._line: SerialLine | None = None
 
     @abstractmethod

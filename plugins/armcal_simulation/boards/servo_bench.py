@@ -36,6 +36,8 @@ class PulseBench(BenchWorld):
         ConfigError: the settings do not fit the experiment.
     """
 
+    faults: ClassVar[tuple[str, ...]] = ("reset", "brown_out", "nack", "stuck")
+
     def __init__(self, settings: ServoBenchSettings, experiment: Experiment, folder: Path) -> None:
         tracked = tracked_arm(settings, experiment)
         file = true_servos(settings, tracked.arm)

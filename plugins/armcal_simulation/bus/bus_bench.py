@@ -104,6 +104,8 @@ class BusWorld(BenchWorld):
         ConfigError: the settings do not fit the experiment.
     """
 
+    faults: ClassVar[tuple[str, ...]] = ("reset", "brown_out", "disconnect", "connect", "jam", "free", "heat", "put")
+
     def __init__(self, settings: BusBenchSettings, experiment: Experiment, folder: Path) -> None:
         tracked = tracked_arm(settings, experiment)
         names = list(tracked.arm.commanded)
