@@ -329,6 +329,7 @@ def test_what_no_longer_runs_is_never_shown_as_nominal_and_go_on(
     assert state["situation"]["life"] == life and says in (state["situation"]["over"] or "")
     assert ("Go on." in told) == (life == "live") and (AFTER_THE_END in told) == (life != "live")
     assert ("not running (it was nominal)" in told) == (life in ("silent", "stopped"))
+    assert ("out of the ordinary" in told) == (life in ("live", "ended"))
 
 
 def test_a_status_with_the_last_good_record_serves_where_no_event_of_it_is_left(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ function drawHealth(state) {
   byId("health").dataset.level = level;
   say("level", isGone(now) ? "not running" : level);
   say("do", now.do || "");
-  say("sentence", now.what ? now.what : state.level_sentence || (status.level === level && status.why) || "");
+  say("sentence", now.what || isGone(now) ? now.what || "" : state.level_sentence || (status.level === level && status.why) || "");
   say("confirm", now.confirm ? `To confirm: ${now.confirm}` : now.earlier ? `The last decision: ${now.earlier}` : "");
   byId("waiting").hidden = !state.waiting;
   say("waiting", state.waiting || "");

@@ -57,7 +57,7 @@ def _health(state: Mapping[str, Any]) -> Panel:
     if now["over"]:
         style = "dim" if level == "nominal" else style  # no green for what nothing follows
     if now["life"] in ("stopped", "silent"):
-        style, level = "red", f"not running (it was {level})"
+        style, level, sentence = "red", f"not running (it was {level})", ""
     shown = Table.grid(padding=(0, 2))
     shown.add_column(style="dim")
     shown.add_column(overflow="fold")
