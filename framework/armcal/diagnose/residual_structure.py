@@ -40,6 +40,8 @@ FEWEST_RECORDS = 30
 _MOST_BLOCKS, _FEWEST_BLOCKS = 60, 30
 _FOLDS = 5
 _MM = 1000.0
+_SAME = 0.999
+"""Cosine from which on two causes are one."""
 _LIKELIER = 0.5
 """Where chance has more of the odds, a cause is none."""
 
@@ -145,7 +147,7 @@ def structure(
     place = next((own for own in read if len(own)), np.zeros((0, len(dataset))))
     moves = moves_of(problem, estimate.values, records, candidates(problem.parameters))
     causes = [*dependences(problem, motion, dataset, moves), *outside(problem, motion, dataset, read, moves)]
-    columns = [rows.columns(one.columns) for one in causes]
+    causes, columns = _named_once(problem, causes, [rows.columns(one.columns) for one in causes])
     kernels = pose_kernels(problem, dataset), time_kernels(len(dataset))
     contest = Contest(causes, columns, fit.residual, basis, rows.by_record, fit.block * _FOLDS // fit.blocks, *kernels)
     structures, first, last = _search(rows, fit, contest, modelled)
@@ -163,6 +165,21 @@ def structure(
         rows.mean_error(fit.residual) * _MM,
         *(len(first.adjusted), len(dataset), block),
     )
+
+
+def _named_once(
+    problem: Problem, causes: Sequence[Dependence], columns: Sequence[Array]
+) -> tuple[list[Dependence], list[Array]]:
+    """Without what a held parameter of a joint's effect does as well, a spring's or a gear's: that one is named."""
+    effects = {f"{name}.{effect}" for name, arm in problem.blueprint.arms.items() for effect in arm.effects}
+    unit = [column / max(float(np.linalg.norm(column)), 1e-300) for column in columns]
+    held = [u for c, u in zip(causes, unit, strict=True) if c.subject.rpartition(".")[0] in effects and u.shape[1] == 1]
+    kept = [
+        i
+        for i, own in enumerate(unit)
+        if causes[i].kind == "held" or own.shape[1] > 1 or all(abs(float(np.sum(one * own))) < _SAME for one in held)
+    ]
+    return [causes[i] for i in kept], [columns[i] for i in kept]
 
 
 def _alike(residual: Array, basis: Array, rows: FitRows, contest: Contest) -> TimeOrPose:
