@@ -8,13 +8,21 @@ from typing import Annotated, Any, ClassVar
 import casadi as ca
 import numpy as np
 from armcal.arm.effects import JointChoice, chosen
-from armcal.arm.pose_residual import OF_TOOL, ModelErrors
+from armcal.arm.pose_residual import OF_TOOL, ModelErrors, reached
 from armcal.base.arrays import Array
-from armcal.base.settings import Settings
 from pydantic import Field
 from typing_extensions import override
 
-from armcal_residual.linear import LinearResidual, PartSettings, Products, packed, regressed, seen, taken_root
+from armcal_residual.linear import (
+    LearnedSettings,
+    LinearResidual,
+    PartSettings,
+    Products,
+    packed,
+    regressed,
+    seen,
+    taken_root,
+)
 
 _ROWS_PER_FEATURE = 2
 
@@ -26,8 +34,8 @@ class SeriesSettings(PartSettings):
     orders: Annotated[int, Field(ge=1)]
 
 
-class FourierSettings(Settings):
-    """Which turning ``joints``, how many ``orders`` of each, and what was ``learned`` (by armcal, not by hand)."""
+class FourierSettings(LearnedSettings):
+    """Which turning ``joints``, how many ``orders`` of each, and what was learned."""
 
     joints: JointChoice = "all"
     orders: Annotated[int, Field(ge=1, le=200)] = 3
@@ -65,9 +73,8 @@ class Fourier(LinearResidual):
         for joint in moved:
             slopes, harmonics = errors.slopes[:, :, len(OF_TOOL) + joint - 1], _harmonics(commands[joint - 1], orders).T
             rows.append(-(slopes[:, :, None] * harmonics[:, None, :]).reshape(-1, 2 * orders))
-        features, left = np.hstack(rows), errors.apart(errors.residuals.ravel())
-        products = Products.of(errors.apart(features), left)
-        fitted = regressed(products, [2 * orders] * len(moved), features.T @ features)
+        features, left = np.hstack(rows), errors.residuals.ravel()
+        fitted = regressed(Products.of(features, left), [2 * orders] * len(moved))
         parts = tuple(
             SeriesSettings(
                 first=len(OF_TOOL) + joint - 1,
@@ -82,7 +89,9 @@ class Fourier(LinearResidual):
         )
         if not parts:
             return None
-        return Fourier(self.settings.model_copy(update={"learned": parts}), self.joint_names)
+        return Fourier(
+            self.settings.model_copy(update={"learned": parts, "within": reached(commands)}), self.joint_names
+        )
 
 
 def _harmonics(angle: Any, orders: int) -> Any:

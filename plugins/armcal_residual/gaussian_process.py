@@ -12,22 +12,21 @@ from typing import Annotated, Any, ClassVar
 
 import casadi as ca
 import numpy as np
-from armcal.arm.pose_residual import OF_TOOL, SURROUNDINGS, ModelErrors, Postures
+from armcal.arm.pose_residual import OF_TOOL, SURROUNDINGS, ModelErrors, Postures, reached
 from armcal.base.arrays import Array
-from armcal.base.settings import Settings
 from pydantic import Field
 from typing_extensions import override
 
 from armcal_residual.correlations import Correlations, ProcessSettings, TermSettings, roots_of
 from armcal_residual.joint_processes import of_joints
-from armcal_residual.linear import LinearResidual, unpacked
+from armcal_residual.linear import LearnedSettings, LinearResidual, unpacked
 from armcal_residual.tool_processes import of_tool
 
 _LEAST_RECORDS = 20
 
 
-class GaussianProcessSettings(Settings):
-    """At how many ``poses`` at most the tool's process is held, and what was ``learned`` (by armcal, not by hand)."""
+class GaussianProcessSettings(LearnedSettings):
+    """At how many ``poses`` at most the tool's process is held, and what was learned."""
 
     poses: Annotated[int, Field(ge=10, le=1000)] = 100
     learned: tuple[ProcessSettings, ...] = ()
@@ -77,7 +76,8 @@ class GaussianProcess(LinearResidual):
         parts += of_tool(errors, left, self.settings.poses, before[False])
         if not parts:
             return None
-        return GaussianProcess(self.settings.model_copy(update={"learned": tuple(parts)}), self.joint_names)
+        update = {"learned": tuple(parts), "within": reached(errors.postures.commands)}
+        return GaussianProcess(self.settings.model_copy(update=update), self.joint_names)
 
     @override
     def deviations(self, postures: Postures) -> Array:

@@ -1,6 +1,6 @@
 """Processes of each turning joint's error over its own angle: a long one, and one of the likeliest finer length scale.
 
-The long one holds on a little where no record stood, and leaves less of the error to the model's parameters.
+The long one holds on a little where no record stood.
 """
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ _Places = tuple[int, ...]
 class _JointProcess:
     """A process of one joint (from 0) over its angle, as features of the rows of the residuals.
 
-    ``beside`` are the rows without what the model's parameters take up; ``between`` is the mean share of the variance
-    that features leave.
+    ``between`` is the mean share of the variance that features leave.
     """
 
     joint: int
@@ -37,7 +36,6 @@ class _JointProcess:
     poses: Array
     roots: Array
     rows: Array
-    beside: Array
     between: float
 
     @classmethod
@@ -53,7 +51,7 @@ class _JointProcess:
         features = correlations.at([command]).T @ roots
         slopes = errors.slopes[:, :, len(OF_TOOL) + joint]
         rows = -(slopes[:, :, None] * features[:, None, :]).reshape(-1, count)
-        return cls(joint, inputs, poses, roots, rows, errors.apart(rows), share_between(features))
+        return cls(joint, inputs, poses, roots, rows, share_between(features))
 
     def term(self, share: float) -> TermSettings:
         """As settings hold it."""
@@ -61,11 +59,11 @@ class _JointProcess:
 
 
 def of_joints(errors: ModelErrors, before: Sequence[ProcessSettings] = ()) -> tuple[list[ProcessSettings], Array]:
-    """Processes of the joints that turn, and what they and the model's parameters leave of the residuals (N x rows).
+    """Processes of the joints that turn, and what they leave of the residuals (N x rows).
 
     Length scales are looked for near those of processes that were learned ``before``, if some were.
     """
-    left = errors.apart(errors.residuals.ravel())
+    left = errors.residuals.ravel()
     turning = [i for i, kind in enumerate(errors.dimensions) if kind == "angle"]
     moved = seen(errors, [i for i in turning if np.ptp(errors.postures.commands[i]) > _JOINT_LENGTHS[-1]])
     search = _LengthSearch(errors, moved, left)
@@ -79,7 +77,7 @@ def of_joints(errors: ModelErrors, before: Sequence[ProcessSettings] = ()) -> tu
         if blocks:
             parts.append(_part([processes[i] for i in blocks], regression, blocks))
         for i in blocks:
-            left = left - processes[i].beside @ regression.weights[i]
+            left = left - processes[i].rows @ regression.weights[i]
     return parts, left.reshape(errors.residuals.shape)
 
 
@@ -107,7 +105,7 @@ class _LengthSearch:
     def __init__(self, errors: ModelErrors, joints: Sequence[int], left: Array) -> None:
         self._errors, self._joints, self._left = errors, joints, left
         self._processes: dict[_Key, _JointProcess] = {}
-        self._products: dict[tuple[_Key, _Key], tuple[Array, Array]] = {}
+        self._products: dict[tuple[_Key, _Key], Array] = {}
         self._regressions: dict[_Places, Regression] = {}
 
     def likeliest(self, before: Mapping[int, float]) -> _Places | None:
@@ -139,8 +137,8 @@ class _LengthSearch:
         """On their features, from what is likeliest of others that are ``near``."""
         if places not in self._regressions:
             keys, start = self._keys(places), None
-            matrix, whole = (np.block([[self._product(a, b)[i] for b in keys] for a in keys]) for i in (0, 1))
-            vector = np.concatenate([self._process(key).beside.T @ self._left for key in keys])
+            matrix = np.block([[self._product(a, b) for b in keys] for a in keys])
+            vector = np.concatenate([self._process(key).rows.T @ self._left for key in keys])
             products = Products(matrix, vector, float(self._left @ self._left), len(self._left))
             if near is not None:
                 known = dict(zip(self._keys(near), self._regressions[near].variances, strict=True))
@@ -148,7 +146,7 @@ class _LengthSearch:
                 variances = [known.get(key, known[key[0], finer[key[0]]]) for key in keys]
                 start = np.array(variances), self._regressions[near].noise
             sizes = [len(self._process(key).poses) for key in keys]
-            self._regressions[places] = regressed(products, sizes, whole, start)
+            self._regressions[places] = regressed(products, sizes, start)
         return self._regressions[places]
 
     def _keys(self, places: _Places) -> list[_Key]:
@@ -161,13 +159,11 @@ class _LengthSearch:
             self._processes[key] = _JointProcess.over(self._errors, key[0], _JOINT_LENGTHS[key[1]])
         return self._processes[key]
 
-    def _product(self, one: _Key, other: _Key) -> tuple[Array, Array]:
-        """Of two processes' features, without what the model's parameters take up, and with it."""
+    def _product(self, one: _Key, other: _Key) -> Array:
+        """Of two processes' features."""
         if (one, other) not in self._products:
-            a, b = self._process(one), self._process(other)
-            self._products[one, other] = a.beside.T @ b.beside, a.rows.T @ b.rows
-            beside, whole = self._products[one, other]
-            self._products[other, one] = beside.T, whole.T
+            self._products[one, other] = self._process(one).rows.T @ self._process(other).rows
+            self._products[other, one] = self._products[one, other].T
         return self._products[one, other]
 
     def _is_possible(self, places: _Places) -> bool:

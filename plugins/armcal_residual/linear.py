@@ -6,7 +6,7 @@ import base64
 import itertools
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import casadi as ca
@@ -29,8 +29,6 @@ _LEAST_TAKEN = 1e-3
 _LEAST_KNOWN = 0.5
 """Weights that records determine: a function of fewer is none."""
 _UNSEEN = 1e-6
-_MOST = 10.0
-"""Times the rms of what is to be explained: as large as a block may be."""
 _AT_A_TIME = 4096
 
 
@@ -48,8 +46,17 @@ class PartSettings(Settings):
     root: Numbers
 
 
+class LearnedSettings(Settings):
+    """What was learned (by armcal, not by hand), and ``within`` which commands of each joint (rad or m) it acts."""
+
+    learned: tuple[Any, ...] = ()
+    within: tuple[tuple[float, float], ...] = ()
+
+
 class LinearResidual(PoseResidual):
     """A pose residual of features with weights."""
+
+    settings: LearnedSettings
 
     @abstractmethod
     def features(self, part: Any, commands: Any, approaches: Any, surroundings: Mapping[str, Any]) -> Any:
@@ -62,7 +69,7 @@ class LinearResidual(PoseResidual):
     @property
     def parts(self) -> Sequence[PartSettings]:
         """What was learned."""
-        return tuple(getattr(self.settings, "learned", ()))
+        return self.settings.learned
 
     @property
     @override
@@ -78,8 +85,9 @@ class LinearResidual(PoseResidual):
         size = len(OF_TOOL) + len(self.joint_names)
         zeros = np.zeros((len(self.joint_names), 1))
         for part in self.parts:
-            if part.first + len(part.scales) > size:
-                raise ValueError(f"found a correction of place {part.first}: it was learned on an arm with more joints")
+            known = len(self.settings.within) or len(self.joint_names)
+            if part.first + len(part.scales) > size or known != len(self.joint_names):
+                raise ValueError(f"found corrections of {known} joints: it was learned on an arm of other joints")
             features = len(self.features(part, zeros, zeros, {}))
             unpacked(part.weights, features, len(part.scales))
             unpacked(part.root, features, None)
@@ -94,22 +102,41 @@ class LinearResidual(PoseResidual):
             weights = unpacked(part.weights, features.numel(), len(part.scales))
             for i, moved in enumerate(ca.vertsplit(ca.mtimes(ca.DM(weights.T), features))):
                 rows[part.first + i] += moved
-        return ca.vertcat(*rows)
+        inside = ca.SX(1)
+        for command, (low, high) in zip(ca.vertsplit(commands), self.settings.within, strict=False):
+            inside = ca.logic_and(inside, ca.logic_and(command >= low, command <= high))
+        return ca.if_else(inside, ca.vertcat(*rows), 0)
 
     @override
     def corrections(self, postures: Postures) -> Array:
         def moved(part: PartSettings, features: Array) -> Array:
             return np.asarray(unpacked(part.weights, len(features), len(part.scales)).T @ features)
 
-        return self._summed(postures, moved)
+        return np.where(self._inside(postures.commands), self._summed(postures, moved), 0.0)
+
+    def _inside(self, commands: Array) -> Any:
+        """Which commands (joints x N) are among those that it learned from (N)."""
+        if not self.settings.within:
+            return np.True_
+        low, high = np.array(self.settings.within).T[:, :, None]
+        return np.all((commands >= low) & (commands <= high), axis=0)
 
     @override
     def deviations(self, postures: Postures) -> Array:
-        def variance(part: PartSettings, features: Array) -> Array:
-            taken = np.sum((unpacked(part.root, len(features), None).T @ features) ** 2, axis=0)
-            return np.outer(np.square(part.scales), np.maximum(self.prior_variance(part, features) - taken, 0.0))
+        """With all that was learned where it corrects nothing."""
 
-        return np.asarray(np.sqrt(self._summed(postures, variance)))
+        def prior(part: PartSettings, features: Array) -> Array:
+            return np.outer(np.square(part.scales), self.prior_variance(part, features))
+
+        def left(part: PartSettings, features: Array) -> Array:
+            taken = np.sum((unpacked(part.root, len(features), None).T @ features) ** 2, axis=0)
+            return np.maximum(prior(part, features) - np.outer(np.square(part.scales), taken), 0.0)
+
+        inside = self._inside(postures.commands)
+        result = np.sqrt(self._summed(postures, left))
+        if np.all(inside):
+            return np.asarray(result)
+        return np.where(inside, result, np.sqrt(self._summed(postures, prior)))
 
     def _summed(self, postures: Postures, of_part: Callable[[PartSettings, Array], Array]) -> Array:
         """What parts give by their features, by correction (6 + joints x N); of some thousand postures at a time."""
@@ -169,13 +196,10 @@ class Products:
         return cls(features.T @ features, features.T @ errors, float(errors @ errors), len(errors))
 
 
-def regressed(
-    products: Products, sizes: Sequence[int], whole: Array | None = None, start: tuple[Array, float] | None = None
-) -> Regression:
+def regressed(products: Products, sizes: Sequence[int], start: tuple[Array, float] | None = None) -> Regression:
     """The most likely variances of blocks of ``sizes`` features with independent weights of equal variance each.
 
-    ``whole`` is X'X of features from which nothing was taken off; by default that of ``products``. ``start`` has
-    variances of the blocks and of the noise that are near.
+    ``start`` has variances of the blocks and of the noise that are near.
     """
     edges = np.cumsum([0, *sizes])
     blocks = [slice(a, b) for a, b in itertools.pairwise(edges)]
@@ -183,18 +207,15 @@ def regressed(
     spread = products.square / max(products.rows, 1)
     total = max(spread * products.rows, 1e-300) / len(blocks)
     precisions = np.array([max(float(diagonal[b].sum()), 1e-300) / total for b in blocks])
-    # A block that acts like what was taken off shows no size of its own: it explains no more than what is there.
-    acting = diagonal if whole is None else np.diag(whole)
-    least = np.array([max(float(acting[b].sum()), 1e-300) for b in blocks]) / (_MOST**2 * max(products.square, 1e-300))
     noise = spread / 2
     if start is not None:
-        precisions, noise = np.clip(1 / start[0], least, 1e30), start[1]
+        precisions, noise = np.clip(1 / start[0], 1e-30, 1e30), start[1]
     for _ in range(_ROUNDS):
         inverse, weights, _ = _posterior(products, precisions, noise, sizes)
         known = np.array([b.stop - b.start - precisions[i] * np.trace(inverse[b, b]) for i, b in enumerate(blocks)])
         squares = np.array([max(float(weights[b] @ weights[b]), 1e-300) for b in blocks])
         error = products.square - 2 * weights @ products.vector + weights @ products.matrix @ weights
-        following = np.clip(np.maximum(known, 1e-12) / squares, least, 1e30)
+        following = np.clip(np.maximum(known, 1e-12) / squares, 1e-30, 1e30)
         noise = max(error, 1e-9 * products.square) / max(products.rows - known.sum(), 1.0)
         moved = np.max(np.abs(np.log(following / precisions)))
         precisions = following
@@ -205,8 +226,6 @@ def regressed(
     squares = np.array([float(weights[b] @ weights[b]) for b in blocks])
     evidence = -(size + products.rows * np.log(noise) + error / noise + precisions @ squares) / 2
     known = np.array([b.stop - b.start - precisions[i] * np.trace(inverse[b, b]) for i, b in enumerate(blocks)])
-    if whole is not None:
-        inverse, _, _ = _posterior(replace(products, matrix=whole), precisions, noise, sizes)
     scale = np.sqrt(np.repeat(precisions, sizes))
     left = scale[:, None] * inverse * scale
     return Regression(tuple(weights[b] for b in blocks), 1 / precisions, left, known, float(evidence), float(noise))

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from armcal.calibration.calibration_file import parameter_records
 from armcal.cli.run import _compliances, _matrices
 from armcal.diagnose.evidence_findings import shift_findings
 from armcal.estimate.estimator import Estimate, estimate
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.problem.problem import Problem
+from armcal.report.tables import parameter_rows
 from armcal.run.experiment import Experiment
 from rich.console import Console
 
@@ -50,7 +52,7 @@ def test_an_estimate_far_beyond_its_bound_keeps_an_interval_as_wide_as_its_devia
     place = beyond.names.index("arm.spring.k2")
     interval, sd = beyond.intervals[place], beyond.deviations[place]
     assert beyond.unconstrained[place] < -5 * sd and "arm.spring.k2" in beyond.at_bound
-    assert interval.one_sided and interval.lower == 0
+    assert interval.bound == "lower" and interval.lower == 0
     assert 1.9 * sd < interval.upper < 2.1 * sd
 
 
@@ -62,6 +64,25 @@ def test_what_a_bound_shifts_beside_itself_is_named(beyond: Estimate) -> None:
     assert f"{worst} ({moved[beyond.names.index(worst)]:+.1f} sd)" in finding.text
     free = fitted(SPRINGS, {**BEYOND, "arm.spring.k2": 0.05})
     assert not shift_findings(free)
+
+
+@pytest.mark.parametrize(("deviations", "shown"), [(0.5, "≤"), (2.9, "≤"), (3.1, " to ")])
+def test_the_end_that_is_a_bound_is_not_guessed_from_where_the_value_lies(
+    beyond: Estimate, deviations: float, shown: str
+) -> None:
+    place = beyond.names.index("arm.spring.k2")
+    own = deviations * beyond.deviations[place]
+    values, unconstrained = beyond.values.copy(), beyond.unconstrained.copy()
+    values[beyond.free_entries[place]] = unconstrained[place] = own
+    assert shown in parameter_rows(replace(beyond, values=values, unconstrained=unconstrained))[place].interval
+
+
+def test_a_parameter_with_the_deviation_of_its_prior_is_not_determined_by_data() -> None:
+    tight = fitted(SPRINGS, {"arm.spring.k2": 0.05}, "parameters.priors={arm.mdh.theta2: 0.0001 deg}")
+    records = {record.name: record for record in parameter_records(tight)}
+    held, free = records["arm.mdh.theta2"], records["arm.mdh.theta3"]
+    assert held.sd == pytest.approx(np.radians(0.0001), rel=1e-2) and free.determined and not free.held_by_prior
+    assert not held.determined and held.held_by_prior
 
 
 def test_names_and_values_pair(beyond: Estimate) -> None:

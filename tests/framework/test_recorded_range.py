@@ -42,9 +42,11 @@ def test_the_range_is_that_of_the_records_or_the_configured_payload() -> None:
     ],
 )
 def test_what_lies_beyond_is_named_with_its_unit(poses: dict[str, list[float]], words: str) -> None:
-    sentence = beyond_records(RECORDED, dataset(**poses), ARMS)
+    beyond, sentence = beyond_records(RECORDED, dataset(**poses), ARMS)
+    assert beyond.any() == bool(words)
     assert (words in sentence and sentence.endswith("was not tested there.")) if words else not sentence
 
 
 def test_a_calibration_that_keeps_no_ranges_warns_of_nothing() -> None:
-    assert beyond_records({}, dataset(q1=[99.0]), ARMS) == ""
+    beyond, sentence = beyond_records({}, dataset(q1=[99.0]), ARMS)
+    assert not beyond.any() and not sentence

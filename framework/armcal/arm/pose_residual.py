@@ -6,6 +6,7 @@ stands at R Exp(turn), p + shift, where R and p are what the model says of it th
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,6 +25,8 @@ CORRECTION = "correction."
 """Of channels of records that carry corrections, ``ARM.correction.shift_x`` and so on: ``Arm.correction_channels``."""
 SURROUNDINGS = ("payload", "temperature")
 """What errors may depend on beside commands and approaches, where it was recorded (kg, deg C)."""
+MARGIN, LEAST_MARGIN = 0.1, math.radians(1)
+"""A joint may be so much of its recorded range beyond it, and a degree (17 mm) if it hardly moved."""
 _Settings = Settings
 
 
@@ -53,12 +56,13 @@ class Postures:
 class ModelErrors:
     """What a model leaves, in units of the noise, and how corrections would change it.
 
+    Nothing of it is what the model's parameters can do: the fit took that.
+
     Attributes:
         postures: of the records (N).
         dimensions: ``angle`` or ``length`` of each joint.
         residuals: in units of their noise and the record's weight (N x rows).
         slopes: of them by the corrections (N x rows x corrections).
-        taken: an orthonormal basis of what the model's parameters take up (N rows x k): what is learned is beside it.
         of_tool: how many of the tool's corrections a record determines: 0, 3 (shifts) or 6.
     """
 
@@ -67,11 +71,6 @@ class ModelErrors:
     residuals: Array
     slopes: Array
     of_tool: int
-    taken: Array
-
-    def apart(self, rows: Array) -> Array:
-        """Rows (N rows, or N rows x M) without what the model's parameters take up."""
-        return rows - self.taken @ (self.taken.T @ rows)
 
 
 class PoseResidual(ABC):
@@ -100,7 +99,10 @@ class PoseResidual(ABC):
 
     @abstractmethod
     def learned(self, errors: ModelErrors) -> PoseResidual | None:
-        """The same with what records say; None where they are too few. What it has learned before is a mere start."""
+        """The same with what records say; None where they are too few. What it has learned before is a mere start.
+
+        Where a joint is beyond the commands of these records (``MARGIN``), it corrects nothing.
+        """
 
     @abstractmethod
     def correction(
@@ -129,6 +131,13 @@ class PoseResidual(ABC):
 
     def __reduce__(self) -> Any:
         return type(self), (self.settings, self.joint_names)
+
+
+def reached(commands: Array) -> tuple[tuple[float, float], ...]:
+    """How far joints (joints x N) moved, with margins: smallest and largest command of each."""
+    margins = np.maximum(MARGIN * np.ptp(commands, axis=1), LEAST_MARGIN)
+    ends = zip(commands.min(axis=1) - margins, commands.max(axis=1) + margins, strict=True)
+    return tuple((float(low), float(high)) for low, high in ends)
 
 
 def corrected(base_T_tool: Transform, correction: Expression) -> Transform:

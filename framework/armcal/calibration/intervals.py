@@ -17,6 +17,7 @@ from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Drift, Parameters
 from armcal.base.settings import Settings
+from armcal.calibration.tool_expression import APPROACH
 from armcal.config.system import System
 from armcal.diagnose.coverage import Stretch, level_name
 from armcal.errors import DataError
@@ -32,6 +33,7 @@ from armcal.estimate.prediction import (
 )
 from armcal.estimate.validation import Recording
 from armcal.estimate.variance import Axes, Component, VarianceComponents, apply_components
+from armcal.problem.corrected import sizes_of, unexplained
 from armcal.problem.drift import Chain, chain, with_drift
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.readings import reading_slopes, with_joint_noise
@@ -107,6 +109,7 @@ class PlusMinus:
         radii: of each position measurement by name: of a ball about the prediction that holds 95 % (N each; m).
         covariances: of each position measurement by name, stretched as half widths are (N x 3 x 3 each; m^2).
         turns: of each pose measurement by name: angles that 90 % of the orientations lie within (N each; rad).
+        unknown: how little learned pose residuals know of each pose (N; m, standard deviation); None without any.
     """
 
     shift: dict[str, Array]
@@ -115,6 +118,7 @@ class PlusMinus:
     radii: dict[str, Array]
     covariances: dict[str, Array] = field(default_factory=dict)
     turns: dict[str, Array] = field(default_factory=dict)
+    unknown: Array | None = None
 
 
 def stretch_records(stretches: Mapping[Recording, Stretch]) -> dict[Literal["same", "new"], StretchRecord]:
@@ -193,7 +197,12 @@ class Uncertainty:
             drift = self._known_drift(recording_record, recorded, along)
             for chunk in _chunks(np.flatnonzero(near)):
                 parts.append(self._within(problem, commands.subset(chunk), chunk, drift, along))
-        return _joined(problem, parts, len(commands), self.record.stretches)
+        plus_minus = _joined(problem, parts, len(commands), self.record.stretches)
+        if not any(arm.residual and arm.residual.is_learned for arm in self.system.arms.values()):
+            return plus_minus
+        rows = [problem.records(commands.subset(chunk)) for chunk in _chunks(np.arange(len(commands)))]
+        unknown = [sizes_of(unexplained(problem, self.values, own)) for own in rows]
+        return replace(plus_minus, unknown=np.concatenate([np.zeros(0), *unknown]))
 
     def _apart(self, problem: Problem, commands: Dataset, places: Indices) -> _Part:
         """Where nothing is told of a drift."""
@@ -204,7 +213,7 @@ class Uncertainty:
             axes: Axes = "together" if instruments <= set(self.system.measurements) else "apart"
             estimated = VarianceComponents(self.components, (), (), 0.0)
             whitened = apply_components(problem, self.values, records, estimated, axes)
-        spreads = self._predictor(problem, None).spreads(whitened, "new")
+        spreads = self._from_either_side(problem, self._predictor(problem, None).spreads(whitened, "new"), commands)
         recording: Recording = "same" if self.record.recording is None else "new"
         still = tuple(np.zeros_like(spread.deviations) for spread in spreads)
         return _Part(places, recording, still, spreads, reading_slopes(problem, self.values, records))
@@ -214,10 +223,26 @@ class Uncertainty:
     ) -> _Part:
         """In the recording, which tells of a drift."""
         records = self._drifted(problem, commands, along, self.noise_scale)
-        spreads = self._predictor(problem, drift).spreads(records, "same")
+        spreads = self._from_either_side(problem, self._predictor(problem, drift).spreads(records, "same"), commands)
         moved = [record.correlation.shift(i, drift.states) for i, record in enumerate(records) if record.correlation]
         off = tuple(m[:, : len(places), 0] for m in moved)
         return _Part(places, "same", off, spreads, reading_slopes(problem, self.values, records))
+
+    def _from_either_side(self, problem: Problem, spreads: Sequence[Spread], commands: Dataset) -> tuple[Spread, ...]:
+        """With half of what the side makes that a joint came from, squared, where that side is not known (0)."""
+        covariances = [spread.covariance.copy() for spread in spreads]
+        used = {channel for kernel in problem.kernels for channel in kernel.factor.channels if APPROACH in channel}
+        for channel in sorted(used & set(commands.channels)):
+            known = commands.column(channel)
+            ends = []
+            for side in (-1.0, 1.0):
+                sides = np.where(np.nan_to_num(known) == 0, side, known)
+                records = problem.records(replace(commands, channels={**commands.channels, channel: sides}))
+                ends.append(problem.residuals(self.values, records))
+            for covariance, low, high in zip(covariances, *ends, strict=True):
+                half = (high - low) / 2
+                covariance += np.einsum("rn,sn->nrs", half, half)
+        return tuple(replace(s, covariance=own) for s, own in zip(spreads, covariances, strict=True))
 
     def _predictor(self, problem: Problem, drift: KnownDrift | None) -> Predictor:
         return Predictor(problem, self.values, self.record.symmetric_covariance, self.noise_scale, self.freedom, drift)
@@ -243,6 +268,8 @@ class Uncertainty:
         """The commands with what instruments read there: residuals may depend on readings in any way."""
         names = [f"{name}.{c.name}" for name, m in self.system.measurements.items() for c in m.channels()]
         unread = dict.fromkeys(names, np.zeros(len(commands)))
+        sides = [f"{arm.name}.{APPROACH}{joint}" for arm in self.system.arms.values() for joint in arm.commanded]
+        commands = replace(commands, channels={**dict.fromkeys(sides, np.zeros(len(commands))), **commands.channels})
         blank = replace(commands, channels={**commands.channels, **unread})
         problem = self._problem(blank)
         read = problem.by_channel(problem.predict(self.values, problem.records(blank)))

@@ -1,23 +1,24 @@
 """Whether poses lie beyond the records of their calibration, where nothing tested how far off predictions are."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from math import inf, radians
+from dataclasses import dataclass, replace
+from math import inf
 from typing import Self
 
 import numpy as np
 
 from armcal.arm.assembly import Arm, command_channels
+from armcal.arm.pose_residual import LEAST_MARGIN, MARGIN
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.units import display_unit, to_unit
 
 PAYLOAD = "payload"
-_MARGIN, _LEAST = 0.1, radians(1)
-"""A joint may be so much of its recorded range beyond it, and a degree (17 mm) if it hardly moved."""
+UNKNOWN = "pose_residual_sd"
+"""How little a learned pose residual knows of a pose (m): the more, the farther the records are that taught it."""
 
 Ranges = Mapping[str, tuple[float, float]]
-"""Smallest and largest value (SI) of each joint and the payload, by channel."""
+"""Smallest and largest value (SI) of each joint and the payload, by channel; and of ``UNKNOWN``."""
 
 
 def recorded_ranges(dataset: Dataset, arms: Mapping[str, Arm], payload: float | None) -> dict[str, tuple[float, float]]:
@@ -49,13 +50,14 @@ class RecordedRange:
 
     @classmethod
     def of(cls, ranges: Ranges, channels: Sequence[str], arms: Mapping[str, Arm]) -> Self:
-        """Of some channels: joints of these arms, and the payload."""
-        dimensions = command_channels(arms)
+        """Of some channels: joints of these arms, the payload, and ``UNKNOWN``."""
+        dimensions = {**command_channels(arms), UNKNOWN: "length"}
         names = tuple(channel.rpartition(".")[2] if len(arms) == 1 else channel for channel in channels)
         units = tuple(display_unit(dimensions.get(channel, "mass")).name for channel in channels)
         low, high = ends = np.array([ranges.get(channel, (-inf, inf)) for channel in channels]).reshape(-1, 2).T
-        is_payload = np.array([channel == PAYLOAD for channel in channels], dtype=bool)
-        margin = np.where(is_payload, _MARGIN * high, np.maximum(_MARGIN * (high - low), _LEAST))
+        margin = np.maximum(MARGIN * (high - low), LEAST_MARGIN)
+        for i, channel in enumerate(channels):
+            margin[i] = {PAYLOAD: MARGIN * high[i], UNKNOWN: 0.0}.get(channel, margin[i])
         return cls(names, units, ends.T, np.column_stack([low - margin, high + margin]))
 
     def beyond(self, values: Array) -> Mask:
@@ -78,7 +80,15 @@ class RecordedRange:
         return f"{count} ({'; '.join(texts)}): how far off predictions are was not tested there."
 
 
-def beyond_records(ranges: Ranges, dataset: Dataset, arms: Mapping[str, Arm]) -> str:
-    """A sentence about the poses of a dataset that lie beyond these ranges; empty if none does."""
+def beyond_records(
+    ranges: Ranges, dataset: Dataset, arms: Mapping[str, Arm], unknown: Array | None = None
+) -> tuple[Mask, str]:
+    """Which poses of a dataset lie beyond these ranges (N), and a sentence about them, empty if none does.
+
+    ``unknown`` is how little a pose residual knows of each (N; m).
+    """
+    if unknown is not None:
+        dataset = replace(dataset, channels={**dataset.channels, UNKNOWN: unknown})
     channels = [*filter(dataset.has, ranges)]
-    return RecordedRange.of(ranges, channels, arms).sentence(dataset.stacked(channels))
+    recorded, values = RecordedRange.of(ranges, channels, arms), dataset.stacked(channels)
+    return np.asarray(recorded.beyond(values).any(axis=0)), recorded.sentence(values)

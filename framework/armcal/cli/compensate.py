@@ -69,7 +69,7 @@ def compensate(console: Console, calibration: Path, targets: Path, out: Path, an
     write_commands(out, compensator, file.targets, file.dataset, assessed, angles)
     if kept := bench.calibration.record.prediction:
         poses = commanded(compensator, file.targets, commands).subset(np.flatnonzero(commands.reached))
-        if text := beyond_records(kept.ranges, poses, {bench.arm: compensator.expression.arm}):
+        if text := beyond_records(kept.ranges, poses, {bench.arm: compensator.expression.arm})[1]:
             console.warn(text)
     _show(console, file, assessed, bench, out)
 

@@ -76,6 +76,7 @@ def predict(
         requested = (*requested, *_tool_channels(tuple(system.arms)))
     shown = [channel for channel in requested if channel.channel in channels]
     extra, medians = _half_widths(plus_minus, shown) if plus_minus else ({}, {})
+    extra |= _beyond(console, loaded, commands, plus_minus)
     write_csv(out, replace(commands, channels=channels, extra=extra), shown)
     _show(console, commands, out, recording, plus_minus, medians)
 
@@ -180,13 +181,25 @@ def _warn_of_missing(console: Console, loaded: Calibration, commands: Dataset, r
     for text in commands.warnings:
         console.warn(text)
     kept = loaded.record.prediction
-    if kept is not None and (text := beyond_records(kept.ranges, commands, loaded.system.arms)):
-        console.warn(text)
     if kept is not None and kept.recording is None and recording == "calibrated":
         console.warn("no parameter drifts in this calibration: all recordings are alike.")
     if kept is not None and kept.recording is not None and recording == "new" and any(map(commands.has, order)):
         text = "these poses are taken for another recording than the calibration's, of whose drift nothing is known"
         console.warn(f"{text}; if they belong to it, say --recording calibrated.")
+
+
+def _beyond(
+    console: Console, loaded: Calibration, commands: Dataset, plus_minus: PlusMinus | None
+) -> dict[str, tuple[str, ...]]:
+    """The column that flags the poses beyond the calibration's records, of which it warns."""
+    kept = loaded.record.prediction
+    if kept is None or not kept.ranges:
+        return {}
+    unknown = plus_minus.unknown if plus_minus else None
+    beyond, text = beyond_records(kept.ranges, commands, loaded.system.arms, unknown)
+    if text:
+        console.warn(text)
+    return {"beyond_records": tuple("1" if own else "0" for own in beyond)}
 
 
 def _half_widths(

@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Callable, Iterator, KeysView, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.special import stdtrit
@@ -24,6 +24,8 @@ CONFIDENCE = 0.95
 NEAR_A_BOUND_SD = 3.0
 """Within so many standard deviations of a bound an interval is one-sided."""
 SMALLEST_SPREAD = 1e-12
+OF_PRIOR = 0.95
+"""Of its prior's standard deviation: data that leave more of it say nothing of a parameter."""
 AT_BOUND = 1e-6
 """In typical scales of the parameter: closer than this, a parameter lies on its bound."""
 
@@ -101,11 +103,11 @@ def spread(estimator: Estimator, executor: Executor | None) -> Estimator:
 
 @dataclass(frozen=True)
 class Interval95:
-    """A 95 % interval of one canonical entry; ``one_sided`` near a bound, where the bound itself is the other end."""
+    """A 95 % interval of one canonical entry; ``bound`` is the end that is a bound of the entry itself, if one is."""
 
     lower: float
     upper: float
-    one_sided: bool
+    bound: Literal["lower", "upper"] | None = None
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,7 @@ class Estimate:
         degrees_of_freedom: residual numbers less what the fit takes up of them, see ``degrees_of_freedom``.
         identifiability: what the data alone determines.
         determined: per free entry, whether data and priors together determine it.
-        identified_by_data: per free entry, whether the data alone does; else only a prior holds it, if anything does.
+        identified_by_data: per free entry, whether the data do; else only a prior holds it, if anything does.
         verdict: the solver's.
         widened: by what the standard deviations of free entries grew because neighbouring records err alike; empty
             where they do and nothing grew by it, None where no such correlation was found.
@@ -223,13 +225,13 @@ class Estimate:
             # the bound.
             low, high = min(unconstrained, upper) - quantile * sd, max(unconstrained, lower) + quantile * sd
             if not np.isfinite(sd):
-                interval = Interval95(lower, upper, False)
+                interval = Interval95(lower, upper)
             elif unconstrained - lower < NEAR_A_BOUND_SD * sd and unconstrained - lower <= upper - unconstrained:
-                interval = Interval95(lower, float(np.clip(high, lower, upper)), True)
+                interval = Interval95(lower, float(np.clip(high, lower, upper)), "lower")
             elif upper - unconstrained < NEAR_A_BOUND_SD * sd:
-                interval = Interval95(float(np.clip(low, lower, upper)), upper, True)
+                interval = Interval95(float(np.clip(low, lower, upper)), upper, "upper")
             else:
-                interval = Interval95(float(value - quantile * sd), float(value + quantile * sd), False)
+                interval = Interval95(float(value - quantile * sd), float(value + quantile * sd))
             intervals.append(interval)
         return tuple(intervals)
 
@@ -299,18 +301,27 @@ def estimate(
         degrees_of_freedom=freedom,
         identifiability=known,
         determined=tuple(bool(x) for x in ~(np.abs(chain) @ unseen > 1e-6)),
-        identified_by_data=_identified_by_data(chain, parameters.scales(), known),
+        identified_by_data=_identified_by_data(chain, prior, half, parameters.scales(), known),
         verdict=solution.verdict,
     )
 
 
-def _identified_by_data(chain: Array, scales: Array, known: Identifiability) -> tuple[bool, ...]:
-    """Of each entry, whether it takes part in no undetermined combination (by more than 1e-6 of its typical scale)."""
+def _identified_by_data(
+    chain: Array, prior: Array, half: Array, scales: Array, known: Identifiability
+) -> tuple[bool, ...]:
+    """Of each entry, whether data add to its prior, as data as noisy as declared would.
+
+    So no entry that takes part in an undetermined combination (by more than 1e-6 of its typical scale), nor one whose
+    standard deviation is still its prior's.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        of_prior = np.sum(np.where(chain != 0, chain**2 / prior, 0.0), axis=1)
+    added = np.sum((chain @ half) ** 2, axis=1) <= OF_PRIOR**2 * of_prior
     if not len(known.null):
-        return (True,) * len(chain)
+        return tuple(bool(x) for x in added)
     moves = np.linalg.norm(chain @ (known.null * scales).T, axis=1)
     typical = np.linalg.norm(chain * scales, axis=1)
-    return tuple(bool(x) for x in moves <= 1e-6 * np.where(typical > 0, typical, 1.0))
+    return tuple(bool(x) for x in added & (moves <= 1e-6 * np.where(typical > 0, typical, 1.0)))
 
 
 def degrees_of_freedom(problem: Problem, values: Array, records: Sequence[FactorRecords], slope: float = 1.0) -> float:

@@ -18,6 +18,7 @@ from armcal.estimate.nuisance import restricted, settled
 from armcal.io.parallel import Executor, Sequential
 from armcal.measure.measurement import Placed
 from armcal.problem.drift import residuals
+from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem
 
 Recording = Literal["same", "new"]
@@ -86,8 +87,8 @@ def errors_and_turns(
     """
     values = settled(problem, values, records)
     raw = problem.residuals(values, records) if training is None else residuals(problem, values, records, training)
-    errors = _sizes(problem, records, raw, error_dimension(problem))
-    return errors, _sizes(problem, records, raw, "angle") if measures_turns(problem) else None
+    own = tuple(zip(problem.kernels, records, raw, strict=True))
+    return _sizes(own, error_dimension(problem)), _sizes(own, "angle") if measures_turns(problem) else None
 
 
 def measures_turns(problem: Problem) -> bool:
@@ -96,19 +97,26 @@ def measures_turns(problem: Problem) -> bool:
     return turned and error_dimension(problem) == "length"
 
 
-def _sizes(problem: Problem, records: Sequence[FactorRecords], raw: Sequence[Array], counted: str) -> Array:
+def _sizes(own: Sequence[tuple[Kernel, FactorRecords, Array]], counted: str) -> Array:
     """Of each record's residual, the entries of one dimension; root mean square over its measurements (N).
 
     Of a measurement of many points, over those that the record has.
     """
-    squares, count = np.zeros((2, records[0].count))
-    for kernel, record, residual in zip(problem.kernels, records, raw, strict=True):
+    squares, count = np.zeros((2, own[0][1].count))
+    for kernel, record, residual in own:
         rows = np.array([dimension == counted for dimension in kernel.factor.dimensions], dtype=bool)
         if rows.any():
             squares += np.where(record.measured, np.sum(residual[rows] ** 2, axis=0), 0.0)
             count += np.where(record.measured, record.points_of(kernel.factor), 0)
     with np.errstate(invalid="ignore"):
         return np.asarray(np.sqrt(squares / count))
+
+
+def errors_apart(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Array:
+    """As ``record_errors`` at rest, of each measurement (measurements x N)."""
+    raw, counted = problem.residuals(values, records), error_dimension(problem)
+    own = zip(problem.kernels, records, raw, strict=True)
+    return np.array([_sizes(((kernel, record, rows),), counted) for kernel, record, rows in own])
 
 
 def error_unit(problem: Problem) -> str:
@@ -244,6 +252,7 @@ class JudgedFit:
         unknown: covariance of these by what a pose residual did not know (N x n_r x n_r each); None without one.
         without: the errors ``at_rest`` without the pose residual that the fit learned; None where it learns none.
         values: of the fit; None if it did not converge.
+        gains: by how much that makes errors of each measurement smaller at rest (measurements x N).
     """
 
     errors: Array
@@ -255,6 +264,7 @@ class JudgedFit:
     unknown: tuple[Array, ...] | None = None
     without: Array | None = None
     values: Array | None = None
+    gains: Array | None = None
 
 
 @dataclass(frozen=True)

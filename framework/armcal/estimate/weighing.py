@@ -227,6 +227,27 @@ def fit(
     return plain_fit(problem, records, estimator.solve(problem, records, start, progress))
 
 
+@dataclass(frozen=True)
+class _Held:
+    """An estimator that stays where a solution is."""
+
+    solution: Solution
+
+    def solve(
+        self, problem: Problem, records: Sequence[FactorRecords], start: Array, progress: Progress = no_progress
+    ) -> Solution:
+        return self.solution
+
+
+def held_fit(
+    problem: Problem, records: Sequence[FactorRecords], estimator: Estimator, solution: Solution
+) -> WeighedFit:
+    """How records weigh about a solution, and how far it leaves them."""
+    at = _Held(solution)
+    own = replace(estimator, inner=at) if isinstance(estimator, Weighing) else at
+    return fit(problem, records, own, solution.values)
+
+
 def plain_fit(problem: Problem, records: Sequence[FactorRecords], solution: Solution) -> WeighedFit:
     """A solution of least squares as a fit."""
     return WeighedFit(solution, _estimate(problem, records, solution), tuple(records), ones(records))

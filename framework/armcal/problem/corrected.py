@@ -60,6 +60,11 @@ def _arms_of(problem: Problem, measurement: str) -> Sequence[str]:
     return tuple(problem.blueprint.measurements[measurement].arms)
 
 
+def sizes_of(covariances: Sequence[Array]) -> Array:
+    """How large that is in each record (N; m): the largest standard deviation of a position (N x n_r x n_r each)."""
+    return np.asarray(np.sqrt(np.max([np.einsum("nrr->n", own[:, :3, :3]) for own in covariances], axis=0)))
+
+
 def unexplained(
     problem: Problem,
     values: Array,

@@ -144,9 +144,8 @@ def _row(estimate: Estimate, i: int, si_unit: str, raw: RawParameter, decimals: 
     determined = math.isfinite(raw.sd)
     lower, upper = fixed(raw.lower, decimals), fixed(raw.upper, decimals)
     written = f"{lower} to {upper}" if determined else NONE
-    if determined and estimate.intervals[i].one_sided:
-        nearer_lower = abs(raw.value - raw.lower) <= abs(raw.upper - raw.value)
-        written = f"≤ {upper}" if nearer_lower else f"≥ {lower}"
+    if determined and (bound := estimate.intervals[i].bound):
+        written = f"≤ {upper}" if bound == "lower" else f"≥ {lower}"
     return ParameterRow(
         name=estimate.names[i],
         unit=shown_unit(si_unit)[1],

@@ -7,7 +7,7 @@ import numpy as np
 
 from armcal.base.dataset import SetAside
 from armcal.calibration.intervals import PredictionRecord, covariance_rows, recording_record, stretch_records
-from armcal.calibration.recorded_range import recorded_ranges
+from armcal.calibration.recorded_range import UNKNOWN, recorded_ranges
 from armcal.diagnose.clustered import widened
 from armcal.diagnose.coverage import fit_and_predict
 from armcal.errors import noted
@@ -17,7 +17,7 @@ from armcal.estimate.polish import hopeless, typical_off
 from armcal.estimate.profile import Profile, profiles
 from armcal.estimate.start import FAR
 from armcal.estimate.validation import CrossValidation, Split, cross_validate
-from armcal.estimate.weighing import WeighedFit, fit, plain_fit
+from armcal.estimate.weighing import WeighedFit, fit, held_fit, plain_fit
 from armcal.io.parallel import Executor
 from armcal.plugins import PluginRegistry
 from armcal.problem.corrected import moved_by
@@ -60,11 +60,15 @@ def calibrate(
         before = FittedRecords(**vars(ready), fitted=_fitted(context, ready))
     faults += registry.notify("armcal_estimate_changed", estimate=before.fitted.estimate)
     run, outcome = _with_pose_residual(context, before)
-    resampled, profiled = _uncertainty(context, run)
+    resampled, profiled = _uncertainty(context, before)
     result = _judged(context, run, outcome, *_validated(context, before, run, outcome))
     faults += _notify_rejected(registry, result.noise.set_aside)
     warnings = (*result.warnings, *dict.fromkeys(faults))
-    return replace(result, command=command, warnings=warnings, bootstrap=resampled, profiles=profiled)
+    # What was learned tells nothing of the parameters: they are as sure as without it.
+    left = run.fitted.estimate
+    stated = replace(before.fitted.estimate, noise_scale=left.noise_scale, degrees_of_freedom=left.degrees_of_freedom)
+    result = replace(result, command=command, warnings=warnings, estimate=stated)
+    return replace(result, bootstrap=resampled, profiles=profiled)
 
 
 def _judged(
@@ -101,7 +105,7 @@ def _judged(
         provenance=replace(experiment, system=system).provenance(dataset),
         noise=noise_result(run.problem, fitted, dataset, split, errors.calibrated_mm),
         intervals=intervals,
-        prediction=_prediction(experiment, run, intervals),
+        prediction=_prediction(experiment, run, outcome, intervals),
         groups=run_groups(experiment, run, errors),
     )
 
@@ -170,8 +174,7 @@ def _with_pose_residual(context: RunContext, run: FittedRecords) -> tuple[Fitted
         arms = outcome.system(experiment.system).arms
         problem = replace(run.problem, blueprint=replace(run.problem.blueprint, arms=arms))
         run = replace(run, problem=problem, records=acting(problem, problem.records(run.dataset), run.dataset))
-        estimator = spread(experiment.estimator, executor)
-        again = fit(problem, run.training, estimator, run.fitted.estimate.values, progress)
+        again = held_fit(problem, run.training, experiment.estimator, run.fitted.solution)
         moved = moved_by(problem, again.estimate.values, run.records, arms[outcome.arm])
         return replace(run, fitted=_widened(run, again)), replace(outcome, moved=moved)
 
@@ -211,11 +214,16 @@ def _validated(
         return errors_of(run, crossed, before), intervals
 
 
-def _prediction(experiment: Experiment, run: FittedRecords, intervals: IntervalResult) -> PredictionRecord | None:
+def _prediction(
+    experiment: Experiment, run: FittedRecords, outcome: ResidualOutcome | None, intervals: IntervalResult
+) -> PredictionRecord | None:
     """What predictions need of a run; None where it did not converge."""
     fitted = run.fitted
     if not fitted.estimate.verdict.converged:
         return None
+    ranges = recorded_ranges(run.dataset, experiment.system.arms, experiment.settings.statics.payload)
+    if outcome is not None and outcome.residual is not None and np.isfinite(outcome.reach):
+        ranges[UNKNOWN] = (0.0, outcome.reach)
     columns = (experiment.source.data.get("data") or {}).get("columns") or {}
     return PredictionRecord(
         entries=fitted.estimate.names,
@@ -223,5 +231,5 @@ def _prediction(experiment: Experiment, run: FittedRecords, intervals: IntervalR
         stretches=stretch_records(intervals.stretches),
         columns={str(name): str(own) for name, own in columns.items()},
         recording=recording_record(run.problem, run.dataset.subset(run.split.train), fitted.records),
-        ranges=recorded_ranges(run.dataset, experiment.system.arms, experiment.settings.statics.payload),
+        ranges=ranges,
     )

@@ -23,23 +23,26 @@ from armcal.estimate.validation import (
     Split,
     cross_validate,
     error_unit,
+    errors_apart,
     failed_fit,
     folds,
     judged_fit,
 )
-from armcal.estimate.weighing import WeighedFit, fit
+from armcal.estimate.weighing import WeighedFit, fit, held_fit
 from armcal.io.parallel import Executor
 from armcal.measure.contact import Contact
 from armcal.measure.partners import PairedMeasurement
-from armcal.problem.corrected import Moved, corrected_records, unexplained
-from armcal.problem.factor_records import unweighted
+from armcal.problem.corrected import Moved, corrected_records, sizes_of, unexplained
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.run.experiment import Experiment
 
 _FOLDS = 5
 _STRETCHES = 10
 _SURE = 2.6
-"""Standard errors, one in 200 by chance, by which errors of records held out must be smaller."""
+"""Standard errors, one in 200 by chance, by which errors of records held out must be smaller, and may be larger."""
+_REGIONS = 5
+_NEAR = 0.99
+"""Of records like those that taught it, that count as near them."""
 _LEAST_GAIN = 0.01
 _FEWEST = 20
 _DETERMINED = 1e-6
@@ -52,7 +55,7 @@ class Comparison:
 
     Attributes:
         without, with_it: mean errors (mm, or mrad).
-        sure: the difference in standard errors; above 0 where the pose residual is better.
+        sure: the difference in standard errors, of the measurement where it is least; above 0 where all are better.
     """
 
     without: float
@@ -60,19 +63,21 @@ class Comparison:
     sure: float
 
     @classmethod
-    def of(cls, without: Array, with_it: Array, parts: tuple[Split, ...]) -> Self:
-        """Of records (N) that were held out together in parts; what a part has in common is one chance."""
-        gains = np.array([float(np.nanmean(without[p.holdout] - with_it[p.holdout])) for p in parts])
-        gains = gains[np.isfinite(gains)]
-        error = float(np.std(gains, ddof=1) / np.sqrt(len(gains))) if len(gains) > 1 else np.inf
-        return cls(
-            float(np.nanmean(without)), float(np.nanmean(with_it)), float(np.nanmean(gains)) / max(error, 1e-300)
-        )
+    def of(cls, without: Array, with_it: Array, gains: Array) -> Self:
+        """Of records (N), and of gains by measurement (measurements x chances)."""
+        return cls(float(np.nanmean(without)), float(np.nanmean(with_it)), min(map(_sure, gains)))
 
     @property
     def gain(self) -> float:
         """Share of the error that it takes away."""
         return 1 - self.with_it / self.without
+
+
+def _sure(gains: Array) -> float:
+    """The mean of gains, those that are a number, in standard errors."""
+    gains = gains[np.isfinite(gains)]
+    error = float(np.std(gains, ddof=1) / np.sqrt(len(gains))) if len(gains) > 1 else np.inf
+    return float(np.mean(gains)) / max(error, 1e-300) if len(gains) else 0.0
 
 
 @dataclass(frozen=True)
@@ -85,6 +90,8 @@ class ResidualOutcome:
         unit: of errors.
         folds: random ones; None where nothing could be compared.
         why: in words, then.
+        harm: where it makes errors larger, in words, if its mean does not say so.
+        reach: as little as it may know of a pose that is near its records (m, standard deviation).
         stretches: of records that were recorded one after another.
         residual: as learned; None if it is not kept.
         crossed: of the random folds, with it.
@@ -97,6 +104,8 @@ class ResidualOutcome:
     unit: str
     folds: Comparison | None = None
     why: str = "the records are too few for it, or show no such error"
+    harm: str = ""
+    reach: float = np.inf
     stretches: Comparison | None = None
     residual: PoseResidual | None = None
     crossed: CrossValidation | None = None
@@ -122,7 +131,7 @@ class ResidualOutcome:
         test = f"{len(self.splits)} folds, and {_STRETCHES} stretches of the recording, held out of fit and learning"
         numbers = f"{self.folds.without:.3g} to {self.folds.with_it:.3g} {self.unit}"
         if self.residual is None:
-            text = f"The pose residual of {self.arm} is not kept: unseen errors went from {numbers}."
+            text = f"The pose residual of {self.arm} is not kept: unseen errors went from {numbers}{self.harm}."
             return [Finding("note", text, test)]
         findings = [Finding("good", f"The pose residual of {self.arm} takes unseen errors from {numbers}.", test)]
         own = self.stretches
@@ -235,12 +244,16 @@ def learned_residual(
     if crossed.failed_folds:
         return replace(nothing, why=f"{crossed.failed_folds} of {len(splits)} fits without a fold did not converge")
     along = cross_validate(problem, training, stretches, *parts)
-    single = tuple(Split(np.array([], dtype=np.intp), np.array([i])) for i in range(count))
-    at_random, in_stretches = _compared(crossed, splits, single), _compared(along, stretches, stretches)
-    kept = at_random.sure > _SURE and at_random.gain > _LEAST_GAIN
+    at_random, gains = _compared(crossed, splits)
+    in_stretches, _ = _compared(along, stretches, together=True)
+    unknown = _unknown(crossed, splits)
+    harm = _harm(gains, unknown)
+    kept = at_random.sure > _SURE and at_random.gain > _LEAST_GAIN and not harm
     return replace(
         nothing,
         folds=at_random,
+        harm=harm,
+        reach=float(np.nanquantile(unknown, _NEAR)) if np.isfinite(unknown).any() else np.inf,
         stretches=in_stretches,
         residual=learned if kept else None,
         crossed=crossed,
@@ -248,17 +261,37 @@ def learned_residual(
     )
 
 
-def _compared(crossed: CrossValidation, splits: tuple[Split, ...], chances: tuple[Split, ...]) -> Comparison:
-    """With and without; records of one of the ``chances`` may miss alike."""
-    without = np.full(len(crossed.errors), np.nan)
+def _compared(crossed: CrossValidation, splits: tuple[Split, ...], together: bool = False) -> tuple[Comparison, Array]:
+    """With and without, and what each record gains by measurement; records of a split may miss alike ``together``."""
+    known = [(split, own) for split, own in zip(splits, crossed.fits, strict=True) if own.gains is not None]
+    rows = len(known[0][1].gains) if known else 1  # type: ignore[arg-type]
+    without, gains = np.full(len(crossed.errors), np.nan), np.full((rows, len(crossed.errors)), np.nan)
+    for split, own in known:
+        without[split.holdout], gains[:, split.holdout] = own.without, own.gains
+    chances = np.array([np.nanmean(gains[:, s.holdout], axis=1) for s, _ in known]).T if together else gains
+    return Comparison.of(_MM * without, _MM * crossed.at_rest, chances), gains
+
+
+def _unknown(crossed: CrossValidation, splits: tuple[Split, ...]) -> Array:
+    """How little the pose residuals of folds knew of each record that they did not see (N; m, standard deviation)."""
+    unknown = np.full(len(crossed.errors), np.nan)
     for split, own in zip(splits, crossed.fits, strict=True):
-        if own.without is not None:
-            without[split.holdout] = own.without
-    return Comparison.of(_MM * without, _MM * crossed.at_rest, chances)
+        if own.unknown is not None:
+            unknown[split.holdout] = sizes_of(own.unknown)
+    return unknown
+
+
+def _harm(gains: Array, unknown: Array) -> str:
+    """Of fifths of the records, by how little the pose residual knew of them, the one where errors grow."""
+    order = np.argsort(unknown, kind="stable")[: int(np.isfinite(unknown).sum())]
+    for place, part in enumerate(np.array_split(order, _REGIONS), 1):
+        if _sure(np.nanmean(gains[:, part], axis=0)) < -_SURE:
+            return f", and they grow in fifth {place} of {_REGIONS} by distance from records that taught it"
+    return ""
 
 
 def judged_with(task: FitTask, layer: Layer) -> JudgedFit:
-    """Fit, learn from what the fit leaves, fit again with that, and judge."""
+    """Fit, learn from what the fit leaves, and judge with that."""
     began, task = time.perf_counter(), task.trained()
     try:
         train, held = task.parts()
@@ -267,13 +300,14 @@ def judged_with(task: FitTask, layer: Layer) -> JudgedFit:
         if not plain.converged:
             return plain
         learned = layer.learned(task.problem, fitted, fitted.records, task.split.train)
+        before = errors_apart(task.problem, fitted.solution.values, held)
         arm = task.problem.blueprint.arms[layer.arm]
         if learned is not None:
             train, held = (
                 corrected_records(task.problem, own, arm, learned.corrections(layer.postures.subset(places)))
                 for own, places in ((train, task.split.train), (held, task.split.holdout))
             )
-            fitted = fit(task.problem, train, task.estimator, fitted.solution.values)
+            fitted = held_fit(task.problem, train, task.estimator, fitted.solution)
         judged = judged_fit(task, fitted.solution, train, held, began)
         if not judged.converged:
             return judged
@@ -283,8 +317,9 @@ def judged_with(task: FitTask, layer: Layer) -> JudgedFit:
         unknown = tuple(unexplained(task.problem, fitted.solution.values, held, own))
     except NotConvergedError:
         return failed_fit(task, began)
-    seconds = time.perf_counter() - began
-    return replace(judged, seconds=seconds, held_residuals=held_residuals, unknown=unknown, without=plain.at_rest)
+    judged = replace(judged, held_residuals=held_residuals, unknown=unknown, without=plain.at_rest)
+    gains = before - errors_apart(task.problem, fitted.solution.values, held)
+    return replace(judged, seconds=time.perf_counter() - began, gains=gains)
 
 
 def model_errors(
@@ -304,20 +339,8 @@ def model_errors(
     good = np.any(moved[:, :, :3] != 0, axis=(1, 2))
     if good.sum() < _FEWEST:
         return None
-    values_slopes = [np.moveaxis(own, 2, 0) for own in problem.jacobians(values, unweighted(records))]
-    taken = np.concatenate(
-        [own * root[:, None, None] for own, root in zip(values_slopes, acting, strict=True)], axis=1
-    )[good]
     of_tool = next((n for n in (len(OF_TOOL), 3) if _determined(moved[good][:, :, :n])), 0)
-    basis = _basis(taken.reshape(-1, taken.shape[2]))
-    return ModelErrors(postures.subset(good), arm.joint_dimensions, left[good], moved[good], of_tool, basis)
-
-
-def _basis(columns: Array) -> Array:
-    """An orthonormal basis of columns (m x n), of what they determine."""
-    lengths = np.linalg.norm(columns, axis=0)
-    left, sizes, _ = np.linalg.svd(columns / np.where(lengths > 0, lengths, 1.0), full_matrices=False)
-    return np.asarray(left[:, sizes > _DETERMINED * max(sizes[0], 1e-300)] if len(sizes) else left)
+    return ModelErrors(postures.subset(good), arm.joint_dimensions, left[good], moved[good], of_tool)
 
 
 def _determined(slopes: Array) -> bool:

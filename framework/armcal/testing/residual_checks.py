@@ -45,6 +45,9 @@ def check_residual(record: Recorder, subject: Subject) -> None:
         expect(bool(np.isfinite(near).all() and np.isfinite(far).all()), "found deviations that are not finite")
         expect(bool((near >= 0).all()), "found deviations below zero")
         expect(float(np.linalg.norm(far)) > float(np.linalg.norm(near)), "found that they do not grow")
+    with record.check("it corrects nothing beyond the commands that it learned from"):
+        turned = Postures(unseen.commands + 2 * np.pi, unseen.approaches)
+        expect(not learned.corrections(turned).any(), "found corrections there")
     with record.check("what it learned is kept in its settings"):
         again = type(learned)(type(learned.settings).model_validate(learned.settings.to_config()), JOINTS)
         expect_repeated(lambda made: made.corrections(unseen), learned, again)
@@ -70,9 +73,7 @@ def _errors(count: int) -> ModelErrors:
     slopes[:, :, len(OF_TOOL) :] = -_levers(commands)
     left = _levers(commands)[:, :, 1] * _truth(commands)[:, None] + random.normal(0, _NOISE_M, (count, 3))
     postures = Postures(commands, np.zeros_like(commands))
-    return ModelErrors(
-        postures, ("angle",) * len(JOINTS), left / _NOISE_M, slopes / _NOISE_M, 3, np.zeros((3 * count, 0))
-    )
+    return ModelErrors(postures, ("angle",) * len(JOINTS), left / _NOISE_M, slopes / _NOISE_M, 3)
 
 
 def _levers(commands: Array) -> Array:
