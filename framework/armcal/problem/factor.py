@@ -356,6 +356,8 @@ def _arm_states(
         if arm.residual is not None:
             names = correction_names(arm.joint_names)
             correction = ca.vertcat(*[records.number(f"{arm.name}.{own}{which}") for own in names])
+            for surrounding in available.intersection(SURROUNDINGS):  # of which it may have learned later
+                records.number(surrounding)
             records.kept |= {c for c in records.symbols if ".approach." in c or c in SURROUNDINGS}
         inputs = ArmInputs(angles, approach, load, deflections[-1], conditions, correction)
         states[name] = replace(arm, residual=None).state(values, inputs)  # records carry what it has learned
