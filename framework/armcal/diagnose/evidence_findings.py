@@ -237,6 +237,8 @@ def _remedies(predicted: Predictable) -> Iterator[str]:
     if "joint" in kinds and predicted.learnable:
         yield "Learn it: arms.NAME.residual: {type: gaussian_process}; or free what armcal identify --fixed recommends."
     elif "joint" in kinds:
+        if predicted.learnable is False:
+            yield "A pose residual cannot learn it from these records: that takes positions or poses of the tool."
         yield "Free what armcal identify --fixed recommends, or add effects to these joints; more poses show more."
     if "time" in kinds:
         yield "Let the base drift (parameters.drift); record the temperature, and repeat one pose from time to time."

@@ -25,6 +25,7 @@ from armcal.base.dataset import Dataset
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.smooth import IMITATED
 from armcal.measure.groups import pose_numbers
+from armcal.measure.partners import PairedMeasurement
 from armcal.problem.motion import Motion, recorded_order
 from armcal.problem.problem import Problem
 
@@ -41,6 +42,8 @@ _SIZES = (0.03, 0.1, 0.3, 1.0)
 """Standard deviations of one function, in those of the residuals."""
 MOST_OF_MEDIAN = 3.0
 """A record farther off than so many medians counts as one that is as far off."""
+_OF_PLACE = 3
+"""So many numbers a record place a tool."""
 _NEXT_CARRIER = 0.1
 """Of the whole share: what predicts less beside the ones before it is not named."""
 
@@ -78,7 +81,7 @@ class Predictable:
         records: how many were looked at.
         poses: how many distinct ones.
         by_time: share that time alone predicts.
-        learnable: whether a pose residual could learn it: tools are measured, and none was asked for yet.
+        learnable: whether a pose residual could learn most of it from what is measured; None where one was asked for.
         imitated: which share of the function of time that residuals follow the pose predicts.
     """
 
@@ -89,7 +92,7 @@ class Predictable:
     records: int
     poses: int
     by_time: float
-    learnable: bool
+    learnable: bool | None
     imitated: float = 0.0
 
     @property
@@ -111,11 +114,12 @@ class Predictable:
 
 @dataclass(frozen=True)
 class _Block:
-    """Columns of some functions: which inputs they are of, and their spectrum."""
+    """Columns of some functions: which inputs they are of, their spectrum, whether along a joint's own motion."""
 
     inputs: frozenset[int]
     columns: Array
     order: Array
+    along: bool = False
 
     @cached_property
     def deviations(self) -> Array:
@@ -156,10 +160,11 @@ def predictable(problem: Problem, rows: FitRows, basis: Array, motion: Motion, d
     size, highest = _SIZES[int(np.argmax(shares[:, 0])) % len(_SIZES)], shares.max(axis=0)
     p = (1 + np.count_nonzero(highest[1:] >= highest[0])) / (1 + _DRAWS)
     chance = float(np.quantile(highest[1:], 1 - LEVEL))
-    tools = all(kernel.factor.output_channels for kernel in problem.kernels)
-    learnable = tools and not any(arm.residual for arm in problem.blueprint.arms.values())
-    predicted = Predictable(float(highest[0]), chance, float(p), (), len(dataset), count, 0.0, learnable)
-    return _carried(predicted, whole.of_first(), inputs, size) if predicted.above_chance else predicted
+    predicted = Predictable(float(highest[0]), chance, float(p), (), len(dataset), count, 0.0, False)
+    if not predicted.above_chance:
+        return predicted
+    first = whole.of_first()
+    return replace(_carried(predicted, first, inputs, size), learnable=_learnable(problem, rows, first, predicted))
 
 
 def _inputs(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[_Input]:
@@ -194,7 +199,7 @@ def _blocks(rows: FitRows, motion: Motion, inputs: Sequence[_Input]) -> Iterator
         features, order = _harmonics(own.angle, highest)
         if own.channel:
             along = _along(rows, motion, own.channel) / typical
-            yield _Block(frozenset({i}), along[:, None] * features[rows.record_of], order)
+            yield _Block(frozenset({i}), along[:, None] * features[rows.record_of], order, True)
         coarse = order <= (_SLOW if own.kind == "time" else _COARSE)
         yield _entries(rows, frozenset({i}), features[:, coarse], order[coarse], acting)
     joints = [i for i, own in enumerate(inputs) if own.kind == "joint"]
@@ -296,3 +301,15 @@ def _carried(predicted: Predictable, whole: _Regression, inputs: Sequence[_Input
         carriers.append(Carrier(inputs[best].kind, inputs[best].name, reached - so_far))
         taken, so_far = taken | {best}, reached
     return replace(predicted, by_time=share({time}), carriers=tuple(carriers))
+
+
+def _learnable(problem: Problem, rows: FitRows, whole: _Regression, predicted: Predictable) -> bool | None:
+    """Whether a pose residual can learn most of it; of records that do not place the tool, joints' own motion alone."""
+    plan = problem.blueprint
+    if any(arm.residual for arm in plan.arms.values()):
+        return None
+    paired = any(isinstance(measurement, PairedMeasurement) for measurement in plan.measurements.values())
+    if paired or not all(kernel.factor.output_channels for kernel in problem.kernels):
+        return False
+    own = replace(whole, blocks=[block for block in whole.blocks if block.along])
+    return rows.by_record.shape[1] >= _OF_PLACE or bool(own.shares(_SIZES).max() > predicted.share / 2)
