@@ -46,9 +46,9 @@ MUCH_BETTER = 3.0
 """A permutation leaves so many times less than the data as they stand."""
 FITS, MISSES = 0.15, 0.01
 """Of the spread of the positions: what a right reading leaves at most to first order, what is worth a look."""
-_EXPLAINS, _FAR_BETTER, _NOISE = (0.03, 0.08), 10.0, 3.0
+_EXPLAINS, _FAR_BETTER, _NOISE = (0.05, 0.08), 10.0, 3.0
 """What it leaves at most once fitted: times the noise, or of the spread, the more the worse the data as given fit."""
-_FITTED, _FIT_STEPS, _FIT_DAMPING = 5, 25, 1e-3
+_FITTED, _FIT_STEPS, _FIT_DAMPING, _FARTHEST = 5, 25, 1e-3, 8.0
 _MOST_RECORDS = 300
 _EQUATIONS = 2.0
 """So many numbers a parameter are needed to separate readings."""
@@ -163,8 +163,7 @@ def _of_contact(
             return np.inf
 
     reach = spread_of(tools(problem, nominal, records)[0][0])
-    as_given = left({})
-    if not MISSES * reach < as_given < np.inf:
+    if not MISSES * reach < (as_given := left({})) < np.inf:
         return None
     readings = [
         _Reading(left(wires), words if len(arms) == 1 else f"{words} ({arm.name})", True)
@@ -260,35 +259,36 @@ def _explained(
     if not likely:
         return []
     noise, explained = float(np.linalg.norm(seen.noise)), []
-    given, fitted = spread_of(seen.measured), _fitted(problem, records, seen, {}, seen.measured)
+    worse = _fitted(problem, records, seen, {}, seen.measured) / spread_of(seen.measured)
     for reading in likely:
         measured = reading.measured
         left = reading.left if measured is None else _fitted(problem, records, seen, reading.read_as, measured)
         spread = kept_spread(seen.measured if measured is None else measured, seen.measured)
-        # A fit may give the arm the size of positions in another unit; what it leaves then says nothing.
-        needed = (fitted if np.isclose(spread, given) else np.inf) / given / MUCH_BETTER
-        near = max(_NOISE * noise, spread * float(np.clip(fitted / given / _FAR_BETTER, *_EXPLAINS)))
-        if left <= min(near, needed * spread):
+        near = max(_NOISE * noise, spread * float(np.clip(worse / _FAR_BETTER, *_EXPLAINS)))
+        if left <= min(near, spread * worse / MUCH_BETTER):
             explained.append((reading, left))
     return explained
 
 
 def _fitted(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, read_as: Wires, measured: Array) -> float:
-    """What a short fit of a reading typically leaves of its positions (median, m)."""
+    """What a short fit of a reading typically leaves (median, m); infinite where it leads far from the nominal arm."""
     number = seen.sighting.kernel
     values, measured, _ = _placed(problem, seen, read_as, measured)
-    beside = problem.subset(records, seen.sighting.chosen)
-    some = [replace(one, weight=0 * one.weight, whitening=None, correlation=None) for one in beside]
+    some = [*problem.subset(records, seen.sighting.chosen)]
+    some = [replace(one, weight=0 * one.weight, whitening=None, correlation=None) for one in some]
     own = rewired(problem.kernels[number].factor.channels, seen.records, read_as)
-    turned = np.tile(np.eye(3), (own.count, 1, 1))
-    rows = np.zeros(len(problem.kernels[number].factor.noise))
+    rows, unturned = np.zeros(len(problem.kernels[number].factor.noise)), np.tile(np.eye(3), (own.count, 1, 1))
     rows[:3] = 1 / seen.noise
     whitening = np.tile(np.diag(rows)[:, :, None], len(own.weight))
-    some[number] = replace(shown_instead(problem, own, number, Tools(measured, turned)), whitening=whitening)
+    some[number] = replace(shown_instead(problem, own, number, Tools(measured, unturned)), whitening=whitening)
     posed = PosedProblem(problem, some)
     try:
         if problem.increments:
-            values = posed.values(descended(posed, posed.x(values), _FIT_STEPS, _FIT_DAMPING, 1e-3))
+            x = descended(posed, posed.x(values), _FIT_STEPS, _FIT_DAMPING, 1e-3)
+            matters = np.diag(posed.model(x).hessian)
+            if np.abs(x - posed.x(values))[matters > _SMALLEST * matters.max()].max(initial=0.0) > _FARTHEST:
+                return np.inf
+            values = posed.values(x)
         return float(np.median(np.linalg.norm(problem.residuals(values, some)[number][:3], axis=0)))
     except NotConvergedError:
         return np.inf
