@@ -84,9 +84,6 @@ class FakeRecalibrator:
     def calibration_text(self):
         return json.dumps({"armcal_calibration": 1, "count": self.count, "total": self.total}) + "\n"
 
-    def what_if(self, joints):
-        return {"joints": dict(joints)}
-
     def rolled_back_event(self, sequence, to):
         return {"event": "decision", "sequence": sequence, "at": 0.0, "kind": "rollback", "to": to, "sentence": "Back."}
 

@@ -17,7 +17,7 @@ APPLICATIONS = {
     "lerobot": {"lerobot"},
     "makers": {"maker"},
     "servobus": {"bus"},
-    "online": {"control", "mission", "recalibrate", "replay", "watch", "what-if"},
+    "online": {"control", "mission", "recalibrate", "replay", "watch"},
     "ros2": {"bag"},
     "serve": {"serve"},
 }

@@ -6,7 +6,6 @@ _COMMANDS = {
     "recalibrate": ("recalibrate:recalibrate", "Keep a calibration true, record by record, as they come."),
     "control": ("control:control", "Query or command a running recalibration."),
     "replay": ("replay:replay_command", "Make every state of a recalibration again from its journal."),
-    "what-if": ("what_if:what_if", "Rank poses by the information that one more record there would add."),
     "watch": ("watch:watch", "Show a recalibration live, in the browser or the terminal."),
     "mission": ("mission:mission", "Simulate a mission, recalibrate over it, judge it by its truth."),
 }

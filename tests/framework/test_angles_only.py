@@ -62,7 +62,7 @@ def test_a_run_states_its_errors_in_mrad_and_is_read_back(place: Path) -> None:
     told = strict(Path("run/metrics.json").read_text())
     held = told["error_mrad"]["calibrated"]["holdout"]
     assert held["rms"] == pytest.approx(ANGLE_MRAD * 2**0.5, rel=0.35), "two angles a station, the stations' mean"
-    assert told["error_mrad"]["nominal"]["holdout"]["rms"] > 50 * held["rms"]
+    assert told["error_mrad"]["nominal"]["holdout"]["rms"] > 3 * held["rms"], "though the nominal arm is placed, too"
     assert "error_mm" not in told
     assert f"{held['mean']:.2f} mrad on average" in told["verdict"]["headline"]
     kept = Calibration.load("run/calibration.yaml").record
@@ -89,8 +89,6 @@ def test_what_follows_a_run_works_too(place: Path) -> None:
     Path("targets.csv").write_text("x_mm,y_mm,z_mm\n300,100,300\n")
     found = strict(armcal("compensate", kept, "--targets", "targets.csv", "--out", "c.csv", "--json").stdout)
     assert found["error_mm"] < 1e-3 < found["nominal_error_mm"]
-    best = strict(armcal("what-if", kept, "--poses", "poses.csv", "--json").stdout)["poses"][0]
-    assert 0 < best["prediction_sd_mrad"] < ANGLE_MRAD
     for form in ("c", "json", "yaml", "ros2"):
         armcal("export", kept, "--format", form, "--out", f"exported.{form}")
     followed = armcal("recalibrate", kept, "--from", "records.csv", "--out", "after").stdout

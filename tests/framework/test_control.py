@@ -16,9 +16,8 @@ from armcal.cli.main import cli
 from armcal.errors import InputError
 from armcal.io.json_server import MOST_CLIENTS, JsonServer
 from armcal.io.unix_socket import short_address
-from armcal_online.running.control import SOCKET, answer, ask, control_server, joint_values
+from armcal_online.running.control import SOCKET, answer, ask, control_server
 from click.testing import CliRunner
-from fake_recalibrator import request
 
 
 def echo(content: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -185,27 +184,17 @@ def test_nobody_there_and_nobody_answering(tmp_path: Path) -> None:
     server.close()
 
 
-def test_joint_values_by_name_and_unit() -> None:
-    found = joint_values({"q1_deg": 180, "q2_mrad": -5, "arm.approach.q1": 1}, request())
-    assert found == {"arm.q1": pytest.approx(3.141592653589793), "arm.q2": -0.005, "arm.approach.q1": 1.0}
-    assert joint_values({"arm.q1": 0.5}, request()) == {"arm.q1": 0.5}
-    for wrong in (None, [], {}, {"q1": 1}, {"q9_deg": 1}, {"q1_deg": "1"}, {"q1_deg": True}, {"q1_deg": float("nan")}):
-        with pytest.raises(InputError):
-            joint_values(wrong, request())
-
-
 def test_the_command_asks_and_tells(tmp_path: Path) -> None:
     def armcal(*arguments: str) -> Any:
         return CliRunner().invoke(cli, ["control", str(tmp_path), *arguments])
 
     with serving(tmp_path):
-        told = json.loads(armcal("what-if", "q1_deg=-10", "q2_deg=5.5").stdout)
-        asked = {"command": "what_if", "joints": {"q1_deg": -10.0, "q2_deg": 5.5}}
-        assert told == {"schema_version": 1, "asked": asked}
+        told = json.loads(armcal("status").stdout)
+        assert told == {"schema_version": 1, "asked": {"command": "status"}}
         assert armcal("pause", "-q").output == ""
         refused = armcal("rollback", "7")
         assert refused.exit_code == 2 and "does not reach there. Give a later one." in refused.output
-        for wrong in (["rollback"], ["rollback", "x"], ["pause", "3"], ["what-if", "q1_deg"], ["reboot"]):
+        for wrong in (["rollback"], ["rollback", "x"], ["pause", "3"], ["reboot"]):
             assert armcal(*wrong).exit_code == 2, wrong
     gone = armcal("status")
     assert gone.exit_code == 2 and "armcal recalibrate" in gone.output

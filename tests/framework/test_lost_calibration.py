@@ -24,7 +24,6 @@ COMMANDS = {
     "export": ("export", "{0}", "--format", "yaml", "--out", "{1}"),
     "serve": ("serve", "{0}", "--evaluator", "interpreted"),
     "capability": ("capability", "{0}", "--out", "{1}"),
-    "what-if": ("what-if", "{0}", "--poses", CONFIGS / "demo.csv"),
     "recalibrate": ("recalibrate", "{0}", "--from", CONFIGS / "demo.csv", "--out", "{1}"),
 }
 

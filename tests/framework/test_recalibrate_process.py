@@ -69,7 +69,6 @@ def test_signals_and_control_of_a_running_process(tmp_path: Path, number: signal
     assert ask(folder, {"command": "rollback", "to": target})["count"] == 7
     assert ask(folder, {"command": "rollback", "to": "p7"})["to"] == target
     assert "found no record 'p99'" in ask(folder, {"command": "rollback", "to": "p99"})["error"]
-    assert ask(folder, {"command": "what_if", "joints": {"q1_mrad": 500}})["joints"] == {"arm.q1": 0.5}
     assert "expected a sequence number" in ask(folder, {"command": "rollback"})["error"]
     assert ask(folder, {"command": "resume"})["ok"]
     wait_for(folder, '"p31"')

@@ -14,7 +14,7 @@ from armcal_online.running.control import GOOD, ask, is_running
 from armcal_online.running.outputs import STATUS
 from armcal_online.watch.events import parsed
 
-_COMMANDS = ("status", "pause", "resume", "finish", "rollback", "what-if")
+_COMMANDS = ("status", "pause", "resume", "finish", "rollback")
 
 
 @click.command()
@@ -27,8 +27,7 @@ def control(console: Console, folder: Path, command: str, values: tuple[str, ...
     """Query or command the recalibration that runs in FOLDER.
 
     `rollback good` takes up the estimate as it was after the last good record, `rollback record m139` after the record
-    of that name, `rollback 120` after entry 120; they and `status` work after the end too. `what-if q1_deg=10 ...`
-    predicts the tip.
+    of that name, `rollback 120` after entry 120; they and `status` work after the end too.
     """
     request: dict[str, Any] = {"command": command}
     if command == "rollback":
@@ -42,8 +41,6 @@ def control(console: Console, folder: Path, command: str, values: tuple[str, ...
         console.warn("no recalibration runs here: this is the last status that one wrote.")
         _show(console, status)
         return
-    elif command == "what-if":
-        request = {"command": "what_if", "joints": dict(map(_value, values))}
     elif values:
         text = f"found {' '.join(values)}, expected nothing more."
         raise InputError(text, where=Location(command), hint="Leave it out.")
@@ -76,13 +73,3 @@ def _target(values: tuple[str, ...]) -> int | str:
         where=Location("rollback"),
         hint=f"For example: armcal control DIR rollback 120, or record m139, or rollback {GOOD}.",
     )
-
-
-def _value(text: str) -> tuple[str, float]:
-    name, _, number = text.partition("=")
-    try:
-        return name.strip(), float(number)
-    except ValueError:
-        raise InputError(
-            f"found {text!r}, expected NAME_UNIT=NUMBER.", where=Location("what-if"), hint="For example q1_deg=10."
-        ) from None

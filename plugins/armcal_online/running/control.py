@@ -6,13 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from armcal.base.units import from_unit
 from armcal.errors import InputError, Location
 from armcal.io.journal.reader import read_entries
 from armcal.io.json_server import Answer, JsonServer
 from armcal.io.unix_socket import short_address
-from armcal.measure.column_match import spellings
-from armcal.measure.reader import ReadRequest
 
 from armcal_online.running.loop import Recalibration
 from armcal_online.running.state_replayer import RECORD
@@ -20,7 +17,7 @@ from armcal_online.running.state_replayer import RECORD
 SOCKET = "control.sock"
 GOOD = "good"
 """In place of a sequence number: that of the last good record."""
-COMMANDS = ("status", "pause", "resume", "rollback", "finish", "what_if")
+COMMANDS = ("status", "pause", "resume", "rollback", "finish")
 
 
 def control_server(folder: Path, answer: Answer) -> JsonServer:
@@ -83,9 +80,6 @@ def answer(recalibration: Recalibration, request: Mapping[str, Any]) -> Mapping[
             recalibration.finishing = "It was asked to finish."
         case "rollback":
             return {"ok": True, **rolled_back(recalibration, request.get("to"))}
-        case "what_if":
-            session = recalibration.session
-            return {"ok": True, **session.what_if(joint_values(request.get("joints"), session.request))}
         case other:
             raise InputError(f"found the command {other!r}, expected one of {', '.join(COMMANDS)}.")
     return {"ok": True, **recalibration.status()}
@@ -127,25 +121,3 @@ def entry_named(journal: Path, name: str) -> int:
         hint = "Give an entry's number or a record's name, as events have them, or the last good record: rollback good."
         raise InputError(f"found no record {name!r} in the journal.", where=Location("rollback"), hint=hint)
     return named[-1]
-
-
-def joint_values(joints: Any, request: ReadRequest) -> dict[str, float]:
-    """Values by channel (SI), from names with units (``q1_deg``) or channels in SI (``arm.q1``).
-
-    Raises:
-        InputError: a name is not known, or a value is no number.
-    """
-    if not isinstance(joints, dict) or not joints:
-        raise InputError("found no joints.", where=Location("joints"), hint='For example {"q1_deg": 10}.')
-    names = {name: (w.channel, unit) for w in request.channels for name, unit in spellings(w).items()}
-    names |= {w.channel: (w.channel, "1") for w in request.channels}
-    values: dict[str, float] = {}
-    for name, value in joints.items():
-        if name not in names:
-            hint = f"Known are {', '.join([*names][:6])}, and others."
-            raise InputError("it is not known.", where=Location(f"joints.{name[:60]}"), hint=hint)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 1e9:
-            raise InputError("it is no number.", where=Location(f"joints.{name[:60]}"), hint="Give a finite number.")
-        channel, unit = names[name]
-        values[channel] = from_unit(float(value), unit)
-    return values

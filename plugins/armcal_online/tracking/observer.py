@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from armcal.base.arrays import Array, Indices
@@ -129,26 +129,6 @@ class Observer:
     def freedom(self, readings: Sequence[Reading]) -> float:
         """Degrees of freedom with which the noise of a record is known: those of its least known reading."""
         return min(self._freedoms[reading.factor] for reading in readings)
-
-    def predicted(self, values: Array, channels: Mapping[str, float]) -> tuple[Reading, ...]:
-        """Readings of a record with these joints and surroundings, as they are predicted at values.
-
-        Raises:
-            NotConvergedError: no equilibrium there.
-        """
-        measured = {name: 0.0 for kernel in self.problem.kernels for name in kernel.factor.output_channels}
-        readings = []
-        for reading in self.readings({**measured, **channels}, {}):
-            kernel, own, record, state = self._repeated(values, reading)
-            factor = kernel.factor
-            outputs = np.empty((len(factor.output_channels) + factor.tools.numel(), LANES))
-            kernel.predict(own, record, state, outputs)
-            read = reading.record.copy()
-            for row, channel in enumerate(factor.output_channels):
-                if channel in factor.channels:
-                    read[factor.channels.index(channel)] = outputs[row, 0]
-            readings.append(replace(reading, record=read))
-        return tuple(readings)
 
     def joint_noise(self, values: Array, readings: tuple[Reading, ...]) -> JointNoise:
         """What noise of the joints' own readings adds at values.

@@ -20,7 +20,6 @@ from armcal.config.system import build_component
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ArmcalError, ConfigError, DataError, Location
 from armcal.estimate.online import Linearised, OnlineEstimator, normalised_innovation_squared
-from armcal.estimate.validation import error_unit
 from armcal.measure.reader import ReadRequest
 from armcal.plugins import PluginRegistry, discover
 
@@ -43,7 +42,6 @@ from armcal_online.tracking.slow_changes import SlowChanges
 from armcal_online.tracking.start import filter_setup
 from armcal_online.tracking.state import Arrival, State, Tick, advanced, remembering, ticked, troubled
 from armcal_online.tracking.updated import calibration_text, deviations
-from armcal_online.tracking.what_if import worth_of_record
 from armcal_online.tracking.window_evidence import HypothesisFilter
 
 _WEEK = 7.0
@@ -273,23 +271,6 @@ class Recalibrator:
             "last_good": events.last_good(state),
             "parameters": self.estimate,
             "evaluator": self.setup.problem.backend,
-        }
-
-    def what_if(self, joints: Mapping[str, float]) -> dict[str, Any]:
-        """How much a record at these joint angles (by channel, rad or m) would determine.
-
-        Raises:
-            DataError: joints are missing, or no measurement reads a single pose.
-        """
-        channels = [f"{a.name}.{j}" for a in self._calibration.system.arms.values() for j in a.commanded]
-        missing = [channel for channel in channels if channel not in joints]
-        if missing:
-            raise DataError(f"found no angle for {', '.join(missing)}.", hint="Give one for each joint.")
-        worth = worth_of_record(self.setup.observer, self.state.belief, joints)
-        return {
-            "bits": worth.bits,
-            f"prediction_sd_{error_unit(self.setup.problem)}": 1000 * worth.deviation,
-            "tells_most": dict(worth.tells_most),
         }
 
     def snapshot(self) -> dict[str, Any]:
