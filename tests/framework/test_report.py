@@ -139,7 +139,6 @@ def result_of(
         table=_table(errors, split),
         verdict=judge(
             found,
-            after / 0.4,
             errors.calibrated_mm,
             split.train,
             errors.calibrated_mm[split.holdout],
