@@ -32,7 +32,6 @@ ROOMS = (
     ("devices",),
     ("testing",),
     ("scaffold",),
-    ("doctor",),
     ("api", "cli"),
 )
 """Lowest first: a room imports only rooms above it in this list, at run time, lazily and for types alike."""

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from importlib import import_module, metadata
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from armcal.errors import ArmcalError, PluginError
 
-_DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow"}
+if TYPE_CHECKING:
+    from packaging.requirements import Requirement
+
+DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "serial": "pyserial", "yaml": "pyyaml"}
 """Of modules that are called otherwise than the distribution that they come with."""
 
 
@@ -44,17 +47,25 @@ def missing_library(fault: ImportError, needed_by: str = "this") -> ArmcalError:
 
 def extra_of(module: str) -> str | None:
     """The smallest extra that brings a module; None where none does."""
+    name = DISTRIBUTIONS.get(module, module)
+    members = {extra: [r.name for r in needed] for extra, needed in requirements().items() if extra}
+    bringing = [extra for extra, names in members.items() if name in names]
+    return min(bringing, key=lambda extra: len(members[extra]), default=None)
+
+
+def requirements() -> dict[str, list[Requirement]]:
+    """What armcal needs in any case, under the empty name, and what each extra adds; none of what its makers need."""
     from packaging.requirements import Requirement
 
     try:
         needed = [Requirement(text) for text in metadata.requires("armcal") or []]
         extras = metadata.metadata("armcal").get_all("Provides-Extra") or []
     except metadata.PackageNotFoundError:
-        return None
-    members = {
-        extra: [r.name for r in needed if r.marker and r.marker.evaluate({"extra": extra})]
-        for extra in extras
-        if extra not in ("test", "dev", "docs", "bench")
+        return {}
+    always = [r for r in needed if r.marker is None or r.marker.evaluate({"extra": ""})]
+    others = [r for r in needed if r.marker and r not in always]
+    users = [extra for extra in extras if extra not in ("test", "dev", "docs", "bench")]
+    return {
+        "": always,
+        **{name: [r for r in others if r.marker and r.marker.evaluate({"extra": name})] for name in users},
     }
-    bringing = [extra for extra, names in members.items() if _DISTRIBUTIONS.get(module, module) in names]
-    return min(bringing, key=lambda extra: len(members[extra]), default=None)

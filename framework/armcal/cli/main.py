@@ -37,7 +37,7 @@ COMMANDS = {
     "convert": ("armcal.cli.convert:convert", "The geometry of an arm in another form: mdh, poe, urdf."),
     "simulate": ("armcal.cli.simulate:simulate", "Simulate measurements of an arm with known parameters."),
     "plugins": ("armcal.cli.plugins:plugins", "List plugins, or check one."),
-    "doctor": ("armcal.cli.doctor:doctor", "What is installed, what works, and what is missing."),
+    "doctor": ("armcal.cli.doctor:doctor", "What is installed and what is missing; a simulated arm calibrated."),
 }
 
 _GLOBAL = ("--plugin", "--disable-plugin")
