@@ -1,14 +1,11 @@
-"""``armcal new robot``: from rows, a URDF or answers to a calibration that works; bad input is refused by place."""
+"""``armcal new robot``: from rows or a URDF to a calibration that works; bad input is refused by place."""
 
 from __future__ import annotations
 
 import json
 import math
-import os
 import re
 import shlex
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,8 +35,8 @@ REGISTRY = discover()
 PAGE = page("new_robot.md")
 
 
-def new_robot(*arguments: str, answers: str | None = None) -> Result:
-    return CliRunner().invoke(cli, ["new", "robot", *arguments], input=answers, prog_name="armcal")
+def new_robot(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, ["new", "robot", *arguments], prog_name="armcal")
 
 
 @pytest.fixture
@@ -316,50 +313,6 @@ def test_the_trackers_frame_stays_out_of_a_urdfs_joints(here: Path) -> None:
     assert now == first
 
 
-ANSWERS = """standard
-2
-revolute
-90
-0
-0
-100
--120
-120
-500
-0
-0
-20
-revolute
-0
-0.2 m
-not a number
-0
-0
--90
--100
-90
-0
-"""
-
-
-def test_answers_make_a_robot(here: Path) -> None:
-    ran = new_robot("asked", answers=ANSWERS)
-    assert ran.exit_code == 0, ran.output
-    told = yaml.safe_load((here / "asked" / "arm.yaml").read_text(encoding="utf-8"))["arms"]["arm"]
-    assert told["model"]["rows"][1]["a_mm"] == 200
-    assert told["links"] == {"link1": {"mass_g": 500, "com_mm": [0, 0, 20], "frame": "row1"}}
-    plan = yaml.safe_load((here / "asked" / "plan.yaml").read_text(encoding="utf-8"))["plan"]
-    assert plan["limits_deg"] == {"q1": [-120, 120], "q2": [-90, 90]}
-
-
-@pytest.mark.parametrize("lines", [0, 1, 5, 20])
-def test_answers_that_end_early_are_refused(lines: int, here: Path) -> None:
-    ran = new_robot("asked", answers="".join(ANSWERS.splitlines(keepends=True)[:lines]))
-    assert ran.exit_code == 2
-    assert "the answers ended before the last question" in ran.output
-    assert list(here.iterdir()) == []
-
-
 # Which way is up
 
 
@@ -419,23 +372,6 @@ def test_up_is_an_axis_or_three_numbers(up: str, expected: tuple[float, ...] | N
             direction(up)
     else:
         assert direction(up) == pytest.approx(expected)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
-def test_somebody_at_a_terminal_is_asked_which_way_is_up_and_of_no_other_frame(here: Path) -> None:
-    import pty
-
-    rows = table(here, f"{HEADER},mass_g\n90,0,0,120,400\n0,200,0,0,900\n")
-    master, slave = pty.openpty()
-    os.write(master, b"sideways\n-y\n")
-    command = [sys.executable, "-m", "armcal.cli", "new", "robot", "arm", "--dh", rows, "--convention", "standard"]
-    ran = subprocess.run(command, stdin=slave, capture_output=True, text=True, timeout=120, cwd=here)
-    os.close(master), os.close(slave)
-    assert "up in the tracker's base frame" in ran.stdout and "found 'sideways' for up" in ran.stdout
-    assert "the target in the tool's frame" not in ran.stdout
-    written = (here / "arm" / "arm.yaml").read_text(encoding="utf-8")
-    assert "gravity_m_s2: [0, 9.81, 0]" in written and "target_mm: [0, 0, 0]" in written
 
 
 # Where the target sits
@@ -547,6 +483,11 @@ def test_a_faulty_urdf_is_refused(fault: str, here: Path) -> None:
 
 
 COMMANDS = {
+    "no description": (
+        [],
+        "no description of the robot r, expected a file of it, or the name of a known skeleton (so101)",
+    ),
+    "a way up alone": (["--up", "z"], "Give --dh FILE with --convention, or --urdf FILE"),
     "no convention": (["--dh", "rows.csv"], "two go by the same name"),
     "two sources": (["--dh", "rows.csv", "--urdf", "r.urdf"], "found both --dh and --urdf"),
     "a tip of rows": (["--tip", "hand"], "found --tip without --urdf"),

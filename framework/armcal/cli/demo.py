@@ -56,7 +56,7 @@ def demo(ctx: click.Context, console: Console, name: str, out: Path | None) -> N
         f"Open {results / 'report.html'} in a browser. Then:",
         f"  armcal identify {folder / _CONFIG}",
         f"  armcal predict {results / 'calibration.yaml'} --poses {folder / 'demo.csv'} --out predicted.csv",
-        "  armcal new robot NAME      for an arm of your own",
+        "  armcal new robot NAME --urdf FILE      for an arm of your own",
     ):
         console.line(text)
 

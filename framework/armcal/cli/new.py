@@ -58,7 +58,7 @@ def new_plugin(console: Console, name: str, kind: str, package: bool, out: Path 
 def new_robot(console: Console, name: str, out: Path | None, **source: Any) -> None:
     """Write all that the robot NAME needs to be calibrated, and try it on simulated records.
 
-    Without --dh and --urdf it asks for the rows; a robot called so101 has rows to begin with.
+    Give --dh with --convention, or --urdf; a robot called so101 has rows to begin with.
     """
     from armcal.cli.new_robot import Source, begin  # all of the solver, which a plugin's files do without
 

@@ -1,13 +1,9 @@
-"""What ``armcal new robot`` does, and what it asks for: the rows of an arm, each number with its unit."""
+"""What ``armcal new robot`` does with what it was given."""
 
 import math
 import sys
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-
-import click
 
 from armcal.base.units import from_unit, parse_quantity
 from armcal.cli.common import Console, command_line
@@ -19,24 +15,16 @@ from armcal.scaffold import dh_table
 from armcal.scaffold.dh_table import read_rows
 from armcal.scaffold.naming import robot_name
 from armcal.scaffold.robot import (
-    ASSUMED_TRAVEL,
-    ASSUMED_TURN,
-    FEWEST_JOINTS,
     MOST,
-    MOST_JOINTS,
     WIDTHS,
     Convention,
-    Mass,
     Robot,
-    RobotJoint,
-    Row,
     Unit,
     robot_of_rows,
 )
 from armcal.scaffold.robot_files import try_out, write_robot
 from armcal.scaffold.urdf_source import robot_of_urdf
 
-_UNKNOWN = "unknown"
 CONVENTIONS: dict[str, Convention] = {"standard": "standard", "modified": "craig"}
 SKELETONS = {path.stem: path for path in sorted(Path(dh_table.__file__).with_name("skeletons").glob("*.csv"))}
 """Rows of arms that many people have, in round numbers, by the name that begins one."""
@@ -44,7 +32,7 @@ SKELETONS = {path.stem: path for path in sorted(Path(dh_table.__file__).with_nam
 
 @dataclass(frozen=True)
 class Source:
-    """What a robot is made from, as given on the command line; it is asked for if nothing is given."""
+    """What a robot is made from, as given on the command line."""
 
     dh: Path | None
     convention: str | None
@@ -60,10 +48,8 @@ def begin(console: Console, name: str, source: Source, folder: Path) -> None:
     """Write a robot's folder, calibrate its simulated records, and say how that went."""
     registry = console.registry()
     robot = _robot(robot_name(name), source, registry)
-    up, target = source.up, source.target
-    if up is None and robot.has_masses and sys.stdin.isatty():  # gravity bends the arm, and somebody is there to ask
-        up = ask_up()
-    robot = replace(robot, up=direction(up) if up else robot.up, target=place(target) if target else robot.target)
+    up = direction(source.up) if source.up else robot.up
+    robot = replace(robot, up=up, target=place(source.target) if source.target else robot.target)
     made = write_robot(replace(robot, widths=_widths(source)), folder, registry)
     with console.progress() as progress:
         trial = try_out(made, registry, command_line(), progress)
@@ -124,7 +110,11 @@ def _robot(name: str, source: Source, registry: PluginRegistry) -> Robot:
     if not source.dh and name in SKELETONS:
         return robot_of_rows(name, "standard", read_rows(SKELETONS[name]))
     if not source.dh:
-        return robot_of_rows(name, *ask_rows(CONVENTIONS))
+        raise ConfigError(
+            f"found no description of the robot {name}, expected a file of it, or the name of a known skeleton "
+            f"({', '.join(SKELETONS)}).",
+            hint="Give --dh FILE with --convention, or --urdf FILE.",
+        )
     if source.convention is None:
         raise ConfigError(
             "found --dh without --convention: two go by the same name.",
@@ -132,31 +122,6 @@ def _robot(name: str, source: Source, registry: PluginRegistry) -> Robot:
             "Rot_x(alpha) Trans_x(a) Rot_z(theta) Trans_z(d).",
         )
     return robot_of_rows(name, CONVENTIONS[source.convention], read_rows(source.dh))
-
-
-def ask_rows(conventions: Mapping[str, Convention]) -> tuple[Convention, tuple[Row, ...]]:
-    """The convention and the rows, from the terminal or standard input.
-
-    Raises:
-        ConfigError: the answers end early.
-    """
-    try:
-        chosen = click.prompt("Denavit-Hartenberg rows", type=click.Choice(tuple(conventions)), default="standard")
-        count = click.prompt("joints", type=click.IntRange(FEWEST_JOINTS, MOST_JOINTS))
-        return conventions[chosen], tuple(_row(number) for number in range(1, count + 1))
-    except click.Abort as fault:
-        raise ConfigError(
-            "the answers ended before the last question.", hint="Answer all of them, or give --dh FILE or --urdf FILE."
-        ) from fault
-
-
-def ask_up() -> str:
-    """Which way is up, as ``direction`` takes it; empty if not known."""
-    words = "up in the tracker's base frame (x, y, z, -x, -y, -z, three numbers, or unknown)"
-    answer = click.prompt(
-        words, default=_UNKNOWN, value_proc=lambda text: text if text == _UNKNOWN else _checked(direction, text)
-    )
-    return "" if answer == _UNKNOWN else str(answer)
 
 
 def direction(text: str) -> tuple[float, float, float]:
@@ -180,15 +145,6 @@ def direction(text: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _checked(read: Callable[[str], object], text: str) -> str:
-    """A text that can be read; else click asks again."""
-    try:
-        read(text)
-    except ConfigError as fault:
-        raise click.BadParameter(fault.message) from fault
-    return text
-
-
 def place(text: str) -> tuple[float, float, float]:
     """A point (m) from ``30,0,12.5`` in mm, or with units: ``3 cm, 0, 12.5 mm``.
 
@@ -196,53 +152,13 @@ def place(text: str) -> tuple[float, float, float]:
         ConfigError: it is none.
     """
     try:
-        x, y, z = (_quantity(part.strip(), "mm", "length") for part in text.split(","))
-    except (ValueError, click.BadParameter) as fault:
+        parts = [part.strip() for part in text.split(",")]
+        x, y, z = (from_unit(float(p), "mm") if is_number(p) else parse_quantity(p, "length") for p in parts)
+        if not all(abs(value) <= MOST["length"] for value in (x, y, z)):
+            raise ValueError(f"{text} is longer than an arm")
+    except ValueError as fault:
         raise ConfigError(
             f"found {text!r} for the target, expected three lengths such as 30,0,12.5 (mm) or 3 cm,0,0.",
             hint="Give the target's place in the frame of the last row, or of the URDF's tip.",
         ) from fault
     return x, y, z
-
-
-def _row(number: int) -> Row:
-    name = f"q{number}"
-    click.echo(f"joint {number}, {name}:", err=True)
-    turns = click.prompt("  it is", type=click.Choice(("revolute", "prismatic")), default="revolute") == "revolute"
-    alpha, a = _ask("  alpha", "deg", "angle"), _ask("  a", "mm", "length")
-    theta, d = _ask("  theta", "deg", "angle"), _ask("  d", "mm", "length")
-    unit, dimension = ("deg", "angle") if turns else ("mm", "length")
-    low, high = (round(end / from_unit(1.0, unit)) for end in (ASSUMED_TURN if turns else ASSUMED_TRAVEL))
-    lower = _ask("  lower limit", unit, dimension, default=low)
-    upper = _ask("  upper limit", unit, dimension, default=high, above=lower)
-    mass = _ask("  mass of its link, 0 if not known", "g", "mass", lowest=0.0)
-    com = [_ask(f"  its centre, {axis} in the row's frame", "mm", "length") for axis in "xyz"] if mass else []
-    known = Mass(mass, (com[0], com[1], com[2])) if mass else None
-    return Row(RobotJoint(name, turns, (lower, upper)), alpha, a, theta, d, known)
-
-
-def _ask(
-    words: str, unit: str, dimension: str, default: float = 0, lowest: float = -math.inf, above: float | None = None
-) -> float:
-    """A number, in SI; asked in ``unit``, and taken in another one that is written behind it."""
-
-    def read(text: Any) -> float:
-        quantity = _quantity(str(text), unit, dimension)
-        if quantity < lowest or (above is not None and quantity <= above):
-            raise click.BadParameter(f"found {text}, expected more.")
-        return quantity
-
-    return float(click.prompt(f"{words}, {unit}", default=str(default), value_proc=read))
-
-
-def _quantity(text: str, unit: str, dimension: str) -> float:
-    if is_number(text):
-        value = from_unit(float(text), unit)
-    else:
-        try:
-            value = parse_quantity(text, dimension)
-        except ValueError as fault:
-            raise click.BadParameter(str(fault)) from fault
-    if not abs(value) <= MOST[dimension]:
-        raise click.BadParameter(f"found {text}, expected an arm's {dimension}.")
-    return value
