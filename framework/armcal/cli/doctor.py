@@ -36,15 +36,13 @@ EXTRAS = {
     "ros2": "recordings of ROS 2 (reader rosbag2, armcal bag)",
     "mujoco": "checking an export for MuJoCo by MuJoCo itself",
 }
-SPARED = {"pyserial": "no servo board on a serial port", "joblib": "folds, starts and studies run in one process only"}
-"""Libraries without which an arm can be calibrated all the same, and what is lost."""
 _MARKS = {"ok": ("ok  ", "green"), "note": ("-   ", None), "warning": ("warn", "yellow"), "fault": ("FAIL", "red")}
 _TRIED = "import sys\ntry: {}\nexcept Exception as e: sys.exit(' '.join(f'{{type(e).__name__}}: {{e}}'.split())[:200])"
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report: a ``note`` is not there and not needed; with a ``fault`` no arm can be calibrated."""
+    """One line of the report: a ``note`` is not there and not needed; a ``fault`` is that no arm can be calibrated."""
 
     section: str
     subject: str
@@ -66,15 +64,15 @@ def doctor(as_json: bool) -> None:
             hint = f"\n     {finding.hint}" if finding.hint else ""
             click.echo(f"{click.style(mark, fg=colour)} {finding.subject}: {finding.text}{hint}")
         findings.append(finding)
-    broken, warned = (", ".join(f.subject for f in findings if f.state == state) for state in ("fault", "warning"))
+    works = not any(finding.state == "fault" for finding in findings)
+    broken = ", ".join(f.subject for f in findings if f.state in ("warning", "fault"))
     if as_json:
-        content = {**JSON_SCHEMA, "works": not broken, "findings": [asdict(finding) for finding in findings]}
+        content = {**JSON_SCHEMA, "works": works, "findings": [asdict(finding) for finding in findings]}
         click.echo(json.dumps(content, indent=2))
-    elif not broken:
-        rest = f"Arms can be calibrated here; what does not work: {warned}."
-        click.echo(f"\n{rest if warned else 'Everything works.'}")
-    if broken:
-        click.echo(f"armcal: arms cannot be calibrated here, see: {broken}.", err=True)
+    elif works:
+        click.echo(f"\nArms can be calibrated here; what does not work: {broken or 'nothing'}.")
+    if not works:
+        click.echo(f"armcal: arms cannot be calibrated here; what does not work: {broken}.", err=True)
         sys.exit(EXIT_BAD_INPUT)
 
 
@@ -124,10 +122,7 @@ def _libraries() -> Iterator[Finding]:
         looked = dict(zip(every, pool.map(look_at, every.values()), strict=True))
     for name in [r.name for r in always]:
         state, text, hint = looked[name]
-        if state in ("note", "fault"):
-            state, lost = ("warning", SPARED[name]) if name in SPARED else ("fault", "nothing works without it")
-            text = f"{text}: {lost}"
-        yield Finding("libraries", name, state, text, hint)
+        yield Finding("libraries", name, "warning" if state == "note" else state, text, hint)
     for extra, needed in needs.items():
         wrong = [(r.name, *looked[r.name]) for r in needed if looked[r.name][0] != "ok"]
         broken = [hint for _, state, _, hint in wrong if state != "note"]
@@ -138,7 +133,7 @@ def _libraries() -> Iterator[Finding]:
 
 
 def look_at(requirement: Requirement) -> tuple[str, str, str]:
-    """Whether a library is there (else a ``note``), imports (else a ``fault``), and is in the range; what to do."""
+    """Whether a library is there (else a ``note``), imports, and is in the range (else a ``warning``); what to do."""
     name, pip = requirement.name, f"'{requirement.name}{requirement.specifier}'."
     pip = "-e . in the checkout." if name == "armcal" else pip
     try:
@@ -149,7 +144,7 @@ def look_at(requirement: Requirement) -> tuple[str, str, str]:
     _, fault = in_child(f"import {module}; print('loaded')")
     if fault:
         text = f"{version} does not load from {getattr(find_spec(module), 'origin', 'anywhere')} ({fault})"
-        return "fault", text, f"Run pip install --force-reinstall {pip}"
+        return "warning", text, f"Run pip install --force-reinstall {pip}"
     if not requirement.specifier.contains(version, prereleases=True):
         return "warning", f"{version} is not in the range {requirement.specifier}", f"Run pip install {pip}"
     return "ok", version, ""
