@@ -237,7 +237,8 @@ def test_it_speaks_to_people_too(monkeypatch: pytest.MonkeyPatch) -> None:
 
     healthy = said()
     assert healthy.exit_code == 0
-    assert "Arms can be calibrated here" in healthy.output
+    assert "Everything works." in healthy.output
+    assert "what does not work: joblib." in said(**{"import joblib": "broken"}).output
     broken = said(main="off by 3 mm", components="odd")
     assert broken.exit_code == 2
     assert "FAIL calibrate" in broken.stdout and "warn all plugins: cannot be loaded: odd" in broken.stdout

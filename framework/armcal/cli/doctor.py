@@ -70,7 +70,8 @@ def doctor(as_json: bool) -> None:
         content = {**JSON_SCHEMA, "works": works, "findings": [asdict(finding) for finding in findings]}
         click.echo(json.dumps(content, indent=2))
     elif works:
-        click.echo(f"\nArms can be calibrated here; what does not work: {broken or 'nothing'}.")
+        rest = f"Arms can be calibrated here; what does not work: {broken}."
+        click.echo(f"\n{rest if broken else 'Everything works.'}")
     if not works:
         click.echo(f"armcal: arms cannot be calibrated here; what does not work: {broken}.", err=True)
         sys.exit(EXIT_BAD_INPUT)
