@@ -14,7 +14,7 @@ from armcal.base.settings import Settings
 from pydantic import Field
 from scipy.linalg import solve_triangular
 
-from armcal_residual.linear import Numbers, PartSettings, Positive
+from armcal_residual.linear import Numbers, Positive
 
 Kind = Literal["angle", "length", "approach", "payload", "temperature"]
 _JITTER = 1e-8
@@ -42,13 +42,19 @@ class TermSettings(Settings):
     share: Positive = 1.0
 
 
-class ProcessSettings(PartSettings):
-    """A process of one term, or the sum of several.
+class ProcessSettings(Settings):
+    """What was learned of some corrections: a process of one term, or the sum of several, as weights of M features.
 
-    ``between`` is the mean share of its variance that features left to the records that taught it, which stood between
-    its poses. These showed it, so that it is in the noise.
+    ``first`` is the place of the first of them, one ``scale`` (m or rad) belongs to each. ``weights`` (M x corrections)
+    give the corrections; ``root`` (M x r) their variances: scale^2 times the features' prior variance less the squared
+    length of ``root``'s product with them. ``between`` is the mean share of the variance that features left to the
+    records that taught it, which stood between its poses. These showed it, so that it is in the noise.
     """
 
+    first: Annotated[int, Field(ge=0)]
+    scales: Annotated[tuple[Positive, ...], Field(min_length=1)]
+    weights: Numbers
+    root: Numbers
     terms: Annotated[tuple[TermSettings, ...], Field(min_length=1)]
     between: Annotated[float, Field(ge=0, le=1)] = 0.0
 

@@ -1,24 +1,19 @@
-"""Corrections that are linear in weights: what Gaussian processes at a few points and Fourier series have in common."""
+"""Weights of features: the likeliest of them, and how settings hold them."""
 
 from __future__ import annotations
 
 import base64
 import itertools
-from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
-import casadi as ca
 import numpy as np
-from armcal.arm.pose_residual import OF_TOOL, ModelErrors, PoseResidual, Postures
+from armcal.arm.pose_residual import OF_TOOL, ModelErrors
 from armcal.base.arrays import Array
-from armcal.base.se3 import Expression
-from armcal.base.settings import Settings
 from numpy.linalg import LinAlgError
 from pydantic import Field
 from scipy.linalg.lapack import dpotrf, dpotri
-from typing_extensions import override
 
 Numbers = Annotated[str, Field(min_length=1)]
 """An array of little-endian doubles, row by row, in base64: exact, and short."""
@@ -29,125 +24,6 @@ _LEAST_TAKEN = 1e-3
 _LEAST_KNOWN = 0.5
 """Weights that records determine: a function of fewer is none."""
 _UNSEEN = 1e-6
-_AT_A_TIME = 4096
-
-
-class PartSettings(Settings):
-    """What was learned of some corrections, as weights of M features.
-
-    ``first`` is the place of the first of them, one ``scale`` (m or rad) belongs to each. ``weights`` (M x corrections)
-    give the corrections; ``root`` (M x r) their variances: scale^2 times the features' prior variance less the squared
-    length of ``root``'s product with them.
-    """
-
-    first: Annotated[int, Field(ge=0)]
-    scales: Annotated[tuple[Positive, ...], Field(min_length=1)]
-    weights: Numbers
-    root: Numbers
-
-
-class LearnedSettings(Settings):
-    """What was learned (by armcal, not by hand), and ``within`` which commands of each joint (rad or m) it acts."""
-
-    learned: tuple[Any, ...] = ()
-    within: tuple[tuple[float, float], ...] = ()
-
-
-class LinearResidual(PoseResidual):
-    """A pose residual of features with weights."""
-
-    settings: LearnedSettings
-
-    @abstractmethod
-    def features(self, part: Any, commands: Any, approaches: Any, surroundings: Mapping[str, Any]) -> Any:
-        """Of a part: expressions (M x 1) of expressions, or an array (M x N) of arrays."""
-
-    @abstractmethod
-    def prior_variance(self, part: Any, features: Array) -> Array:
-        """Of the function where features are these (M x N), in units of the squared scale (N)."""
-
-    @property
-    def parts(self) -> Sequence[PartSettings]:
-        """What was learned."""
-        return self.settings.learned
-
-    @property
-    @override
-    def is_learned(self) -> bool:
-        return bool(self.parts)
-
-    def check(self) -> None:
-        """Refuse what was learned on another arm, or was damaged.
-
-        Raises:
-            ValueError: with what is wrong.
-        """
-        size = len(OF_TOOL) + len(self.joint_names)
-        zeros = np.zeros((len(self.joint_names), 1))
-        for part in self.parts:
-            known = len(self.settings.within) or len(self.joint_names)
-            if part.first + len(part.scales) > size or known != len(self.joint_names):
-                raise ValueError(f"found corrections of {known} joints: it was learned on an arm of other joints")
-            features = len(self.features(part, zeros, zeros, {}))
-            unpacked(part.weights, features, len(part.scales))
-            unpacked(part.root, features, None)
-
-    @override
-    def correction(
-        self, commands: Expression, approaches: Expression, surroundings: Mapping[str, Expression]
-    ) -> Expression:
-        rows = [ca.SX(0)] * (len(OF_TOOL) + len(self.joint_names))
-        for part in self.parts:
-            features = self.features(part, commands, approaches, surroundings)
-            weights = unpacked(part.weights, features.numel(), len(part.scales))
-            for i, moved in enumerate(ca.vertsplit(ca.mtimes(ca.DM(weights.T), features))):
-                rows[part.first + i] += moved
-        inside = ca.SX(1)
-        for command, (low, high) in zip(ca.vertsplit(commands), self.settings.within, strict=False):
-            inside = ca.logic_and(inside, ca.logic_and(command >= low, command <= high))
-        return ca.if_else(inside, ca.vertcat(*rows), 0)
-
-    @override
-    def corrections(self, postures: Postures) -> Array:
-        def moved(part: PartSettings, features: Array) -> Array:
-            return np.asarray(unpacked(part.weights, len(features), len(part.scales)).T @ features)
-
-        return np.where(self._inside(postures.commands), self._summed(postures, moved), 0.0)
-
-    def _inside(self, commands: Array) -> Any:
-        """Which commands (joints x N) are among those that it learned from (N)."""
-        if not self.settings.within:
-            return np.True_
-        low, high = np.array(self.settings.within).T[:, :, None]
-        return np.all((commands >= low) & (commands <= high), axis=0)
-
-    @override
-    def deviations(self, postures: Postures) -> Array:
-        """With all that was learned where it corrects nothing."""
-
-        def prior(part: PartSettings, features: Array) -> Array:
-            return np.outer(np.square(part.scales), self.prior_variance(part, features))
-
-        def left(part: PartSettings, features: Array) -> Array:
-            taken = np.sum((unpacked(part.root, len(features), None).T @ features) ** 2, axis=0)
-            return np.maximum(prior(part, features) - np.outer(np.square(part.scales), taken), 0.0)
-
-        inside = self._inside(postures.commands)
-        result = np.sqrt(self._summed(postures, left))
-        if np.all(inside):
-            return np.asarray(result)
-        return np.where(inside, result, np.sqrt(self._summed(postures, prior)))
-
-    def _summed(self, postures: Postures, of_part: Callable[[PartSettings, Array], Array]) -> Array:
-        """What parts give by their features, by correction (6 + joints x N); of some thousand postures at a time."""
-        total = np.zeros((len(OF_TOOL) + len(self.joint_names), postures.commands.shape[1]))
-        for start in range(0, total.shape[1], _AT_A_TIME):
-            here = slice(start, start + _AT_A_TIME)
-            own = postures.subset(here)
-            for part in self.parts:
-                rows = slice(part.first, part.first + len(part.scales))
-                total[rows, here] += of_part(part, self.features(part, own.commands, own.approaches, own.surroundings))
-        return total
 
 
 @dataclass(frozen=True)
@@ -189,11 +65,6 @@ class Products:
     vector: Array
     square: float
     rows: int
-
-    @classmethod
-    def of(cls, features: Array, errors: Array) -> Products:
-        """From rows."""
-        return cls(features.T @ features, features.T @ errors, float(errors @ errors), len(errors))
 
 
 def regressed(products: Products, sizes: Sequence[int], start: tuple[Array, float] | None = None) -> Regression:

@@ -11,4 +11,3 @@ def armcal_register_residuals(register: Register) -> None:
         "armcal_residual.gaussian_process:GaussianProcess",
         "a Gaussian process over the sines and cosines of the joints",
     )
-    register("fourier", "armcal_residual.fourier:Fourier", "a few harmonics of each joint")

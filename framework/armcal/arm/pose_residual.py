@@ -101,7 +101,7 @@ class PoseResidual(ABC):
     def learned(self, errors: ModelErrors) -> PoseResidual | None:
         """The same with what records say; None where they are too few. What it has learned before is a mere start.
 
-        Where a joint is beyond the commands of these records (``MARGIN``), it corrects nothing.
+        Where more than one joint is beyond the commands of these records (``MARGIN``), it corrects nothing.
         """
 
     @abstractmethod
