@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.diagnose.clustered import widened
-from armcal.diagnose.evidence_findings import what_neighbours_cost
+from armcal.diagnose.evidence_findings import _what_neighbours_cost
 from armcal.estimate.estimator import Estimate, estimate
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.problem.problem import Problem
@@ -60,7 +60,7 @@ def test_along_a_path_intervals_grow_and_the_verdict_says_by_how_much() -> None:
     np.testing.assert_allclose(wide.deviations, plain.deviations * wide.widened)
     inverse = np.linalg.inv(wide.square_root_information)
     np.testing.assert_allclose(np.sqrt(np.sum(inverse**2, axis=1)), wide.deviations, rtol=1e-6)
-    text = what_neighbours_cost(wide)
+    text = _what_neighbours_cost(wide)
     assert "wider, by a factor of" in text and wide.names[int(np.argmax(wide.widened))] in text
 
 
@@ -70,7 +70,7 @@ def test_in_random_order_they_do_not_and_nobody_says_so() -> None:
     assert wide.widened is not None
     assert np.median(wide.widened or (1.0,)) < 1.15
     if not wide.widened:
-        assert "does not widen" in what_neighbours_cost(wide)
+        assert "does not widen" in _what_neighbours_cost(wide)
 
 
 @pytest.mark.slow

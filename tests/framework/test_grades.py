@@ -98,10 +98,11 @@ def test_an_estimate_beyond_four_deviations_of_its_prior_is_bad(tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_a_fit_with_nearly_as_many_parameters_as_equations_is_bad(tmp_path: Path) -> None:
-    """Ten records: 30 equations for 28 parameters that nothing else holds."""
+def test_a_fit_with_nearly_as_many_parameters_as_equations_is_overfitted(tmp_path: Path) -> None:
+    """Ten records: 30 equations for 28 parameters that nothing else holds. At 2.4 mm it is better than 24 mm."""
     code, verdict = ran(tmp_path, "validation.holdout=0.95")
-    assert code == 3 and "Overfitted: records that did not train have an error of" in bad(verdict)
+    texts = [finding["text"] for finding in verdict["findings"] if finding["grade"] == "warning"]
+    assert code == 0 and any("Overfitted: records that did not train have an error of" in text for text in texts)
 
 
 def test_what_the_parameters_take_of_the_training_errors_is_no_overfitting() -> None:
@@ -113,9 +114,15 @@ def test_what_the_parameters_take_of_the_training_errors_is_no_overfitting() -> 
         values = rng.normal(size=2 * equations)
         found = np.linalg.lstsq(columns[:equations], values[:equations], rcond=None)[0]
         errors = np.linalg.norm((values - columns @ found).reshape(-1, 3), axis=1)
-        return bool(overfitted(errors[:30], errors[30:], equations, equations - spent))
+        return bool(overfitted(errors[:30], errors[30:], errors[30:] + np.nan, equations, equations - spent))
 
     assert not any(judged(spent) for spent in (5, 30, 60, 60, 60)) and all(judged(88) for _ in range(5))
+
+
+def test_overfitting_is_bad_where_the_nominal_arm_is_as_good() -> None:
+    trained, unseen = np.full(30, 0.1), np.full(30, 1.0)
+    grades = [overfitted(trained, unseen, np.full(30, nominal), 90, 80)[0].grade for nominal in (0.9, 1.1)]
+    assert grades == ["bad", "warning"]
 
 
 @pytest.mark.slow

@@ -259,7 +259,7 @@ def test_poses_beyond_the_records_are_named(answerer: Answerer, calibration: Cal
     far = middle + 0.7 * np.ptp(edges, axis=1) * (np.arange(6) == 1)
     answer = told(answerer, do="forward", joint_angles_deg=[middle.tolist(), far.tolist()])
     channels = {f"arm.{name}": np.deg2rad([a, b]) for name, a, b in zip(NAMES, middle, far, strict=True)}
-    sentence = beyond_records(ranges, Dataset(("1", "2"), channels), calibration.system.arms)
+    _, sentence = beyond_records(ranges, Dataset(("1", "2"), channels), calibration.system.arms)
     assert answer["beyond_records"] == [1] and answer["warning"] == sentence and "(q2 " in sentence
     moves = {"targets": answer["tools"], "path": True, "start_deg": middle.tolist()}
     heavy = told(answerer, do="compensate", **moves, payload_kg=9)

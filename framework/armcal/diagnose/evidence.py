@@ -46,7 +46,8 @@ class PriorsAlone:
 class Evidence:
     """All of it; what was not looked at, or is not known, is None.
 
-    ``unit`` is that of all errors, mm or mrad; ``name`` what they are errors of; ``rows`` how many numbers each is of.
+    ``unit`` is that of all errors, mm or mrad; ``name`` what they are errors of; ``noise`` how far noise puts each
+    record off (N), and of how many numbers that is.
     """
 
     structure: ResidualStructure | None = None
@@ -59,7 +60,7 @@ class Evidence:
     name: str = "Tip"
     rounding: Rounding | None = None
     elsewhere: Elsewhere | None = None
-    rows: int = 3
+    noise: tuple[Array, float] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json."""

@@ -163,8 +163,12 @@ def worse_than_aligned(judged_mm: Array, left_mm: float, spent: float, held: str
     return [Finding("bad", text, test, held or action)]
 
 
-def overfitted(trained_mm: Array, judged_mm: Array, equations: int, freedom: float, unit: str = "mm") -> list[Finding]:
+def overfitted(
+    trained_mm: Array, judged_mm: Array, nominal_mm: Array, equations: int, freedom: float, unit: str = "mm"
+) -> list[Finding]:
     """Errors of records that did not train beside those that did (nan where unknown), parameters counted.
+
+    It is bad where the nominal arm, which the same records placed, is as good.
 
     A fit that spends p of m equations leaves sqrt(1 - p/m) of the noise in the records that train it, so that their
     errors by sqrt(m / (m - p)) are the noise. Records that did not train have sqrt(1 + p / (m - p - 1)) times that
@@ -182,9 +186,10 @@ def overfitted(trained_mm: Array, judged_mm: Array, equations: int, freedom: flo
         f"the training records lead one to expect ({noise:.3g} {unit})."
     )
     test = f"medians; {equations - freedom:.0f} of {equations} equations are spent on parameters; limit {OVERFITTED:g}"
-    return [
-        Finding("bad", text, test, "Measure more poses, more different ones; free fewer parameters; or give priors.")
-    ]
+    action = "Measure more poses, more different ones; free fewer parameters; or give priors."
+    both = np.isfinite(judged_mm) & np.isfinite(nominal_mm)
+    gains = both.any() and np.mean(judged_mm[both]) < np.mean(nominal_mm[both])
+    return [Finding("warning" if gains else "bad", text, test, action)]
 
 
 def contradicting(minority: Minority | None, ids: Sequence[str]) -> list[Finding]:

@@ -11,7 +11,8 @@ from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.units import digits, display_unit, readable, to_unit
 from armcal.estimate.estimator import Estimate
-from armcal.estimate.validation import error_rows
+from armcal.estimate.validation import error_dimension
+from armcal.problem.factor_records import noise_roots
 from armcal.problem.motion import Motion
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -83,7 +84,7 @@ class Judged:
     position: Indices
 
 
-def noise_limit(errors: Array, rows: int) -> float:
+def noise_limit(errors: Array, rows: float) -> float:
     """Beyond what equal normal noise seldom (``BY_CHANCE``) puts any of these errors, each of so many numbers.
 
     Its size is known from their median; a range is seldom off by so little as a position is, so its medians count more.
@@ -91,6 +92,25 @@ def noise_limit(errors: Array, rows: int) -> float:
     numbers = len(errors) * rows
     medians = fdtri(rows, _EFFICIENCY * numbers, 1 - BY_CHANCE / len(errors)) * rows / (2 * gammaincinv(rows / 2, 0.5))
     return float(np.sqrt(medians) * np.median(errors))
+
+
+def noise_of(problem: Problem, records: Sequence[FactorRecords]) -> tuple[Array, float]:
+    """How far noise, as records state it, puts each off (N; SI), and of how many independent numbers that is.
+
+    Noise of joints is larger the farther out the arm reaches, and moves it along some directions more than along
+    others. More than three numbers, as of an image, are off together.
+    """
+    counted, count = error_dimension(problem), records[0].count
+    total, squares = np.zeros((2, count))
+    for kernel, record in zip(problem.kernels, records, strict=True):
+        rows = [dimension == counted for dimension in kernel.factor.dimensions]
+        roots = noise_roots(kernel.factor, record)[:, rows]
+        covariance = np.where(record.measured[:, None, None], roots @ np.swapaxes(roots, 1, 2), 0.0)
+        total += np.trace(covariance, axis1=1, axis2=2)
+        squares += np.sum(covariance**2, axis=(1, 2))
+    known = total > 0
+    rows_known = total[known] ** 2 / squares[known]
+    return np.sqrt(np.where(known, total, 1.0)), float(np.clip(np.median(rows_known), 1, 3)) if known.any() else 3.0
 
 
 def large_errors(
@@ -109,8 +129,9 @@ def large_errors(
         return None
     variance = _leverage(problem, records, estimate)
     if limit_mm is None:
-        sizes = np.sqrt(1 + variance / sum(len(kernel.factor.noise) for kernel in problem.kernels))
-        limits = sizes * noise_limit(errors[known] / sizes[known], error_rows(problem, records))
+        noise, numbers = noise_of(problem, records)
+        sizes = noise * np.sqrt(1 + variance / sum(len(kernel.factor.noise) for kernel in problem.kernels))
+        limits = sizes * noise_limit(errors[known] / sizes[known], numbers)
     else:
         limits = np.full(len(errors), limit_mm)
     beyond = np.flatnonzero(known & (errors > limits))

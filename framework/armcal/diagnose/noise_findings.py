@@ -15,7 +15,8 @@ Grade = Literal["good", "note", "warning", "bad"]
 MOST_LISTED = 10
 MOST_SUSPICIOUS = 0.2
 """Of the training records; more of them are no outliers."""
-_SMALLEST_MM = 5e-6
+_SMALLEST = 1e-3
+"""Of the noise, in thousandths: smaller errors are a simulation's without noise."""
 _MOST_NAMED = 5
 _TOO_MANY = "their noise is larger than the others', or the model lacks something where they are"
 _SHOWN = {"rad": (180 / np.pi, " deg"), "m": (1000.0, " mm")}
@@ -62,12 +63,15 @@ def suspect_findings(fitted: WeighedFit, ids: Sequence[str]) -> list[Finding]:
     return findings
 
 
-def suspicious_records(errors_mm: Array, rows: int, ids: Sequence[str], fitted: WeighedFit | None) -> list[str]:
-    """Ids of training records beyond their limit, the farthest first; each error is of so many numbers."""
+def suspicious_records(errors: Array, rows: float, ids: Sequence[str], fitted: WeighedFit | None) -> list[str]:
+    """Ids of training records beyond their limit, the farthest first.
+
+    ``errors`` are in units of each record's noise, of so many numbers each.
+    """
     if fitted is not None and fitted.loss != "none":
         return list(dict.fromkeys(ids[suspect.record] for suspect in fitted.suspects))
-    beyond = np.flatnonzero(errors_mm > max(noise_limit(errors_mm, rows), _SMALLEST_MM))
-    return [ids[i] for i in beyond[np.argsort(-errors_mm[beyond], kind="stable")]]
+    beyond = np.flatnonzero(errors > max(noise_limit(errors, rows), _SMALLEST))
+    return [ids[i] for i in beyond[np.argsort(-errors[beyond], kind="stable")]]
 
 
 def outlier_findings(suspicious: Sequence[str], ids: Sequence[str], fitted: WeighedFit | None) -> list[Finding]:

@@ -153,22 +153,21 @@ def _of_contact(
         return None
 
     def left(read_as: Wires) -> float:
-        """A reading's, as many times more as it moves tools less."""
-        read = rewired(kernel.factor.channels, own, read_as)
+        """A reading's."""
         try:
-            others = [*records[:number], read, *records[number + 1 :]]
-            smaller = reach / max(spread_of(tools(problem, nominal, others)[0][0]), _SMALLEST)
-            return apart_in_groups(problem, number, read, nominal) * max(1.0, smaller)
+            return apart_in_groups(problem, number, rewired(kernel.factor.channels, own, read_as), nominal)
         except NotConvergedError:
             return np.inf
 
     reach = spread_of(tools(problem, nominal, records)[0][0])
     if not MISSES * reach < (as_given := left({})) < np.inf:
         return None
+    # Another unit of angles would put all tools near one place, whatever they touch.
     readings = [
         _Reading(left(wires), words if len(arms) == 1 else f"{words} ({arm.name})", True)
         for arm in arms
         for words, wires in [*single_joints(arm), *coupled_joints(arm)]
+        if all(abs(factor) == 1 for channels, _ in wires.values() for factor in channels.values())
     ]
     best, *others = sorted(readings, key=lambda reading: reading.left)
     if best.left > min(FITS * reach, as_given / MUCH_BETTER):

@@ -93,7 +93,8 @@ def judge(
     seen = evidence or Evidence()
     determined = determined_finding(estimate, seen.priors_alone, np.median(judged_mm) if len(judged_mm) else None)
     own, trained = [ids[i] for i in train], errors_mm[train]
-    suspicious = suspicious_records(trained, seen.rows, own, fitted)
+    sizes, numbers = seen.noise or (np.ones(len(errors_mm)), 3.0)
+    suspicious = suspicious_records(trained / sizes[train], numbers, own, fitted)
     noise = component_findings(fitted.components) if fitted and fitted.components else [_size(estimate, trained, seen)]
     findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
     findings += [*shift_findings(estimate), *noise, *_freedom(estimate), *_causes(seen)]

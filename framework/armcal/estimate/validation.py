@@ -147,15 +147,6 @@ def error_dimension(problem: Problem) -> str:
     return next(dimension for dimension in ERROR_UNITS if dimension in measured)
 
 
-def error_rows(problem: Problem, records: Sequence[FactorRecords]) -> int:
-    """How many numbers a record's error is of, 3 at the most: more of them, as of an image, are off together."""
-    counted = error_dimension(problem)
-    rows = np.zeros(records[0].count)
-    for kernel, record in zip(problem.kernels, records, strict=True):
-        rows += record.measured * kernel.factor.dimensions.count(counted)
-    return int(np.clip(np.median(rows), 1, 3))
-
-
 def hold_out(count: int, fraction: float, seed: int, poses: Indices | None = None) -> Split:
     """A random split; the same for the same count and seed. Records of one pose (numbers, N) stay together."""
     poses, number = _poses(count, poses)

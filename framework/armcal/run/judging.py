@@ -26,7 +26,7 @@ from armcal.diagnose.gross_findings import (
 )
 from armcal.diagnose.held import MOST_RECORDS as MOST_FOR_HELD
 from armcal.diagnose.held import contradictions, freed, held_scales
-from armcal.diagnose.large_errors import Judged, large_errors
+from armcal.diagnose.large_errors import Judged, large_errors, noise_of
 from armcal.diagnose.majority import minority, moved_findings, moved_groups
 from armcal.diagnose.noise_findings import Finding
 from armcal.diagnose.outside import predicted_positions
@@ -42,7 +42,7 @@ from armcal.diagnose.unseen import (
 from armcal.diagnose.verdict import Verdict, judge
 from armcal.estimate.estimator import Estimate, Estimator
 from armcal.estimate.start import certificates
-from armcal.estimate.validation import Halves, error_name, error_rows, error_unit, halves, pose_size, record_errors
+from armcal.estimate.validation import Halves, error_name, error_unit, halves, pose_size, record_errors
 from armcal.estimate.weighing import Weighing
 from armcal.measure.measurement import Placed
 from armcal.planning.candidates import deviations as deviations_of
@@ -209,7 +209,7 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
         error_name(problem),
         rounded,
         away,
-        error_rows(problem, run.records),
+        noise_of(problem, run.records),
     )
 
 
@@ -266,7 +266,7 @@ def _worse(run: FittedRecords, errors: RecordErrors, judged_mm: Array, settings:
     if any(arm.residual is not None and arm.residual.is_learned for arm in arms.values()):
         return worse
     trained = (errors.calibrated_mm if errors.at_rest_mm is None else errors.at_rest_mm)[run.split.train]
-    return worse + overfitted(trained, judged_mm, equations, freedom, errors.unit)
+    return worse + overfitted(trained, judged_mm, errors.rival_mm, equations, freedom, errors.unit)
 
 
 def _by_weights(
