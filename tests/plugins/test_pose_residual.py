@@ -269,6 +269,7 @@ def test_errors_that_depend_on_the_temperature_are_learned_where_it_was_recorded
     assert [own.of for own in part.terms[0].inputs][-1] == "temperature"
 
 
+@pytest.mark.slow
 def test_a_prediction_that_lacks_the_temperature_is_less_sure():
     calibration = expanding_run().calibration
     at = {f"arm.q{i}": np.full(2, 0.3) for i in (1, 2, 3)}
