@@ -1,9 +1,13 @@
 """Held parameters are judged by what records scatter, not by how many rows they have."""
 
+from pathlib import Path
+
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.held import HeldParameter, clustered_variance
+from armcal.run.experiment import Experiment
+from armcal.run.pipeline import calibrate
 
 RECORDS, ROWS, COLUMNS, DRAWS = 20, 30, 6, 400
 
@@ -40,3 +44,10 @@ def test_what_records_do_not_show_has_no_deviation_and_is_stated_with_unit() -> 
     held = HeldParameter("camera.board_bend_x", "m", 0.0, 1.0104e-3, 2.9e-5, 9.0)
     assert str(held) == "camera.board_bend_x is held at 0 mm, but the records put it at 1.010 +- 0.029 mm"
     assert HeldParameter("k", "1", 0.0, 0.0, np.inf, 1.0).p_value == 1.0
+
+
+def test_play_that_is_held_at_none_reads_no_approach_and_stops_no_run() -> None:
+    """The fit of thirty ruler points reads the approach of four joints alone; the fifth has no play to be freed."""
+    config = Path(__file__).resolve().parents[2] / "configs" / "so101" / "ruler.yaml"
+    structure = calibrate(Experiment.load(config, ["evaluator=interpreted", "validation.folds=0"])).evidence.structure
+    assert structure is not None and structure.tested > 20

@@ -123,7 +123,7 @@ def dependences(problem: Problem, motion: Motion, dataset: Dataset, moves: Moves
 
 def _of_held(problem: Problem, moves: Moves) -> Iterator[Dependence]:
     """Parameters that the fit held, as ``armcal identify --fixed`` judges them."""
-    for name in candidates(problem.parameters):
+    for name in filter(moves.__contains__, candidates(problem.parameters)):
         block, columns = problem.parameters[name], moves[name]
         words, measure = f"{name}, which is held", "armcal identify --fixed, which judges it on records held out"
         one = block.domain.dof == 1

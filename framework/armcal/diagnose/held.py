@@ -152,14 +152,22 @@ def clustered_variance(rows: FitRows, basis: Array, sums: Array, noise_scale: fl
 
 
 def freed(problem: Problem, names: Sequence[str]) -> Problem:
-    """The problem as a function of fixed parameters too; its records serve both."""
+    """The problem as a function of fixed parameters too; its records serve both.
+
+    Components that, once free, read a channel that these records lack (the approach, for play held at none) stay fixed.
+    """
     if not names:
         return problem
     plan = problem.blueprint
     parameters = plan.parameters.with_free([*(block.name for block in plan.parameters.free), *names])
     plan, kept = replace(plan, parameters=parameters), ("channels", "output_channels", "noise", "dimensions", "points")
     kernels = plan.kernels(0, dict.fromkeys(plan.measurements, "interpreted"))
-    pairs = zip(kernels, problem.kernels, strict=True)  # of the points that are looked at, which may be few
+    pairs = [*zip(kernels, problem.kernels, strict=True)]  # of the points that are looked at, which may be few
+    if any(k.channels[: k.shared] != own.channels[: own.shared] for k, own in ((a.factor, b.factor) for a, b in pairs)):
+        owners = dict.fromkeys(name.rpartition(".")[0] for name in names)
+        parts = [[name for name in names if name.rpartition(".")[0] == owner] for owner in owners]
+        alike = [name for part in parts if len(parts) > 1 and freed(problem, part) is not problem for name in part]
+        return freed(problem, alike)
     same = (replace(k, factor=replace(k.factor, **{n: getattr(own.factor, n) for n in kept})) for k, own in pairs)
     return replace(problem, parameters=parameters, kernels=tuple(same), blueprint=plan)
 
