@@ -170,7 +170,7 @@ def test_the_page_is_done_word_for_word(tmp_path: Path) -> None:
                 assert part.strip() in ran.stderr
             told[command.text.split()[1]] = ran.stdout
     errors = json.loads((tmp_path / "runs/experiment/metrics.json").read_text(encoding="utf-8"))["error_mm"]
-    assert errors["nominal"]["holdout"]["mean"] > 10
+    assert errors["nominal"]["holdout"]["mean"] > 1, "though the station places the nominal arm, too"
     assert errors["calibrated"]["holdout"]["mean"] < 0.3
     study = json.loads((tmp_path / "runs/study/study.json").read_text(encoding="utf-8"))
     assert study["lowest"] == "with it"
