@@ -48,7 +48,7 @@ FITS, MISSES = 0.15, 0.01
 """Of the spread of the positions: what a right reading leaves at most to first order, what is worth a look."""
 _EXPLAINS, _FAR_BETTER, _NOISE = (0.05, 0.08), 10.0, 3.0
 """What it leaves at most once fitted: times the noise, or of the spread, the more the worse the data as given fit."""
-_FITTED, _FIT_STEPS, _FIT_DAMPING, _FARTHEST = 5, 25, 1e-3, 8.0
+_FITTED, _FIT_STEPS, _FIT_DAMPING, _FARTHEST, _DETERMINED = 5, 25, 1e-3, 8.0, 1e-3
 _MOST_RECORDS = 300
 _EQUATIONS = 2.0
 """So many numbers a parameter are needed to separate readings."""
@@ -231,8 +231,9 @@ def _of(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, arm: Ar
             apart = f"{digits(float(np.linalg.norm(shift)) * _MM)} mm and {digits(angle, 2)} deg"
             words = f"the arm's base elsewhere by {apart}"
             left = straight.left(turn.T @ (seen.measured - shift[:, None]))
-            if left <= enough and straight.can_move(turn, shift):
-                return None  # the fit moves the base there by itself
+            by_itself = left <= enough and straight.can_move(turn, shift)
+            if by_itself and _fitted(problem, records, seen, {}, seen.measured) <= _EXPLAINS[1] * spread:
+                return None  # the fit moves the base there
             read = _Reading(left, words, False, {}, turn.T @ (seen.measured - shift[:, None]))
             explained = _explained(problem, records, seen, [read], enough)
         if not explained:
@@ -285,7 +286,7 @@ def _fitted(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, rea
         if problem.increments:
             x = descended(posed, posed.x(values), _FIT_STEPS, _FIT_DAMPING, 1e-3)
             matters = np.diag(posed.model(x).hessian)
-            if np.abs(x - posed.x(values))[matters > _SMALLEST * matters.max()].max(initial=0.0) > _FARTHEST:
+            if np.abs(x - posed.x(values))[matters > _DETERMINED * matters.max()].max(initial=0.0) > _FARTHEST:
                 return np.inf
             values = posed.values(x)
         return float(np.median(np.linalg.norm(problem.residuals(values, some)[number][:3], axis=0)))
