@@ -231,11 +231,10 @@ def _of(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, arm: Ar
             apart = f"{digits(float(np.linalg.norm(shift)) * _MM)} mm and {digits(angle, 2)} deg"
             words = f"the arm's base elsewhere by {apart}"
             left = straight.left(turn.T @ (seen.measured - shift[:, None]))
-            by_itself = left <= enough and straight.can_move(turn, shift)
-            if by_itself and _fitted(problem, records, seen, {}, seen.measured) <= _EXPLAINS[1] * spread:
-                return None  # the fit moves the base there
             read = _Reading(left, words, False, {}, turn.T @ (seen.measured - shift[:, None]))
             explained = _explained(problem, records, seen, [read], enough)
+            if explained and straight.can_move(turn, shift):
+                return None  # the fit moves the base there by itself
         if not explained:
             few = seen.thinned(_SEVERAL_RECORDS)
             if _left(problem, few, {}, few.measured, np.inf) <= MISSES * spread:
@@ -284,8 +283,8 @@ def _fitted(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, rea
     posed = PosedProblem(problem, some)
     try:
         if problem.increments:
+            matters = np.diag(posed.model(posed.x(values)).hessian)
             x = descended(posed, posed.x(values), _FIT_STEPS, _FIT_DAMPING, 1e-3)
-            matters = np.diag(posed.model(x).hessian)
             if np.abs(x - posed.x(values))[matters > _DETERMINED * matters.max()].max(initial=0.0) > _FARTHEST:
                 return np.inf
             values = posed.values(x)
