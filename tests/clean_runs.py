@@ -191,9 +191,9 @@ def run(kind: str, seed: int, config: Path) -> Outcome:
         found = calibrate(Experiment.load(config, (), data)).verdict.findings
     except ArmcalError as fault:
         return Outcome(kind, seed, len(dataset), "refused", (str(fault),), time.process_time() - began)
-    told = [finding for finding in found if finding.grade in ("bad", "warning")]
-    grade = told[0].grade if told else "good"
-    said = tuple(f"{finding.grade}: {finding.text} [{finding.test}]" for finding in told)
+    concerns = [finding for finding in found if finding.grade in ("bad", "warning")]
+    grade = concerns[0].grade if concerns else "good"
+    said = tuple(f"{finding.grade}: {finding.text} [{finding.test}]" for finding in concerns)
     return Outcome(kind, seed, len(dataset), grade, said, time.process_time() - began)
 
 

@@ -209,7 +209,7 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
         error_name(problem),
         rounded,
         away,
-        noise_of(problem, run.records),
+        noise_of(few, records),
     )
 
 
