@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import graphlib
+import inspect
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -152,11 +153,11 @@ def test_the_framework_names_no_plugin_package() -> None:
 
 
 @pytest.mark.parametrize("path", [*FILES, *sorted(PLUGINS.rglob("*.py"))], ids=lambda p: p.stem)
-def test_files_and_functions_stay_short(path: Path) -> None:
+def test_modules_and_functions_can_be_held_in_mind(path: Path) -> None:
     source = _source(path)
-    assert source.lines <= 400
+    assert source.lines <= 900
     for name, length in source.functions:
-        assert length < 45, f"{path}: {name}"
+        assert length < 60, f"{path}: {name}"
 
 
 def test_only_the_command_line_prints_or_exits() -> None:
@@ -170,3 +171,24 @@ def test_the_public_interface_is_small_and_light() -> None:
 
     assert len(armcal.__all__) <= 20
     assert all(getattr(armcal, name) is not None for name in (*armcal.__all__, *armcal._HOMES))
+
+
+def test_documented_names_have_docstrings() -> None:
+    """What users and authors of plugins read: the names of ``armcal`` with their public methods, and the hooks."""
+    import armcal
+    from armcal import hooks
+
+    things = [getattr(armcal, name) for name in (*armcal.__all__, *armcal._HOMES)]
+    documented = [thing for thing in things if inspect.isclass(thing) or inspect.isfunction(thing)]
+    for thing in (
+        *documented,
+        *(
+            kind
+            for kind in vars(hooks).values()
+            if getattr(kind, "__module__", "") == hooks.__name__ and inspect.isclass(kind)
+        ),
+    ):
+        assert inspect.getdoc(thing), thing
+        for name, member in vars(thing).items() if inspect.isclass(thing) else ():
+            if not name.startswith("_") and (inspect.isfunction(member) or isinstance(member, (property, classmethod))):
+                assert inspect.getdoc(getattr(thing, name)), f"{thing.__name__}.{name}"
