@@ -41,7 +41,6 @@ def use_plugins(*places: str | Path, disabled: Sequence[str] = ()) -> None:
 
 
 def disabled() -> tuple[str, ...]:
-    """Names of plugins that are left out."""
     return _listed(DISABLED)
 
 
@@ -62,7 +61,6 @@ def files() -> dict[str, Path]:
 
 
 def digest(file: Path) -> str:
-    """What tells the content of a file from any other's, in the place of a version."""
     return f"sha256 {hashlib.sha256(file.read_bytes()).hexdigest()[:16]}"
 
 
@@ -71,12 +69,10 @@ class FilePoint(EntryPoint):
 
     @classmethod
     def of(cls, name: str) -> FilePoint:
-        """The plugin of a file."""
         return cls(name, f"{__name__}.{name}", GROUP)
 
     @property
     def file(self) -> Path:
-        """Where it is."""
         return files()[self.name]
 
     def load(self) -> ModuleType:
@@ -102,12 +98,10 @@ class _Loader(SourceFileLoader):
     """Leaves no compiled file beside the source, whose age could not tell two edits of one second apart."""
 
     def exec_module(self, module: ModuleType) -> None:
-        """The module also knows of which content it is."""
         module.armcal_digest = digest(Path(self.path))  # type: ignore[attr-defined]
         super().exec_module(module)
 
     def get_code(self, fullname: str) -> CodeType:
-        """Compiled each time."""
         return self.source_to_code(self.get_data(self.path), self.path)
 
 

@@ -74,7 +74,6 @@ class PluginInfo:
 
     @property
     def is_file(self) -> bool:
-        """Whether it is a single file without a package."""
         return self.module.startswith(f"{plugin_files.__name__}.")
 
 
@@ -88,7 +87,6 @@ class PluginRegistry:
 
     @property
     def faults(self) -> tuple[PluginInfo, ...]:
-        """Plugins that failed to load."""
         return tuple(plugin for plugin in self.plugins if plugin.fault)
 
     def announced_by(self, plugin: PluginInfo) -> tuple[Component, ...]:
@@ -129,7 +127,6 @@ class PluginRegistry:
         raise PluginError(f"no plugin offers {spoken(kind)} called {name!r}.", hint=hint)
 
     def notify(self, event: str, **what: Any) -> list[str]:
-        """Tell every observer of an event; gives what went wrong in those that failed, which stops nothing."""
         faults = []
         for observer in getattr(self.manager.hook, event).get_hookimpls():
             try:
@@ -151,7 +148,6 @@ def _kind_name(kind: str) -> str:
 
 
 def spoken(kind: str) -> str:
-    """A kind with its article."""
     name = _kind_name(kind)
     return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
 
@@ -194,7 +190,6 @@ def _state(folder: str) -> tuple[str, int]:
 
 @lru_cache(maxsize=8)
 def _installed(path: tuple[tuple[str, int], ...]) -> tuple[EntryPoint, ...]:
-    """The entry points of all that is installed there, whose files are read once."""
     return tuple(entry_points(group=plugin_files.GROUP))
 
 

@@ -43,7 +43,6 @@ class Registration:
 
 
 def new_manager() -> pluggy.PluginManager:
-    """A plugin manager with armcal's hook specifications."""
     manager = pluggy.PluginManager(hooks.PROJECT)
     manager.add_hookspecs(hooks)
     return manager
@@ -65,7 +64,6 @@ class Loaded:
 
     @classmethod
     def of(cls, point: EntryPoint) -> Self:
-        """A plugin may fail to load in any way."""
         name = f"{point.name} ({point.value})"
         try:
             module = point.load()
@@ -76,7 +74,6 @@ class Loaded:
 
 @lru_cache(maxsize=8)  # a command, its experiment and its calibration each look for plugins
 def registered(plugins: tuple[Loaded, ...]) -> tuple[pluggy.PluginManager, tuple[Registration, ...]]:
-    """A manager of all plugins, and what became of each; one that fails in any way is left out, and says why."""
     manager, alone = new_manager(), new_manager()
     return manager, tuple(_registered(manager, alone, plugin) for plugin in plugins)
 
@@ -102,7 +99,6 @@ def _registered(manager: pluggy.PluginManager, alone: pluggy.PluginManager, plug
 
 
 def said(fault: BaseException) -> str:
-    """A fault in one line."""
     text = str(fault) if isinstance(fault, ArmcalError) else f"{type(fault).__name__}: {fault}"
     return " ".join(text.split())
 

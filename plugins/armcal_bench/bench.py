@@ -143,7 +143,6 @@ class Bench:
         return built
 
     def camera(self) -> LiveCamera | None:
-        """The live camera, if one is configured; see ``device``."""
         return None if self.settings.camera is None else self._built("camera")
 
     def simulator(self) -> SimulatedBench:

@@ -50,7 +50,6 @@ class BodySettings(Settings):
 
     @property
     def has_base(self) -> bool:
-        """Whether a base body is looked for."""
         return self.base != NONE
 
 

@@ -38,7 +38,6 @@ class Hazard:
 
     @property
     def content(self) -> dict[str, Any]:
-        """For programs."""
         return {"kind": self.kind, "joint": self.joint, "amount_deg": math.degrees(self.amount), "what": self.sentence}
 
 

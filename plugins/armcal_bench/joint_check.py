@@ -58,12 +58,10 @@ class Zero:
 
     @property
     def is_far(self) -> bool:
-        """Whether it is further off than a calibration by hand leaves it."""
         return abs(self.value) >= math.radians(_UNREMARKABLE_DEG)
 
     @property
     def teeth(self) -> list[tuple[int, float]]:
-        """By how many teeth the horn may well be off, and the probability of each, the most likely one first."""
         degrees, variance = math.degrees(self.value), _REST_DEG**2 + math.degrees(self.sd) ** 2
         weights = {
             k: 0.1 ** abs(k) * math.exp(-((degrees - k * TOOTH_DEG) ** 2) / (2 * variance))
@@ -75,7 +73,6 @@ class Zero:
 
     @property
     def is_sure(self) -> bool:
-        """Whether it tells the tooth."""
         return len(self.teeth) == 1
 
     def sentence(self, joint: str) -> str:
@@ -101,12 +98,10 @@ class JointCheck:
 
     @property
     def far_zeros(self) -> list[str]:
-        """Of zeros that are further off than a calibration by hand leaves them, and the teeth of a horn."""
         return [zero.sentence(joint) for joint, zero in self.zeros.items() if zero.is_far]
 
     @property
     def notes(self) -> list[str]:
-        """Of other zeros that may be a horn on another tooth; and what can tell."""
         lines = [zero.sentence(joint) for joint, zero in self.zeros.items() if not zero.is_far]
         unsure = [joint for joint, zero in self.zeros.items() if not zero.is_sure]
         return [*filter(None, lines), *([_TELLS.format(joints=", ".join(unsure))] if unsure else [])]

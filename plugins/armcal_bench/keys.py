@@ -42,7 +42,6 @@ _WISH = re.compile(b"|".join(map(re.escape, sorted(_WISHES, key=len, reverse=Tru
 
 @contextmanager
 def single_keys(descriptor: int) -> Iterator[None]:
-    """The terminal shows no keys and waits for no Enter; afterwards it is as before, whatever happens."""
     before = termios.tcgetattr(descriptor)
     try:
         tty.setcbreak(descriptor, termios.TCSANOW)

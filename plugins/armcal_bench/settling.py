@@ -94,7 +94,6 @@ class Settling:
         self._frames.clear()
 
     def feed(self, frames: Iterable[TrackerFrame]) -> None:
-        """Take in frames as they come; what is older than a window, and than this stand, is forgotten."""
         for frame in frames:
             self._frames.append((frame, repeats(frame, self._last, self._bodies)))
             self._last = frame

@@ -75,12 +75,10 @@ class Board(Settings):
 
     @property
     def layout(self) -> Layout:
-        """What is printed."""
         raise NotImplementedError
 
     @model_validator(mode="after")
     def _with_enough_tags(self) -> Self:
-        """Its family has all its ids."""
         family, ids = self.tag_family, self.tag_ids
         known = tags_in(family) if family else 0
         if ids.stop > known:
@@ -95,12 +93,10 @@ class Board(Settings):
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Width and height of what is printed (m)."""
         return self.layout.extent
 
     @property
     def step(self) -> float:
-        """The distance of neighbouring points (m)."""
         return self.layout.step
 
     @property
@@ -110,12 +106,10 @@ class Board(Settings):
 
     @property
     def tag_family(self) -> str:
-        """The family of its tags; empty if it has none."""
         return self.layout.tag_family
 
     @property
     def tag_ids(self) -> range:
-        """The ids of its tags."""
         return self.layout.tag_ids
 
     @property
@@ -140,7 +134,6 @@ class Chessboard(Board):
 
     @property
     def layout(self) -> Layout:
-        """The inner corners, row by row from the origin."""
         extent = (self.columns + 1) * self.square, (self.rows + 1) * self.square
         return Layout(_grid(self.columns, self.rows, self.square), extent, self.square, 0.7 * self.square)
 
@@ -171,7 +164,6 @@ class Charuco(Board):
 
     @property
     def layout(self) -> Layout:
-        """The inner corners, row by row from the origin."""
         return Layout(
             points=_grid(self.columns - 1, self.rows - 1, self.square),
             extent=(self.columns * self.square, self.rows * self.square),
@@ -254,7 +246,6 @@ def _grid(columns: int, rows: int, step: float) -> Array:
 
 
 def tag_modules(family: str, border_bits: int = 1) -> int:
-    """Black and white cells along a tag's edge, its border included; ValueError for a family that there is not."""
     tags_in(family)
     match = _DICTIONARY.fullmatch(family)
     inner = int(match[1]) if match else math.isqrt(int(family.split("h")[0]))
@@ -262,7 +253,6 @@ def tag_modules(family: str, border_bits: int = 1) -> int:
 
 
 def _tag_reach(tag: float, family: str, border_bits: int) -> float:
-    """Within its border a tag's corner has nothing else around it."""
     return 1.3 * tag * border_bits / tag_modules(family, border_bits)
 
 

@@ -45,7 +45,6 @@ def board() -> None:
 
 
 def _output(command: Any) -> Any:
-    """The options of every kind of board."""
     paper = click.option("--paper", type=click.Choice(list(PAPERS)), default="a4", show_default=True, help="Its size.")
     out = click.option(
         "--out", required=True, type=click.Path(path_type=Path), help="The files' name; .pdf, .svg and .yaml are added."

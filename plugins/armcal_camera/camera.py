@@ -82,7 +82,6 @@ class CameraSettings(InstrumentSettings):
 
 
 def carrying_frames(mounting: str, frame: str, board_frame: str | None) -> tuple[str, str]:
-    """What carries the camera and what carries the boards, by the settings."""
     carrying = (frame, BASE_FRAME) if mounting == "eye_in_hand" else (BASE_FRAME, frame)
     return carrying[0], board_frame or carrying[1]
 
@@ -122,29 +121,24 @@ class Camera(PointInstrument):
 
     @property
     def carriers(self) -> Mapping[str, str]:
-        """The frames of the arm that carry the camera and the boards."""
         stated = {"frame": self.settings.frame, "board_frame": self.settings.board_frame or BASE_FRAME}
         return {setting: frame for setting, frame in stated.items() if setting == "frame" or frame != BASE_FRAME}
 
     @property
     def lender(self) -> str | None:
-        """The camera whose boards these are."""
         return None if self.settings.boards_of is None else str(self.settings.boards_of)
 
     @property
     def borrowed(self) -> Sequence[str]:
-        """The poses of boards, how they are bent, and their scale."""
         parts = ("x", "y", "z", "rotation", "bend_x", "bend_y")
         return (*(f"{name}_{part}" for name in self.board_names for part in parts), "board_scale")
 
     @property
     def scale(self) -> str:
-        """The parameter on which all lengths depend."""
         return "" if self.lender else "board_scale"
 
     @property
     def scale_check(self) -> str:
-        """How to find out what it is."""
         return "Measure the board over its whole width, and state its size"
 
     def check_lender(self, lender: object) -> None:
@@ -174,17 +168,14 @@ class Camera(PointInstrument):
 
     @cached_property
     def boards(self) -> tuple[Board, ...]:
-        """What it sees, in the order in which points are counted."""
         return self.settings.boards or (self.settings.board,)
 
     @property
     def board_names(self) -> tuple[str, ...]:
-        """The first part of the names of each board's parameters."""
         return ("board",) if len(self.boards) == 1 else tuple(f"board{i}" for i in range(1, len(self.boards) + 1))
 
     @cached_property
     def used(self) -> tuple[Indices, ...]:
-        """Which points of each board are used, in order."""
         return tuple(spread_points(board.points, self.settings.most_points) for board in self.boards)
 
     @cached_property
@@ -199,7 +190,6 @@ class Camera(PointInstrument):
 
     @property
     def point_names(self) -> Sequence[str]:
-        """The number of each point, counted over all boards."""
         starts = np.cumsum([0, *(len(board.points) for board in self.boards)])
         return [str(start + k) for start, used in zip(starts, self.used, strict=False) for k in used]
 
@@ -223,11 +213,9 @@ class Camera(PointInstrument):
         return tuple(own)
 
     def point_channels(self) -> tuple[Channel, ...]:
-        """Column and row in the image."""
         return Channel("u", "image"), Channel("v", "image")
 
     def point_noise(self) -> tuple[float, ...]:
-        """Of u and of v (thousands of pixels)."""
         return (float(self.settings.noise),) * 2
 
     def point_outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Any], point: Any) -> Any:
@@ -266,7 +254,6 @@ class Camera(PointInstrument):
 
     @property
     def image(self) -> tuple[float, float] | None:
-        """Width and height (thousands of pixels), as stated or as the file of intrinsics states them."""
         s = self.settings
         return s.image or (s.intrinsics.image if s.intrinsics else None)
 
@@ -281,12 +268,10 @@ class Camera(PointInstrument):
         return np.asarray(visible)
 
     def dimensions(self) -> Sequence[str]:
-        """Places in an image."""
         return ("image",) * len(self.noise())
 
     @property
     def place(self) -> tuple[str, str]:
-        """The camera's, beside the arm or on what carries it."""
         words = {BASE_FRAME: "beside the arm", TOOL_FRAME: "on the hand"}
         return "camera", words.get(self.camera_frame, f"on {self.camera_frame}")
 
@@ -309,7 +294,6 @@ class Camera(PointInstrument):
         )
 
     def rendered(self, frames: Mapping[str, Array], values: Mapping[str, Array]) -> Iterator[bytes]:
-        """An image of each record, blurred and with noise as an ordinary camera has them."""
         return rendered_records(self, frames, values)
 
     def propose(self, reading: Reading) -> Proposal:
@@ -322,7 +306,6 @@ class Camera(PointInstrument):
 
     @property
     def _setup(self) -> Setup:
-        """What a start depends on."""
         s = self.settings
         points = tuple(board.points[used] for board, used in zip(self.boards, self.used, strict=True))
         return Setup(self.board_names, points, s.model, s.intrinsics is not None, (self.camera_frame, self.board_frame))

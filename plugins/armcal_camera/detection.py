@@ -52,7 +52,6 @@ class Detection:
 
 
 def detect(image: Grey, board: Board) -> Detection:
-    """Look for a board."""
     find = _chessboard if isinstance(board, Chessboard) else _tags
     nothing = Detection(np.full((len(board.points), 2), np.nan), f"the {board.kind} was not found")
     for reduced in _reductions(image):
@@ -63,7 +62,6 @@ def detect(image: Grey, board: Board) -> Detection:
 
 
 def _reductions(image: Grey) -> Iterator[Grey]:
-    """The image reduced, the smallest first."""
     cv2, largest = opencv(), max(image.shape)
     for side in _SIDES_PX:
         factor = max(1.0, largest / side)
@@ -74,7 +72,6 @@ def _reductions(image: Grey) -> Iterator[Grey]:
 
 
 def _enlarged(points: Any, reduced: Grey, image: Grey) -> Array:
-    """Points of a reduced image in the full one, whose pixels are areas."""
     factors = np.array(image.shape[::-1]) / np.array(reduced.shape[::-1])
     return np.asarray((np.asarray(points, dtype=float).reshape(-1, 2) + 0.5) * factors - 0.5)
 
@@ -160,7 +157,6 @@ def _astray(known: Array, pixels: Array) -> int:
 
 
 def _other_tags(reduced: Grey, board: Board, nothing: Detection) -> Detection:
-    """What tags are there in place of the board's; a dictionary of OpenCV begins with those that are smaller."""
     reliable = (family for family in FAMILIES if family != "16h5")  # it is seen in anything
     for family in (board.tag_family, *(f"DICT_{n}X{n}_1000" for n in (4, 5, 6, 7)), *reliable):
         ids = _detected(reduced, family, getattr(board, "border_bits", 1))[1]
@@ -174,7 +170,6 @@ def _other_tags(reduced: Grey, board: Board, nothing: Detection) -> Detection:
 
 
 def _detected(reduced: Grey, family: str, border_bits: int) -> tuple[Any, list[int]]:
-    """Corners of the tags of a family in an image, and their ids."""
     aruco = opencv().aruco
     parameters = aruco.DetectorParameters()
     parameters.markerBorderBits = border_bits

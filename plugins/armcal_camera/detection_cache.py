@@ -21,7 +21,6 @@ _KEPT = 20_000
 
 
 def detection_key(content: bytes, board: Board) -> str:
-    """What a detection depends on."""
     rest = json.dumps([board.to_config(), VERSION, opencv().__version__])
     return hashlib.sha256(content + rest.encode()).hexdigest()[:40]
 
@@ -51,7 +50,6 @@ def keep_detection(key: str, detection: Detection) -> None:
 
 
 def forget_old() -> None:
-    """Keep those that were used last."""
     with suppress(OSError):
         files = sorted(_place("").parent.glob("*"), key=lambda path: path.stat().st_mtime, reverse=True)
         for path in files[_KEPT:]:

@@ -192,7 +192,6 @@ def _model(camera: Instrument) -> str:
 
 
 def _frames(camera: Instrument) -> tuple[str, str]:
-    """What carries the camera and what carries the boards."""
     s = camera.settings
     return carrying_frames(s.get("mounting", "eye_in_hand"), s.get("frame", TOOL_FRAME), s.get("board_frame"))
 
@@ -212,7 +211,6 @@ def _opencv_matrix(name: str, matrix: Array) -> Sequence[str]:
 
 
 def _urdf_joint(parent: str, child: str, pose: Array) -> str:
-    """A fixed joint; URDF's roll, pitch and yaw turn about fixed axes."""
     rpy = Rotation.from_matrix(pose[:3, :3]).as_euler("xyz")
     place, turn = (" ".join(f"{x:.9g}" for x in numbers) for numbers in (pose[:3, 3], rpy))
     return (

@@ -53,7 +53,6 @@ class FlangePose:
         return ()
 
     def chain(self, values: Mapping[str, Any]) -> Chain:
-        """Three sliding joints along the axes of the base, then turns about z, y and x."""
         slides = [Joint(axis, se3.identity(), _STILL, direction) for axis, direction in _AXES.items()]
         turns = [Joint(f"r{axis}", se3.identity(), _AXES[axis]) for axis in "zyx"]
         return Chain(se3.identity(), (*slides, *turns), Attachment(6, se3.identity()))
@@ -111,7 +110,6 @@ def _off(tools: Array, targets: Array) -> Array:
 
 
 def _different(commands: Array) -> Array:
-    """Rows that differ (k x n)."""
     kept: list[Array] = []
     for row in commands[np.isfinite(commands).all(axis=1)]:
         if all(np.abs(row - other).max() > _SAME for other in kept):

@@ -41,7 +41,6 @@ def upright(grid: Array, crossing: Array) -> tuple[Array, Array]:
 
 
 def is_chessboard(crossing: Array) -> bool:
-    """Whether dark and bright quadrants change from corner to corner (R x C), as hardly anything else has it."""
     whole, seen = float(np.nansum(np.abs(crossing))), float(np.isfinite(crossing).mean())
     return seen > _MOST and abs(_alternating(crossing)) > _MOST * whole
 

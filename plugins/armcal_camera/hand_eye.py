@@ -55,7 +55,6 @@ def hand_eye(a: Array, b: Array) -> HandEye | None:
 
 
 def _better(a: Array, b: Array, kept: Mask) -> HandEye:
-    """The better of the closed forms of the poses that decide."""
     a, b = a[kept], b[kept]
     answers = {"Park": _park(a, b), "Shah": _shah(a, b), "Daniilidis": _daniilidis(a, b)}
     solved = [_with_translations(a, b, name, *turns) for name, turns in answers.items()]
@@ -106,7 +105,6 @@ def _motions(a: Array, b: Array) -> tuple[Array, Array]:
 
 
 def _y_of(a: Array, x: Array, b: Array) -> Array:
-    """The rotation of Y that goes best with that of X."""
     return _proper(np.einsum("nij,jk,nlk->il", a[:, :3, :3], x, b[:, :3, :3]))
 
 
@@ -148,7 +146,6 @@ def _dual_quaternion(motions: Array) -> Array:
 
 
 def _proper(matrix: Array) -> Array:
-    """The rotation nearest to a matrix."""
     left, _, right = np.linalg.svd(matrix)
     return np.asarray(left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right)
 

@@ -22,7 +22,6 @@ MOST_BYTES = 512 * 1024**2
 
 
 def is_image(path: Path) -> bool:
-    """Whether a file's name says that it is an image."""
     return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
 
 

@@ -143,12 +143,10 @@ class ImagesReader:
 
 
 def sees_boards(measurement: object) -> TypeGuard[SeesBoards]:
-    """Whether a measurement is a camera's."""
     return isinstance(measurement, SeesBoards)
 
 
 def _own(places: Path | Mapping[str, Path] | None, camera: str, cameras: int) -> Path | None:
-    """The folder or file of one camera."""
     if isinstance(places, Mapping):
         if camera not in places:
             message = f"found {', '.join(places)}, expected the camera {camera} as well."
@@ -161,7 +159,6 @@ def _own(places: Path | Mapping[str, Path] | None, camera: str, cameras: int) ->
 
 
 def look(boards: Sequence[Board], path: Path) -> View:
-    """What the image in a file says of boards."""
     return look_at(boards, input_bytes(path, MOST_BYTES, "an image"), path.name)
 
 
@@ -298,7 +295,6 @@ def corner_channels(camera: str, corners: Array, known: Collection[str]) -> dict
 
 
 def _with_corners(dataset: Dataset, camera: str, views: Sequence[View], known: set[str]) -> Dataset:
-    """The dataset with the channels of a camera that are asked for."""
     pixels = [np.full_like(view.corners, np.nan) if view.fault else view.corners for view in views]
     channels = corner_channels(camera, np.stack(pixels, axis=1), known)
     digest = hashlib.sha256("".join([dataset.sha256, *(view.sha256 for view in views)]).encode()).hexdigest()

@@ -73,7 +73,6 @@ def read_intrinsics(path: str | Path) -> IntrinsicsSettings:
 
 
 def _of_matrix(content: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Of ROS and of OpenCV."""
     matrix = next((_numbers(content[key]) for key in _MATRIX if key in content), [])
     if len(matrix) != 9:
         return None

@@ -28,7 +28,6 @@ _KINDS = "the number of a camera (0), its device (/dev/video0), an address (rtsp
 
 
 def _named(value: object) -> object:
-    """A source's name; a file's or a folder's becomes a whole path."""
     text = str(value)
     if isinstance(value, bool) or text.isdecimal() or "://" in text:
         return text

@@ -167,7 +167,6 @@ def _contradicting(agree: Mask) -> Indices:
 
 
 def _times_further(off: Array, first: Indices, second: Indices) -> float:
-    """How many times further pairs across two groups are off than those within."""
     apart = np.where(np.eye(len(off), dtype=bool), np.nan, off)
     within = max(float(np.nanmedian(apart[np.ix_(group, group)])) for group in (first, second))
     return float(np.nanmedian(apart[np.ix_(first, second)])) / max(within, 1e-9)
@@ -184,6 +183,5 @@ def _pairs(poses: Array) -> tuple[Array, Array]:
 
 
 def _off(points: Array, image: Array) -> float:
-    """How far corners lie from the best homography (root mean square)."""
     shown = np.c_[points[:, :2], np.ones(len(points))] @ homography(points[:, :2], image).T
     return float(np.sqrt(np.mean(np.sum((shown[:, :2] / shown[:, 2:] - image) ** 2, axis=1))))

@@ -39,7 +39,6 @@ def outline(board: Board) -> Array:
 
 
 def _squares(board: Board) -> Array:
-    """The dark squares of a chessboard; the first is at the upper left."""
     if not isinstance(board, Chessboard | Charuco):
         return np.zeros((0, 4))
     is_chessboard = isinstance(board, Chessboard)

@@ -47,7 +47,6 @@ class _FlangeReading:
     arms: tuple[str, ...] = ("",)
 
     def channels(self) -> tuple[Channel, ...]:
-        """A place and a unit quaternion."""
         return (*(Channel(name, "length") for name in "xyz"), *(Channel(name, DIMENSIONLESS) for name in _QUATERNION))
 
 

@@ -153,7 +153,6 @@ def _texels_per_metre(board: Board, lens: Lens, pose: Array) -> float:
 
 
 def _darkness(board: Board, start: Array, texels: float) -> NDArray[np.float32]:
-    """How much of each texel is dark (H x W)."""
     width, height = (math.ceil((extent + board.step) * texels) for extent in board.extent)
     texture = np.zeros((height, width), np.float32)
     for x0, y0, x1, y1 in (dark_rectangles(board) - [*start, *start]) * texels:
@@ -163,7 +162,6 @@ def _darkness(board: Board, start: Array, texels: float) -> NDArray[np.float32]:
 
 
 def _coverage(low: float, high: float) -> tuple[slice, Array]:
-    """Which texels of a line an interval touches, and how much of each it covers."""
     texels = np.arange(math.floor(low), math.ceil(high))
     return slice(texels[0], texels[-1] + 1), np.minimum(texels + 1, high) - np.maximum(texels, low)
 

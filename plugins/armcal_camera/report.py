@@ -34,7 +34,6 @@ _CROSS = "m-3 0h6m-3-3v6"
 
 
 def cameras(result: RunResult) -> ReportSection | None:
-    """Reprojection residuals over the sensor and by image, of every camera of the run."""
     described = result.system.description["measurements"]
     start, parts, count = 0, list[str](), sum(section["type"] == "camera" for section in described.values())
     for name, measurement in result.system.measurements.items():

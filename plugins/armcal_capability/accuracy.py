@@ -29,7 +29,6 @@ class Unexplained:
 
     @property
     def of_the_arm(self) -> float:
-        """What is left beyond the instrument's noise."""
         return float(np.sqrt(max(self.left**2 - self.instrument**2, 0.0)))
 
 

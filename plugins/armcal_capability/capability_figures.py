@@ -52,7 +52,6 @@ def sections_of(survey: Survey, settings: CapabilitySettings) -> tuple[_Section,
 
 
 def reach_figure(survey: Survey, settings: CapabilitySettings) -> bytes:
-    """Where the tool comes, and in how many of the postures drawn (PNG)."""
     from matplotlib.colors import LogNorm
 
     counts = survey.voxels.counts.astype(float)
@@ -61,7 +60,6 @@ def reach_figure(survey: Survey, settings: CapabilitySettings) -> bytes:
 
 
 def quantity_figure(survey: Survey, settings: CapabilitySettings, name: str) -> bytes:
-    """A quantity's mean over the postures of each cell (PNG)."""
     quantity, cells = BY_NAME[name], survey.voxels.mean(name)
     low, high = np.percentile(cells, [2, 98]) if quantity.good == "high" else (0.0, np.percentile(cells, 98))
     how = {"cmap": _GOOD_LOW if quantity.good == "low" else _GOOD_HIGH, "vmin": low, "vmax": max(high, low + 1e-12)}
@@ -154,7 +152,6 @@ def _map(axes: Any, voxels: Voxels, cells: Array, section: _Section, how: Mappin
 
 
 def _limits(axes: Any, voxels: Voxels, section: _Section, colour: str = _LIMIT, width: float = 1.0) -> None:
-    """The outline of all cells seen along the axis that is cut, holes of the sample closed."""
     from scipy.ndimage import binary_closing
 
     plane = voxels.places[:, [section.across, section.up]]

@@ -25,7 +25,6 @@ _SHORT = {
 
 
 def quantity_table(summary: Mapping[str, Any]) -> Table:
-    """Each quantity over all cells that are reached."""
     rows = tuple(
         (
             ", ".join(filter(None, (BY_NAME[name].words, BY_NAME[name].unit))),
@@ -65,14 +64,12 @@ def areas_table(designs: Mapping[str, Mapping[str, Any]], caption: str) -> Table
 
 
 def number(value: float | None) -> str:
-    """Three significant digits."""
     if value is None:
         return "-"
     return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
 
 
 def share(value: float | None) -> str:
-    """In per cent."""
     return "-" if value is None else f"{100 * value:.1f} %"
 
 
@@ -126,7 +123,6 @@ def render_page(
 
 
 def show_table(console: Console, table: Table) -> None:
-    """One table on the terminal; numbers stand to the right."""
     shown = ScreenTable(title=table.caption, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for words, is_number in table.headings:
         shown.add_column(words, justify="right" if is_number else "left")

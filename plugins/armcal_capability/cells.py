@@ -35,12 +35,10 @@ class Voxels:
         return np.asarray((self.places + 0.5) * self.size)
 
     def mean(self, name: str) -> Array:
-        """Of a quantity, over the postures of each cell."""
         return np.asarray(self.values[name][1])
 
 
 def voxels_of(postures: Postures, size: float) -> Voxels:
-    """The cells of postures; their order is that of their places, whatever that of the postures."""
     places = np.floor(postures.positions / size).astype(np.int64)
     cells, cell, counts = np.unique(places, axis=0, return_inverse=True, return_counts=True)
     values = grouped(postures.values, cell.ravel(), len(cells))
@@ -83,7 +81,6 @@ class AreaMap:
 
     @property
     def reached(self) -> Mask:
-        """Which cells the tool reaches."""
         return np.asarray(self.counts > 0)
 
 

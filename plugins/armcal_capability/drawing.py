@@ -20,7 +20,6 @@ class Picture:
 
     @property
     def data(self) -> str:
-        """As it stands in the page."""
         return base64.b64encode(self.png).decode()
 
 
@@ -47,7 +46,6 @@ def style(axes: Any, across: str = "", up: str = "", grid: Literal["both", "y", 
 
 
 def png_of(figure: Any) -> bytes:
-    """A figure as PNG; the same figure gives the same bytes."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", metadata={"Software": None})
     return stream.getvalue()

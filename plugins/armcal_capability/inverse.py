@@ -34,7 +34,6 @@ class Pointing:
 
     @classmethod
     def of(cls, settings: ToolDirectionSettings) -> Self:
-        """As configured."""
         along = np.array(settings.along, dtype=float)
         return cls("xyz".index(settings.axis), along / np.linalg.norm(along), settings.within)
 
@@ -96,7 +95,6 @@ def _equations(
 
 
 def _moved(commands: Array, error: Array, slope: Array, limits: Array) -> Array:
-    """After one step; joints that stand at a limit and are pushed beyond it stay."""
     pull = np.einsum("nmj,nm->jn", slope, error)
     held = ((commands <= limits[:, :1]) & (pull < 0)) | ((commands >= limits[:, 1:]) & (pull > 0))
     free = slope * ~held.T[:, None, :]

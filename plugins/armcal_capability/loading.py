@@ -123,14 +123,12 @@ def load_designs(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, C
 
 
 def _with_rules(source: ConfigSource, config_source: ConfigSource) -> ConfigSource:
-    """A configuration with the sections of another that set how it is surveyed."""
     data = {**source.data, **{key: config_source.data[key] for key in _RULES if key in config_source.data}}
     marks = {**source.marks, **{place: at for place, at in config_source.marks.items() if place and place[0] in _RULES}}
     return replace(source, data=data, marks=marks)
 
 
 def _with_servos(subject: Subject, path: Path) -> Subject:
-    """With the steps of its servos, from a servo file."""
     file = load_servo_file(path)
     if fault := unknown_joint(file.servos, subject.arm.commanded):
         raise ConfigError(f"{fault}.", where=Location(str(path)))

@@ -105,7 +105,6 @@ class MechanicsFunction:
 
 
 def _function(expression: ToolExpression) -> ca.Function:
-    """(record, state) -> pose, its slope by commands and by a force, efforts."""
     tool = expression.base_T_tool
     pose = ca.vertcat(ca.vec(tool.rotation), tool.translation)
     slope = replace(slopes(expression), corrected=pose)

@@ -172,7 +172,6 @@ def singular_values(slopes: Array) -> Array:
 
 
 def moves(values: Array) -> int:
-    """In how many directions the tool moves anywhere; an arm in a plane has no more than two."""
     if not values.size:
         return 0
     return int(np.sum(values.max(axis=0) > _NOTHING * values.max()))

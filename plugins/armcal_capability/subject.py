@@ -52,7 +52,6 @@ class Subject:
 
     @property
     def slides(self) -> Mask:
-        """Which commanded joints slide."""
         return np.array([dimension == "length" for dimension in self.arm.commanded.values()])
 
     def holding(self, stated: dict[str, float]) -> Array:

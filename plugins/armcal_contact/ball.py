@@ -66,7 +66,6 @@ class BallInSocket(OneArmContact):
         self.mean_weight = _MEAN_WEIGHT if settings.socket == "mean" else 1.0
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """The ball's centre on the tool (m)."""
         return point_blocks("centre", self.settings.centre)
 
     def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
@@ -81,13 +80,11 @@ class BallInSocket(OneArmContact):
         return {axis: place[i] for i, axis in enumerate("xyz")}
 
     def named_groups(self) -> tuple[str, ...]:
-        """Sockets at known places, and those at known distances."""
         before = "*/" if len(self.group_labels) > 1 else ""
         apart = [f"{before}{name}" for known in self.settings.distances for name in known.between]
         return (*self.settings.sockets, *apart)
 
     def ties(self, groups: Sequence[str]) -> tuple[Tie, ...]:
-        """Known distances, within each tool position."""
         if self.settings.sockets_of is not None:
             return ()
         ties = []
@@ -104,11 +101,9 @@ class BallInSocket(OneArmContact):
         return self._ball(arms, values) - ca.vertcat(*[values[axis] for axis in "xyz"])
 
     def noise(self) -> tuple[float, ...]:
-        """Of each coordinate (m)."""
         return (self.settings.noise,) * 3
 
     def noise_channels(self) -> tuple[tuple[Channel, ...], ...]:
-        """One for all three."""
         return ((Channel("noise", "length"),),) * 3
 
     def _ball(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> Any:
@@ -116,6 +111,5 @@ class BallInSocket(OneArmContact):
 
 
 def _beyond(distance: float, first: Mapping[str, Any], second: Mapping[str, Any]) -> Any:
-    """By how much two sockets are farther apart than a known distance (m)."""
     apart = ca.vertcat(*[second[axis] - first[axis] for axis in "xyz"])
     return ca.sqrt(ca.dot(apart, apart)) - distance

@@ -41,17 +41,14 @@ class ClampedTool(OneArmContact):
     }
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """The fixture in the base frame (m, unit quaternion)."""
         return self.settings.fixture.blocks("fixture")
 
     def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
-        """The clamped tool's pose in the fixture (m, unit quaternion)."""
         known = self.settings.points.get(group)
         blocks = pose_blocks("point") if known is None else known.blocks("point")
         return tuple(replace(block, free=known is None) for block in blocks)
 
     def named_groups(self) -> tuple[str, ...]:
-        """The known points."""
         return tuple(self.settings.points)
 
     def group_starts(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
@@ -71,5 +68,4 @@ class ClampedTool(OneArmContact):
         return (self.settings.noise,) * 3 + (self.settings.orientation_noise,) * 3
 
     def dimensions(self) -> tuple[str, ...]:
-        """Position, then rotation."""
         return ("length",) * 3 + ("angle",) * 3

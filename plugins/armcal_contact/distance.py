@@ -37,23 +37,18 @@ class TipDistance(Instrument):
 
     @property
     def partner_label(self) -> str:
-        """What names the other record."""
         return str(self.settings.partner)
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """The tip on the tool (m)."""
         return point_blocks("tip", self.settings.tip)
 
     def channels(self) -> tuple[Channel, ...]:
-        """The distance of the two tips."""
         return (Channel("distance", "length"),)
 
     def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
-        """The distance of the two tips (m)."""
         tip = point_expression("tip", values)
         here, there = (arms[name].base_T_tool.apply(tip) for name in self.arms)
         return {"distance": ca.sqrt(ca.dot(here - there, here - there))}
 
     def noise(self) -> tuple[float, ...]:
-        """Of a distance (m)."""
         return (self.settings.noise,)

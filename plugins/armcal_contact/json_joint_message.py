@@ -147,7 +147,6 @@ class JointMessages:
         return plan
 
     def _spelt(self, name: str) -> list[tuple[str, str]]:
-        """What a joint's key may be, and its unit; a name that the settings gave may have one itself."""
         split = split_suffix(name)
         whole = split[1].name if split and split[1].name in _UNITS else self._unit or ""
         return [(name, whole), *[(f"{name}_{unit}", unit) for unit in _UNITS]]

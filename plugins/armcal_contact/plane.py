@@ -44,7 +44,6 @@ class PlaneContact(OneArmContact):
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"noise_mm": 0.05, "tip_mm": [0, 0, 60]}
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """The tip on the tool (m)."""
         return point_blocks("tip", self.settings.tip)
 
     def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
@@ -53,7 +52,6 @@ class PlaneContact(OneArmContact):
         return tuple(replace(block, free=True) for block in (*tilts, scalar("offset", "m", 0.0, 0.01)))
 
     def group_starts(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
-        """A plane of the stated normal goes through the tip."""
         offset = ca.dot(ca.SX(list(self.settings.normal)), self._tip(arms, values))
         return {"tilt_1": ca.SX(0), "tilt_2": ca.SX(0), "offset": offset}
 
@@ -68,7 +66,6 @@ class PlaneContact(OneArmContact):
         return ca.dot(tilted, self._tip(arms, values)) - values["offset"]
 
     def noise(self) -> tuple[float, ...]:
-        """Across the plane (m)."""
         return (self.settings.noise,)
 
     def _tip(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> Any:

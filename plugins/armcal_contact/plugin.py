@@ -5,7 +5,6 @@ from armcal.hooks import Register, hookimpl
 
 @hookimpl
 def armcal_register_measurements(register: Register) -> None:
-    """Announce the measurements."""
     register("ball_in_socket", "armcal_contact.ball:BallInSocket", "a ball on the tool, seated in sockets")
     register("clamped_tool", "armcal_contact.clamp:ClampedTool", "the tool clamped at points that do not move")
     register("plane_contact", "armcal_contact.plane:PlaneContact", "a tip that touches planes")
@@ -14,11 +13,9 @@ def armcal_register_measurements(register: Register) -> None:
 
 @hookimpl
 def armcal_register_readers(register: Register) -> None:
-    """Announce the reader."""
     register("mukca", "armcal_contact.mukca_reader:MukcaReader", "folders of postures with a ball in two sockets")
 
 
 @hookimpl
 def armcal_register_joint_streams(register: Register) -> None:
-    """Announce the joint stream."""
     register("json_lines", "armcal_contact.json_joints:JsonLinesJoints", "a JSON object a line: UDP, a pipe, a file")

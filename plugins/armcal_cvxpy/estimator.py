@@ -146,13 +146,11 @@ class _Cone:
         self._units, self._now = cp.Parameter(6, nonneg=True), cp.Parameter((3, 3), symmetric=True)
 
     def constraint(self, step: cp.Variable) -> cp.Constraint:
-        """As cvxpy takes it."""
         moved = cp.multiply(self._units, step[self._place])
         xx, xy, xz, yy, yz, zz = (moved[i] for i in range(6))
         return self._now + cp.bmat([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) >> 0
 
     def set(self, at: Array, units: Array) -> None:
-        """Where the block stands (coordinates in typical scales), and what one of its step's units is."""
         unit = float(np.max(units[self._place]))
         self._now.value = symmetric(self._base + at[self._place]) / unit
         self._units.value = units[self._place] / unit

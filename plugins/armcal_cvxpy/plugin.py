@@ -5,5 +5,4 @@ from armcal.hooks import Register, hookimpl
 
 @hookimpl
 def armcal_register_estimators(register: Register) -> None:
-    """Announce the estimator."""
     register("cvxpy", "armcal_cvxpy.estimator:CvxpyEstimator", "sequential convex steps; the same answer as ipopt")

@@ -58,26 +58,21 @@ class ClosedChain(Contact):
 
     @property
     def arms(self) -> tuple[str, ...]:
-        """Left and right."""
         return (self._settings.left, self._settings.right)
 
     @property
     def group_labels(self) -> tuple[str, ...]:
-        """What names a clamp."""
         return self._settings.group_labels
 
     def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
-        """left_tool_T_right_tool in one clamp (m, unit quaternion)."""
         known = self._settings.clamps.get(group)
         blocks = pose_blocks("clamp") if known is None else known.blocks("clamp")
         return tuple(replace(block, free=known is None) for block in blocks)
 
     def named_groups(self) -> tuple[str, ...]:
-        """The known clamps."""
         return tuple(self._settings.clamps)
 
     def group_starts(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
-        """The clamp is how the tools stand to each other."""
         between = self._between(arms)
         place = {f"clamp_{axis}": between.translation[i] for i, axis in enumerate("xyz")}
         return {**place, "clamp_rotation": quaternion_expression(between.rotation)}
@@ -92,7 +87,6 @@ class ClosedChain(Contact):
         return (self._settings.noise,) * 3 + (self._settings.orientation_noise,) * 3
 
     def dimensions(self) -> tuple[str, ...]:
-        """Position, then rotation."""
         return ("length",) * 3 + ("angle",) * 3
 
     def _between(self, arms: Mapping[str, ArmState]) -> se3.Transform:

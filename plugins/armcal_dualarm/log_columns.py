@@ -36,12 +36,10 @@ class ArmColumns(Settings):
 
     @property
     def from_base(self) -> tuple[Column, ...]:
-        """The columns in the order of the joints from the base."""
         return tuple(self.columns[number - 1] for number in self.order or range(1, len(self.columns) + 1))
 
     @property
     def ratios(self) -> Array:
-        """Motor over joint, from the base."""
         return np.ones(len(self.columns)) if self.gear_ratios is None else np.array(self.gear_ratios)
 
 

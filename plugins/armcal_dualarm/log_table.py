@@ -93,12 +93,10 @@ def text_of(path: Path, line: int | None, data: bytes) -> str:
 
 
 def delimiter_of(text: str) -> str:
-    """What parts the cells of a row; a blank stands for any blanks."""
     return next((delimiter for delimiter in _DELIMITERS if delimiter in text), " ")
 
 
 def cells_of(text: str, delimiter: str) -> list[str]:
-    """The cells of a row."""
     parts = text.split() if delimiter == " " else text.split(delimiter)
     return [part.strip().strip('"').strip() for part in parts]
 

@@ -5,17 +5,14 @@ from armcal.hooks import Register, hookimpl
 
 @hookimpl
 def armcal_register_measurements(register: Register) -> None:
-    """Announce the measurement."""
     register("closed_chain", "armcal_dualarm.closure:ClosedChain", "two arms clamped together at their tools")
 
 
 @hookimpl
 def armcal_register_readers(register: Register) -> None:
-    """Announce the reader."""
     register("two_arm_log", "armcal_dualarm.log_reader:TwoArmLogReader", "motor angles of several arms, perhaps a log")
 
 
 @hookimpl
 def armcal_register_joint_streams(register: Register) -> None:
-    """Announce the joint stream."""
     register("two_arm_log", "armcal_dualarm.live:TwoArmLogStream", "motor angles of several arms, as they are logged")

@@ -66,7 +66,6 @@ TOLERANCE = 1e-12
 
 
 def test_source(e: ToolExpression, reference: Reference, prefix: str, places: Mapping[str, str]) -> str:
-    """The program with armcal's own answers in it."""
     cases = zip(reference.records, reference.base_T_tool, reference.efforts, strict=True)
     rows = [
         f"  {{{input_row(e, list(record))},\n   {c_row(pose.ravel())},\n   {c_row(efforts)}}}"
@@ -77,7 +76,6 @@ def test_source(e: ToolExpression, reference: Reference, prefix: str, places: Ma
 
 
 def input_row(e: ToolExpression, record: list[float]) -> str:
-    """A record as the initial value of an arm_input."""
     n, sizes = len(e.joints), (3, 1, 3, 3, 3)
     rows, start = [c_row(record[:n]), c_row(record[n : 2 * n])], 2 * n
     for size in sizes:

@@ -89,7 +89,6 @@ class CExporter:
 
 
 def _remarks(request: ExportRequest, conditions: Sequence[str]) -> list[str]:
-    """What the code takes for granted."""
     texts = []
     if request.arm.deflection_size and not request.payload_stated:
         texts.append("the calibration does not say what hangs on the tool: the default payload is 0 kg")

@@ -101,7 +101,6 @@ def arm_functions(e: ToolExpression, prefix: str) -> ArmFunctions:
 
 
 def _twist(e: ToolExpression) -> tuple[Expression, Expression]:
-    """Position and small turns from a rotation that is held, whose derivative is the twist; and that rotation."""
     held = ca.SX.sym("held", 3, 3)
     turned = ca.mtimes(e.base_T_tool.rotation, held.T)
     turns = [turned[2, 1], turned[0, 2], turned[1, 0]]
@@ -113,7 +112,6 @@ def _at_tool(e: ToolExpression, slope: Expression, held: Expression) -> Expressi
 
 
 def _rows(matrix: Expression) -> Expression:
-    """Row by row."""
     return ca.vec(ca.densify(matrix).T)
 
 

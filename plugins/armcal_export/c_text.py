@@ -38,7 +38,6 @@ def c_number(value: float) -> str:
 
 
 def c_row(numbers: Iterable[float]) -> str:
-    """Numbers as the initial value of an array."""
     return "{" + ", ".join(c_number(number) for number in numbers) + "}"
 
 
@@ -85,7 +84,6 @@ def filled(template: str, prefix: str, **values: str) -> str:
 
 
 def with_prefix(text: str, prefix: str) -> str:
-    """Names under another prefix."""
     return _PREFIX.sub(lambda match: f"{prefix if match[1] == 'arm' else prefix.upper()}_", text)
 
 

@@ -75,7 +75,6 @@ def _entry(effect: str, spring: Spring, chain: Chain) -> SpringEntry:
 
 
 def chain_of(request: ExportRequest) -> Chain:
-    """The arm's chain at its calibrated values; all its expressions are constants."""
     return request.arm.chain({name: ca.SX(list(map(float, value))) for name, value in request.values.items()})
 
 

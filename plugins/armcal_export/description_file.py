@@ -56,7 +56,6 @@ class YamlExporter:
         return Exported(content, changed_numbers(request), companions=beside)
 
     def written(self, arm_description: ArmDescription) -> bytes:
-        """The file's content."""
         text = yaml.dump(
             arm_description.model_dump(mode="json"), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110,
             default_flow_style=None,
@@ -91,7 +90,6 @@ def read_description(content: bytes) -> ArmDescription:
 
 
 def schema() -> bytes:
-    """The JSON schema."""
     return resources.files("armcal_export").joinpath(SCHEMA_FILE).read_bytes()
 
 

@@ -75,7 +75,6 @@ def mjcf(
 
 
 def spring_name(site: str, number: int) -> str:
-    """Of a passive hinge."""
     return f"{site}_spring{number}"
 
 

@@ -130,7 +130,6 @@ def _kept(axes: Sequence[tuple[Array, float]], slides: bool) -> list[Hinge]:
 
 
 def _left_out(request: ExportRequest, arm_description: ArmDescription) -> tuple[str, ...]:
-    """What no passive hinge and no mass does."""
     bent = {spring.effect for spring in arm_description.springs if not spring.linear}
     effects = [name for name in request.arm.effects if name in bent or _displaces(request, name)]
     masses = [mass.name for mass in arm_description.masses if mass.loads_up_to != mass.moved_by and mass.mass_kg > 0]
@@ -156,7 +155,6 @@ def _displaces(request: ExportRequest, name: str) -> bool:
 
 
 def _reach(request: ExportRequest, loaded: LoadedModel, commands: Array) -> float:
-    """How far MuJoCo's tool at rest is from the calibrated arm's, at most over poses that settle in both (m)."""
     expression, largest = request.expression(), 0.0
     tools, _, settled = in_equilibrium(expression, expression.records(commands).T)
     for command, tool in zip(commands.T[settled], tools[settled], strict=True):

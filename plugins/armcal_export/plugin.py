@@ -5,7 +5,6 @@ from armcal.hooks import Register, hookimpl
 
 @hookimpl
 def armcal_register_exporters(register: Register) -> None:
-    """Announce the exporters."""
     register("c", "armcal_export.c_code:CExporter", "C99: kinematics in equilibrium, Jacobian, efforts, compensation")
     register("yaml", "armcal_export.description_file:YamlExporter", "the arm as numbers that explain themselves")
     register("json", "armcal_export.description_file:JsonExporter", "the same as yaml, with its schema")

@@ -20,7 +20,6 @@ _ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r"}
 
 
 def ros2_text(node: str, parameters: Mapping[str, Value], comment: str) -> str:
-    """A parameter file of one node; dotted names become nested keys."""
     tree: dict[str, Any] = {}
     for name, value in parameters.items():
         *above, last = name.split(".")

@@ -54,7 +54,6 @@ class QuadraticModel(Posed):
     about: NormalEquations
 
     def bounds(self) -> tuple[Array, Array]:
-        """The problem's."""
         return self.posed.bounds()
 
     def cost(self, x: Array) -> float:
@@ -62,11 +61,9 @@ class QuadraticModel(Posed):
         return self._moved(x).cost
 
     def model(self, x: Array) -> NormalEquations:
-        """Its Hessian is exact, and may be indefinite."""
         return self.posed.by_increments(x, self._moved(x))
 
     def exact_hessian(self, x: Array) -> Array:
-        """The model's."""
         return self.model(x).hessian
 
     def _moved(self, x: Array) -> NormalEquations:
@@ -78,7 +75,6 @@ class QuadraticModel(Posed):
 
 
 def has_matrices(parameters: Parameters) -> bool:
-    """Whether a semidefinite matrix is free."""
     return any(isinstance(block.domain, Semidefinite) for block in parameters.free)
 
 
@@ -116,7 +112,6 @@ def _model(posed: PosedProblem, x: Array) -> NormalEquations | None:
 
 
 def definite(posed: PosedProblem, x: Array, least: float) -> Array:
-    """No semidefinite matrix so near its cone's boundary that the gradient of its root vanishes."""
     values, parameters = posed.values(x), posed.problem.parameters
     for block in parameters.free:
         if isinstance(block.domain, Semidefinite):

@@ -64,7 +64,6 @@ class IpoptEstimator:
         self._settings, self._executor = settings, executor or Sequential()
 
     def spread(self, executor: Executor) -> IpoptEstimator:
-        """The same, its starts done by an executor."""
         return IpoptEstimator(self._settings, executor)
 
     def solve(
@@ -203,7 +202,6 @@ class _Objective:
 
     @property
     def stuck(self) -> bool:
-        """Whether no step, however short, leads on."""
         return self._refused >= _MOST_REFUSED
 
     def settled(self, x: Array) -> bool:
@@ -223,11 +221,9 @@ class _Objective:
         return abs(gain) <= _ROUNDING * model.cost
 
     def gradient(self, x: Array) -> Array:
-        """By scaled increments."""
         return self._evaluate(x).gradient / self.unit
 
     def hessian(self, x: Array) -> Array:
-        """Gauss-Newton, or exact for the residuals."""
         return (self._posed.exact_hessian(x) if self._exact else self._evaluate(x).hessian) / self.unit
 
     def _evaluate(self, x: Array) -> NormalEquations:

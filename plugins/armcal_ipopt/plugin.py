@@ -5,7 +5,6 @@ from armcal.hooks import Register, hookimpl
 
 @hookimpl
 def armcal_register_estimators(register: Register) -> None:
-    """Announce the estimator."""
     register(
         "ipopt",
         "armcal_ipopt.estimator:IpoptEstimator",

@@ -23,7 +23,6 @@ class ApproachBacklash(JointEffect):
     """
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """One half-width a joint."""
         return tuple(scalar(f"lag{joint}", "rad", 0.0, PLAY_SCALE_RAD) for joint in self.joints)
 
     def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:
@@ -52,7 +51,6 @@ class TorqueBacklash(SiteSprings):
         return tuple(scalar(f"play{joint}", "rad", 0.0, PLAY_SCALE_RAD, physical) for joint in self.joints)
 
     def spring(self, site: int, value: Any) -> Spring:
-        """One coordinate."""
         floor = self.settings.transition**2
         return Spring(site, (), lambda torque, command: value * torque / ca.sqrt(torque * torque + floor))
 
@@ -74,11 +72,9 @@ class BearingPlay(SiteSprings):
     Settings = BearingPlaySettings
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """One half-width a site."""
         physical = Interval(lower=0.0)
         return tuple(scalar(f"tilt{site}", "rad", 0.0, PLAY_SCALE_RAD, physical) for site in self.sites)
 
     def spring(self, site: int, value: Any) -> Spring:
-        """Three coordinates."""
         floor = self.settings.transition**2
         return Spring(site, XYZ, lambda moment, command: value * moment / ca.sqrt(ca.dot(moment, moment) + floor))

@@ -26,7 +26,6 @@ class Delay(JointEffect):
         self._rates, self.conditions = {joint: rate.name for joint, rate in rates.items()}, tuple(rates.values())
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """How old the recorded joints are at the time of the measurement (s)."""
         return (scalar("delay", "s", 0.0, _SCALE_S),)
 
     def shaped(self, chain: Chain, conditions: Mapping[str, Any], values: Mapping[str, Any]) -> Chain:

@@ -32,7 +32,6 @@ class ServoMap(JointEffect):
     Settings = ServoMapSettings
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """Gains, then the offset, of each joint in turn."""
         blocks, gains = [], ("above", "below") if self.settings.gains == "two" else ("gain",)
         for joint in self.joints:
             blocks += [scalar(f"{name}{joint}", "1", 0.0, GAIN_SCALE) for name in gains]
@@ -40,7 +39,6 @@ class ServoMap(JointEffect):
         return tuple(blocks)
 
     def zeros(self) -> dict[str, int]:
-        """The offsets."""
         return {f"offset{joint}": joint for joint in self.joints}
 
     def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:
@@ -61,7 +59,6 @@ class GearError(JointEffect):
     """
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """Four amplitudes a joint."""
         return tuple(
             scalar(f"{wave}{periods}_{joint}", "rad", 0.0, GEAR_SCALE_RAD)
             for joint in self.joints

@@ -26,15 +26,12 @@ class SiteSprings(JointEffect):
 
     @property
     def sites(self) -> tuple[int, ...]:
-        """Where a spring is."""
         return (0, *self.joints) if getattr(self.settings, "base", False) else self.joints
 
     def springs(self, values: Mapping[str, Any]) -> tuple[Spring, ...]:
-        """One a site."""
         return tuple(self.spring(site, values[f"{self.letter}{site}"]) for site in self.sites)
 
     def spring(self, site: int, value: Any) -> Spring:
-        """That of a site, by its parameter."""
         raise NotImplementedError
 
 
@@ -69,7 +66,6 @@ class TorsionalSprings(SiteSprings):
         return (0, *self.joints) if self.settings.base_axis else self.joints
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """One compliance a site."""
         physical = Interval(lower=0.0)
         nominal = self.settings.compliance
         return tuple(
@@ -77,7 +73,6 @@ class TorsionalSprings(SiteSprings):
         )
 
     def spring(self, site: int, value: Any) -> Spring:
-        """One coordinate."""
         directions = () if site else (_AXES[self.settings.base_axis],)
         return Spring(site, directions, lambda load, command: value * load)
 
@@ -91,11 +86,9 @@ class CubicSprings(SiteSprings):
     letter = "c"
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """One number a joint, zero at first."""
         return tuple(scalar(f"c{joint}", "rad_per_Nm3", 0.0, CUBIC_SCALE_RAD_PER_NM3) for joint in self.joints)
 
     def spring(self, site: int, value: Any) -> Spring:
-        """One coordinate."""
         return Spring(site, (), lambda load, command: value * load * load * load)
 
 
@@ -122,13 +115,11 @@ class Compliances(SiteSprings):
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"compliance_rad_per_Nm": 0.02}
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """One matrix a site."""
         c = self.settings.compliance
         nominal, scale = (c, 0.0, 0.0, c, 0.0, c), COMPLIANCE_SCALE_RAD_PER_NM
         return tuple(ParameterBlock(f"C{site}", "rad_per_Nm", nominal, Semidefinite(), scale) for site in self.sites)
 
     def spring(self, site: int, value: Any) -> Spring:
-        """Three coordinates."""
         xx, xy, xz, yy, yz, zz = (value[i] for i in range(6))
         matrix = ca.vertcat(ca.horzcat(xx, xy, xz), ca.horzcat(xy, yy, yz), ca.horzcat(xz, yz, zz))
         return Spring(site, XYZ, lambda moment, command: ca.mtimes(matrix, moment))

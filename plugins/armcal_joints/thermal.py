@@ -59,7 +59,6 @@ class ThermalLength(JointEffect):
 
 
 def _on_longer(at: Attachment, factors: Sequence[Any]) -> Attachment:
-    """An attachment on the link behind its joint."""
     return replace(at, joint_T_frame=_longer(at.joint_T_frame, factors[at.joint]))
 
 

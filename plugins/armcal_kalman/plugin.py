@@ -5,7 +5,6 @@ from armcal.hooks import Register, hookimpl
 
 @hookimpl
 def armcal_register_online_estimators(register: Register) -> None:
-    """Two filters on filterpy's, and a window."""
     register("extended", "armcal_kalman.filters:ExtendedFilter", "iterated extended Kalman filter")
     register("unscented", "armcal_kalman.filters:UnscentedFilter", "unscented Kalman filter")
     register("window", "armcal_kalman.window:WindowEstimator", "the last records solved together again and again")

@@ -40,11 +40,9 @@ class MotorFile:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is unusual and can be used, a sentence each."""
         return tuple(text for motor in self.motors.values() for text in _notes(motor))
 
     def with_motors(self, motors: Mapping[str, Motor]) -> str:
-        """The text with these motors' numbers in place of the old ones, all else as it was."""
         text = self.text
         for name, new in motors.items():
             old = self.motors[name]

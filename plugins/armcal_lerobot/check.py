@@ -74,7 +74,6 @@ def check_content(
 
 
 def _other_servos(file: MotorFile, other: MotorFile) -> list[str]:
-    """Motors that have another id in the other file, sentences."""
     ids = {name: (motor.id, other.motors[name].id) for name, motor in file.motors.items()}
     text = "another servo answers to it, and what follows is not the whole of what changed. Give each its id again."
     return [
@@ -157,7 +156,6 @@ def sections(file: MotorFile, gripper: Gripper | None, model: str) -> str:
 
 
 def _key(name: str) -> str:
-    """A name as a key of YAML: quoted, if it is not a plain one."""
     return name if re.fullmatch(r"[A-Za-z_][\w.-]*", name) else json.dumps(name)
 
 
@@ -259,7 +257,6 @@ def _ranges(file: MotorFile, gripper: Gripper | None) -> list[str]:
 
 
 def _passed(motor: Motor) -> str:
-    """That a motor's encoder passed its end, a sentence."""
     text = (
         f"{motor.name} has a range of {2 * motor.half_range_deg:.0f} deg, counts {motor.range_min} to "
         f"{motor.range_max}: {PASSED_END}, and its zero, the middle of the range, is wrong with it."

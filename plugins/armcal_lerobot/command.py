@@ -22,7 +22,6 @@ def lerobot() -> None:
 
 
 def _of_arm(command: Any) -> Any:
-    """The options that say which arm, and how its motors are called."""
     config = click.option("--arm", "config", type=FILE, help="The arm's configuration or calibration: gives mm.")
     name = click.option("--arm-name", metavar="NAME", help="Which arm, where there are several.")
     joint = click.option("--joint", "joints", multiple=True, metavar="MOTOR=JOINT", help=_JOINT_HELP)

@@ -116,7 +116,6 @@ class Gripper:
             raise InputError(text, where=self._where, hint=mend)
 
     def motor_of(self, joint: str) -> tuple[str, int]:
-        """The motor that turns a joint, and its sense."""
         return self._wiring[joint]
 
     @property

@@ -54,7 +54,6 @@ class Motion:
 
     @property
     def starts(self) -> Array:
-        """What each episode's state begins at (episodes x motors)."""
         first: dict[int, Array] = {}
         for stretch in self.stretches:
             first.setdefault(stretch.episode, np.median(stretch.reached[:_START_FRAMES], axis=0))

@@ -50,12 +50,10 @@ class Motor:
 
     @property
     def half_range_deg(self) -> float:
-        """Degrees from the middle to either end."""
         return (self.range_max - self.range_min) / 2 * DEGREES_A_COUNT
 
     @property
     def turns_freely(self) -> bool:
-        """Whether the range is the whole turn, as LeRobot writes for wrist_roll."""
         return self.range_min == 0 and self.range_max == LAST_COUNT
 
     def is_beyond(self, own_deg: float | None) -> bool:
@@ -71,7 +69,6 @@ class Motor:
         return 2 * self.half_range_deg > own_deg + (_SAME_DEG if is_at_end else _LONGER_DEG)
 
     def degrees_in(self, units: Units) -> float:
-        """Degrees of one unit of a data set that was recorded with this file."""
         if units == "degrees":
             return 1.0
         sign = -1.0 if self.drive_mode else 1.0  # LeRobot inverts percent by the drive mode, and never degrees

@@ -34,7 +34,6 @@ class RestRecord:
 
     @property
     def name(self) -> str:
-        """Its id, and its image's name without the ending."""
         return f"e{self.episode:06d}_f{self.frame:06d}"
 
 

@@ -52,20 +52,16 @@ class Figure:
     high: float
 
     def times(self, factor: float) -> Figure:
-        """In another unit."""
         ends = sorted((self.low * factor, self.high * factor))
         return Figure(self.value * factor, *ends)
 
     def plus(self, number: float) -> Figure:
-        """Moved by a number that is known."""
         return Figure(self.value + number, self.low + number, self.high + number)
 
     def no_finer(self, half: float) -> Figure:
-        """With an interval of at least so much either way."""
         return Figure(self.value, min(self.low, self.value - half), max(self.high, self.value + half))
 
     def minus(self, other: Figure) -> Figure:
-        """The difference of two independent numbers."""
         half = float(np.hypot(self.high - self.low, other.high - other.low)) / 2
         middle = self.value - other.value
         return Figure(middle, middle - half, middle + half)
@@ -101,7 +97,6 @@ class Tracking:
 
 
 def trackings(motion: Motion, torque: Torque | None = None) -> tuple[Tracking, ...]:
-    """Every motor's."""
     return tuple(_tracking(motion, index, torque) for index in range(len(motion.motors)))
 
 

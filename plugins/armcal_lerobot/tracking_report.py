@@ -67,7 +67,6 @@ def show_compare(console: Console, content: Mapping[str, Any]) -> None:
 
 
 def page(content: Mapping[str, Any], command: str) -> str:
-    """One self-contained HTML file."""
     names = " and ".join(Path(folder).name for folder in content["data"])
     shown = {"title": names, "sentences": _sentences(content), "tables": _tables(content)}
     return rendered("compare.html.j2", {**shown, "command": command, "version": __version__}, Path(__file__).parent)
@@ -119,7 +118,6 @@ def _tables(content: Mapping[str, Any]) -> list[Table]:
 
 
 def _followed(entry: Mapping[str, Any]) -> list[str]:
-    """Unit, gain, offset and backlash."""
     return [entry["unit"], _shown(entry["gain"], 1, 3), *(_shown(entry[key], 1, 2) for key in ("offset", "backlash"))]
 
 

@@ -142,7 +142,6 @@ def _at_zero(chain: Chain, family: Family) -> tuple[Array, Array]:
 
 
 def _compare(request: ExportRequest, chain: Chain, family: Family, frames: Array, left: Array) -> None:
-    """What was written, and the tool on it, in random poses within the limits."""
     commands = random_commands(request.arm).T
     apart, turned = largest_difference(_flange_poses(chain, family, commands)[1], tips(frames, commands) @ left)
     if not (apart <= TOLERANCE and turned <= 10 * TOLERANCE):

@@ -88,7 +88,6 @@ def read_text(text: str, path: Path, robot: str | None = None) -> MakersArm:
 
 
 def has_offsets(text: str, path: Path) -> bool:
-    """Whether a file has numbers alone, as robot_calibration writes its offsets."""
     if _SECTION.search(text):
         return False
     root = read_section(text, path)

@@ -23,7 +23,6 @@ class Entry:
     keys: tuple[str, ...] = ()
 
     def refuse(self, message: str, hint: str = AGAIN) -> NoReturn:
-        """Raise a DataError here."""
         raise DataError(message, where=self.node.origin.at(self.node.line, self.keys), hint=hint)
 
     @property
@@ -33,7 +32,6 @@ class Entry:
 
     @property
     def entries(self) -> dict[str, Entry]:
-        """What stands under its keys; nothing of a text or a list."""
         return {key: Entry(node, (*self.keys, key)) for key, node in entries_of(self.node).items()}
 
     @property

@@ -125,7 +125,6 @@ class Nominal:
 
 
 def nominal_arms() -> dict[str, Nominal]:
-    """All of them by name."""
     arms = [Nominal(name, UR, _UR_JOINTS, _UR_LINKS, dh_frames(*ur_rows(name))) for name in _UR_M]
     for name, rows in _XARM.items():
         joints = tuple(f"joint{i}" for i in range(1, len(rows) + 1))

@@ -107,7 +107,6 @@ class MdhModel:
         return self._settings.joints or tuple(f"q{i}" for i in range(1, count + 1))
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """Every number of the rows and of the extra transforms."""
         blocks = [_block(name, value) for name, value in self._step_values("base", self._settings.base)]
         for i, row in enumerate(self._settings.rows, start=1):
             blocks += [_block(n, v) for n, v in self._step_values(f"before{i}", row.before)]

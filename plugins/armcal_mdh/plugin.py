@@ -5,7 +5,6 @@ from armcal.hooks import Register, hookimpl
 
 @hookimpl
 def armcal_register_models(register: Register) -> None:
-    """Announce the model."""
     register(
         "mdh",
         "armcal_mdh.model:MdhModel",

@@ -59,7 +59,6 @@ class EventFile:
             os.replace(self._path, self._earlier)
 
     def close(self) -> None:
-        """Close the file."""
         if self._descriptor is not None:
             os.close(self._descriptor)
         self._descriptor = None

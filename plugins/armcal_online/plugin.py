@@ -13,6 +13,5 @@ _COMMANDS = {
 
 @hookimpl
 def armcal_register_commands(register: Register) -> None:
-    """Announce the commands."""
     for name, (target, summary) in _COMMANDS.items():
         register(name, f"armcal_online.commands.{target}", summary)

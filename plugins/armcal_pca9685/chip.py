@@ -53,7 +53,6 @@ class Channel(NamedTuple):
 
 
 def channel_register(channel: int) -> int:
-    """The first of a channel's four."""
     return LED0 + CHANNEL_BYTES * channel
 
 
@@ -68,7 +67,6 @@ def pulse_on(channel: int, counts: int) -> Channel:
 
 
 def no_pulse(channel: int) -> Channel:
-    """Full-off."""
     return Channel(channel * _SPREAD, FULL)
 
 
@@ -80,7 +78,6 @@ class Chip:
 
     @property
     def where(self) -> Location:
-        """For messages."""
         return Location(f"PCA9685 at 0x{self._address:02x}")
 
     def prepare(self, foreign_pulses: ForeignPulses) -> None:

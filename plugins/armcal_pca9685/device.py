@@ -39,12 +39,10 @@ class Servo:
 
     @cached_property
     def place(self) -> tuple[int, int]:
-        """The board's address, and the channel."""
         return self.calibrated.address, self.calibrated.channel
 
     @cached_property
     def clock(self) -> PulseClock:
-        """What its pulses are counted by."""
         return self.calibrated.clock
 
     @cached_property
@@ -56,7 +54,6 @@ class Servo:
 
     @cached_property
     def borne(self) -> tuple[int, int]:
-        """The fewest and the most counts that lie within the pulses that it bears."""
         low, high = (pulse / self.clock.tick for pulse in self.pulse_range)
         return math.ceil(low - _COUNT_SLACK), math.floor(high + _COUNT_SLACK)
 
@@ -71,7 +68,6 @@ class Servo:
 
     @cached_property
     def table(self) -> PulseTable:
-        """Angles and pulses."""
         return self.calibrated.table
 
 

@@ -57,7 +57,6 @@ class FirmataDecoder:
         return messages
 
     def forget(self) -> None:
-        """Drop an unfinished message, as after a line was opened anew."""
         self._rest = b""
 
 
@@ -80,12 +79,10 @@ def i2c_config() -> bytes:
 
 
 def i2c_write(address: int, data: bytes) -> bytes:
-    """Write to a device."""
     return bytes((SYSEX, I2C_REQUEST, address, WRITE)) + pairs(data) + bytes((END,))
 
 
 def i2c_read(address: int, register: int, count: int) -> bytes:
-    """Read from a register of a device, once."""
     return bytes((SYSEX, I2C_REQUEST, address, READ_ONCE)) + pairs(bytes((register, count))) + bytes((END,))
 
 
@@ -96,7 +93,6 @@ def i2c_reply(data: bytes) -> I2cReply | None:
 
 
 def text_of(data: bytes) -> str:
-    """A text that came in pairs."""
     return (unpaired(data) or b"").decode(errors="replace")
 
 

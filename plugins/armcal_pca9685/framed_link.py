@@ -56,7 +56,6 @@ class FramedLink(GuardedLink, Link):
     @property
     @override
     def took_over(self) -> bool:
-        """What the board did before ``open`` counts too."""
         return self._took_over
 
     def open(self, clock: Clock) -> LinkIdentity:

@@ -5,7 +5,6 @@ from armcal.hooks import Register, hookimpl
 
 @hookimpl
 def armcal_register_links(register: Register) -> None:
-    """Announce the links."""
     register("linux_i2c", "armcal_pca9685.linux_i2c:LinuxI2cLink", "an I2C bus of this computer")
     register("firmata", "armcal_pca9685.firmata_link:FirmataLink", "a board with stock Firmata on a serial port")
     register("framed", "armcal_pca9685.framed_link:FramedLink", "a board that looks after the arm by itself")
@@ -13,5 +12,4 @@ def armcal_register_links(register: Register) -> None:
 
 @hookimpl
 def armcal_register_devices(register: Register) -> None:
-    """Announce the devices."""
     register("pca9685", "armcal_pca9685.device:Pca9685Device", "servos on PCA9685 boards")

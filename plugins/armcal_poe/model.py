@@ -53,7 +53,6 @@ class NominalAxis:
 
     @property
     def frame(self) -> Transform:
-        """The frame at the configured point."""
         return _constant(self.rotation, self.point)
 
     def frame_on(self, direction: Expression, point: Expression) -> Transform:
@@ -74,18 +73,15 @@ class NominalAxis:
         return self.frame_on(direction, nearest_base + direction * ca.dot(direction, _sparse(self.point)))
 
     def in_frame(self, angular: Expression, linear: Expression) -> tuple[Expression, Expression]:
-        """A twist given in the base frame, in the configured axis's frame."""
         back = _sparse(self.rotation.T)
         return ca.mtimes(back, angular), ca.mtimes(back, linear + ca.cross(angular, _sparse(self.point)))
 
 
 def _constant(rotation: Array, position: Array) -> Transform:
-    """A motion of numbers."""
     return Transform(_sparse(rotation), _sparse(position))
 
 
 def _sparse(numbers: Array) -> Expression:
-    """Numbers whose zeros cost nothing."""
     return ca.sparsify(ca.SX(ca.DM(numbers)))
 
 

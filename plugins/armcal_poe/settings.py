@@ -34,7 +34,6 @@ class _JointSettings(Settings):
 
     @property
     def direction(self) -> Vector:
-        """The axis at length one."""
         x, y, z = np.array(self.axis) / np.linalg.norm(self.axis)
         return float(x), float(y), float(z)
 

@@ -70,7 +70,6 @@ class Correlations:
 
     @classmethod
     def of(cls, inputs: Sequence[Input], poses: Array) -> Correlations:
-        """With poses (inputs x M)."""
         columns, middle, constant = [], poses.mean(axis=1), np.zeros(poses.shape[1])
         for own, pose, centre in zip(inputs, poses, middle, strict=True):
             weight = own.scale**-2

@@ -57,7 +57,6 @@ class GaussianProcess(PoseResidual):
         self._check()
 
     def _check(self) -> None:
-        """Refuse what was learned on another arm, or was damaged."""
         count, known = len(self.joint_names), len(self.settings.within)
         zeros = Postures(np.zeros((count, 1)), np.zeros((count, 1)))
         for part in self.settings.learned:
@@ -173,5 +172,4 @@ class GaussianProcess(PoseResidual):
 
 
 def poses_of(term: TermSettings) -> Array:
-    """Of a term (inputs x M)."""
     return unpacked(term.poses, None, len(term.inputs)).T

@@ -54,7 +54,6 @@ class _JointProcess:
         return cls(joint, inputs, poses, roots, rows, share_between(features))
 
     def term(self, share: float) -> TermSettings:
-        """As settings hold it."""
         return TermSettings(inputs=self.inputs, poses=packed(self.poses), share=share)
 
 
@@ -130,7 +129,6 @@ class _LengthSearch:
         return best
 
     def processes(self, places: _Places) -> list[_JointProcess]:
-        """Those of the joints with the first of the length scales, and with these."""
         return [self._process(key) for key in self._keys(places)]
 
     def regression(self, places: _Places, near: _Places | None = None) -> Regression:
@@ -160,7 +158,6 @@ class _LengthSearch:
         return self._processes[key]
 
     def _product(self, one: _Key, other: _Key) -> Array:
-        """Of two processes' features."""
         if (one, other) not in self._products:
             self._products[one, other] = self._process(one).rows.T @ self._process(other).rows
             self._products[other, one] = self._products[one, other].T

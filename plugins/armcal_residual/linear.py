@@ -47,13 +47,11 @@ class Regression:
     noise: float
 
     def left_of(self, blocks: Sequence[int]) -> Array:
-        """The same of some blocks' weights."""
         edges = np.cumsum([0, *map(len, self.weights)])
         chosen = np.concatenate([np.arange(edges[i], edges[i + 1]) for i in blocks])
         return np.asarray(self.left[np.ix_(chosen, chosen)])
 
     def is_known(self, block: int) -> bool:
-        """Whether the rows say anything of a block's weights."""
         return bool(self.known[block] > _LEAST_KNOWN)
 
 
@@ -103,7 +101,6 @@ def regressed(products: Products, sizes: Sequence[int], start: tuple[Array, floa
 
 
 def _posterior(products: Products, precisions: Array, noise: float, sizes: Sequence[int]) -> tuple[Array, Array, float]:
-    """Covariance and mean of the weights, and the logarithm of how many times their prior covariance is larger."""
     scale = 1 / np.sqrt(np.repeat(precisions, sizes))
     inner, size = inverted(scale[:, None] * products.matrix * scale / noise + np.eye(len(scale)))
     inverse = scale[:, None] * inner * scale
@@ -137,7 +134,6 @@ def taken_root(roots: Array, left: Array) -> Array:
 
 
 def packed(array: Array) -> str:
-    """An array as settings hold it; an empty one too."""
     return base64.b64encode(np.ascontiguousarray(array, dtype="<f8").tobytes()).decode("ascii") or "none"
 
 

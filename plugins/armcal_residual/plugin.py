@@ -5,7 +5,6 @@ from armcal.hooks import Register, hookimpl
 
 @hookimpl
 def armcal_register_residuals(register: Register) -> None:
-    """Announce the pose residuals."""
     register(
         "gaussian_process",
         "armcal_residual.gaussian_process:GaussianProcess",

@@ -64,7 +64,6 @@ def of_tool(
 
 
 def _inputs(errors: ModelErrors) -> tuple[list[tuple[Kind, int]], list[tuple[Kind, int]]]:
-    """Joints that moved, and approaches that differ; and what differs around them."""
     postures, joints = errors.postures, range(len(errors.dimensions))
     moved: list[tuple[Kind, int]] = [
         ("angle" if errors.dimensions[i] == "angle" else "length", i)
@@ -150,15 +149,12 @@ class _Likelihood:
 
     @property
     def nothing(self) -> float:
-        """Its cost where there is noise alone."""
         return len(self.errors) / 2 * float(np.sum(np.log(np.mean(self.errors**2, axis=0))))
 
     def cost(self, at: Array) -> float:
-        """At logarithms of length scales and of the noise."""
         return self(at)[0]
 
     def __call__(self, at: Array) -> tuple[float, Array]:
-        """With the gradient."""
         (count, outputs), ratio = self.errors.shape, np.exp(2 * at[-1])
         kernel, inverse, size = self._factored(at)
         solved = inverse @ self.errors
@@ -170,18 +166,15 @@ class _Likelihood:
         return float(value), np.append(slope, 2 * ratio * np.trace(by_kernel))
 
     def scales(self, at: Array) -> Array:
-        """Of the process, by output."""
         solved = self._factored(at)[1] @ self.errors
         return np.asarray(np.sqrt(np.maximum(np.mean(self.errors * solved, axis=0), 1e-24)))
 
     def _factored(self, at: Array) -> tuple[Array, Array, float]:
-        """The correlations, the inverse with the noise, and the logarithm of its determinant."""
         kernel = np.exp(-np.tensordot(np.exp(-2 * at[:-1]), self.squares, axes=1) / 2)
         return kernel, *inverted(kernel + np.exp(2 * at[-1]) * np.eye(len(kernel)))
 
 
 def _likeliest(likelihood: _Likelihood, start: Array) -> Array:
-    """Where the marginal likelihood is largest, near a start."""
     bounds = [_LENGTHS] * (len(start) - 1) + [_NOISE]
     options = {"maxiter": _STEPS}
     return np.asarray(minimize(likelihood, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x)

@@ -162,7 +162,6 @@ def _pgm(grey: NDArray[np.uint8]) -> bytes:
 
 
 def _camera_info(message: Any) -> str:
-    """The YAML of ROS's camera_info_manager."""
     distortion = [float(x) for x in message.d]
     content = {
         "image_width": int(message.width),

@@ -82,5 +82,4 @@ class Ros2NodeExporter:
 
 
 def _comment(text: str) -> str:
-    """What may stand in a docstring."""
     return "".join(c if c.isprintable() and c not in '"\\' else " " for c in text)[:80]

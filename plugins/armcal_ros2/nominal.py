@@ -16,7 +16,6 @@ _MUCH_BETTER = 10.0
 
 
 def joint_channels(request: ReadRequest) -> list[str]:
-    """Of all arms, in the order of their joints."""
     return [f"{name}.{joint}" for name, arm in request.arms.items() for joint in arm.commanded]
 
 
@@ -42,7 +41,6 @@ def is_inverted(tools: Array, poses: Array) -> bool:
 
 
 def _left(tools: Array, poses: Array) -> float:
-    """Root mean square of what no affine map of tools, so no base and no point, makes of places (m); else infinite."""
     known = np.isfinite(poses[:, :3, 3]).all(axis=1)
     if known.sum() < _FEWEST:
         return np.inf

@@ -245,7 +245,6 @@ class Rosbag2Reader:
         return [f"{text}, as robot_state_publisher does, and not measured."]
 
     def _moving_remarks(self, seen: Mapping[str, Sequence[_Seen]]) -> list[str]:
-        """Of measurements that move in most of the rests in which they saw something, sentences."""
         remarks = []
         for name, own in seen.items():
             moves = [bool(one.fault) for one in own if one.samples >= _FEWEST_SAMPLES]

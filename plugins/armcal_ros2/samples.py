@@ -120,7 +120,6 @@ class MeasuredLog:
 
     @property
     def types(self) -> tuple[str, ...]:
-        """Of the messages that it reads."""
         return tuple(_FIELDS) if self.settings.reference is None else (TRANSFORMS,)
 
     def reads(self, topic: Topic) -> bool:

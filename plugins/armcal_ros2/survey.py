@@ -34,7 +34,6 @@ class TopicSummary:
 
     @property
     def measured(self) -> list[str]:
-        """The frames that are not computed from joint states."""
         return [frame for frame, count in self.frames.items() if 2 * self.computed[frame] < count]
 
 
@@ -47,7 +46,6 @@ class Survey:
     remarks: list[str]
 
     def content(self) -> dict[str, Any]:
-        """As JSON."""
         rests = {name: [[rest.begin, rest.end] for rest in log.rests] for name, log in self.joints.items()}
         topics = {name: vars(topic) for name, topic in self.topics.items()}
         names = {name: list(log.names) for name, log in self.joints.items()}

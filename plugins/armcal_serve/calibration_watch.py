@@ -114,7 +114,6 @@ class CalibrationWatch:
         return self._rested() if now >= self._rests_at else None
 
     def taken(self) -> None:
-        """The content that was tried last is used now."""
         self._taken_sha256, self._refusal = self._tried_sha256, ""
         self.state, self.why = "taken", ""
 
@@ -125,7 +124,6 @@ class CalibrationWatch:
         self._again_at = self._clock() + AGAIN_S if again else None
 
     def close(self) -> None:
-        """Let go of the file."""
         if self._held is not None:
             self._held.close()
             self._held = None

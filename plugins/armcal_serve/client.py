@@ -47,7 +47,6 @@ class Client:
         return dict(json.loads(line))
 
     def close(self) -> None:
-        """End the connection."""
         self._answers.close()
         self._connection.close()
 

@@ -31,12 +31,10 @@ class Ticket:
         self.answer: bytes | None = None
 
     def answered(self, answer: bytes) -> None:
-        """Take the answer, and send what can be sent in order."""
         self.answer = answer
         self.conversation.flush()
 
     def refused(self, fault: ArmcalError) -> None:
-        """Answer with an error."""
         self.answered(as_bytes(refusal(id_of(self.line), fault)))
 
 
@@ -56,17 +54,14 @@ class Conversation:
 
     @property
     def open(self) -> int:
-        """How many requests have no sent answer."""
         return len(self._tickets)
 
     def ask(self, number: int, line: bytes, arrived: float) -> Ticket:
-        """A new request, after the others."""
         ticket = Ticket(number, line, arrived, self)
         self._tickets.append(ticket)
         return ticket
 
     def flush(self) -> None:
-        """Send what can be sent in order."""
         while self._tickets and self._tickets[0].answer is not None:
             answer = self._tickets.popleft().answer
             if not self.ended and answer is not None:

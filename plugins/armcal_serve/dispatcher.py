@@ -35,7 +35,6 @@ class Dispatcher:
 
     @property
     def waiting(self) -> int:
-        """Requests that no worker has."""
         return len(self._again) + sum(len(conversation.waiting) for conversation in self._round)
 
     def ask(self, conversation: Conversation, line: bytes) -> Ticket:
@@ -59,7 +58,6 @@ class Dispatcher:
         conversation.ask(self.requests, b"", time.monotonic()).refused(fault)
 
     def dispatch(self, workers: Iterable[WorkerProcess]) -> None:
-        """Give each idle worker a request."""
         for worker in workers:
             if worker.ticket is None and not worker.gone:
                 ticket = self._next()
@@ -76,7 +74,6 @@ class Dispatcher:
             ticket.refused(why)
 
     def give_up(self, why: ArmcalError) -> None:
-        """Answer all waiting requests with an error."""
         while (ticket := self._next()) is not None:
             ticket.refused(why)
 

@@ -33,7 +33,6 @@ class Poller:
             self._selector.modify(place, events, (read, write))
 
     def step(self, longest_s: float) -> None:
-        """Wait at most so long, and call the handlers of what is ready."""
         for key, events in self._selector.select(longest_s):
             read, write = key.data
             if self._selector.get_map().get(key.fd) is not key:

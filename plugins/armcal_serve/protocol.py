@@ -249,7 +249,6 @@ class CompensateAnswer(PoseAnswer):
 
 
 def refusal(identity: Any, fault: ArmcalError) -> Refusal:
-    """An error as an answer."""
     return {
         "armcal_serve": VERSION,
         "id": identity,
@@ -277,7 +276,6 @@ def known_id(content: Any) -> str | int | float | None:
 
 
 def as_bytes(answer: Mapping[str, Any]) -> bytes:
-    """An answer as it is sent, without a line end."""
     return as_line(answer).encode()
 
 

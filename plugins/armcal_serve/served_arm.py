@@ -47,12 +47,10 @@ class ServedArm:
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """The commanded ones."""
         return tuple(self.dimensions)
 
     @property
     def turns_only(self) -> bool:
-        """Whether no commanded joint slides."""
         return set(self.dimensions.values()) <= {"angle"}
 
     @property

@@ -44,7 +44,6 @@ class Message:
     arrived: float = 0.0
 
     def packed(self) -> bytes:
-        """As it is sent."""
         return _HEAD.pack(len(self.content), self.number, self.arrived) + self.content
 
 

@@ -62,11 +62,9 @@ class WorkerPool:
 
     @property
     def worker_pids(self) -> list[int]:
-        """The processes that answer now."""
         return [worker.pid for worker in self._active]
 
     def begin(self, snapshot: Snapshot) -> None:
-        """Make the first calibration ready."""
         self._next = snapshot
         self._start(gently=False)
 
@@ -107,7 +105,6 @@ class WorkerPool:
                 self._leaving.remove(worker)
 
     def close(self) -> None:
-        """End all workers."""
         for worker in self._active:
             worker.leave()
         idle = [*self._next_ready, *([self._making] if self._making else [])]
@@ -209,7 +206,6 @@ class WorkerPool:
         self._notify("refused", f"the new calibration is not taken: {fault}", {"why": str(fault)})
 
     def _left(self, worker: WorkerProcess) -> bool:
-        """Whether a worker ended by itself."""
         if not worker.gone:
             return False
         self.lost += 1

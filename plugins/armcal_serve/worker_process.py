@@ -55,33 +55,27 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int:
-        """The process's number."""
         return self._process.pid
 
     def give(self, ticket: Ticket) -> None:
-        """Hand a request over."""
         self.since = time.monotonic()
         self.ticket = ticket
         self._send(Message(ticket.number, ticket.line, ticket.arrived))
 
     def leave(self) -> None:
-        """Let it end, which it does when it finds the socket closed."""
         self._leaves_by = time.monotonic() + _TO_END_S
         self._close()
 
     def kill(self) -> None:
-        """End it now."""
         self._process.kill()
         self._close()
 
     def ended(self) -> bool:
-        """Whether the process is no more; one that was let go and stays is killed."""
         if self._leaves_by is not None and time.monotonic() > self._leaves_by:
             self._process.kill()
         return self._process.poll() is not None
 
     def wait(self) -> None:
-        """Until the process is no more."""
         try:
             self._process.wait(_TO_END_S)
         except subprocess.TimeoutExpired:

@@ -56,7 +56,6 @@ class Bus:
 
     @property
     def where(self) -> Location:
-        """For messages."""
         return Location(self.settings.meant)
 
     def open(self) -> str:
@@ -87,7 +86,6 @@ class Bus:
         self.open()
 
     def close(self) -> None:
-        """Let go of the port. May be called twice."""
         self._port.close()
 
     def probe(self, servo: int, reply_s: float) -> Received:
@@ -99,7 +97,6 @@ class Bus:
         return Received(tuple(answers), damaged, b"")
 
     def ping(self, servo: int) -> bool:
-        """Whether a servo answers."""
         try:
             self._ask(servo, Instruction.PING, b"", None)
         except DeviceLostError:
@@ -169,7 +166,6 @@ class Bus:
             self._is_clean = self._heard(self.settings.reply, len(packet)) == packet
 
     def name(self, servo: int) -> str:
-        """A servo, for people."""
         return f"{self._names[servo]} (id {servo})" if servo in self._names else f"the servo with id {servo}"
 
     def _ask(self, servo: int, instruction: Instruction, parameters: bytes, count: int | None) -> Status:
@@ -204,17 +200,14 @@ class Bus:
         raise DeviceLostError(f"{name} does not answer ({tries} tries).", where=self.where, hint=SILENT_MEND)
 
     def _wait(self, size: int, attempt: int) -> float:
-        """How long an exchange of so many bytes may take (s)."""
         return size * _BITS / self.settings.baud + self.settings.reply * (1 << attempt)
 
     def _send(self, packet: bytes) -> None:
-        """After what came too late has been passed over; an answer bears no number by which it would be known."""
         self._heard(0.0 if self._is_clean else self.settings.reply)
         self._is_clean = True
         self._port.write(packet)
 
     def _heard(self, quiet_s: float, most: int = 1 << 16) -> bytes:
-        """What comes until it has been quiet for so long."""
         heard = b""
         while len(heard) < most and (data := self._port.read(quiet_s)):
             heard += data

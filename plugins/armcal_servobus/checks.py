@@ -131,7 +131,6 @@ def examined(bus: Bus, joints: Mapping[str, ServoJoint]) -> Examination:
 
 
 def _wrong_servo(bus: Bus, label: str, joint: ServoJoint) -> Mistake | None:
-    """Two servos with one id, or another model."""
     servo = looked_at(bus, joint.id, _READINGS)
     if servo.is_doubled:
         what = f"answers damaged or twice ({servo.damaged} times)"
@@ -167,7 +166,6 @@ def _mistakes(label: str, joint: ServoJoint, eeprom: Eeprom) -> list[Mistake]:
 
 
 def calibrated_parts(joints: Mapping[str, ServoJoint], eeproms: Mapping[str, Eeprom]) -> dict[str, Any]:
-    """All of the servos that a calibration hangs on, by joint."""
     parts: dict[str, Any] = {}
     for name, joint in joints.items():
         parts[name] = {"id": joint.id, "model": joint.model.name, "offset": eeproms[name].offset}

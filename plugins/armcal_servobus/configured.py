@@ -23,13 +23,11 @@ _TYPE = "servobus"
 
 
 def on_config(command: Any) -> Any:
-    """The argument CONFIG and the options that all commands have."""
     return click.argument("config", type=FILE)(overrides(speaking(command)))
 
 
 @contextmanager
 def opened(config: Path, overrides: tuple[str, ...]) -> Iterator[tuple[Bus, dict[str, ServoJoint], WiringRecord, str]]:
-    """The bus of a configuration, open; its joints, what was checked of them, and the adapter's serial number."""
     source = load_config(config, overrides)
     settings = _settings(source)
     joints = settings.chosen(settings.joints)

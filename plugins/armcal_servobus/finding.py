@@ -45,17 +45,14 @@ class FoundServo:
 
     @property
     def is_doubled(self) -> bool:
-        """Whether it answers as two do."""
         return self.damaged >= _AGAIN
 
     @property
     def model_name(self) -> str:
-        """For people."""
         return self.model.name if self.model else f"model {self.number}"
 
     @property
     def content(self) -> dict[str, Any]:
-        """For programs."""
         own: dict[str, Any] = {"baud": self.baud, "id": self.id, "model": self.model.name if self.model else None}
         own |= {"model_number": self.number, "firmware": self.firmware, "position": self.position}
         own |= {"voltage_V": self.voltage, "temperature_C": self.temperature}

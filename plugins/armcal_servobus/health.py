@@ -39,7 +39,6 @@ class Health:
         self._reported: set[tuple[str, str]] = set()
 
     def begin(self, eeprom: Mapping[str, Eeprom]) -> None:
-        """With what the servos' EEPROMs hold."""
         self._eeprom, self._loaded_since, self._reported = eeprom, {}, set()
 
     def check(self, readings: Mapping[str, ServoReading], now: float) -> None:

@@ -53,7 +53,6 @@ class Homing:
 
     @property
     def content(self) -> dict[str, float]:
-        """For programs."""
         return {"before": self.before, "after": self.after, "change_deg": math.degrees(self.change)}
 
     @property
@@ -81,7 +80,6 @@ def corrected(zeros: Mapping[str, float]) -> Targets:
 
 
 def restored(offsets: Mapping[str, int]) -> Targets:
-    """Servos get these offsets (counts)."""
     return lambda joint, position, before: position + joint.model.offset_sign * (offsets[joint.name] - before)
 
 

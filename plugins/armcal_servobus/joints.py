@@ -54,7 +54,6 @@ class BusJointSettings(Settings):
 
     @property
     def servo_model(self) -> ServoModel:
-        """Its registers."""
         return MODELS[self.model]
 
 
@@ -107,12 +106,10 @@ class ServoJoint:
 
     @property
     def id(self) -> int:
-        """On the bus."""
         return self.settings.id
 
     @cached_property
     def model(self) -> ServoModel:
-        """Its registers."""
         return self.settings.servo_model
 
     @cached_property
@@ -133,7 +130,6 @@ class ServoJoint:
 
     @property
     def middle(self) -> float:
-        """The count in the middle of its range."""
         return sum(self.count_range) / 2
 
     def angle(self, count: float) -> float:
@@ -145,7 +141,6 @@ class ServoJoint:
         return self.settings.zero_count + self.settings.direction * angle / self.model.step
 
     def unwrapped(self, count: int, before: float | None = None) -> int:
-        """The count that is meant, nearest to the one before it or to the middle of its range."""
         if not self.model.wraps:
             return count
         near = self.middle if before is None else before
@@ -199,5 +194,4 @@ def drivable(joints: Collection[ServoJoint]) -> None:
 
 
 def named(joints: Mapping[str, ServoJoint]) -> dict[int, str]:
-    """Joints by id."""
     return {joint.id: name for name, joint in joints.items()}

@@ -47,7 +47,6 @@ class Register:
         return value.to_bytes(self.size, order, signed=self.is_signed)
 
     def unpack(self, data: bytes, order: Literal["little", "big"]) -> int:
-        """From its bytes."""
         value = int.from_bytes(data, order, signed=self.is_signed)
         if self.sign_bit is None:
             return value
@@ -100,22 +99,18 @@ class ServoModel:
         return self.turn / self.counts
 
     def pack(self, name: str, value: int) -> bytes:
-        """A register's bytes."""
         return self.registers[name].pack(value, self.order)
 
     def unpack(self, name: str, data: bytes, at: int | None = None) -> int:
-        """A register's number, from bytes that begin at an address, or at the register's own."""
         register = self.registers[name]
         first = register.address - (register.address if at is None else at)
         return register.unpack(data[first : first + register.size], self.order)
 
     def holds(self, name: str, stretch: tuple[int, int]) -> bool:
-        """Whether a stretch (address, bytes) has all of a register."""
         register, (first, count) = self.registers.get(name), stretch
         return register is not None and first <= register.address <= first + count - register.size
 
     def words(self, alarm: int) -> tuple[str, ...]:
-        """What the bits of an alarm say."""
         named = tuple(text for bit, text in self.alarms.items() if alarm & bit)
         unknown = alarm & ~sum(self.alarms)
         return (*named, f"alarm 0x{unknown:02x}") if unknown else named

@@ -177,7 +177,6 @@ class Framing2(Framing):
 
 
 def checksum(body: bytes) -> int:
-    """The inverted sum."""
     return ~sum(body) & 0xFF
 
 

@@ -5,17 +5,14 @@ from armcal.hooks import Register, hookimpl
 
 @hookimpl
 def armcal_register_devices(register: Register) -> None:
-    """Announce the device."""
     register("servobus", "armcal_servobus.device:ServoBusDevice", "serial-bus servos: Feetech STS and SCS, Dynamixel")
 
 
 @hookimpl
 def armcal_register_joint_streams(register: Register) -> None:
-    """Announce the joint stream."""
     register("servobus", "armcal_servobus.stream:ServoBusStream", "serial-bus servos of an arm guided by hand")
 
 
 @hookimpl
 def armcal_register_commands(register: Register) -> None:
-    """Announce the command."""
     register("bus", "armcal_servobus.command:bus", "Serial-bus servos: find them, check them, set homing offsets.")

@@ -44,7 +44,6 @@ class Servos:
         self._speeds: dict[str, int] = {}
 
     def reading(self, joint: str) -> ServoReading:
-        """One servo's; see ``readings``."""
         return self.readings((joint,))[joint]
 
     def readings(self, names: Iterable[str] | None = None) -> dict[str, ServoReading]:
@@ -124,7 +123,6 @@ class Servos:
             raise DeviceError(text, where=self._bus.where, hint="Hold the arm and switch the servos' power off.")
 
     def command(self, goals: Mapping[str, int]) -> None:
-        """Goals (counts) of several joints, at once for all that have them in the same place."""
         self._goals |= goals
         places: dict[tuple[int, int], dict[int, bytes]] = {}
         for name, goal in goals.items():

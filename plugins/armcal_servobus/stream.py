@@ -102,7 +102,6 @@ class ServoBusStream(JointStream):
         self._bus = None
 
     def _angle(self, name: str, count: int) -> float:
-        """A joint that turns further than once is followed from reading to reading."""
         joint = self._joints[name]
         low, high = joint.count_range
         whole = joint.unwrapped(count, self._before.get(name) if high - low >= joint.model.counts else None)

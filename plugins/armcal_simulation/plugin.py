@@ -7,7 +7,6 @@ _HERE = "armcal_simulation"
 
 @hookimpl
 def armcal_register_simulators(register: Register) -> None:
-    """Announce the simulators."""
     register("elastic_arm", f"{_HERE}.simulator:ElasticArmSimulator", "an arm with a stated truth")
     register("contacts", f"{_HERE}.contacts:ContactsSimulator", "postures in sockets and clamps")
     register("mission", f"{_HERE}.mission.simulator:MissionOfDays", "a rover's arm over some days, and what befalls it")
@@ -15,6 +14,5 @@ def armcal_register_simulators(register: Register) -> None:
 
 @hookimpl
 def armcal_register_benches(register: Register) -> None:
-    """Announce the simulated benches."""
     register("servo_bench", f"{_HERE}.boards.servo_bench:ServoBench", "a servo board at a pty, an arm, a tracker")
     register("bus_bench", f"{_HERE}.bus.bus_bench:BusBench", "smart servos on a bus at a pty, an arm, a tracker")

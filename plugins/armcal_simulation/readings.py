@@ -76,7 +76,6 @@ def disturbed(
 
 
 def is_orientation(channel: str) -> bool:
-    """Whether a channel is a part of a quaternion."""
     return channel.rpartition(".")[2] in _QUATERNION
 
 

@@ -131,7 +131,6 @@ class ElasticArmSimulator:
         return at_truth(request, self._settings.truth), with_channels(dataset, reached)
 
     def _reached(self, arm: Arm, commands: Array) -> Array:
-        """Where a servo board puts the joints (joints x poses)."""
         reached, step = commands.copy(), self._settings.quantisation
         if step:
             turning = [dimension == "angle" for dimension in arm.commanded.values()]

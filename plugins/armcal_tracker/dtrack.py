@@ -65,12 +65,10 @@ class DTrackTracker(CountingTracker):
 
     @property
     def restarts(self) -> int:
-        """How often the frame counter began anew."""
         return self._counter.restarts
 
     @property
     def address(self) -> tuple[str, int]:
-        """Host and port, once it is open."""
         assert self._socket is not None
         host, port, *_ = self._socket.getsockname()
         return str(host), int(port)

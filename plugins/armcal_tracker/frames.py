@@ -126,11 +126,9 @@ class CountingTracker(Tracker):
 
     @property
     def missing(self) -> int:
-        """How many frames never came, by their number."""
         return self._counter.missing
 
     def _accepts(self, frame: Frame) -> bool:
-        """Whether the frame's number is neither repeated nor late; counts it, or what is wrong with its bodies."""
         fault = self._counter.fault(frame.counter)
         self._refused.update([fault] if fault else frame.wrong)
         return not fault

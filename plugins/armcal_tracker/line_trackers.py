@@ -63,7 +63,6 @@ class LineTracker(CountingTracker):
         self._source, self._clock, self._counter, self._renewed = source, clock, FrameCounter(), 0
 
     def _begin_anew(self) -> None:
-        """Another file took the place of the one that was read, or it was cut."""
         self._counter.begin_anew()
 
     def _frame(self, line: bytes) -> Frame | None:
@@ -116,7 +115,6 @@ class JsonLinesTracker(LineTracker):
 
     @property
     def address(self) -> tuple[str, int]:
-        """Host and port, once a port is open."""
         assert isinstance(self._source, UdpLines)
         return self._settings.host, self._source.port
 

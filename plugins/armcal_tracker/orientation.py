@@ -28,11 +28,9 @@ class Orientation(Settings):
 
     @property
     def declared(self) -> str:
-        """The declared meaning of the columns."""
         raise NotImplementedError
 
     def mapped(self) -> Mapping[str, str]:
-        """The file's own column of each local name."""
         raise NotImplementedError
 
     def size(self, values: Array) -> Array:
@@ -52,7 +50,6 @@ class Orientation(Settings):
         raise NotImplementedError
 
     def others(self, values: Array) -> Mapping[str, Rotation]:
-        """What the columns would be if they meant something else."""
         raise NotImplementedError
 
 
@@ -70,7 +67,6 @@ class QuaternionColumns(Orientation):
 
     @override
     def mapped(self) -> dict[str, str]:
-        """Channels w, x, y, z, whatever the order in the file."""
         own = dict(zip(self.order, self.columns, strict=True))
         return {name: own[name[1]] for name in QUATERNION}
 
@@ -112,24 +108,20 @@ class RotationColumns(Orientation):
 
     @override
     def size(self, values: Array) -> Array:
-        """The largest entry."""
         return np.asarray(np.abs(values).max(axis=1))
 
     @override
     def fault(self, values: Array) -> Array:
-        """The largest entry of R^T R - I."""
         matrices = values.reshape(-1, 3, 3)
         squares = np.swapaxes(matrices, 1, 2) @ matrices
         return np.asarray(np.abs(squares - np.eye(3)).max(axis=(1, 2)))
 
     @override
     def rotations(self, values: Array) -> Rotation:
-        """The nearest ones."""
         return Rotation.from_matrix(values.reshape(-1, 3, 3))
 
     @override
     def others(self, values: Array) -> dict[str, Rotation]:
-        """Column by column, which is the inverse as well."""
         return {"it column by column, that is as body_T_base,": self.rotations(values).inv()}
 
 
@@ -158,7 +150,6 @@ class AnglesColumns(Orientation):
 
     @override
     def others(self, values: Array) -> dict[str, Rotation]:
-        """Turns about the axes that turned before, a rotation vector as a UR writes it, and the other unit."""
         degrees = self.unit == "deg"
         return {
             "it as rotation_vector": Rotation.from_rotvec(values, degrees=degrees),
@@ -194,7 +185,6 @@ class EulerColumns(AnglesColumns):
 
     @override
     def others(self, values: Array) -> dict[str, Rotation]:
-        """The other kind of axes, the other direction, and the other unit."""
         degrees, other = self.unit == "deg", self.order.swapcase()
         return {
             f"order: {other}": Rotation.from_euler(other, values, degrees=degrees),
@@ -219,7 +209,6 @@ class VectorColumns(AnglesColumns):
 
     @override
     def others(self, values: Array) -> dict[str, Rotation]:
-        """The inverse, roll, pitch and yaw, and the other unit."""
         degrees = self.unit == "deg"
         return {
             "it as rpy": Rotation.from_euler("xyz", values, degrees=degrees),

@@ -5,21 +5,18 @@ from armcal.hooks import Register, hookimpl
 
 @hookimpl
 def armcal_register_measurements(register: Register) -> None:
-    """Announce the measurements."""
     register("tip_position", "armcal_tracker.position:TipPosition", "position of a target on the tool")
     register("tip_pose", "armcal_tracker.pose:TipPose", "position and orientation of a body on the tool")
 
 
 @hookimpl
 def armcal_register_readers(register: Register) -> None:
-    """Announce the readers."""
     register("csv", "armcal_tracker.csv_reader:CsvReader", "columns by name with their unit as suffix")
     register("pose_csv", "armcal_tracker.pose_csv_reader:PoseCsvReader", "as csv, with orientations in it")
 
 
 @hookimpl
 def armcal_register_trackers(register: Register) -> None:
-    """Announce the live trackers."""
     register("dtrack", "armcal_tracker.dtrack:DTrackTracker", "DTrack's ASCII output over UDP")
     register(
         "json_lines", "armcal_tracker.line_trackers:JsonLinesTracker", "a JSON object a line: UDP, or a growing file"

@@ -65,11 +65,9 @@ class TipPose(TipPosition):
     }
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """The body on the tool (m, unit quaternion)."""
         return pose_blocks("target", self.settings.target, self.settings.target_rotation)
 
     def channels(self) -> tuple[Channel, ...]:
-        """Three coordinates and a quaternion, of either sign."""
         return super().channels() + tuple(Channel(name, "dimensionless") for name in _QUATERNION)
 
     def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
@@ -98,11 +96,9 @@ class TipPose(TipPosition):
         return super().noise() + three(self.settings.orientation_noise)
 
     def dimensions(self) -> tuple[str, ...]:
-        """Position, then rotation."""
         return ("length",) * 3 + ("angle",) * 3
 
     def noise_channels(self) -> tuple[tuple[Channel, ...], ...]:
-        """Each entry's own, or one for all three."""
         angles = tuple((Channel(f"noise_{turn}", "angle"), Channel("noise_rotation", "angle")) for turn in _TURNS)
         return super().noise_channels() + angles
 

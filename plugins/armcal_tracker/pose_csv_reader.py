@@ -73,7 +73,6 @@ class PoseCsvSettings(CsvSettings):
 
     @property
     def orientation(self) -> Orientation:
-        """Whichever is given."""
         return next(orientation for orientation in self._given() if orientation is not None)
 
 

@@ -37,30 +37,24 @@ class TipPosition(Instrument):
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"noise_mm": 0.5, "target_mm": [10, 0, 25]}
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """The target on the tool (m)."""
         return point_blocks("target", self.settings.target)
 
     def mistakes(self) -> tuple[Mistake, ...]:
-        """A target that came loose."""
         again = "repeat some of the first poses now, fasten the target, and calibrate the records after it apart"
         own = tuple(block.name for block in self.parameters())
         return (Mistake("bump", "the target moves on the tool there", again, own, "once"),)
 
     def channels(self) -> tuple[Channel, ...]:
-        """Three coordinates."""
         return tuple(Channel(axis, "length") for axis in "xyz")
 
     def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
-        """The target's position in the base frame (m)."""
         position = self.base_T_tool(arms).apply(point_expression("target", values))
         return {axis: position[i] for i, axis in enumerate("xyz")}
 
     def noise(self) -> tuple[float, ...]:
-        """Of each coordinate (m)."""
         return three(self.settings.noise)
 
     def noise_channels(self) -> tuple[tuple[Channel, ...], ...]:
-        """Each coordinate's own, or one for all three."""
         return tuple((Channel(f"noise_{axis}", "length"), Channel("noise", "length")) for axis in "xyz")
 
 

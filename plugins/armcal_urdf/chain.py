@@ -33,7 +33,6 @@ class ChainJoint:
 
     @property
     def moves(self) -> bool:
-        """Whether it is not fixed."""
         return self.urdf.kind in MOVING
 
 
@@ -47,7 +46,6 @@ class UrdfChain:
 
     @property
     def moving(self) -> tuple[ChainJoint, ...]:
-        """The joints that are not fixed."""
         return tuple(joint for joint in self.joints if joint.moves)
 
 

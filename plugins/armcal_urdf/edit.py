@@ -25,7 +25,6 @@ class Placed:
 
     @property
     def changed(self) -> Mapping[str, Three]:
-        """The attributes of which a number changed."""
         pairs = {"xyz": (self.joint.xyz, self.xyz), "rpy": (self.joint.rpy, self.rpy)}
         return {name: now for name, (before, now) in pairs.items() if before != now}
 

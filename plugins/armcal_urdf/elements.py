@@ -47,7 +47,6 @@ class Element:
     children: list[Element] = field(default_factory=list)
 
     def all(self, tag: str) -> Iterator[Element]:
-        """The children of a name."""
         return (child for child in self.children if child.tag == tag)
 
     def one(self, tag: str) -> Element | None:
@@ -74,7 +73,6 @@ class Element:
         return value
 
     def refuse(self, message: str, hint: str) -> NoReturn:
-        """Raise a ConfigError about this element."""
         raise ConfigError(message, where=Location(self.label or None, self.line), hint=hint)
 
 
@@ -136,7 +134,6 @@ class _Builder:
 
 
 def words_of(value: str) -> list[str]:
-    """The words of an attribute, between white space as XML knows it."""
     return [word for word in _WHITE.split(value) if word]
 
 

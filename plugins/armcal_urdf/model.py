@@ -99,7 +99,6 @@ class UrdfSettings(Settings):
         return self
 
     def to_config(self) -> dict[str, Any]:
-        """Without a path: the text is enough."""
         return {name: value for name, value in super().to_config().items() if name != "path"}
 
     def quarter_turn(self, joint: UrdfJoint) -> float:
@@ -117,12 +116,10 @@ class UrdfSettings(Settings):
 
     @property
     def robot(self) -> Robot:
-        """Its links and joints."""
         return read_robot(self.text, self.file)
 
     @property
     def content(self) -> bytes:
-        """The URDF as its file had it."""
         return encode(self.text, self.encoding or "utf-8")
 
 
@@ -149,12 +146,10 @@ class UrdfModel:
 
     @cached_property
     def urdf_chain(self) -> UrdfChain:
-        """The chain, as the URDF has it."""
         return chain_of(self.settings.robot, self.settings.root, self.settings.tip)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """The moving joints from root to tip, those that follow others too."""
         return tuple(joint.name for joint in self.urdf_chain.moving)
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
@@ -168,7 +163,6 @@ class UrdfModel:
         return tuple(blocks)
 
     def masses(self) -> tuple[MassSpec, ...]:
-        """The stated masses of the links that the chain moves, in the frames of the chain's links."""
         return self.urdf_chain.masses if self.settings.inertials == "use" else ()
 
     def chain(self, values: Mapping[str, Any]) -> Chain:

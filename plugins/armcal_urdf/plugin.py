@@ -5,11 +5,9 @@ from armcal.hooks import Register, hookimpl
 
 @hookimpl
 def armcal_register_models(register: Register) -> None:
-    """Announce the model."""
     register("urdf", "armcal_urdf.model:UrdfModel", "a serial chain between two links of a URDF")
 
 
 @hookimpl
 def armcal_register_exporters(register: Register) -> None:
-    """Announce the exporter."""
     register("urdf", "armcal_urdf.export:UrdfExporter", "the URDF it was made from, with calibrated origins")

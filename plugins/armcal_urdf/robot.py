@@ -70,12 +70,10 @@ class Robot:
 
     @cached_property
     def above(self) -> Mapping[str, UrdfJoint]:
-        """The joint that carries each link but the root."""
         return {joint.child: joint for joint in self.joints.values()}
 
     @cached_property
     def below(self) -> Mapping[str, tuple[UrdfJoint, ...]]:
-        """The joints that stand on each link, in the order of the file."""
         children: dict[str, list[UrdfJoint]] = {name: [] for name in self.links}
         for joint in self.joints.values():
             children[joint.parent].append(joint)
@@ -83,7 +81,6 @@ class Robot:
 
     @property
     def root(self) -> str:
-        """The link that no joint carries."""
         return next(name for name in self.links if name not in self.above)
 
     def path(self, root: str, tip: str) -> tuple[UrdfJoint, ...] | None:
@@ -98,7 +95,6 @@ class Robot:
         return tuple(reversed(joints))
 
     def leaves(self, root: str) -> tuple[str, ...]:
-        """The links beyond a link, or itself, that carry no joint."""
         leaves, waiting = [], [root]
         while waiting:
             link = waiting.pop(0)
@@ -214,7 +210,6 @@ def _only(element: Element | None, known: tuple[str, ...]) -> Element | None:
 
 
 def _refuse_misspelt(element: Element, known: tuple[str, ...]) -> None:
-    """A misspelt <origin> would be passed over, and the arm be wrong; what is another thing altogether may stay."""
     for child in element.children:
         _refuse_alike(child, f"<{child.tag}>", child.tag, known)
 

@@ -96,7 +96,6 @@ class Arm:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """From the base to the tip, those that follow others too."""
         return self.model.joint_names
 
     @cached_property
@@ -140,7 +139,6 @@ class Arm:
         return tuple(f"{self.name}.{name}" for name in correction_names(self.joint_names))
 
     def postures(self, dataset: Dataset, environment: Environment) -> Postures:
-        """Where all joints were commanded to go, those that follow others too, and from where, and what was around."""
         stated = {"payload": environment.payload_mass}
 
         def recorded(channel: str) -> Array:
@@ -154,17 +152,14 @@ class Arm:
 
     @cached_property
     def joint_dimensions(self) -> tuple[str, ...]:
-        """``angle`` or ``length`` of each joint's displacement."""
         return tuple("angle" if joint.is_revolute else "length" for joint in self.nominal_chain.joints)
 
     @cached_property
     def nominal_chain(self) -> Chain:
-        """The chain at nominal parameters."""
         return self.chain(self._nominal)
 
     @cached_property
     def length(self) -> float:
-        """From joint to joint, and to the tool (m)."""
         steps = [*(joint.parent_T_joint for joint in self.nominal_chain.joints), self.nominal_chain.tool.joint_T_frame]
         return float(sum(np.linalg.norm(evaluated(step.translation)) for step in steps))
 
@@ -173,7 +168,6 @@ class Arm:
         return {block.name: ca.SX(list(block.nominal)) for block in self.parameters()}
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """All blocks, under their full names."""
         blocks = list(prefixed(f"{self.name}.", self.placement))
         blocks += prefixed(self._scope(self.model_name), declared(self.model))
         for name, effect in self.effects.items():
@@ -185,7 +179,6 @@ class Arm:
         return tuple(blocks)
 
     def chain(self, values: Mapping[str, Expression]) -> Chain:
-        """The model's chain, for full parameter names."""
         chain = self.model.chain(scoped(values, self._scope(self.model_name)))
         if fault := chain_fault(chain, self.joint_names):
             refuse(self.model.chain, *fault)
@@ -198,7 +191,6 @@ class Arm:
         return replace(chain, base_T_mount=base_T_model @ chain.base_T_mount)
 
     def springs(self, values: Mapping[str, Expression]) -> tuple[Spring, ...]:
-        """The springs of all effects, in the order of the effects."""
         every: list[Spring] = []
         for name, effect in self.effects.items():
             springs = effect.springs(scoped(values, self._scope(name)))
@@ -211,7 +203,6 @@ class Arm:
 
     @cached_property
     def deflection_size(self) -> int:
-        """How many numbers an elastic state of this arm has."""
         return len(self.spring_names)
 
     @property
@@ -221,7 +212,6 @@ class Arm:
 
     @cached_property
     def spring_names(self) -> tuple[str, ...]:
-        """What gives, in words, for each number of an elastic state."""
         sites = elastic_sites(self.nominal_chain, self.springs(self._nominal))
         names = (f"the mount of {self.name}", *(f"joint {joint} of {self.name}" for joint in self.joint_names))
         return tuple(names[site.site] for site in sites for _ in range(site.size))
@@ -252,12 +242,10 @@ class Arm:
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """Names of the columns that its effects read of the surroundings."""
         return tuple(dict.fromkeys(condition.name for _, condition in self.declared))
 
     @property
     def declared(self) -> tuple[tuple[str, Condition], ...]:
-        """The columns that effects and pose residual read of the surroundings, each with the name of what reads it."""
         read = [(name, effect.conditions) for name, effect in self.effects.items()]
         read += [] if self.residual is None else [("residual", self.residual.conditions)]
         return tuple(
@@ -305,7 +293,6 @@ class Arm:
 
 
 def prefixed(scope: str, blocks: Sequence[ParameterBlock]) -> tuple[ParameterBlock, ...]:
-    """Local blocks under their full names."""
     return tuple(replace(block, name=scope + block.name) for block in blocks)
 
 
@@ -317,12 +304,10 @@ class LocalValues(dict[str, Expression]):
 
 
 def scoped(values: Mapping[str, Expression], scope: str) -> LocalValues:
-    """The values below a scope, under their local names."""
     return LocalValues({name.removeprefix(scope): value for name, value in values.items() if name.startswith(scope)})
 
 
 def command_channels(arms: Mapping[str, Arm]) -> dict[str, str]:
-    """The ``command_channels`` of all arms."""
     return {channel: dimension for arm in arms.values() for channel, dimension in arm.command_channels.items()}
 
 

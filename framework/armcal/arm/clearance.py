@@ -42,7 +42,6 @@ class Capsule:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """Those that its ends are fixed in."""
         return (self.start.frame, self.end.frame)
 
 
@@ -61,7 +60,6 @@ class Box(Settings):
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """The base."""
         return (BASE_FRAME,)
 
 
@@ -80,7 +78,6 @@ class HalfSpace(Settings):
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """The base."""
         return (BASE_FRAME,)
 
 
@@ -137,7 +134,6 @@ class Checked:
 
 
 def joints_of_frames(arm: Arm) -> dict[str, int]:
-    """Every frame that a point may be fixed in, and the joint that moves it."""
     return {BASE_FRAME: 0, **frame_names(arm.nominal_chain)}
 
 
@@ -155,7 +151,6 @@ class ClearanceCheck:
 
     @property
     def pairs(self) -> tuple[tuple[tuple[str, str], ...], ...]:
-        """The pairs of each rule."""
         return tuple(self._pairs)
 
     def worst(self, pose: Array) -> str:
@@ -261,7 +256,6 @@ def segment_to_box(p: Array, q: Array, low: Array, high: Array) -> Array:
 
 
 def _outside(points: Array, low: Array, high: Array) -> Array:
-    """From the nearest point of the box to each point."""
     return np.asarray(points - np.clip(points, low, high))
 
 

@@ -33,7 +33,6 @@ class ElasticSite:
 
     @property
     def size(self) -> int:
-        """How many coordinates it has."""
         return max(1, len(self.directions))
 
 

@@ -28,12 +28,10 @@ class Environment:
 
     @property
     def acting(self) -> tuple[float, ...]:
-        """All of it, in the order of ``LOAD_CHANNELS``."""
         return (*self.gravity, self.payload_mass, *self.payload_com, *self.force, *self.torque)
 
     @property
     def load(self) -> Load:
-        """As constant expressions."""
         return Load.of([ca.SX(number) for number in self.acting])
 
 

@@ -176,7 +176,6 @@ class Evaluator:
         raise refusal(self._elastic.described(bad, own[:, 0]), self._elastic.springs, at[:, 0], slopes[0], far)
 
     def _slopes(self, values: Array, record: Array, state: Array) -> Evaluate:
-        """What Newton's method asks for, of these records at their states."""
         size = len(state)
 
         def evaluate(places: Indices) -> tuple[Array, Array]:

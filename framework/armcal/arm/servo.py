@@ -80,12 +80,10 @@ class PulseClock:
 
     @property
     def longest_pulse(self) -> float:
-        """All counts of a period but one (s)."""
         return (COUNTS - 1) * self.tick
 
     @property
     def tick(self) -> float:
-        """The length of one count (s)."""
         return (self.prescale + 1) / self.oscillator_hz
 
     @staticmethod
@@ -94,7 +92,6 @@ class PulseClock:
         return round(oscillator_hz / (COUNTS * rate_hz)) - 1
 
     def counts(self, pulse: Expression) -> Expression:
-        """The whole number of counts nearest to a pulse (s), halves up."""
         return ca.floor(pulse / self.tick + 0.5)
 
 

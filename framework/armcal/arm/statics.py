@@ -134,6 +134,5 @@ def _cross(a: Expression, b: Expression) -> Expression:
 
 
 def frame_names(chain: Chain) -> Mapping[str, int]:
-    """Every frame a mass may be given in, and the joint that moves it."""
     moved_by = {name: at.joint for name, at in chain.frames.items()}
     return {MOUNT_FRAME: 0, **moved_by, TOOL_FRAME: chain.tool.joint}

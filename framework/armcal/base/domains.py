@@ -118,12 +118,10 @@ class Rotation(Domain):
     increments: ClassVar[tuple[str, ...]] = ("rx", "ry", "rz")  # about the axes of the moved frame
 
     def check(self, value: Array) -> str:
-        """Unit norm."""
         norm = float(np.linalg.norm(value))
         return "" if abs(norm - 1) < 1e-6 else f"a quaternion of norm {norm:g} is not a rotation"
 
     def retract(self, base: Array, delta: Array) -> Array:
-        """base * exp(delta)."""
         product = quaternion_matrix(base) @ quaternion_exp(delta)
         return np.asarray(product / np.linalg.norm(product))
 
@@ -144,11 +142,9 @@ class Pose(Domain):
     increments: ClassVar[tuple[str, ...]] = ("rx", "ry", "rz", "x", "y", "z")  # in the axes of the moved frame
 
     def check(self, value: Array) -> str:
-        """Unit quaternion, finite translation."""
         return Rotation().check(value[:4]) or ("" if np.isfinite(value).all() else f"{value} is not finite")
 
     def retract(self, base: Array, delta: Array) -> Array:
-        """Rotation and translation each moved in the base's own frame."""
         moved = base[4:] + rotation_matrix(base[:4]) @ delta[3:]
         return np.concatenate([Rotation().retract(base[:4], delta[:3]), moved])
 
@@ -177,14 +173,12 @@ class ScrewAxis(Domain):
     increments: ClassVar[tuple[str, ...]] = ("turn1", "turn2", "shift1", "shift2")  # across the axis
 
     def check(self, value: Array) -> str:
-        """Unit direction, moment across it."""
         norm, pitch = float(np.linalg.norm(value[:3])), float(value[:3] @ value[3:])
         if abs(norm - 1) > 1e-6:
             return f"the axis has length {norm:g}, not 1"
         return "" if abs(pitch) < 1e-9 else f"the screw has pitch {pitch:g} m, a revolute joint has none"
 
     def retract(self, base: Array, delta: Array) -> Array:
-        """Turn the direction, shift the nearest point."""
         across, nearest = two_across(base[:3]), np.cross(base[:3], base[3:])
         turn = rotation_matrix(quaternion_exp(across @ delta[:2]))
         direction = turn @ base[:3]
@@ -225,17 +219,14 @@ class Direction(Domain):
     increments: ClassVar[tuple[str, ...]] = ("turn1", "turn2")  # about two directions across it
 
     def check(self, value: Array) -> str:
-        """Unit length."""
         norm = float(np.linalg.norm(value))
         return "" if abs(norm - 1) < 1e-6 else f"the direction has length {norm:g}, not 1"
 
     def retract(self, base: Array, delta: Array) -> Array:
-        """Turn it."""
         turned = rotation_matrix(quaternion_exp(two_across(base) @ delta)) @ base
         return np.asarray(turned / np.linalg.norm(turned))
 
     def local(self, base: Array, value: Array) -> Array:
-        """The smallest turn from one to the other."""
         turn_axis = np.cross(base, value)
         sine, cosine = float(np.linalg.norm(turn_axis)), float(base @ value)
         return np.asarray(two_across(base).T @ turn_axis * (math.atan2(sine, cosine) / sine if sine > 1e-12 else 1.0))
@@ -260,7 +251,6 @@ class Semidefinite(Domain):
     increments: ClassVar[tuple[str, ...]] = entries
 
     def check(self, value: Array) -> str:
-        """No negative eigenvalue."""
         if not np.isfinite(value).all():
             return f"{value} is not finite"
         lowest = float(np.linalg.eigvalsh(symmetric(value))[0])
@@ -268,7 +258,6 @@ class Semidefinite(Domain):
         return "" if lowest >= -1e-12 * max(1.0, largest) else f"its smallest eigenvalue is {lowest:g}"
 
     def retract(self, base: Array, delta: Array) -> Array:
-        """(S + delta)(S + delta)."""
         root = _root(base) + symmetric(delta)
         return _entries(root @ root)
 
@@ -282,15 +271,12 @@ class Semidefinite(Domain):
         return np.column_stack([_entries(root @ unit + unit @ root) for unit in _UNITS])
 
     def increment_scale(self, scale: float) -> float:
-        """A root's unit is the root of the unit."""
         return math.sqrt(scale)
 
     def coordinates(self, base: Array, delta: Array) -> Array:
-        """The difference of the entries."""
         return self.retract(base, delta) - base
 
     def from_coordinates(self, base: Array, coordinates: Array) -> Array:
-        """To the nearest semidefinite matrix."""
         return self.local(base, base + coordinates)
 
     def coordinates_jacobian(self, base: Array, delta: Array) -> Array:
@@ -302,7 +288,6 @@ class Semidefinite(Domain):
         return np.eye(6)
 
     def curvature(self, gradient: Array, convex: bool = True) -> Array | None:
-        """Without it, what belongs at zero has no curvature there at all."""
         halves = np.array([1.0, 0.5, 0.5, 1.0, 0.5, 1.0])
         slope = symmetric(gradient * halves)
         if convex:
@@ -317,7 +302,6 @@ def symmetric(entries: Array) -> Array:
 
 
 def _root(entries: Array) -> Array:
-    """The symmetric root of six canonical entries' matrix, or of the nearest semidefinite one."""
     size, directions = np.linalg.eigh(symmetric(entries))
     return np.asarray((directions * np.sqrt(np.maximum(size, 0.0))) @ directions.T)
 

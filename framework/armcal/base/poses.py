@@ -41,7 +41,6 @@ def pose_blocks(
 
 
 def pose_transform(name: str, values: Mapping[str, Expression]) -> Transform:
-    """The motion that the blocks of ``pose_blocks`` stand for."""
     return Transform(rotation_of(values[f"{name}_rotation"]), point_expression(name, values))
 
 
@@ -99,7 +98,6 @@ class PoseSettings(Settings):
 
     @property
     def unit_quaternion(self) -> tuple[float, ...]:
-        """The rotation as w, x, y, z."""
         if self.quaternion is not None:
             q = np.array(self.quaternion) / np.linalg.norm(self.quaternion)
             return tuple(float(x) for x in q)
@@ -115,5 +113,4 @@ class PoseSettings(Settings):
         return matrix
 
     def blocks(self, name: str) -> tuple[ParameterBlock, ...]:
-        """As parameters; see ``pose_blocks``."""
         return pose_blocks(name, self.position, self.unit_quaternion)

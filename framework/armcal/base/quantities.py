@@ -36,7 +36,6 @@ class UnitOf:
         units_of(self.dimension)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
-        """The marked type's own schema, behind a check for a value that was refused already."""
         return core_schema.no_info_before_validator_function(_raise_fault, handler(source))
 
 
@@ -117,17 +116,14 @@ def kind_of(annotations: Iterable[Any]) -> Kind:
 
 
 def spelt(name: str, dimension: str) -> str:
-    """The customary key of a quantity, ``d_mm``."""
     return f"{name}_{display_unit(dimension).name}"
 
 
 def accepted(name: str, dimension: str) -> str:
-    """Every key of a quantity, for a message."""
     return " or ".join(f"{name}_{u.name}" for u in units_of(dimension))
 
 
 def example(name: str, dimension: str, value: Any = "...") -> str:
-    """How a quantity is written, for a message."""
     by_key = f"{spelt(name, dimension)}: {value}"
     if isinstance(value, (list, dict)):
         return by_key
@@ -135,7 +131,6 @@ def example(name: str, dimension: str, value: Any = "...") -> str:
 
 
 def has_number(value: Any, kind: Kind) -> bool:
-    """Whether a field's value holds a number that needs a unit."""
     if isinstance(value, (list, tuple)):
         return any(has_number(entry, kind) for entry in value)
     if isinstance(value, Mapping):

@@ -52,7 +52,6 @@ class Transform:
         return ca.mtimes(self.rotation, point) + self.translation
 
     def inverse(self) -> Transform:
-        """b_T_a."""
         back = self.rotation.T
         return Transform(back, -ca.mtimes(back, self.translation))
 
@@ -83,7 +82,6 @@ def evaluated(expression: Expression) -> Array:
 
 
 def identity() -> Transform:
-    """The motion that moves nothing."""
     return Transform(ca.SX.eye(3), ca.SX(3, 1))
 
 
@@ -121,7 +119,6 @@ def rotation_about(axis: str, angle: Expression) -> Transform:
 
 
 def translation_along(axis: str, distance: Expression) -> Transform:
-    """A translation (m) along the x, y or z axis."""
     return translation(*[distance if axis == name else 0.0 for name in "xyz"])
 
 

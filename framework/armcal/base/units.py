@@ -31,7 +31,6 @@ class Unit:
 
     @property
     def factor(self) -> float:
-        """SI units in one of this unit."""
         return self.numerator / self.denominator
 
 
@@ -124,7 +123,6 @@ _DECIMAL_COMMA = re.compile(r"\s*[+-]?[0-9]+,[0-9]+")
 
 
 def unit(name: str) -> Unit:
-    """The unit of that name; ValueError lists the known ones."""
     if name not in UNITS:
         raise ValueError(f"unit {name!r} is not known; expected one of {', '.join(UNITS)}.")
     return UNITS[name]

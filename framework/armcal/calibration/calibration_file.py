@@ -99,7 +99,6 @@ class CalibrationFile(Settings):
 
 
 def identity_of(description: Mapping[str, Any]) -> str:
-    """A hash of an arm's whole description."""
     return hashlib.sha256(json.dumps(plain(description), sort_keys=True).encode()).hexdigest()
 
 
@@ -136,7 +135,6 @@ def parameter_records(estimate: Estimate) -> tuple[ParameterRecord, ...]:
 
 
 def dump(content: Mapping[str, Any]) -> str:
-    """YAML text, keys in order, numbers to their last digit."""
     return yaml.dump(plain(dict(content)), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
 
 
@@ -196,7 +194,6 @@ def _quoted(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
 
 
 def _in_line(dumper: yaml.SafeDumper, entries: list[Any]) -> yaml.SequenceNode:
-    """Numbers side by side, everything else one below the other."""
     are_numbers = bool(entries) and all(isinstance(entry, int | float) for entry in entries)
     return dumper.represent_sequence("tag:yaml.org,2002:seq", entries, flow_style=are_numbers)
 
@@ -206,7 +203,6 @@ _Dumper.add_representer(list, _in_line)
 
 
 def lost_calibration(record: CalibrationFile, path: str | Path) -> ConfigError:
-    """What is wrong with a calibration whose recalibration ended at the level lost."""
     recalibrated = record.recalibrated or {}
     reason = str(recalibrated.get("why", "")).rstrip(".")
     return ConfigError(

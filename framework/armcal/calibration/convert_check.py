@@ -71,7 +71,6 @@ def load_source(path: str | Path, arm: str | None, registry: PluginRegistry) -> 
 
 
 def nominal_values(model: ArmModel) -> dict[str, Array]:
-    """The nominal entries of a model's blocks under their local names."""
     return {block.name: np.array(block.nominal) for block in model.parameters()}
 
 
@@ -89,7 +88,6 @@ def reload(text: str, registry: PluginRegistry) -> Chain:
 
 
 def difference(one: Chain, two: Chain) -> Difference:
-    """At the same commands, over random poses within the first one's limits."""
     known = rigid_chain(one)
     commands = random_commands(known, POSES, _SEED)
     same_mount = bool(np.abs(known.base_T_mount - rigid_chain(two).base_T_mount).max() < _SAME_MOUNT)

@@ -125,7 +125,6 @@ def _link(frame: Array, point: Array, direction: Array, convention: Convention) 
 
 
 def _nearly_parallel(foot: Array, w: Array, convention: Convention) -> Link:
-    """To an axis through a point in the plane across the one before."""
     a = math.hypot(foot[0], foot[1])
     theta = math.atan2(foot[1], foot[0]) if a > _NOWHERE else 0.0
     x, y, z = _motion("z", -theta, 0.0)[:3, :3] @ w
@@ -138,7 +137,6 @@ def _nearly_parallel(foot: Array, w: Array, convention: Convention) -> Link:
 
 
 def _frame_on(frame: Array, direction: Array) -> Array:
-    """A frame at the same place with z along a direction, x as near to the frame's own as that lets it."""
     x = frame[:3, 0] if abs(frame[:3, 0] @ direction) < 0.9 else frame[:3, 1]
     x = x - direction * (direction @ x)
     x = x / np.linalg.norm(x)

@@ -41,7 +41,6 @@ def poe_section(chain: RigidChain) -> dict[str, Any]:
 
 
 def numbers(values: Array) -> list[float]:
-    """Numbers without what rounding left of zeros."""
     return [round(float(value), _DIGITS) + 0.0 for value in values]
 
 

@@ -63,7 +63,6 @@ class RecordingRecord(Settings):
 
     @property
     def dataset(self) -> Dataset:
-        """The records."""
         return Dataset.of_rows(self.channels, self.records, "the recording that the calibration keeps")
 
 
@@ -90,7 +89,6 @@ class PredictionRecord(Settings):
 
     @property
     def symmetric_covariance(self) -> Array:
-        """Of the free entries, both triangles."""
         lower = np.zeros((len(self.covariance), len(self.covariance)))
         for i, row in enumerate(self.covariance):
             lower[i, : i + 1] = row
@@ -122,7 +120,6 @@ class PlusMinus:
 
 
 def stretch_records(stretches: Mapping[Recording, Stretch]) -> dict[Literal["same", "new"], StretchRecord]:
-    """As they are kept."""
     return {
         name: StretchRecord(
             coordinates={level_name(p): x for p, x in zip(LEVELS, stretch.coordinates, strict=True)},
@@ -133,7 +130,6 @@ def stretch_records(stretches: Mapping[Recording, Stretch]) -> dict[Literal["sam
 
 
 def covariance_rows(covariance: Array) -> tuple[tuple[float, ...], ...]:
-    """The lower triangle, to twelve digits."""
     return tuple(tuple(float(f"{x:.{_DIGITS}g}") for x in row[: i + 1]) for i, row in enumerate(covariance))
 
 
@@ -221,7 +217,6 @@ class Uncertainty:
     def _within(
         self, problem: Problem, commands: Dataset, places: Indices, drift: KnownDrift, along: Chain | None
     ) -> _Part:
-        """In the recording, which tells of a drift."""
         records = self._drifted(problem, commands, along, self.noise_scale)
         spreads = self._from_either_side(problem, self._predictor(problem, drift).spreads(records, "same"), commands)
         moved = [record.correlation.shift(i, drift.states) for i, record in enumerate(records) if record.correlation]
@@ -248,7 +243,6 @@ class Uncertainty:
         return Predictor(problem, self.values, self.record.symmetric_covariance, self.noise_scale, self.freedom, drift)
 
     def _known_drift(self, recording: RecordingRecord, dataset: Dataset, along: Chain | None) -> KnownDrift:
-        """The drift of the recording, told by its records, along a chain of places."""
         problem = self._problem(dataset)
         records = self._drifted(problem, dataset, along)
         if recording.weights:

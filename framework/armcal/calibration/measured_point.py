@@ -42,12 +42,10 @@ class MeasuredPoint:
 
     @property
     def distance(self) -> float:
-        """From the tool's origin (m)."""
         return float(np.linalg.norm(self.tool_T_target[:3, 3]))
 
     @property
     def transform(self) -> Transform:
-        """As an expression of constants."""
         pose = ca.DM(self.tool_T_target)
         return Transform(ca.sparsify(ca.SX(pose[:3, :3])), ca.sparsify(ca.SX(pose[:3, 3])))
 

@@ -68,7 +68,6 @@ class CheckRecord(Settings):
 
     @property
     def commands(self) -> Dataset:
-        """The records."""
         return Dataset.of_rows(self.channels, self.records, "the check poses")
 
 

@@ -48,7 +48,6 @@ class RigidJoint:
 
     @property
     def direction(self) -> Array:
-        """The axis in the base frame."""
         return np.asarray(self.base_T_joint[:3, :3] @ self.axis)
 
     @property
@@ -67,7 +66,6 @@ class RigidChain:
 
 
 def numeric_chain(model: ArmModel, values: Mapping[str, Array]) -> Chain:
-    """A model's chain for values under local names; all its expressions are constants."""
     return model.chain({name: ca.SX(ca.DM(value)) for name, value in values.items()})
 
 
@@ -102,7 +100,6 @@ def require_plain_axes(chain: RigidChain, target: str) -> None:
 
 
 def require_independent(chain: RigidChain, target: str) -> None:
-    """Raise ProblemError for the first joint that follows another."""
     for joint in chain.joints:
         if joint.mimic is not None:
             raise ProblemError(

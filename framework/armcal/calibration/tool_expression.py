@@ -78,7 +78,6 @@ class ToolExpression(ElasticPass):
         return record
 
     def uses(self, channels: Sequence[str]) -> bool:
-        """Whether the tool or the elastic state depends on any of these channels."""
         chosen = ca.vertcat(*[self.record[self.channels.index(channel)] for channel in channels])
         return bool(ca.depends_on(ca.vertcat(ca.vec(self.base_T_tool.matrix()), self.next_state), chosen))
 

@@ -35,34 +35,27 @@ class Console:
 
     @property
     def out(self) -> Screen:
-        """For results."""
         return Screen(soft_wrap=False, quiet=self.quiet or self.json)
 
     @property
     def err(self) -> Screen:
-        """For warnings and progress."""
         return Screen(stderr=True, quiet=self.quiet)
 
     def warn(self, text: str) -> None:
-        """One warning line."""
         self.err.print(f"warning: {text}", style="yellow", soft_wrap=True)
 
     def danger(self, text: str) -> None:
-        """A warning of what can break an arm: with -q too."""
         replace(self, quiet=False).warn(text)
 
     def detail(self, text: str) -> None:
-        """Only with -v."""
         if self.verbose:
             self.err.print(text, style="dim", soft_wrap=True)
 
     def result(self, content: Mapping[str, Any]) -> None:
-        """The machine-readable result, with --json."""
         if self.json:
             click.echo(as_json({**JSON_SCHEMA, **content}))
 
     def line(self, text: str, style: str = "") -> None:
-        """One line of the result, which the terminal may wrap."""
         self.out.print(text, style=style, soft_wrap=True)
 
     def table(
@@ -75,7 +68,6 @@ class Console:
         self.out.print(table)
 
     def registry(self) -> PluginRegistry:
-        """The plugins; one warning for each broken one."""
         registry = discover()
         for plugin in registry.faults:
             self.warn(f"plugin {plugin.name} ({plugin.module}) is left out: {plugin.fault}")
@@ -199,5 +191,4 @@ def warn_of_target(console: Console, subject: str, target: MeasuredPoint | None)
 
 
 def command_line() -> str:
-    """How this command was called, to be repeated."""
     return shlex.join(["armcal", *sys.argv[1:]])

@@ -27,7 +27,6 @@ class Screen(Console):
             yield segment if segment.control else Segment(shown(segment.text), segment.style)
 
     def print(self, *objects: Any, **more: Any) -> None:
-        """As rich does; a table whose words and numbers would be cut is shown row by row."""
         fitting = []
         for part in objects:
             lines = self.render_lines(part, pad=False) if isinstance(part, Table) else []

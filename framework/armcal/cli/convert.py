@@ -82,7 +82,6 @@ def _sections(original: ConvertSource, target: str, convention: Convention) -> t
 
 
 def _yaml(section: Mapping[str, Any]) -> str:
-    """A section ``model:`` with short lists on one line each."""
     return yaml.safe_dump({"model": section}, sort_keys=False, allow_unicode=True, width=110, default_flow_style=None)
 
 

@@ -181,7 +181,6 @@ def _serial_ports() -> Iterator[Finding]:
 
 
 def _main_job() -> Finding:
-    """Calibrate the simulated arm of the demonstration, report and all."""
     with tempfile.TemporaryDirectory(prefix="armcal-doctor-") as place:
         _, fault = in_child("from armcal.cli.main import main; main()", "demo", "--out", f"{place}/demo")
         if not fault:

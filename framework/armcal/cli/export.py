@@ -137,7 +137,6 @@ def _with_what_is_left_out(
 
 
 def _files(out: Path, exported: Exported, calibration: Path) -> dict[Path, bytes]:
-    """Every file to be written, by its path."""
     files = {out: exported.content}
     for name, content in exported.companions.items():
         beside = out.with_name(name)

@@ -239,7 +239,6 @@ def _markdown(entry: Entry) -> list[str]:
 
 
 def _paragraphs(text: str) -> list[str]:
-    """A docstring's paragraphs; its attributes as a list."""
     plain, sections = _sections(text)
     lines = [line for part in plain.split("\n\n") for line in (_marked(" ".join(part.split())), "")]
     attributes = [f"- `{name}`: {_marked(said)}" for name, said in sections.get("Attributes", {}).items()]
@@ -251,7 +250,6 @@ def _marked(text: str) -> str:
 
 
 def as_text(reference: Reference) -> str:
-    """For a terminal."""
     lines: list[str] = []
     for kind in reference.kinds:
         lines += [f"{kind.kind}: {kind.hook.name}", *_indented(kind.hook.text, 2)]

@@ -209,7 +209,6 @@ def _section(console: Console, title: str, lines: list[str]) -> None:
 
 
 def fixed_content(console: Console, experiment: Experiment, ready: Prepared) -> dict[str, Any]:
-    """Fixed parameters judged, for JSON."""
     with console.progress() as progress:
         judged = fixed_parameters(experiment, ready, progress)
     return {

@@ -47,7 +47,6 @@ class LazyGroup(click.Group):
     """A group that knows its commands by name and imports one only to run it; plugins add theirs."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Our own in a fixed order, then those of plugins."""
         return [*COMMANDS, *_plugin_commands()]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
@@ -81,7 +80,6 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """A name that is none is refused with the nearest that is."""
         if (command := self.get_command(ctx, args[0])) is not None:
             return args[0], command, args[1:]
         near = difflib.get_close_matches(args[0], self.list_commands(ctx), n=1, cutoff=0.6)

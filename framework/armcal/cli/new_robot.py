@@ -88,7 +88,6 @@ def begin(console: Console, name: str, source: Source, folder: Path) -> None:
 
 
 def _widths(source: Source) -> dict[Unit, float]:
-    """Of the priors."""
     given: dict[Unit, float | None] = {"mm": source.prior_mm, "deg": source.prior_deg}
     widths = {**WIDTHS, **{unit: width for unit, width in given.items() if width is not None}}
     for unit, width in widths.items():

@@ -19,7 +19,6 @@ _MOST = 1 << 18
 
 
 def say(text: str, err: bool = False) -> None:
-    """One text, to standard output or error."""
     click.echo(shown(text), err=err)
 
 
@@ -71,7 +70,6 @@ class Outlet:
             self._stuck = not self._changed.wait_for(lambda: not self._size, 0 if self._stuck else _AT_ONCE_S)
 
     def finish(self) -> None:
-        """Wait until all is written; for a terminal as long as it takes anything."""
         with self._changed:
             while self._size:
                 before = self._written
@@ -80,15 +78,12 @@ class Outlet:
                     return
 
     def isatty(self) -> bool:
-        """Whether it is a terminal."""
         return self._terminal
 
     def fileno(self) -> int:
-        """The stream's descriptor."""
         return self._descriptor
 
     def writable(self) -> bool:
-        """Yes."""
         return True
 
     def _pump(self) -> None:

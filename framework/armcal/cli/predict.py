@@ -191,7 +191,6 @@ def _warn_of_missing(console: Console, loaded: Calibration, commands: Dataset, r
 def _beyond(
     console: Console, loaded: Calibration, commands: Dataset, plus_minus: PlusMinus | None
 ) -> dict[str, tuple[str, ...]]:
-    """The column that flags the poses beyond the calibration's records, of which it warns."""
     kept = loaded.record.prediction
     if kept is None or not kept.ranges:
         return {}

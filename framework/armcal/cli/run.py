@@ -183,14 +183,12 @@ def _compliances(result: RunResult) -> Table:
 
 
 def _in_ascii(text: str) -> str:
-    """A number of the report for terminals of any encoding."""
     for sign, word in ((MINUS, "-"), (NONE, "-"), ("≤", "up to"), ("≥", "from")):
         text = text.replace(sign, word)
     return text.strip()
 
 
 def _matrices(result: RunResult) -> Table:
-    """Compliance matrices by their principal values, the softest direction last."""
     estimate = result.estimate
     factor, unit = shown_unit("rad_per_Nm")
     table = columned(f"Principal compliances, {unit}", ("parameter", "stiffest", "", "softest"))

@@ -74,7 +74,6 @@ class BoardSettings(Settings):
 
     @property
     def clock(self) -> PulseClock:
-        """What its pulses are counted by."""
         return PulseClock(self.oscillator_hz, self.prescale)
 
 
@@ -100,7 +99,6 @@ class ServoSettings(Settings):
 
     @property
     def table(self) -> PulseTable:
-        """Its pulse table."""
         return PulseTable(self.angles, self.pulses)
 
 
@@ -123,12 +121,10 @@ class CalibratedServo(Settings):
 
     @property
     def table(self) -> PulseTable:
-        """Its pulse table."""
         return PulseTable(self.angles, self.pulses)
 
     @property
     def clock(self) -> PulseClock:
-        """What its pulses are counted by."""
         return PulseClock(self.oscillator_hz, self.prescale)
 
 
@@ -212,7 +208,6 @@ def load_servo_file(path: str | Path) -> ServoFile:
 
 
 def servo_file_text(file: ServoFile) -> str:
-    """The file as YAML; reading it gives equal numbers, to the last bit."""
     lines = ["boards:"]
     lines += [f"  {_word(name)}: {{{_listed(board_fields(board))}}}" for name, board in file.boards.items()]
     lines.append("servos:")
@@ -221,13 +216,11 @@ def servo_file_text(file: ServoFile) -> str:
 
 
 def board_fields(board: BoardSettings) -> list[tuple[str, str]]:
-    """Keys and values of a board as they are written."""
     clock = [("oscillator_hz", _number(board.oscillator_hz)), ("rate_hz", _number(board.rate_hz))]
     return [("address", f"0x{board.address:02x}"), *clock, ("id", _quoted(board.id))]
 
 
 def servo_fields(servo: ServoSettings) -> list[tuple[str, str]]:
-    """Keys and values of a servo as they are written."""
     angles = _in_unit("angles", servo.angles, "deg", math.degrees, "rad")
     pulses = _in_unit("pulses", servo.pulses, "us", lambda pulse: 1e6 * pulse, "s")
     borne = _in_unit("pulse_range", servo.pulse_range, "us", lambda pulse: 1e6 * pulse, "s")

@@ -338,8 +338,6 @@ def _refusable(source: ConfigSource, at: Path, build: Callable[[], T]) -> T:
 
 
 def _with(source: ConfigSource, path: Path, value: Any) -> ConfigSource:
-    """The same configuration with another value at a path."""
-
     def rebuilt(data: Any, steps: Path) -> Any:
         if not steps:
             return value

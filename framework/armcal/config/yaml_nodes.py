@@ -55,7 +55,6 @@ class Origin:
     prefix: tuple[Step, ...] = ()
 
     def at(self, line: int | None, path: tuple[Step, ...] | None = None) -> Location:
-        """The place of a line, and of a full path in the merged config."""
         shown = dotted(self.prefix if path is None else path)
         return Location(self.label, line if self.numbered else None, shown or None)
 

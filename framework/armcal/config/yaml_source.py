@@ -66,7 +66,6 @@ class ConfigSource:
         return replace(self.marks[tuple(steps)], field=dotted((*steps, *path[len(steps) :])) or None)
 
     def refuse(self, path: tuple[Step, ...], message: str, hint: str = "") -> NoReturn:
-        """Raise a ConfigError at the place of a path."""
         raise ConfigError(message, where=self.where(path), hint=hint)
 
 
@@ -123,7 +122,6 @@ def root_of(path: Path, root: Path | None) -> Path:
 
 
 def as_source(tree: Node, path: Path, reader: Reader) -> ConfigSource:
-    """A tree as a configuration."""
     marks: dict[tuple[Step, ...], Location] = {}
     return ConfigSource(_build(tree, (), marks), marks, path, reader.root, tuple(reader.files))
 

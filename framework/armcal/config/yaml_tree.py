@@ -11,7 +11,6 @@ _STEPS = re.compile(r'(?:"([^"]+)"|([^."\s]+))(?:\.|$)')
 
 
 def entries_of(node: Node) -> dict[str, Node]:
-    """A mapping's entries; none of anything else."""
     return node.value if isinstance(node.value, dict) else {}
 
 

@@ -100,7 +100,6 @@ class SimulatedClock(Clock):
         return answer
 
     def close(self) -> None:
-        """Let go of the bench; its time stands still."""
         self._answers.close()
         self._socket.close()
 

@@ -34,7 +34,6 @@ _BUFFER_BYTES = 4 << 20
 
 
 def _named(value: object) -> object:
-    """A source's name; a file's becomes a whole path."""
     if not isinstance(value, str) or value == STANDARD_INPUT:
         return value
     if value.startswith("udp:"):
@@ -175,7 +174,6 @@ class UdpLines(LineSource):
 
     @property
     def port(self) -> int:
-        """Its number."""
         return int(self._socket.getsockname()[1])
 
     @override

@@ -50,7 +50,6 @@ def bytes_from(link: Link, address: int, register: int, count: int) -> bytes:
 
 
 def state_of(device: JointDevice) -> DeviceState:
-    """Which joints get which pulses, each one of the device's."""
     state = device.state()
     if not isinstance(state, DeviceState):
         refuse(device.state, state, "a DeviceState")
@@ -125,14 +124,12 @@ def shots_of(camera: LiveCamera) -> Sequence[Shot]:
 
 
 def shot_of(camera: LiveCamera) -> Shot:
-    """An image taken now."""
     shot = camera.shoot()
     _check_shot(camera.shoot, shot)
     return shot
 
 
 def refused_by(part: Tracker | JointStream) -> Mapping[str, int]:
-    """How much was passed over, by reason."""
     refused = part.refused
     if not isinstance(refused, Mapping) or not _is_all(int, refused.values()):
         _refuse_attribute(part, "refused", "a mapping of reasons to counts")
@@ -140,13 +137,11 @@ def refused_by(part: Tracker | JointStream) -> Mapping[str, int]:
 
 
 def check_joint_names(device: JointDevice, joints: tuple[str, ...]) -> None:
-    """Refuse a device that moves other joints than those that it was given."""
     if device.joint_names != joints:
         _refuse_attribute(device, "joint_names", f"{joints}, as it was given them")
 
 
 def check_seen(camera: LiveCamera, measurements: Mapping[str, Measurement]) -> None:
-    """Refuse a camera, open, that is of none of these measurements."""
     if camera.measurement not in measurements:
         _refuse_attribute(camera, "measurement", f"one of {', '.join(measurements)}")
 

@@ -50,7 +50,6 @@ class SerialPortSettings(Settings):
 
     @property
     def meant(self) -> str:
-        """The port, for people."""
         return str(self.port) if self.port is not None else f"the adapter {self.serial_number}"
 
 
@@ -113,7 +112,6 @@ class SerialPort:
                 self._lose(fault)
 
     def close(self) -> None:
-        """Let go of it. May be called twice."""
         port, self._port = self._port, None
         if port is not None:
             port.close()

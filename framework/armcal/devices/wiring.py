@@ -65,7 +65,6 @@ class WiringRecord:
 
     @property
     def path(self) -> Path:
-        """Where it is written down."""
         return self.stated_in.with_name(f"{self.stated_in.name}.checked")
 
     def note(self, right: Iterable[str], others: Iterable[str], seen: Mapping[str, Any]) -> None:

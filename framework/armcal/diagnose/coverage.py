@@ -77,7 +77,6 @@ class Stretch:
     radius: float | None
 
     def as_dict(self) -> dict[str, float | None]:
-        """For YAML and JSON."""
         named: dict[str, float | None] = {level_name(p): x for p, x in zip(LEVELS, self.coordinates, strict=True)}
         return {**named, "radius_95": self.radius}
 
@@ -104,7 +103,6 @@ class Coverage:
 
     @property
     def stated(self) -> tuple[float, ...]:
-        """Of the intervals that predictions give."""
         return self.stretched or self.raw
 
     def as_dict(self) -> dict[str, object]:
@@ -131,7 +129,6 @@ def level_name(level: float) -> str:
 
 
 def predictor(problem: Problem, fitted: WeighedFit) -> Predictor:
-    """What a fit predicts."""
     estimate = fitted.estimate
     drift = KnownDrift.by(problem, estimate.values, fitted.records)
     return Predictor(
@@ -199,7 +196,6 @@ def fit_and_predict(task: FitTask) -> JudgedFit:
 
 
 def besides(scores: Scores, places: Indices) -> Scores:
-    """The scores of all records but some."""
     errors = scores.errors.copy()
     errors[:, places] = np.nan
     return replace(scores, errors=errors)

@@ -77,7 +77,6 @@ class Records:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Residual numbers of each factor."""
         return tuple(slope.shape[0] for slope in self.motion.slopes)
 
     def along(self, joint: str, features: Array) -> tuple[Array, ...]:
@@ -206,7 +205,6 @@ def _of_approach(here: Records, arm: str, joint: str, shown: str, si: str) -> It
 
 
 def _of_coupling(here: Records, name: str, arm: Arm, joint: str, shown: str) -> Iterator[Dependence]:
-    """A share of another joint's command on this one, as a belt or a gear that runs through it would add."""
     for other, dimension in arm.commanded.items():
         command = here.dataset.column(f"{name}.{other}")
         if other == joint or dimension != arm.commanded[joint] or _spread(command) <= 0:

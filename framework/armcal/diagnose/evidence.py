@@ -153,7 +153,6 @@ def _tip_motions(problem: Problem, values: Array, poses: Dataset, null: Array) -
 
 
 def _position_rows(problem: Problem) -> list[int]:
-    """Which residual numbers, all factors stacked, are those of the first position in a base frame."""
     start = 0
     for kernel in problem.kernels:
         factor = kernel.factor

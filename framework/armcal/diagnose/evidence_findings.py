@@ -89,7 +89,6 @@ def shift_findings(estimate: Estimate) -> list[Finding]:
 
 
 def _at_its_edge(estimate: Estimate, block: ParameterBlock) -> bool:
-    """Whether a block lies on a bound, or a matrix on its cone."""
     if isinstance(block.domain, Semidefinite):
         sizes = np.linalg.eigvalsh(symmetric(estimate.values[estimate.parameters.entries_of(block.name)]))
         return bool(sizes.min() <= AT_BOUND * block.scale)
@@ -141,7 +140,6 @@ def steadier_weights(name: str, estimated: Halves, declared: Halves, unit: str) 
 
 
 def _by_chance(differences: Array, level: float = 0.05) -> float:
-    """A mean of so many differences that chance makes in so many cases, one-sided."""
     count = len(differences)
     return float(stdtrit(count - 1, 1 - level) * np.std(differences, ddof=1) / np.sqrt(count))
 
@@ -221,7 +219,6 @@ def _predictable_finding(structure: ResidualStructure) -> Finding:
 
 
 def predicted_in_short(predicted: Predictable) -> str:
-    """How much of the residuals is no noise."""
     share = f"{percent(predicted.share)} of the variance of the residuals is not noise"
     names = [carrier.words for carrier in predicted.carriers]
     listed = " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
@@ -251,7 +248,6 @@ def _remedies(predicted: Predictable) -> Iterator[str]:
 
 
 def percent(share: float) -> str:
-    """In words."""
     return f"{100 * share:.0f} %" if share >= 0.095 else f"{100 * share:.1g} %" if share > 0.0005 else "0.1 %"
 
 
@@ -341,7 +337,6 @@ def neighbour_findings(structure: ResidualStructure | None, estimate: Estimate, 
 
 
 def _what_neighbours_cost(estimate: Estimate) -> str:
-    """What correlated neighbours do to the intervals of the parameters."""
     factors = estimate.widened
     if not factors:
         return "In the order in which these poses were measured that does not widen the intervals of the parameters."

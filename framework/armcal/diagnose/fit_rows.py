@@ -86,7 +86,6 @@ class FitRows:
         return np.vstack([*parts, below])
 
     def mean_error(self, residual: Array) -> float:
-        """Mean length of the raw residuals that rows stand for (m); root mean square over several factors."""
         return float(np.mean(self.errors(residual)))
 
     def errors(self, residual: Array) -> Array:

@@ -80,7 +80,6 @@ class Proportion:
 
     @property
     def is_clear(self) -> bool:
-        """Whether lengths give it seldom by chance, be each off by as much as the others or by a share of its own."""
         t, levels = -abs(self.share) / max(self.sd, 1e-300), (AS_MUCH, BY_SHARES)
         return all(2 * stdtr(freedom, t) < level for freedom, level in zip(self.freedoms, levels, strict=True))
 
@@ -107,7 +106,6 @@ class Figure:
 
 
 def thinned(chosen: Indices, most: int) -> Indices:
-    """At most so many of some records, evenly."""
     return chosen[:: max(1, -(-len(chosen) // most))]
 
 

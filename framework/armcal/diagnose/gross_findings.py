@@ -98,7 +98,6 @@ def jumped(left: ResidualStructure | None) -> list[Finding]:
 
 
 def _share(structure: Structure, left: ResidualStructure) -> float:
-    """Of the mean error, what one structure makes up."""
     return structure.falls_mm / max(left.mean_mm, 1e-12)
 
 

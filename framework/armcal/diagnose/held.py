@@ -53,7 +53,6 @@ class HeldParameter:
 
     @property
     def p_value(self) -> float:
-        """That it is where it is held."""
         return 2 * float(stdtr(self.freedom, -abs(self.off) / self.sd))
 
     def __str__(self) -> str:
@@ -97,7 +96,6 @@ def contradictions(problem: Problem, estimate: Estimate, records: Sequence[Facto
 def held_scales(
     problem: Problem, estimate: Estimate, records: Sequence[FactorRecords]
 ) -> list[tuple[HeldParameter, str]]:
-    """Of all measurements that have a scale and hold it, each with how a user finds out what it is."""
     scaled = [(f"{n}.{m.scale}", m) for n, m in problem.blueprint.measurements.items() if isinstance(m, HasScale)]
     checks = {n: m.scale_check for n, m in scaled if n in problem.parameters.names and not problem.parameters[n].free}
     return [(one, checks[name]) for name, one in held_parameters(problem, estimate, records, list(checks)).items()]
@@ -173,7 +171,6 @@ def freed(problem: Problem, names: Sequence[str]) -> Problem:
 
 
 def moves_of(problem: Problem, values: Array, records: Sequence[FactorRecords], held: Sequence[str]) -> Moves:
-    """Of all free parameters and of held ones."""
     wider = freed(problem, held)
     bare = [replace(one, weight=np.sign(one.weight), whitening=None, correlation=None) for one in records]
     chain, parts = wider.parameters.entries_jacobian(values), []

@@ -64,7 +64,6 @@ class LargeErrors:
     explained: tuple[Miss, ...]
 
     def in_words(self, unit: str) -> str:
-        """Beyond what."""
         stated = f"{readable(self.limit_mm)} {unit}"
         return f"above {stated}" if self.configured else f"beyond what noise explains ({stated} for most records)"
 

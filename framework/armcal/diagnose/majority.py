@@ -91,7 +91,6 @@ def _lengths(rows: FitRows, residual: Array) -> Array:
 
 
 def _since(far: Indices, near: Indices, position: Indices) -> int | None:
-    """The far record from which on (in recorded order) nearly all are far, and before which nearly none is."""
     order = np.sort(np.concatenate([position[far], position[near]]))
     is_far = np.isin(order, position[far])
     if not is_far[-1]:
@@ -144,7 +143,6 @@ def moved_groups(problem: Problem, values: Array, records: Sequence[FactorRecord
 
 
 def moved_findings(moved: Sequence[Moved]) -> list[Finding]:
-    """In words."""
     return [
         Finding(
             "warning",

@@ -33,12 +33,10 @@ class Finding:
 
     @property
     def whole(self) -> str:
-        """All of it in one line."""
         return self.text + (f" [{self.test}]" if self.test else "") + (f" {self.action}" if self.action else "")
 
 
 def first_few(texts: Sequence[str], most: int = 5) -> str:
-    """The first ones, and how many more there are."""
     return ", ".join(texts[:most]) + (f" and {len(texts) - most} more" if len(texts) > most else "")
 
 

@@ -105,7 +105,6 @@ class Repeats:
 
     @property
     def exceeded(self) -> bool:
-        """Whether residuals are more than noise, by chance and by size."""
         return self.p_value < LACK and self.left_mm > TIMES_REPEATS * self.scatter_mm
 
 
@@ -135,7 +134,6 @@ def repeats_of(residual: Array, basis: Array, rows: FitRows, pose: Indices, kern
 
 
 def _shared(own: Array, taken_up: Array, pose: Indices, kernels: Kernels) -> bool:
-    """Whether means of poses (G x r) miss as those nearby do, freed of what the fit takes up of them (G x r x n)."""
     within, first = np.linalg.qr(taken_up.reshape(own.size, -1))[0], np.unique(pose, return_index=True)[1]
     if within.shape[1] >= own.size:
         return False

@@ -74,7 +74,6 @@ class Contest:
         return tuple(names)
 
     def beside(self, others: Sequence[int]) -> tuple[Array, Array]:
-        """Residual and basis with some causes in the model."""
         basis = self.basis
         for other in others:
             basis = np.hstack([basis, own_basis(self.columns[other], basis)[0]])
@@ -82,12 +81,10 @@ class Contest:
         return self.residual - added @ (added.T @ self.residual), basis
 
     def time_imitated(self) -> float:
-        """Which share of the function of time that the residual follows the pose predicts."""
         over_time = smooth(self.residual, self.basis, self.by_record, self.time).function
         return self.pose.imitate(over_time[self.by_record])
 
     def likeliest(self, others: Sequence[int], independence: float) -> int:
-        """Which cause has the most odds beside others in the model."""
         return int(np.argmax(self._gains(*self.beside(others), others, independence)))
 
     def odds(self, cause: int, others: Sequence[int], independence: float) -> Odds:
@@ -118,7 +115,6 @@ class Contest:
         return Odds(float(np.exp(shown[mine] - total)), alternatives, float(np.exp(shown[CHANCE] - total)))
 
     def _gains(self, residual: Array, basis: Array, others: Sequence[int], independence: float) -> Array:
-        """Logarithm of each cause's odds against noise; that of a cause already in the model is no number."""
         total, freedom = max(float(residual @ residual), 1e-300), len(residual) - basis.shape[1]
         gains = np.full(len(self.causes), -np.inf)
         for i in set(range(len(self.causes))) - set(others):

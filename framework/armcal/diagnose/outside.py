@@ -146,7 +146,6 @@ def _of_mistakes(here: Records, problem: Problem, moves: Moves) -> Iterator[Depe
 
 
 def _places(count: int, most: int) -> list[int]:
-    """Spread over a recording, so many at most, none within the first or last few records."""
     inner = np.arange(_FEWEST_APART, count - _FEWEST_APART + 1)
     step = max(_FEWEST_APART, -(-len(inner) // most))
     return [int(i) for i in inner[step // 2 :: step]]

@@ -117,7 +117,6 @@ class _Seen:
         return self.sighting.measured
 
     def thinned(self, most: int) -> Self:
-        """At most so many of the records, evenly."""
         every = np.arange(0, self.records.count, max(1, -(-self.records.count // most)))
         rows = tuple((words, positions[:, every]) for words, positions in self.rows)
         (records,) = subset([self.records], every)
@@ -153,7 +152,6 @@ def _of_contact(
         return None
 
     def left(read_as: Wires) -> float:
-        """A reading's."""
         try:
             return apart_in_groups(problem, number, rewired(kernel.factor.channels, own, read_as), nominal)
         except NotConvergedError:
@@ -333,7 +331,6 @@ def _left(problem: Problem, seen: _Seen, read_as: Wires, measured: Array, enough
 
 
 def _of_axes(seen: _Seen, straight: Adapting) -> Iterator[tuple[str, Array]]:
-    """All exchanges and signs of axes, but turns that the fit makes by itself; other units; a row early or late."""
     if seen.placing is not None:
         yield LEFT_HANDED, np.diag([1.0, 1.0, -1.0]) @ seen.measured
     else:

@@ -64,7 +64,6 @@ class Carrier:
 
     @property
     def words(self) -> str:
-        """As a part of a sentence."""
         of = {"joint": f"the angle of {self.name}", "approach": f"the side {self.name} was approached from"}
         return of.get(self.kind, f"the {self.kind}" if self.kind != "time" else "time")
 
@@ -211,7 +210,6 @@ def _blocks(rows: FitRows, motion: Motion, inputs: Sequence[_Input]) -> Iterator
 
 
 def _along(rows: FitRows, motion: Motion, channel: str) -> Array:
-    """The data's rows by a joint's command."""
     return rows.columns([slope[:, :, None] for slope in motion.along(channel)])[: len(rows.record_of), 0]
 
 
@@ -248,7 +246,6 @@ class _Regression:
     values: Array
 
     def of_first(self) -> Self:
-        """Of the first values alone."""
         return replace(self, values=self.values[:, :1])
 
     def shares(self, sizes: Sequence[float], inputs: AbstractSet[int] | None = None) -> Array:

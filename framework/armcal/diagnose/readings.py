@@ -66,7 +66,6 @@ def single_joints(arm: Arm) -> list[tuple[str, Wires]]:
 
 
 def coupled_joints(arm: Arm) -> Iterator[tuple[str, Wires]]:
-    """Each joint's reading taken for its own less, or plus, that of another of its kind."""
     for joint, other in permutations(arm.commanded, 2):
         for sign in (1.0, -1.0) if arm.commanded[joint] == arm.commanded[other] else ():
             factor = arm.couplings.get(joint, {}).get(other, 0.0) + sign
@@ -94,7 +93,6 @@ def several_joints(arm: Arm) -> Iterator[tuple[str, Wires]]:
 
 
 def axes_words(order: Sequence[int], signs: Sequence[float]) -> str:
-    """Axes in this order, with these signs."""
     moved = [i for i in range(3) if order[i] != i]
     negative = [_AXES[order[i]] for i in range(3) if signs[i] < 0]
     if len(moved) == 2 and not negative:
@@ -106,7 +104,6 @@ def axes_words(order: Sequence[int], signs: Sequence[float]) -> str:
 
 
 def _wires(arm: Arm, joints: Mapping[str, str], factor: float, added: float = 0.0) -> Wires:
-    """Commands and approaches of some joints read as those of others, times a factor; of approaches, times its sign."""
     return {
         f"{arm.name}.{part}{joint}": ({f"{arm.name}.{part}{other}": scale}, summand)
         for joint, other in joints.items()
@@ -134,7 +131,6 @@ def scaled_positions() -> Iterator[tuple[str, Array]]:
 
 
 def unit_mistaken(factor: float) -> str:
-    """Which unit, taken for which other, makes lengths so many times as large as they are."""
     pairs = product(_UNITS.items(), repeat=2)
     return next(f"{own} among {other}" for (own, size), (other, taken) in pairs if np.isclose(taken / size, factor))
 
@@ -226,7 +222,6 @@ def two_frames(tools: Tools, measured: Array, basis: Array) -> TwoFrames | None:
 
 
 def rewired(channels: Sequence[str], own: FactorRecords, read_as: Wires) -> FactorRecords:
-    """Records with channels read as sums of others, times factors, and a summand."""
     read = own.record.copy()
     for channel, (others, added) in read_as.items():
         if channel in channels and all(other in channels for other in others):
@@ -271,7 +266,6 @@ class Adapting:
         return np.asarray(np.sqrt(unit * np.maximum(left, 0.0)))
 
     def can_move(self, turn: Array, shift: Array) -> bool:
-        """Whether the free parameters move all positions as the beginning of a motion of the base would."""
         moved = (np.cross(Rotation.from_matrix(turn).as_rotvec(), self.predicted.T) + shift).ravel()
         along = self.ways.T @ moved
         return float(moved @ moved - along @ along) <= _TURNED**2 * float(moved @ moved)
@@ -291,7 +285,6 @@ def within(along: Array, sizes: Array, radius: float) -> Array:
 
 
 def is_place(names: Sequence[str]) -> bool:
-    """Whether the first of a group's parameters are a place."""
     return tuple(name[-1:] for name in names[:3]) == tuple(_AXES)
 
 

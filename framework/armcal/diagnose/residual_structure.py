@@ -112,12 +112,10 @@ class ResidualStructure:
 
     @property
     def is_predictable(self) -> bool:
-        """Whether other records predict some of a record's residuals."""
         return self.predictable is not None and self.predictable.above_chance
 
     @property
     def worthwhile(self) -> tuple[Structure, ...]:
-        """Those that would lower the mean error by a hundredth of it, and by what an instrument may read."""
         least = max(WORTHWHILE * self.mean_mm, SMALLEST_SHOWN)
         return tuple(s for s in self.structures if s.falls_mm >= least)
 
@@ -197,7 +195,6 @@ def _alike(residual: Array, basis: Array, rows: FitRows, contest: Contest) -> Ti
 
 
 def _looked_at(candidates: Indices, position: Indices) -> Indices:
-    """In recorded order; of very many, runs of neighbours spread over the recording."""
     order = candidates[np.argsort(position[candidates], kind="stable")]
     if len(order) <= MOST_RECORDS:
         return order

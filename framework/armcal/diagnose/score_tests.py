@@ -50,21 +50,17 @@ class Fit:
 
     @property
     def blocks(self) -> int:
-        """How many there are."""
         return int(self.block.max(initial=-1)) + 1
 
     def without(self, basis: Array) -> Self:
-        """With orthonormal columns (rows x k) taken up as well."""
         residual = self.residual - basis @ (basis.T @ self.residual)
         return replace(self, residual=residual, draws=self.draws - basis @ (basis.T @ self.draws))
 
     def with_fewer_draws(self) -> Self:
-        """For the tests after the first."""
         return replace(self, draws=self.draws[:, :FEWER_DRAWS])
 
 
 def linear_fit(slopes: Array, residual: Array, block: Indices, records: Indices, neighbours: Mask) -> tuple[Fit, Array]:
-    """A fit from its slopes (rows x n) and residual at the solution; and an orthonormal basis of the slopes."""
     lengths = np.linalg.norm(slopes, axis=0)
     basis = np.linalg.qr(slopes / np.where(lengths > 0, lengths, 1.0))[0]
     noise = np.random.default_rng(0).normal(size=(len(residual), DRAWS))
@@ -158,7 +154,6 @@ def _ratios(bases: Sequence[Array], both: Array, fit: Fit) -> Array:
 
 
 def _by_block(columns: Array, fit: Fit) -> Array:
-    """Rows (rows x n) block by block, zeros behind those of short blocks (blocks x most rows x n)."""
     order, sizes = np.argsort(fit.block, kind="stable"), np.bincount(fit.block)
     place = np.arange(len(order)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
     blocks = np.zeros((len(sizes), int(sizes.max()), columns.shape[1]))
@@ -171,7 +166,6 @@ def _p_value(size: int, spare: int, ratio: Array) -> Array:
 
 
 def _neighbours(fit: Fit, both: Array) -> tuple[float, Array]:
-    """Correlation of neighbouring records less that of the draws, and two-sided p-values by the draws' spread."""
     first = np.flatnonzero(fit.neighbours)
     if len(first) < 10:
         return 0.0, np.ones(both.shape[1])

@@ -51,7 +51,6 @@ class Kernels:
 
     @cached_property
     def features(self) -> tuple[Array, ...]:
-        """So that features times their transposes are the kernels, but for their smallest parts."""
         features = []
         for kernel in self.kernels:
             values, vectors = np.linalg.eigh(kernel)

@@ -63,7 +63,6 @@ class Elsewhere:
 
     @property
     def in_words(self) -> str:
-        """How well."""
         return f"Away from the contacts the tool is known to {readable(self.rms_mm)} mm (root mean square)"
 
 
@@ -165,7 +164,6 @@ def hidden_payload(
 
 
 def hidden_payload_findings(hidden: HiddenPayload | None) -> list[Finding]:
-    """What the verdict says of it."""
     if hidden is None:
         return []
     text = (
@@ -177,7 +175,6 @@ def hidden_payload_findings(hidden: HiddenPayload | None) -> list[Finding]:
 
 
 def elsewhere_findings(away: Elsewhere | None) -> list[Finding]:
-    """What the verdict says of it."""
     if away is None:
         return []
     text = f"{away.in_words}: the error of contacts is only by how much postures at one place disagree."

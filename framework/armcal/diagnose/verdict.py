@@ -61,7 +61,6 @@ class Verdict:
 
     @property
     def bad(self) -> tuple[Finding, ...]:
-        """Why the values are not to be used; empty if they may be."""
         return tuple(finding for finding in self.findings if finding.grade == "bad")
 
 
@@ -182,7 +181,6 @@ def _in_short(
 
 
 def _causes(seen: Evidence) -> list[Finding]:
-    """What is wrong with instruments and recorded joints."""
     return [*contradiction_findings(seen.contradictions), *rounding_findings(seen.rounding, seen.unit)]
 
 
@@ -214,7 +212,6 @@ def _left(seen: Evidence, estimate: Estimate) -> list[str]:
 
 
 def _is_beyond_noise(estimate: Estimate) -> bool:
-    """Chi-square, one-sided."""
     freedom = max(1, estimate.degrees_of_freedom)
     return bool(estimate.noise_scale**2 * freedom > chdtri(freedom, LEVEL / 2))
 
@@ -291,7 +288,6 @@ def _size(estimate: Estimate, trained_mm: Array, seen: Evidence) -> Finding:
 
 
 def _freedom(estimate: Estimate) -> list[Finding]:
-    """Are equations enough left to judge the residuals by? Ten give the noise to within a fifth or so."""
     freedom = estimate.degrees_of_freedom
     if freedom >= FEWEST_FREEDOM:
         return []

@@ -20,7 +20,6 @@ class Measure:
     scale: float
 
     def shown(self, coefficient: float) -> tuple[float, str]:
-        """So many typical scales in the unit that people are shown."""
         factor, unit = shown_unit(self.unit)
         return coefficient * self.scale * factor, unit
 
@@ -39,7 +38,6 @@ class Combination:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the parameters that take part."""
         return tuple(name for name, _ in self.terms)
 
     @property

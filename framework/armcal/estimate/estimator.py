@@ -97,7 +97,6 @@ class SpreadableEstimator(Protocol):
 
 
 def spread(estimator: Estimator, executor: Executor | None) -> Estimator:
-    """An estimator on an executor, if it has pieces to spread."""
     return estimator.spread(executor) if executor and isinstance(estimator, SpreadableEstimator) else estimator
 
 

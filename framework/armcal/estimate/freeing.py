@@ -52,7 +52,6 @@ class Freeing:
 
 
 def candidates(parameters: Parameters) -> tuple[str, ...]:
-    """Fixed parameters of arms and instruments; masses, gravity, and matrices, which start at zero, are left out."""
     return tuple(
         block.name
         for block in parameters.blocks

@@ -54,7 +54,6 @@ class Identifiability:
 
     @cached_property
     def determined(self) -> tuple[bool, ...]:
-        """Whether each coordinate is free of undetermined combinations."""
         null = self.null
         return tuple(bool(x < _NEGLIGIBLE) for x in np.linalg.norm(null, axis=0)) if len(null) else (True,) * len(self)
 
@@ -63,12 +62,10 @@ class Identifiability:
 
     @property
     def null(self) -> Array:
-        """Orthonormal rows that span the undetermined combinations (in typical scales)."""
         return self.directions[self.rank :]
 
     @property
     def condition(self) -> float:
-        """Largest over smallest singular value among the determined ones."""
         if not len(self):
             return 1.0
         if not self.rank:
@@ -77,7 +74,6 @@ class Identifiability:
 
     @property
     def weakest(self) -> Combination:
-        """The combination that the data determines least, undetermined ones aside."""
         if not self.rank:
             return Combination(())
         return named(self.directions[self.rank - 1], self.names, self.measures, _LARGE_SHARE)
@@ -100,7 +96,6 @@ class Identifiability:
 
 
 def measures_of(parameters: Parameters) -> tuple[Measure, ...]:
-    """How each coordinate of the free blocks is shown."""
     return tuple(Measure(block.unit, block.scale) for block in parameters.coordinate_blocks)
 
 
@@ -198,12 +193,10 @@ def correlations(covariance: Array) -> Array:
 
 
 def numerical_rank(scaled: Array) -> int:
-    """The rank of R (m x n, columns scaled) by singular values or by QR with pivoting, whichever finds more."""
     diagonal = np.diag(qr(scaled, pivoting=True, mode="r")[0])
     return max(_count_above(np.asarray(np.linalg.svd(scaled, compute_uv=False))), _count_above(np.abs(diagonal)))
 
 
 def _count_above(values: Array) -> int:
-    """How many stand above the rank tolerance."""
     largest = float(values.max(initial=0.0))
     return int(np.sum(values > RANK_TOLERANCE * largest)) if largest > 0 else 0

@@ -137,7 +137,6 @@ def _evaluate(terms: Sequence[Term], prior: Array, theta: Array) -> _Local:
 
 
 def _least_squares(terms: Sequence[Term], prior: Array) -> float:
-    """y' P y with all noise declared."""
     rows = [term.jacobian.reshape(-1, len(prior)) for term in terms]
     stacked = np.vstack([*rows, np.diag(np.sqrt(prior))])
     target = np.concatenate([*[term.target.ravel() for term in terms], np.zeros(len(prior))])

@@ -49,7 +49,6 @@ class Loss:
         return np.asarray(1 / (1 + (norms / self.constant) ** 2))
 
     def stiffness(self, norms: Array) -> tuple[Array, Array]:
-        """Second derivatives of the loss along the residual, and across it."""
         weight = self.weight(norms)
         if self.name == "huber":
             return np.where(norms <= self.constant, 1.0, 0.0), weight
@@ -80,10 +79,8 @@ def tuned(name: LossName, dimension: int) -> Loss:
 
 
 def norm_grid() -> Array:
-    """Norms on which means over Gaussian residuals are taken."""
     return np.linspace(0.0, _LARGEST_NORM, _STEPS + 1)
 
 
 def median_norm(dimension: int) -> float:
-    """Of so many standard Gaussian numbers."""
     return float(np.sqrt(chdtri(dimension, 0.5)))

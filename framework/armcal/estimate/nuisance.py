@@ -90,12 +90,10 @@ def restricted(problem: Problem, records: Sequence[FactorRecords]) -> Problem:
 
 
 def with_free(problem: Problem, names: set[str]) -> Problem:
-    """The same functions with fewer parameters free."""
     return replace(problem, parameters=problem.parameters.with_free(names))
 
 
 def untrained(problem: Problem) -> Problem:
-    """The problem as nothing had been fitted: every group held."""
     return with_free(problem, {block.name for block in problem.parameters.free if not block.nuisance})
 
 
@@ -122,7 +120,6 @@ def settled(problem: Problem, values: Array, records: Sequence[FactorRecords]) -
 
 
 def _present(problem: Problem, records: Sequence[FactorRecords]) -> set[str]:
-    """Full names of the parameters of all groups with a weighted record."""
     names = set()
     plan = problem.blueprint
     for (instance, measurement), record in zip(plan.measurements.items(), records, strict=True):

@@ -61,17 +61,14 @@ class Placing:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All of them."""
         return (*self.base, *self.target)
 
     @property
     def stands_anywhere(self) -> bool:
-        """Whether the base may be brought to any pose."""
         return self.rank == 6
 
     @classmethod
     def of(cls, motions: Sequence[_Motion]) -> Placing:
-        """Of what parameters move."""
         base = tuple(motion for motion in motions if motion.of_base)
         target = tuple(motion for motion in motions if not motion.of_base)
         shifts = [(m.name, m.twists[0][3:]) for m in target if len(m.twists) == 1 and _shifts_only(m.twists[0])]
@@ -190,7 +187,6 @@ def _basis(columns: Sequence[Array], size: int) -> Array:
 
 
 def _turned(parameters: Parameters, random: np.random.Generator) -> Array:
-    """A value vector with the free angles and rotations anywhere."""
     values = parameters.nominal()
     for block in parameters.free:
         place = parameters.entries_of(block.name)

@@ -143,7 +143,6 @@ def hopeless(
 
 
 def typical_off(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, values: Array) -> float:
-    """Median residual by the spread of the measured positions, the worst of all measurements that read positions."""
     worst = 0.0
     for kernel, record, residual in zip(problem.kernels, records, problem.residuals(values, records), strict=True):
         channels, seen = kernel.factor.position_channels, record.measured[: len(dataset)]

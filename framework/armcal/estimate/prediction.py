@@ -51,7 +51,6 @@ class Spread:
     freedom: float
 
     def of(self, rows: range) -> Spread:
-        """Of some of the numbers."""
         return replace(self, covariance=self.covariance[:, rows.start : rows.stop, rows.start : rows.stop])
 
     @cached_property
@@ -142,7 +141,6 @@ class Predictor:
 
     @property
     def drifts(self) -> bool:
-        """Whether any parameter does."""
         return any(block.drift is not None for block in self.problem.parameters.free)
 
     def residuals(self, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
@@ -234,7 +232,6 @@ class Predictor:
 
 
 def is_position(kernel: Kernel) -> bool:
-    """Whether a factor's residual begins with measured minus predicted position (or pose)."""
     return bool(kernel.factor.position_channels) and kernel.factor.rows in (len(POSITION), 2 * len(POSITION))
 
 

@@ -167,7 +167,6 @@ class _Search:
         self.failed = 0
 
     def _cost_of(self, values: Array) -> float:
-        """Of residuals and priors."""
         posed = PosedProblem(self._problem, self._records)
         return posed.cost(posed.x(values))
 

@@ -59,12 +59,10 @@ class RobustFit:
 
 
 def losses(problem: Problem, name: LossName) -> tuple[Loss, ...]:
-    """The tuned loss of each factor."""
     return tuple(tuned(name, kernel.factor.rows) for kernel in problem.kernels)
 
 
 def ones(records: Sequence[FactorRecords]) -> Weights:
-    """Every record at full weight."""
     return tuple(np.ones(record.count) for record in records)
 
 
@@ -254,7 +252,6 @@ def _at_rest(problem: Problem, records: Sequence[FactorRecords], values: Array) 
 
 
 def _with_status(solution: Solution, text: str, converged: bool | None = None) -> Solution:
-    """The solution with a text added to its status."""
     past = solution.verdict
     done = past.converged if converged is None else past.converged and converged
     return Solution(solution.values, replace(past, status=f"{past.status}; {text}", converged=done))

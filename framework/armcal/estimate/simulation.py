@@ -96,7 +96,6 @@ def measured_with_noise(
 
 
 def with_channels(dataset: Dataset, channels: Mapping[str, Array]) -> Dataset:
-    """The dataset with channels added or exchanged."""
     return replace(dataset, channels={**dataset.channels, **{k: np.asarray(v) for k, v in channels.items()}})
 
 

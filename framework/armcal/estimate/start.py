@@ -63,7 +63,6 @@ class Start:
     warnings: tuple[str, ...] = ()
 
     def values(self, problem: Problem) -> tuple[Array, ...]:
-        """Where fits of a problem with these parameters may start, the first of them the likeliest."""
         starts, parameters = list[Array](), problem.parameters
         for vector in self.vectors:
             values = parameters.nominal()
@@ -132,7 +131,6 @@ def _chosen(
 
 
 def shown_by(alignment: Alignment, tools: Tools, sighting: Sighting) -> Tools:
-    """What the instrument sees of the nominal arm that stands there, its body mounted as it was measured."""
     turned = alignment.turn @ tools.rotations
     if sighting.turned is not None:
         turned = turned @ hand_eye(tools.rotations, sighting.turned)[1]
@@ -155,7 +153,6 @@ def _disagreement(problem: Problem, values: Array, configured: float, left: floa
 
 
 def pose_words(alignment: Alignment) -> str:
-    """Where the base frame stands in the instrument's, as people read it."""
     x, y, z = alignment.shift * _MM
     roll, pitch, yaw = Rotation.from_matrix(alignment.turn).as_euler("xyz", degrees=True)
     return f"({x:.1f}, {y:.1f}, {z:.1f}) mm, roll, pitch, yaw ({roll:.2f}, {pitch:.2f}, {yaw:.2f}) deg"
@@ -216,7 +213,6 @@ def certificates(problem: Problem, values: Array, records: Sequence[FactorRecord
 
 
 def _own(problem: Problem, name: str) -> dict[str, ParameterBlock]:
-    """Parameters of a measurement by local name."""
     blocks = problem.parameters.blocks
     return {b.name.removeprefix(f"{name}."): b for b in blocks if b.name.startswith(f"{name}.")}
 
@@ -268,7 +264,6 @@ def _frame(problem: Problem, values: Array, dataset: Dataset, of: str, name: str
 
 
 def _typical(problem: Problem, values: Array, records: Sequence[FactorRecords], number: int) -> float:
-    """The median error of what one measurement read, of the records in which it did."""
     points = records[number].points_of(problem.kernels[number].factor) * records[number].measured
     squares = np.sum(problem.residuals(values, records)[number] ** 2, axis=0)[points > 0]
     errors = np.sqrt(squares / points[points > 0])

@@ -61,12 +61,10 @@ class Undetermined:
 
 
 def identify(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Identifiability:
-    """What records determine at a value vector, judged at zero residual."""
     return identify_from(factor_at_zero(problem, values, records), problem.parameters)
 
 
 def identify_from(triangle: Array, parameters: Parameters) -> Identifiability:
-    """The same from R (m x n) with R'R the information by coordinates."""
     return analyse(triangle, parameters.scales(), parameters.coordinate_names, measures_of(parameters))
 
 
@@ -114,7 +112,6 @@ def held_by_nothing(parameters: Parameters, known: Identifiability) -> tuple[Com
 
 
 def nearby(parameters: Parameters, values: Array, away: float = _AWAY, seed: int = 0) -> Array:
-    """A value vector so many typical scales away, within bounds."""
     random = np.random.default_rng(seed)
     at, scale = parameters.local(values), parameters.increment_scales()
     lower, upper = parameters.increment_bounds()
@@ -143,7 +140,6 @@ def random_records(problem: Problem, records: Sequence[FactorRecords], seed: int
 
 
 def _scaled(problem: Problem, values: Array, poses: Sequence[FactorRecords]) -> Array:
-    """R by coordinates in typical scales, at zero residual, of the poses that can be taken up."""
     fitting = projected(problem, values, poses)
     can = fits(problem, values, fitting)
     weighed = []

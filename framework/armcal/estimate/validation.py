@@ -39,7 +39,6 @@ class ErrorSummary:
     count: int
 
     def as_dict(self) -> dict[str, float | int | None]:
-        """For JSON."""
         return asdict(self)
 
 
@@ -92,7 +91,6 @@ def errors_and_turns(
 
 
 def measures_turns(problem: Problem) -> bool:
-    """Whether orientations are measured beside lengths."""
     turned = any("angle" in kernel.factor.dimensions for kernel in problem.kernels)
     return turned and error_dimension(problem) == "length"
 
@@ -218,7 +216,6 @@ class FitTask:
     split: Split
 
     def parts(self) -> tuple[tuple[FactorRecords, ...], tuple[FactorRecords, ...]]:
-        """The records that train, and those that judge."""
         train, held = (self.problem.subset(self.records, part) for part in (self.split.train, self.split.holdout))
         return train, held
 
@@ -274,7 +271,6 @@ class CrossValidation:
 
 
 def fit_and_judge(task: FitTask) -> JudgedFit:
-    """Fit on the training records of a task, judge on its others."""
     began, task = time.perf_counter(), task.trained()
     try:
         train, held = task.parts()
@@ -291,7 +287,6 @@ def judged_fit(
     held: Sequence[FactorRecords],
     began: float,
 ) -> JudgedFit:
-    """Errors of the other records by a solution on the training records."""
     judged, turns = errors_and_turns(task.problem, solution.values, held, train)
     at_rest = record_errors(task.problem, solution.values, held)
     if not solution.verdict.converged:
@@ -316,7 +311,6 @@ def cross_validate(
     executor: Executor | None = None,
     judge: Callable[[FitTask], JudgedFit] = fit_and_judge,
 ) -> CrossValidation:
-    """Fit on each fold's training records, judge on its others; the same compiled functions throughout."""
     tasks = [FitTask(problem, estimator, start, tuple(records), split) for split in splits]
     fits = (executor or Sequential()).map(judge, tasks, lambda done: progress("cross-validation", done))
     errors, at_rest, turns = np.full((3, records[0].count), np.nan)

@@ -77,16 +77,13 @@ class VarianceComponents:
     rounds: int = 1
 
     def share(self, kind: str) -> float:
-        """Of all components of a kind."""
         return sum(c.share for c in self.components if c.kind == kind)
 
     @property
     def mostly_joints(self) -> bool:
-        """Whether most of the residuals' variance is that of joints."""
         return self.share("joint") > 0.5
 
     def close_to(self, other: VarianceComponents) -> bool:
-        """Whether another estimate differs by less than a tenth of its standard deviations."""
         if [c.name for c in self.components] != [c.name for c in other.components]:
             return False
         return all(
@@ -138,7 +135,6 @@ def apply_components(
     variance_components: VarianceComponents,
     axes: Axes,
 ) -> tuple[FactorRecords, ...]:
-    """The same records (which carry the declared noise), whitened by the estimated covariances."""
     sources = _sources(problem, values, records, axes)
     variance = {c.name: c.sd**2 for c in variance_components.components}
     result = []
@@ -189,7 +185,6 @@ def _sources(problem: Problem, values: Array, records: Sequence[FactorRecords], 
 
 
 def _mean_variance(basis: Sequence[Array], records: Sequence[FactorRecords]) -> float:
-    """Mean diagonal entry over the residual numbers that count."""
     total, count = 0.0, 0
     for record, own in zip(records, basis, strict=True):
         used = record.weight[: record.count] > 0
@@ -201,7 +196,6 @@ def _mean_variance(basis: Sequence[Array], records: Sequence[FactorRecords]) -> 
 def _terms(
     problem: Problem, values: Array, records: Sequence[FactorRecords], bases: Sequence[list[Array]], sizes: Array
 ) -> list[Term]:
-    """Residuals, Jacobians and bases (of mean variance one) of the records that count."""
     parameters = problem.parameters
     chain, moved = parameters.entries_jacobian(values), parameters.coordinates(parameters.local(values))
     residuals, jacobians, terms = problem.whitened_residuals(values, records), problem.jacobians(values, records), []

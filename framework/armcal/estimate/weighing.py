@@ -96,7 +96,6 @@ class WeighedFit:
 
     @property
     def set_aside(self) -> tuple[Suspect, ...]:
-        """Those that took no part."""
         return tuple(s for s in self.suspects if s.weight == 0)
 
     @property
@@ -113,7 +112,6 @@ class Weighing:
     settings: NoiseSettings
 
     def spread(self, executor: Executor) -> Weighing:
-        """The same, with the inner estimator's own pieces done by an executor."""
         return Weighing(spread(self.inner, executor), self.settings)
 
     def solve(
@@ -123,7 +121,6 @@ class Weighing:
         start: Array,
         progress: Progress = no_progress,
     ) -> Solution:
-        """The values alone."""
         return self._weighed(problem, self._declared(problem, records, start, progress), records, progress)[0].solution
 
     def fit(
@@ -160,7 +157,6 @@ class Weighing:
     def _declared(
         self, problem: Problem, records: Sequence[FactorRecords], start: Array, progress: Progress
     ) -> RobustFit:
-        """The fit by the declared noise."""
         return self._robust(problem, tuple(records), self.inner.solve(problem, records, start, progress), progress)
 
     def _weighed(
@@ -190,7 +186,6 @@ class Weighing:
     def _robust(
         self, problem: Problem, records: tuple[FactorRecords, ...], first: Solution, progress: Progress
     ) -> RobustFit:
-        """From a least-squares solution; Cauchy's loss and the selection start from Huber's, which has one minimum."""
         loss = self.settings.loss
         if loss == "none" or not first.verdict.converged or not problem.increments:
             return RobustFit(first, ones(records), (1.0,) * len(records), ())
@@ -210,7 +205,6 @@ class Weighing:
 
 
 def weighed(estimator: Estimator, settings: NoiseSettings) -> Estimator:
-    """The estimator itself for plain least squares, else one that weighs records."""
     return estimator if settings.loss == "none" and not settings.estimate else Weighing(estimator, settings)
 
 
@@ -221,7 +215,6 @@ def fit(
     start: Array,
     progress: Progress = no_progress,
 ) -> WeighedFit:
-    """The fit of any estimator, weighing or not."""
     if isinstance(estimator, Weighing):
         return estimator.fit(problem, records, start, progress)
     return plain_fit(problem, records, estimator.solve(problem, records, start, progress))
@@ -242,14 +235,12 @@ class _Held:
 def held_fit(
     problem: Problem, records: Sequence[FactorRecords], estimator: Estimator, solution: Solution
 ) -> WeighedFit:
-    """How records weigh about a solution, and how far it leaves them."""
     at = _Held(solution)
     own = replace(estimator, inner=at) if isinstance(estimator, Weighing) else at
     return fit(problem, records, own, solution.values)
 
 
 def plain_fit(problem: Problem, records: Sequence[FactorRecords], solution: Solution) -> WeighedFit:
-    """A solution of least squares as a fit."""
     return WeighedFit(solution, _estimate(problem, records, solution), tuple(records), ones(records))
 
 

@@ -60,7 +60,6 @@ class BatchFunction:
 
     @property
     def compiled(self) -> bool:
-        """Whether C serves it."""
         return self._library is not None
 
     def __call__(self, *inputs: Array) -> list[Array]:
@@ -214,12 +213,10 @@ void {_ITERATE}(long n, double **in, const long *stride) {{
 
 
 def _addresses(name: str, sizes: Sequence[int]) -> list[str]:
-    """Where each array begins in one piece of memory."""
     return [f"{name} + {start} * LANES" for start in accumulate([0, *sizes[:-1]])]
 
 
 def _trial(batch: BatchFunction, sample: Sequence[Array]) -> compiler.Trial:
-    """What a new library has to give for the sample, all inputs in one piece of memory and so all outputs."""
     given = [np.ascontiguousarray(array[:, : c_source.LANES], dtype=float) for array in sample]
     expected = np.concatenate(batch.interpreted(*given))
     return compiler.Trial(_VECTOR, (np.concatenate(given), np.zeros_like(expected)), {1: expected}, _AGREEMENT)

@@ -43,7 +43,6 @@ TWO_ARGUMENTS = {
 
 @cache
 def operations() -> Mapping[int, str]:
-    """CasADi's operations by number: ``ADD``, ``SIN``."""
     return {getattr(ca, name): name[3:] for name in dir(ca) if name.startswith("OP_")}
 
 
@@ -81,7 +80,6 @@ class _Writer:
         self._count = 0
 
     def run(self) -> None:
-        """Write every instruction."""
         f = self._function
         for k in range(f.n_instructions()):
             self._instruction(operations()[f.instruction_id(k)], f.instruction_input(k), f.instruction_output(k), k)
@@ -118,7 +116,6 @@ class _Writer:
         return self._assign(f"{prefix}{_FUNCTIONS[operation]}({', '.join(texts)})", uniform)
 
     def _sine_and_cosine(self, operation: str, argument: _Term) -> _Term:
-        """One call gives both; most angles want both."""
         text = argument.text
         if text not in self._sincos:
             self._sincos[text] = number = len(self._sincos)
@@ -184,18 +181,15 @@ def _in_parts(name: str, arguments: list[str], lines: Sequence[str]) -> str:
 
 
 def _renamed(line: str, names: Mapping[str, str]) -> str:
-    """A statement with other names for its values."""
     return _VALUE.sub(lambda value: names[value[0]], line)
 
 
 def _made_by(line: str) -> list[str]:
-    """The values that a statement declares."""
     declared = line.partition(";")[0].partition("=")[0]
     return _VALUE.findall(declared) if line.startswith("V ") else []
 
 
 def support_source() -> str:
-    """Vector type and elementary functions."""
     return resources.files("armcal.functions").joinpath("kernel_support.h").read_text(encoding="utf-8")
 
 

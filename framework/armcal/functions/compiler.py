@@ -50,7 +50,6 @@ def find_compiler() -> str | None:
 
 
 def cache_directory() -> Path:
-    """Where compiled kernels are kept."""
     text = os.environ.get("ARMCAL_CACHE_DIR")
     if text:
         return Path(text).absolute()
@@ -58,7 +57,6 @@ def cache_directory() -> Path:
 
 
 def library_key(text: str) -> str:
-    """A key for an expression's serialised text on this machine with this compiler."""
     parts = (text, " ".join(FLAGS), _compiler_identity(), processor())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:40]
 
@@ -80,7 +78,6 @@ class Trial:
     tolerance: float
 
     def as_json(self) -> dict[str, object]:
-        """For the process that makes the call."""
         arguments = [one.ravel().tolist() if isinstance(one, np.ndarray) else one for one in self.arguments]
         expected = {str(place): numbers.ravel().tolist() for place, numbers in self.expected.items()}
         return {"entry": self.entry, "arguments": arguments, "expected": expected, "tolerance": self.tolerance}
@@ -172,7 +169,6 @@ def _prepare(key: str, source: Callable[[], str], trial: Callable[[], Trial] | N
 
 
 def _forget_old(directory: Path) -> None:
-    """Keep the libraries that were used last, and no folder of a build that was killed."""
     libraries = sorted(directory.glob("*.so"), key=lambda path: path.stat().st_mtime, reverse=True)
     for path in libraries[KEPT_LIBRARIES:]:
         with suppress(OSError):

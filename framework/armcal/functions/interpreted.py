@@ -71,7 +71,6 @@ class InterpretedFunction:
         return outputs
 
     def _evaluated(self, inputs: Sequence[Array], records: int) -> list[Array]:
-        """The outputs (records x entries each) of one block, valid until the next."""
         bound = self._memory.bound.get(records)
         if bound is None:
             bound = self._memory.bound[records] = BoundFunction(self.function, records, self._shared)

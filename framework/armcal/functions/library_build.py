@@ -21,12 +21,10 @@ _DIGEST = 32
 
 
 def digest_of(content: bytes) -> str:
-    """What a library's name ends in."""
     return hashlib.sha256(content).hexdigest()[:_DIGEST]
 
 
 def library_name(key: str, digest: str) -> str:
-    """What a library is called."""
     return f"{key}-{digest}.so"
 
 
@@ -51,7 +49,6 @@ def build(folder: Path) -> None:
 
 
 def passes(folder: Path) -> bool:
-    """Whether the library gives the numbers that its trial expects."""
     trial = json.loads((folder / "job.json").read_text(encoding="utf-8"))["trial"]
     entry = getattr(ctypes.CDLL(str(folder / "kernel.so")), trial["entry"])
     arguments = [_argument(argument) for argument in trial["arguments"]]

@@ -52,7 +52,6 @@ def plain_numbers(cells: Sequence[str]) -> Array | None:
 
 
 def is_missing(text: str) -> bool:
-    """Whether a cell says that its value is not known."""
     return text.strip().lower() in MISSING
 
 
@@ -75,7 +74,6 @@ def read_cell(cell: str) -> float | CellFault:
 
 
 def with_point(text: str) -> str:
-    """A decimal comma as a point."""
     return text.strip().replace(",", ".")
 
 

@@ -15,7 +15,6 @@ _FEWEST_OTHERS = 10
 
 
 def may_be_cut(end: bytes) -> bool:
-    """Whether a file that ends in these bytes may have lost the end of its last cell."""
     return end[-1:] not in (b"\n", b"\r", b'"')
 
 

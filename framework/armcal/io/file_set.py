@@ -77,7 +77,6 @@ def _write(files: Mapping[Path, bytes], keep: bool) -> None:
 
 
 def _clean_up(place: Path) -> None:
-    """Remove what was staged for a file by a process that was killed."""
     own = re.compile(re.escape(_prefix(place)) + r"[a-z0-9_]{8}")
     for path in place.parent.iterdir():
         with suppress(OSError):

@@ -162,14 +162,12 @@ def _movable(folder: Path) -> bool:
 
 
 def _alike(staging: Path, folder: Path) -> bool:
-    """Whether another directory can have the owner and the rights of ours; it is given the rights."""
     new, old = staging.stat(), folder.stat()
     staging.chmod(stat.S_IMODE(old.st_mode))
     return (new.st_uid, new.st_gid) == (old.st_uid, old.st_gid)
 
 
 def _beside(folder: Path) -> str:
-    """What directories beside ours are called that are on their way into it."""
     return f"{_STAGING}{folder.name[:_LONGEST_NAME]}-"
 
 
@@ -254,7 +252,6 @@ def _one_by_one(staging: Path, folder: Path, present: list[str], names: list[str
 
 
 def _next(folder: Path) -> Path:
-    """Where the next earlier set goes."""
     earlier = folder / EARLIER
     earlier.mkdir(exist_ok=True)
     number = 1

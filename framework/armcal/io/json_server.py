@@ -57,7 +57,6 @@ class JsonServer:
         self._selector.register(descriptor, selectors.EVENT_READ, readable)
 
     def serve(self, wait_s: float = 0.0) -> None:
-        """Answer the requests that have come, or the first that come within a time."""
         for key, _ in self._selector.select(wait_s):
             key.data()
         for client in [*self._clients]:
@@ -68,7 +67,6 @@ class JsonServer:
                 self._drop(client)
 
     def close(self) -> None:
-        """Send what is ready, and take the socket away."""
         for client in [*self._clients]:
             self._write(client)
             self._drop(client)

@@ -18,7 +18,6 @@ class LineCutter:
 
     @property
     def begun(self) -> bool:
-        """Whether a line has begun whose end has not come."""
         return bool(self._open) or self._too_long
 
     def feed(self, data: bytes) -> list[bytes | None]:
@@ -32,7 +31,6 @@ class LineCutter:
         return lines
 
     def rest(self) -> bytes | None:
-        """What has come of the line that is open; it is closed by this."""
         line = None if self._too_long else bytes(self._open).removesuffix(b"\r")
         self._open.clear()
         self._too_long = False
@@ -84,7 +82,6 @@ class StandardOutput:
             self.closed = True
 
     def _written(self, data: bytes, descriptor: int) -> bool:
-        """Whether the line went out whole; half a line is ended before the next."""
         left = memoryview(b"\n" + data if self._begun else data)
         while left:
             count = write_ready(descriptor, left, 0.0 if self.lost else self._patience_s)

@@ -45,7 +45,6 @@ class Sequential:
     """One after another in this process."""
 
     def map(self, work: Callable[[T], R], tasks: Sequence[T], report: Report = unreported) -> list[R]:
-        """As the protocol says."""
         results = []
         for number, task in enumerate(tasks):
             report(number / len(tasks))
@@ -167,7 +166,6 @@ def parse_executor(text: str) -> Executor:
 
 
 def _picklable(what: object) -> bool:
-    """Whether another process could be told this."""
     try:
         pickle.dumps(what)
     except Exception:  # each library has its own way of refusing

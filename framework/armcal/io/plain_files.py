@@ -70,7 +70,6 @@ def input_bytes(path: Path, most: int, expected: str, refusal: type[InputError] 
 
 
 def refuse(path: Path | str, message: str, hint: str, line: int | None = None, column: str | None = None) -> NoReturn:
-    """Raise a DataError about a file, or about a line or a column of it."""
     raise DataError(message, where=Location(str(path), line=line, field=column), hint=hint)
 
 

@@ -359,7 +359,6 @@ def _known(dataset: Dataset, channel: str) -> Array:
 
 
 def _runs(values: Array) -> list[tuple[int, int]]:
-    """Runs of identical columns (start, stop) that are long enough to mean a frozen instrument."""
     changes = np.flatnonzero((values[:, 1:] != values[:, :-1]).any(axis=0)) + 1
     edges = np.concatenate([[0], changes, [values.shape[1]]])
     long = np.flatnonzero(np.diff(edges) >= FROZEN_RECORDS)
@@ -367,7 +366,6 @@ def _runs(values: Array) -> list[tuple[int, int]]:
 
 
 def _first_alike(dataset: Dataset, channels: Sequence[str]) -> Indices:
-    """For each record the first that agrees with it, to the last bit, in these channels."""
     table = np.ascontiguousarray(dataset.stacked(channels).T) + 0.0  # -0.0 and 0.0 are one value
     table[np.isnan(table)] = np.nan  # and so are all that are missing
     data, step = table.tobytes(), table.itemsize * table.shape[1]

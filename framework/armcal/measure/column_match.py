@@ -39,7 +39,6 @@ class Header:
     layout_hint: str = ""
 
     def refuse(self, message: str, hint: str, column: str | None = None) -> NoReturn:
-        """Raise a DataError at this place, perhaps at one column."""
         raise DataError(message, where=Location(self.source, line=self.line, field=column), hint=hint)
 
     def refuse_layout(self, message: str, hint: str, column: str | None = None) -> NoReturn:
@@ -153,7 +152,6 @@ def match_columns(header: Header, requested_channels: Sequence[RequestedChannel]
 
 
 def spellings(w: RequestedChannel) -> dict[str, str]:
-    """Each name a channel's column may have, and the unit it declares."""
     if w.dimension in ("1", DIMENSIONLESS):
         return dict.fromkeys(w.columns, "1")
     return {f"{name}_{u.name}": u.name for name in w.columns for u in units_of(w.dimension)}
@@ -186,7 +184,6 @@ def refuse_missing(header: Header, w: RequestedChannel, unused: Sequence[str]) -
 
 
 def _nearest(names: Iterable[str], columns: Sequence[str]) -> str:
-    """The names in the file that come nearest, for a message."""
     shown = {name.lower()[:64]: name[:64] for name in columns}
     near = [shown[n] for name in names for n in difflib.get_close_matches(name.lower()[:64], shown, n=2)]
     if near:

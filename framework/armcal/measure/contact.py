@@ -54,7 +54,6 @@ class OneArmContact(Contact):
         self.group_labels = settings.group_labels
 
     def base_T_tool(self, arms: Mapping[str, ArmState]) -> Transform:  # noqa: N802
-        """Where its tool is."""
         return arms[self.arms[0]].base_T_tool
 
 
@@ -71,7 +70,6 @@ class ArmsAlone(Contact):
         return ca.vertcat(*[arms[name].base_T_tool.translation for name in self.arms])
 
     def noise(self) -> tuple[float, ...]:
-        """Of no meaning."""
         return (1.0,) * (3 * len(self.arms))
 
 

@@ -100,7 +100,6 @@ def column_names(
 
 
 def _text(number: float) -> str:
-    """In full; empty where there is no number."""
     return "" if math.isnan(number) else repr(number)
 
 

@@ -38,7 +38,6 @@ class OwnedTie:
 
 
 def owner_of(instance: str, measurement: GroupedMeasurement) -> str:
-    """The instance whose groups a measurement uses."""
     return measurement.group_owner or instance
 
 
@@ -138,7 +137,6 @@ def refuse_lost(dataset: Dataset, measurements: Mapping[str, Measurement], lost:
 
 
 def group_blocks(measurements: Mapping[str, Measurement], groups: Groups) -> tuple[ParameterBlock, ...]:
-    """The parameters of all groups under their full names."""
     blocks = []
     for instance, measurement in measurements.items():
         if isinstance(measurement, GroupedMeasurement) and owner_of(instance, measurement) == instance:
@@ -150,19 +148,16 @@ def group_blocks(measurements: Mapping[str, Measurement], groups: Groups) -> tup
 
 
 def grouped_instances(measurements: Mapping[str, Measurement]) -> tuple[str, ...]:
-    """The instances whose records fall into groups."""
     return tuple(name for name, measurement in measurements.items() if isinstance(measurement, GroupedMeasurement))
 
 
 def group_key(measurements: Mapping[str, Measurement], groups: Groups, instance: str, number: int) -> str:
-    """The key of a measurement's group by its place."""
     measurement = measurements[instance]
     owner = owner_of(instance, measurement) if isinstance(measurement, GroupedMeasurement) else instance
     return groups[owner][number]
 
 
 def group_name(owner: str, key: str, local: str) -> str:
-    """The full name of a group's parameter."""
     return f"{owner}.{key}.{local}"
 
 

@@ -44,24 +44,20 @@ class Layout:
     evidence: frozenset[str] = frozenset()
 
     def column(self, channel: str) -> str:
-        """What a channel is called in the source."""
         return self.columns.get(channel, channel)
 
     def place(self, dataset: Dataset, index: int) -> str:
-        """Where a record stood, in words."""
         if self.by_id:
             return dataset.ids[index]
         return f"{'line' if self.by_line else 'row'} {dataset.row(index)}"
 
     def where(self, dataset: Dataset, index: int, channel: str | None = None) -> Location:
-        """A record's place, for an error."""
         column = self.column(channel) if channel else None
         if self.by_line:
             return Location(dataset.source or None, line=dataset.row(index), field=column)
         return dataset.where(index, column)
 
     def shown(self, channel: str, si_value: float) -> str:
-        """A value in the unit its source declares."""
         unit = self.units.get(channel, "1")
         value = to_unit(si_value, unit) if unit in UNITS else si_value
         return f"{value:.10g}" + ("" if unit == "1" else f" {unit}")
@@ -122,6 +118,5 @@ def set_aside(dataset: Dataset, layout: Layout, faulty: Mapping[int, str], why: 
 
 
 def warned(dataset: Dataset, text: str) -> Dataset:
-    """The dataset with one more warning."""
     place = f"{dataset.source}: " if dataset.source else ""
     return replace(dataset, warnings=(*dataset.warnings, place + text))

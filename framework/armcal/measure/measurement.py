@@ -196,14 +196,12 @@ class NamesMistakes(Protocol):
 
 
 def borrowed_names(measurement: Measurement) -> dict[str, str]:
-    """Full names of the parameters that a measurement borrows, by local name."""
     if not isinstance(measurement, Borrowing) or measurement.lender is None:
         return {}
     return {local: f"{measurement.lender}.{local}" for local in measurement.borrowed}
 
 
 def borrowed_values(measurement: Measurement, values: Mapping[str, Expression]) -> dict[str, Expression]:
-    """Of all values (by full names), those that a measurement borrows, by local name."""
     return {local: values[full] for local, full in borrowed_names(measurement).items()}
 
 

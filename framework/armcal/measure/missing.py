@@ -45,7 +45,6 @@ def set_aside_not_finite(dataset: Dataset, layout: Layout) -> Dataset:
 
 
 def _missing(dataset: Dataset, layout: Layout) -> str:
-    """In how many records of these each column lacks a value, the most first."""
     counts = {name: int(np.sum(~np.isfinite(values))) for name, values in dataset.channels.items()}
     most = sorted((name for name, count in counts.items() if count), key=lambda name: -counts[name])
     more = f" and {len(most) - _MOST_COUNTED} columns more" if len(most) > _MOST_COUNTED else ""
@@ -53,7 +52,6 @@ def _missing(dataset: Dataset, layout: Layout) -> str:
 
 
 def _reason(dataset: Dataset, layout: Layout, index: int) -> str:
-    """Everything that a record lacks."""
     texts = []
     for channel, values in dataset.channels.items():
         if not np.isfinite(values[index]):

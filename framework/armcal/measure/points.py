@@ -143,7 +143,6 @@ class PointInstrument(Instrument):
 
     @property
     def point_names(self) -> Sequence[str]:
-        """What ends the names of each point's channels."""
         return [str(number) for number in range(len(self.points))]
 
     @override

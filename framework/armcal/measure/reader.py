@@ -47,7 +47,6 @@ class RequestedChannel:
 
     @property
     def what(self) -> str:
-        """Its name, with the effects that read it, for a message."""
         readers = " and ".join(self.effects)
         return f"{self.channel}, which the effect {readers} reads" if readers else self.channel
 
@@ -168,7 +167,6 @@ def evidence_channels(arms: Mapping[str, Arm]) -> tuple[RequestedChannel, ...]:
 
 
 def _deviations(measurements: Mapping[str, Measurement]) -> Iterator[RequestedChannel]:
-    """What records may say of their own noise; a prediction has no use for it."""
     by_instance = {
         instance: {channel.name: channel for own in noise_channels(measurement) for channel in own}
         for instance, measurement in measurements.items()

@@ -132,12 +132,10 @@ class Rows:
         return int(self.joints.shape[1])
 
     def part(self, start: int, stop: int) -> Rows:
-        """From a row to before another."""
         time = None if self.time is None else self.time[start:stop]
         return Rows(self.joints[:, start:stop], time, tuple(cells[start:stop] for cells in self.texts))
 
     def followed_by(self, other: Rows) -> Rows:
-        """One after the other."""
         time = None if self.time is None or other.time is None else np.concatenate([self.time, other.time])
         texts = tuple(own + more for own, more in zip(self.texts, other.texts, strict=True))
         return Rows(np.hstack([self.joints, other.joints]), time, texts)

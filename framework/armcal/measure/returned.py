@@ -70,7 +70,6 @@ def _is_texts(value: Any) -> bool:
 
 
 def check_channels(measurement: Measurement) -> None:
-    """Refuse channels that are none (PluginError)."""
     channels = measurement.channels()
     if not isinstance(channels, Sequence):
         refuse(measurement.channels, channels, "a sequence of Channel(name, dimension)")

@@ -44,29 +44,23 @@ class Candidates:
 
     @property
     def draws(self) -> int:
-        """Of the parameters."""
         return len(self.rows)
 
     @property
     def count(self) -> int:
-        """How many candidates there are."""
         return int(self.rows.shape[2])
 
     @property
     def size(self) -> int:
-        """How many coordinates there are."""
         return int(self.rows.shape[3])
 
     def subset(self, chosen: Indices) -> Candidates:
-        """Some of the candidates."""
         return Candidates(self.base, np.take(self.rows, chosen, axis=2))
 
     def known(self) -> Array:
-        """Information before (draws x n x n)."""
         return np.asarray(np.swapaxes(self.base, 1, 2) @ self.base)
 
     def ridge(self) -> float:
-        """A little information on everything, for matrices that have to be inverted before they are full."""
         mean = float(np.mean(np.einsum("krij,krij->kr", self.rows, self.rows))) * self.rows.shape[1] / self.size
         known = float(np.mean(np.einsum("kij,kij->k", self.base, self.base))) / self.size
         return float(RIDGE * max(mean, known, 1e-300))

@@ -36,7 +36,6 @@ class Criterion:
     trace: tuple[Callable[[Array], Array], Callable[[Array], Array]] | None
 
     def of(self, information: Array) -> Array:
-        """The value of information matrices (... x n x n)."""
         return self.value(np.maximum(np.linalg.eigvalsh(information), FLOOR))
 
     def efficiency(self, value: float, bound: float, size: int) -> float:
@@ -50,7 +49,6 @@ class Criterion:
 
 
 def _power(p: float) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-    """Derivatives of -x^-p."""
     return (lambda x: p * x ** (-p - 1)), (lambda x: -p * (p + 1) * x ** (-p - 2))
 
 
@@ -141,7 +139,6 @@ class Observability:
     o5: float
 
     def as_dict(self) -> dict[str, float]:
-        """For JSON."""
         return asdict(self)
 
 

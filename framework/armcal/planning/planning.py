@@ -48,7 +48,6 @@ class Plan:
 
 
 def value_of(candidates: Candidates, by: Criterion, chosen: Indices) -> float:
-    """The criterion of a plan, by QR of its rows."""
     singular = [np.linalg.svd(t, compute_uv=False) for t in candidates.triangles(chosen)]
     padded = [np.pad(s, (0, candidates.size - len(s))) for s in singular]
     squared = np.maximum(np.array([np.sort(s**2) for s in padded]), 1e-300)
@@ -129,21 +128,18 @@ def _best(task: Task, starts: list[Indices], kicks: int, random: np.random.Gener
 
 
 def _drawn(task: Task, weights: Array, random: np.random.Generator) -> Indices:
-    """A random plan in which a candidate is the likelier the more the relaxation gives it."""
     pool = np.repeat(np.arange(task.candidates.count), task.limit)
     waits = random.exponential(size=len(pool)) / np.maximum(weights[pool], _LEAST_WEIGHT)
     return np.sort(pool[np.argsort(waits)[: task.count]])
 
 
 def _rounded(task: Task, relaxed: Relaxation) -> Indices:
-    """The relaxation's heaviest candidates."""
     remaining = relaxed.weights[:, None] - np.arange(task.limit)
     heaviest = np.argsort(-remaining.ravel(), kind="stable")[: task.count]
     return np.sort(heaviest // task.limit).astype(np.intp)
 
 
 def _promising(task: Task, relaxed: Relaxation, begin: Indices | None) -> Indices:
-    """All candidates, or those with the largest scores and weights, in rising order."""
     number = task.candidates.count
     if number <= AT_ONCE:
         return np.arange(number)
@@ -153,7 +149,6 @@ def _promising(task: Task, relaxed: Relaxation, begin: Indices | None) -> Indice
 
 
 def _built_up(task: Task, held: Tally) -> Indices:
-    """Pose by pose, each the best addition."""
     held.restart(np.zeros(0, dtype=np.intp))
     times = np.zeros(task.candidates.count, dtype=int)
     chosen = []
@@ -179,20 +174,17 @@ class _Climb:
         self.begin(np.asarray(start, dtype=np.intp))
 
     def begin(self, chosen: Indices) -> None:
-        """Stand at a plan."""
         self.chosen: list[int] = [int(i) for i in chosen]
         self.times = np.bincount(chosen, minlength=self.task.candidates.count)
         self.held.restart(chosen)
 
     def let_in(self) -> float:
-        """Add the best; the change of value."""
         change = self.held.if_added()
         best = _best_addition(change, self.times, self.task.limit)
         self._enter(best)
         return float(change[best])
 
     def take_out(self) -> float:
-        """Remove the one that is missed least; the change of value."""
         change = self.held.if_removed(np.array(self.chosen, dtype=np.intp))
         place = int(np.argmax(change))
         self._leave(place)

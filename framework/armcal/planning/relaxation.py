@@ -44,19 +44,16 @@ class Task:
     limit: int = 1
 
     def most(self, scores: Array) -> float:
-        """The largest sum of scores that a plan can have."""
         whole, left = divmod(self.count, self.limit)
         best = -np.sort(-scores)
         rest = best[whole] * left if left else 0.0
         return float(np.sum(best[:whole]) * self.limit + rest)
 
     def threshold(self, scores: Array) -> float:
-        """The score of the last pose of the plan whose scores have the largest sum."""
         last = -(-self.count // self.limit) - 1
         return float(-np.partition(-scores, last)[last])
 
     def subset(self, chosen: Indices) -> Task:
-        """The same with fewer candidates."""
         return Task(self.candidates.subset(chosen), self.criterion, self.count, self.limit)
 
 
@@ -102,7 +99,6 @@ def tangent(task: Task, weights: Array) -> Tangent:
 
 
 def certified(task: Task, weights: Array, upper: Tangent, how: str) -> Relaxation:
-    """The bound that a tangent gives on all candidates."""
     scores = task.candidates.scores(upper.gradients)
     return Relaxation(weights, upper.constant + task.most(scores), scores, how)
 
@@ -135,7 +131,6 @@ def relax(task: Task, solver: Solver, how: str, at_once: int | None = None) -> R
 
 
 def _next_active(task: Task, made: Relaxation, active: Indices, most: int) -> Indices:
-    """Those in use, and those outside that could do better than the least useful one in use."""
     used = np.flatnonzero(made.weights > 1e-7 * task.limit)
     floor = task.threshold(made.scores[active])
     outside = np.ones(task.candidates.count, dtype=bool)

@@ -37,12 +37,10 @@ class Suggestion:
 
 
 def is_worth_measuring(suggestions: Sequence[Suggestion]) -> bool:
-    """Whether standard deviations would shrink by a twentieth or more."""
     return bool(suggestions) and 1 - suggestions[-1].shrink >= LEAST_GAIN
 
 
 def in_words(suggestions: Sequence[Suggestion]) -> str:
-    """All of them, as the end of a sentence."""
     beside = list(dict.fromkeys(joint for suggestion in suggestions for joint in suggestion.beside))
     moved = f", each with {' and '.join(beside)} moved as well, which stood still" if beside else ""
     return "; ".join(suggestion.text for suggestion in suggestions) + moved
@@ -92,7 +90,6 @@ def suggest(
 
 
 def _text(commands: Mapping[str, float], units: Mapping[str, str]) -> str:
-    """A pose as people read it."""
     parts = [f"{to_unit(value, units[channel]):.0f}" for channel, value in commands.items()]
     if len(set(units.values())) > 1:
         return f"({', '.join(f'{part} {unit}' for part, unit in zip(parts, units.values(), strict=True))})"

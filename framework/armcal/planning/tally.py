@@ -51,7 +51,6 @@ class Tally(Protocol):
 
 
 def tally(candidates: Candidates, criterion: Criterion) -> Tally:
-    """A tally for a criterion."""
     if criterion.name in ("D", "A"):
         kind = DeterminantTally if criterion.name == "D" else TraceTally
         draws = zip(candidates.base, candidates.rows, strict=True)
@@ -184,7 +183,6 @@ class DeterminantTally(Tally):
         return np.asarray((factor.T @ self._flat.T).reshape(-1, self._n_rows, self._count))
 
     def _outer(self, first: Array, second: Array) -> Array:
-        """Packed sum over columns of the products of rows."""
         total = first[0][self._left] * second[0][self._right]
         for a, b in zip(first[1:], second[1:], strict=True):
             total += a[self._left] * b[self._right]

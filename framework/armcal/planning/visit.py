@@ -22,7 +22,6 @@ def travel_times(joint_angles: Array, speeds: Array) -> Array:
 
 
 def path_time(times: Array, order: Indices) -> float:
-    """Of visiting the poses in an order (s)."""
     return float(times[order[:-1], order[1:]].sum())
 
 
@@ -62,7 +61,6 @@ def heat(efforts: Array) -> Array:
 
 
 def peak(heats: Array, order: Indices, window: int = WINDOW) -> float:
-    """The hottest joint's largest moving average along an order."""
     window = min(window, len(order))
     sums = np.cumsum(np.pad(heats[:, order], ((0, 0), (1, 0))), axis=1)
     return float(np.max(sums[:, window:] - sums[:, :-window]) / window)

@@ -130,21 +130,18 @@ def _sample(factor: Factor, backend: Backend) -> tuple[Array, Array, Array, Arra
 
 
 def _stride(array: Array) -> int:
-    """Numbers from one channel to the next."""
     if array.size and array.strides[1] != array.itemsize:
         raise ValueError("the records of a channel must lie side by side")
     return array.strides[0] // array.itemsize
 
 
 def _pointers(values: Array, *channels: Array) -> list[int]:
-    """Addresses; the C side takes contiguous values, and one stride for record and state."""
     if not values.flags.c_contiguous or len({_stride(array) for array in channels if array.size}) > 1:
         raise ValueError("values must be contiguous, record and state slices of arrays of one width")
     return [values.ctypes.data, *(array.ctypes.data for array in channels)]
 
 
 def _signature(function: Any, outputs: int) -> Any:
-    """Count and stride, three inputs, then each output with its own stride, tolerance, most passes."""
     integer, pointer = ctypes.c_long, ctypes.c_void_p
     shared = [integer, integer, pointer, pointer, pointer]
     function.argtypes = [*shared, *[pointer, integer] * outputs, ctypes.c_double, ctypes.c_int]

@@ -47,7 +47,6 @@ class Blueprint:
         return replace(dataset, channels=channels) if len(channels) > len(dataset.channels) else dataset
 
     def kernels(self, records: int, choices: Mapping[str, EvaluatorChoice]) -> tuple[Kernel, ...]:
-        """A kernel for each measurement, for about so many records, by the evaluator chosen for it."""
         shared = (self.arms, self.parameters, self.environment, self.channels)
         return tuple(
             build_kernel(build_factor(name, measurement, *shared), records, choices[name])
@@ -78,7 +77,6 @@ class Blueprint:
         return tuple(result)
 
     def ties(self) -> tuple[TieFunction, ...]:
-        """What is known between groups beside the records."""
         owned = ties_of(self.measurements, self.groups)
         return tuple(TieFunction.of(owned_tie, self.parameters) for owned_tie in owned)
 

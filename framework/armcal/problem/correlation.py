@@ -132,19 +132,16 @@ class Correlation:
         return [kept(np.abs(at[:, None] - at)) for at in place.T]
 
     def subset(self, chosen: Indices) -> Correlation:
-        """Some records of all; the same states."""
         slopes, raw = (tuple(s[:, chosen] for s in rows) for rows in (self.slopes, self.raw))
         return Correlation(slopes, raw, self.node[chosen], self.apart)
 
     def weighted(self, factors: Sequence[Array]) -> Correlation:
-        """With every record's weight multiplied, factor by factor (width each)."""
         pairs = zip(self.slopes, factors, strict=True)
         slopes = tuple(slope * np.sqrt(factor)[None, :, None] for slope, factor in pairs)
         return Correlation(slopes, self.raw, self.node, self.apart)
 
     @property
     def _start(self) -> Array:
-        """What the first node has of the one before it."""
         return np.zeros(self.apart.shape[1])
 
     @cached_property
@@ -192,7 +189,6 @@ class Correlation:
 
     @staticmethod
     def _apart(stacked: Array, like: Sequence[Array]) -> tuple[Array, ...]:
-        """Stacked rows factor by factor, as long as others."""
         ends = np.cumsum([len(rows) for rows in like])[:-1]
         parts = np.split(stacked.transpose(1, 0, 2), ends)
         return tuple(part[:, : rows.shape[1]] for part, rows in zip(parts, like, strict=True))

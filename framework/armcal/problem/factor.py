@@ -87,12 +87,10 @@ class Factor(ElasticPass):
 
     @property
     def rows(self) -> int:
-        """How many entries the residual of a record has."""
         return len(self.noise)
 
     @property
     def shared(self) -> int:
-        """How many channels, the first ones, all points of a record have in common."""
         return len(set(self.channels) & set(self.expressed.channels))
 
     @property
@@ -194,7 +192,6 @@ class _Records:
         return self.number(channel) if channel in self._available else ca.SX(default)
 
     def used_by(self, expression: Expression) -> dict[str, Expression]:
-        """The symbols that an expression depends on, or a pose residual."""
         return {n: own for n, own in self.symbols.items() if n in self.kept or ca.depends_on(expression, own)}
 
 
@@ -325,7 +322,6 @@ def _of_points(factor: Factor, measurement: Measurement, points: Array) -> Facto
 
 
 def _symbols(name: str, blocks: Sequence[ParameterBlock]) -> tuple[Expression, dict[str, Expression]]:
-    """One symbol for all entries of some blocks, and the part of it that is each block's value."""
     symbols, start, values = ca.SX.sym(name, sum(block.size for block in blocks)), 0, {}
     for block in blocks:
         values[block.name] = symbols[start : start + block.size]

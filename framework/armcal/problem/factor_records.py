@@ -42,7 +42,6 @@ class FactorRecords:
     present: Mask | None = None
 
     def equations(self, rows: int) -> int:
-        """How many residual numbers these are, of so many a record; those of weight zero are none."""
         counted = self.weight != 0
         return int(self.present[:, counted].sum()) if self.present is not None else rows * int(counted.sum())
 
@@ -159,7 +158,6 @@ def weighted(records: Sequence[FactorRecords], weights: Sequence[Array]) -> tupl
 
 
 def unweighted(records: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
-    """The same records without weights and what they share."""
     return tuple(replace(record, weight=np.ones_like(record.weight), correlation=None) for record in records)
 
 
@@ -181,12 +179,10 @@ def mean_shares(factor: Factor, factor_records: FactorRecords) -> list[Array]:
 
 
 def correlation_of(records: Sequence[FactorRecords]) -> Correlation | None:
-    """What the records share."""
     return records[0].correlation if records else None
 
 
 def _filled(chosen: Indices, last: int) -> Indices:
-    """Padded to whole vectors with a last record."""
     return np.concatenate([chosen, np.full(-len(chosen) % LANES, max(0, last))]).astype(np.intp)
 
 
@@ -262,7 +258,6 @@ class PointRecords:
 
     @property
     def count(self) -> int:
-        """How many points a record has."""
         return len(self.points)
 
     def split(self, record: Array) -> Array:

@@ -68,11 +68,9 @@ class GroupedKernel:
 
     @property
     def is_plain(self) -> bool:
-        """Whether the kernel's values are just the free entries, in order."""
         return len(self.free) == 1 and np.array_equal(self.free[0], np.arange(self.width))
 
     def values(self, values: Array, group: int) -> Array:
-        """The kernel's values for one group."""
         entries = self.entries[group]
         if len(entries) and entries[-1] == HELD:
             return np.concatenate([values[entries[entries != HELD]], self.spare])
@@ -97,7 +95,6 @@ class GroupedKernel:
         return slopes if records.present is None else np.where(records.present[:, None], slopes, 0.0)
 
     def predict(self, values: Array, records: FactorRecords) -> Shown:
-        """What the records show."""
         factor = self.kernel.factor
         count = len(factor.output_channels)
         shown = np.empty((count + factor.tools.numel(), records.record.shape[1]))
@@ -106,7 +103,6 @@ class GroupedKernel:
         return Shown(shown[:count], shown[count:].reshape(factor.tools.numel() // 12, 4, 3, records.count))
 
     def nuisance_starts(self, values: Array, records: FactorRecords) -> Array:
-        """Where each record alone has its group's parameters start (entries x width)."""
         starts = np.empty((len(self.kernel.factor.nuisance_names), records.record.shape[1]))
         if len(starts):
             self._evaluate(self.kernel.nuisance_starts, values, records, starts)
@@ -180,7 +176,6 @@ class GroupedKernel:
         return scattered, residual * scale
 
     def _parts(self, group: Indices | None, width: int) -> Iterator[tuple[int, Indices]]:
-        """Each group that occurs, with the records that belong to it; records of none go with the first."""
         if group is None or len(self.entries) <= 1:
             yield 0, np.arange(width)
             return

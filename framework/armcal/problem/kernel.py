@@ -37,7 +37,6 @@ class Kernel:
 
     @cached_property
     def _by_channels(self) -> dict[tuple[str, ...], InterpretedFunction]:
-        """Slopes by channels, once they were asked for."""
         return {}
 
     @cached_property
@@ -48,7 +47,6 @@ class Kernel:
 
     @cached_property
     def hessian(self) -> ca.Function:
-        """The exact Hessian of one record."""
         return self.factor.hessian_function()
 
     @cached_property
@@ -84,11 +82,9 @@ class Kernel:
         return self._by_channels[channels]
 
     def residuals(self, values: Array, record: Array, state: Array, residual: Array) -> None:
-        """Residuals in equilibrium."""
         self._over_points(self._residuals, values, record, state, residual)
 
     def linearise(self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array) -> None:
-        """Residuals and Jacobian in equilibrium."""
         self._over_points(self._linearise, values, record, state, residual, jacobian)
 
     def predict(self, values: Array, record: Array, state: Array, shown: Array) -> None:
@@ -108,7 +104,6 @@ class Kernel:
         self._over_points(self.evaluator.require_held, values, record, state)
 
     def nuisance_starts(self, values: Array, record: Array, state: Array, starts: Array) -> None:
-        """Where each record alone has its group's parameters start, in equilibrium (entries x records)."""
         starts[:] = Evaluator(self.factor, self.factor.nuisance_starts)(values, record, state)
 
     def _over_points(
@@ -188,5 +183,4 @@ def kernel_source(factor: Factor) -> str:
 
 
 def driver_source() -> str:
-    """The loop over records: equilibrium, residual, Jacobian."""
     return resources.files("armcal.problem").joinpath("kernel_driver.h").read_text(encoding="utf-8")

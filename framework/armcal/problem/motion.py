@@ -40,7 +40,6 @@ class Motion:
 
     @classmethod
     def of(cls, problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset) -> Motion:
-        """At the values that a fit found."""
         arms = problem.blueprint.arms
         channels = tuple(command_channels(arms))
         blocks = {b.name: values[problem.parameters.entries_of(b.name)] for b in problem.parameters.blocks}
@@ -53,7 +52,6 @@ class Motion:
         return cls(channels, slopes, loads, _by_load(problem, values, records, dataset) if elastic else ())
 
     def subset(self, chosen: Indices) -> Motion:
-        """Some records of all."""
         loads = {
             name: SiteLoads(load.moments[..., chosen], load.efforts[..., chosen], load.levers[..., chosen])
             for name, load in self.loads.items()
@@ -116,7 +114,6 @@ def _by_load(problem: Problem, values: Array, records: Sequence[FactorRecords], 
 
 
 def _of_points(kernel: Kernel, whole: Kernel, slopes: Array) -> Array:
-    """The rows of slopes by a kernel of all points that belong to the points of another, which may have few of them."""
     if kernel.factor.points is None:
         return slopes
     every = {channel: row for row, channel in enumerate(whole.factor.output_channels)}

@@ -26,7 +26,6 @@ class NormalEquations:
     hessian: Array
 
     def chained(self, jacobian: Array) -> NormalEquations:
-        """The same with respect to increments, by d entries / d increment."""
         return NormalEquations(self.cost, jacobian.T @ self.gradient, jacobian.T @ self.hessian @ jacobian)
 
 
@@ -39,11 +38,9 @@ class ExtraRows:
 
     @property
     def cost(self) -> float:
-        """Half their square."""
         return 0.5 * float(self.residual @ self.residual)
 
     def added_to(self, equations: NormalEquations) -> NormalEquations:
-        """The sums with these rows among them."""
         by_residual, products = self.jacobian.T @ self.residual, self.jacobian.T @ self.jacobian
         return NormalEquations(
             equations.cost + self.cost, equations.gradient + by_residual, equations.hessian + products
@@ -51,7 +48,6 @@ class ExtraRows:
 
 
 def stacked(rows: Sequence[ExtraRows], width: int) -> ExtraRows:
-    """Several as one."""
     residual = np.concatenate([np.zeros(0), *(row.residual for row in rows)])
     return ExtraRows(residual, np.vstack([np.zeros((0, width)), *(row.jacobian for row in rows)]))
 
@@ -95,7 +91,6 @@ class TieFunction:
 
     @property
     def sides(self) -> tuple[Indices, Indices]:
-        """The positions that belong to each group; every group has the same parameters."""
         half = len(self.entries) // 2
         return self.entries[:half], self.entries[half:]
 
@@ -112,7 +107,6 @@ class TieFunction:
         return ExtraRows(residual.ravel() / self.noise, jacobian / self.noise[:, None])
 
     def curvature(self, values: Array, places: Mapping[int, int], width: int) -> Array:
-        """What the residual's own curvature adds to the Hessian of half its whitened square (width x width)."""
         second = np.asarray(self.bend(values[self.entries], self.residual(values) / self.noise**2))
         columns, free = self._free(places)
         whole = np.zeros((width, width))
@@ -120,6 +114,5 @@ class TieFunction:
         return whole
 
     def _free(self, places: Mapping[int, int]) -> tuple[list[int], list[int]]:
-        """Which of its numbers are free, and their places."""
         columns = [column for column, entry in enumerate(self.entries.tolist()) if entry in places]
         return columns, [places[int(self.entries[column])] for column in columns]

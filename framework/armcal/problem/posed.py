@@ -28,19 +28,15 @@ class PosedProblem:
         return lower / self.scales, upper / self.scales
 
     def x(self, values: Array) -> Array:
-        """Where a value vector lies."""
         return self.problem.parameters.local(values) / self.scales
 
     def values(self, x: Array) -> Array:
-        """The value vector there."""
         return self.problem.parameters.retract(x * self.scales)
 
     def coordinates(self, x: Array) -> Array:
-        """The same place for a cone solver."""
         return self.problem.parameters.coordinates(x * self.scales) / self.coordinate_scales
 
     def from_coordinates(self, c: Array) -> Array:
-        """The place a cone solver means, or the nearest one that the domains allow."""
         return self.problem.parameters.from_coordinates(c * self.coordinate_scales) / self.scales
 
     def cost(self, x: Array) -> float:

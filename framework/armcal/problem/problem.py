@@ -68,7 +68,6 @@ class Problem:
 
     @cached_property
     def _bytes(self) -> bytes:
-        """The blueprint, and what evaluates each measurement."""
         choices = {k.factor.name: k.backend.name for k in self.kernels}
         return pickle.dumps((self.blueprint.bare(), choices, self.parameters))
 
@@ -79,17 +78,14 @@ class Problem:
 
     @property
     def backend(self) -> str:
-        """What evaluates it: ``compiled``, ``interpreted`` or both."""
         return ", ".join(sorted({kernel.backend.name for kernel in self.kernels}))
 
     @property
     def increments(self) -> int:
-        """How many numbers an increment has."""
         return len(self.parameters.coordinate_names)
 
     @property
     def free_names(self) -> tuple[str, ...]:
-        """Names of the free canonical entries."""
         return tuple(self.parameters.entry_names[i] for i in self.parameters.free_entries)
 
     @cached_property
@@ -131,7 +127,6 @@ class Problem:
     weighted = staticmethod(factor_records.weighted)
 
     def equations(self, records: Sequence[FactorRecords]) -> int:
-        """How many residual numbers the records give; those of weight zero are no evidence."""
         return sum(
             record.equations(len(kernel.factor.noise)) for kernel, record in zip(self.kernels, records, strict=True)
         ) + sum(len(tie.noise) for tie in self.ties)
@@ -242,7 +237,6 @@ class Problem:
         )
 
     def predict(self, values: Array, records: Sequence[FactorRecords]) -> tuple[Shown, ...]:
-        """What the records of each factor show."""
         self._check_fixed(values)
         return tuple(grouped.predict(values, record) for grouped, record in zip(self.grouped, records, strict=True))
 
@@ -257,20 +251,17 @@ class Problem:
         return tuple(grouped.nuisance_starts(values, record)[:, : record.count] for grouped, record in pairs)
 
     def _extra(self, values: Array, records: Sequence[FactorRecords]) -> ExtraRows:
-        """The rows that belong to no single record."""
         rows = [self.tie_rows(values)]
         for grouped, record in zip(self.grouped, records, strict=True):
             rows += [ExtraRows(residual, jacobian) for jacobian, residual in grouped.linearised_means(values, record)]
         return stacked(rows, len(self._places))
 
     def tie_rows(self, values: Array) -> ExtraRows:
-        """What is known between groups, whitened."""
         places = self._places
         return stacked([tie.rows(values, places, len(places)) for tie in self.ties], len(places))
 
     @property
     def _places(self) -> dict[int, int]:
-        """Where each free entry stands among the free ones."""
         return {entry: i for i, entry in enumerate(self.parameters.free_entries)}
 
     def _independent_blocks(self, values: Array, records: Sequence[FactorRecords]) -> Iterator[tuple[Array, Array]]:
@@ -295,7 +286,6 @@ class Problem:
 
     @cached_property
     def _compiled_in(self) -> Indices:
-        """Positions of the entries that the kernels hold as numbers."""
         plan = self.blueprint.parameters
         held = [block.name for block in plan.blocks if not block.free and not block.nuisance]
         return np.array([i for name in held for i in range(*plan.entries_of(name).indices(1 << 30))], dtype=np.intp)
@@ -303,11 +293,9 @@ class Problem:
 
 @lru_cache(maxsize=64)
 def _from_bytes(written: bytes) -> Problem:
-    """A problem that another process sent, compiled once here."""
     blueprint, choices, parameters = pickle.loads(written)
     return Problem(parameters, blueprint.kernels(0, choices), blueprint, blueprint.ties())
 
 
 def triangular(rows: Array) -> Array:
-    """R of a QR decomposition."""
     return np.asarray(np.linalg.qr(rows, mode="r"))

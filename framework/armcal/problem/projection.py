@@ -36,7 +36,6 @@ def projected(problem: Problem, values: Array, records: Sequence[FactorRecords])
 
 
 def as_predicted(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
-    """Records with what the model predicts in the place of measured numbers, wherever a Jacobian depends on these."""
     if not any(_bilinear(kernel.factor.expressed) for kernel in problem.kernels):
         return tuple(records)
     predicted = predicted_records(problem, values, records)
@@ -47,7 +46,6 @@ def as_predicted(problem: Problem, values: Array, records: Sequence[FactorRecord
 
 
 def predicted_records(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
-    """Records with what the model predicts in the place of all measured numbers."""
     predicted = []
     for kernel, before, shown in zip(problem.kernels, records, problem.predict(values, records), strict=True):
         record = before.record.copy()
@@ -65,7 +63,6 @@ def factor_at_zero(problem: Problem, values: Array, records: Sequence[FactorReco
 
 
 def fits(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[Mask, ...]:
-    """Which records a contact can be in at these values, one mask a factor; all of any other measurement."""
     residuals = problem.residuals(values, records)
     return tuple(
         np.ones(residual.shape[1], dtype=bool)
@@ -86,17 +83,14 @@ def joint_channels(factor: Factor) -> tuple[int, ...]:
 
 
 def approach_channels(factor: Factor) -> tuple[int, ...]:
-    """Which rows of a record are directions of approach."""
     return tuple(i for i, c in enumerate(factor.channels) if ".approach." in c)
 
 
 def _measured(factor: Factor) -> tuple[int, ...]:
-    """Which rows of a record are measured; none of a contact."""
     return tuple(i for i, c in enumerate(factor.channels) if c in factor.output_channels)
 
 
 def _bilinear(factor: Factor) -> bool:
-    """Whether the derivative by values or deflections depends on what was measured."""
     rows = _measured(factor)
     if not rows:
         return False
@@ -125,5 +119,4 @@ def _fitting_joints(grouped: GroupedKernel, values: Array, factor_records: Facto
 
 
 def _whitened(factor: Factor, residual: Array) -> Array:
-    """The largest entry of each record's residual in units of the noise."""
     return np.asarray(np.abs(residual / np.array(factor.noise)[:, None]).max(axis=0, initial=0.0))

@@ -41,7 +41,6 @@ class Tools:
     rotations: Array
 
     def subset(self, chosen: Indices) -> Tools:
-        """Some of them."""
         return Tools(self.places[:, chosen], self.rotations[chosen])
 
 
@@ -95,7 +94,6 @@ def alignments(tools: Tools, measured: Array, basis: Array, turned: Array | None
 
 
 def nearest(tools: Tools, measured: Array, basis: Array) -> Alignment:
-    """The best of few quick alignments."""
     few = np.arange(0, measured.shape[1], max(1, measured.shape[1] // _FEW))
     some, seen = tools.subset(few), measured[:, few]
     starts = [_started(some, seen, *start) for start in islice(_starts(some, seen, basis, None), _QUICK)]
@@ -104,7 +102,6 @@ def nearest(tools: Tools, measured: Array, basis: Array) -> Alignment:
 
 
 def _between(tools: Tools, one: Alignment, other: Alignment) -> float:
-    """How far targets lie apart by two alignments (median, m)."""
     return float(np.median(np.linalg.norm(one.moved(tools) - other.moved(tools), axis=0)))
 
 
@@ -158,7 +155,6 @@ def _starts(tools: Tools, measured: Array, basis: Array, turned: Array | None) -
 
 
 def _started(tools: Tools, measured: Array, offset: Array, turn: Array | None) -> Alignment:
-    """The pose of the base that goes with an offset."""
     points = tools.places + np.einsum("nij,j->in", tools.rotations, offset)
     if turn is None:
         turn, shift = rigid_fit(points, measured)

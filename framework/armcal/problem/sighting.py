@@ -37,20 +37,16 @@ class Sighting:
 
     @property
     def size(self) -> float:
-        """How far the positions are spread (m)."""
         return spread_of(self.measured)
 
     def subset(self, places: Indices) -> Sighting:
-        """Some of its records."""
         turned = None if self.turned is None else self.turned[places]
         return Sighting(self.kernel, self.chosen[places], self.measured[:, places], turned)
 
     def thinned(self, most: int) -> Sighting:
-        """At most so many of the records, evenly."""
         return self.subset(np.arange(0, len(self.chosen), max(1, -(-len(self.chosen) // most))))
 
     def off(self, tools: Tools) -> float:
-        """Typical distance from what an arm shows (m); turns count at the distance of the spread."""
         squares = np.sum((self.measured - tools.places) ** 2, axis=0)
         if self.turned is not None:
             turns = Rotation.from_matrix(np.swapaxes(tools.rotations, 1, 2) @ self.turned).magnitude()

@@ -18,7 +18,6 @@ _TRIANGLE = "m-4 5l4-7l4 7z"
 
 
 def roles(result: RunResult) -> tuple[Mask, Mask]:
-    """Which records trained, which were held out."""
     train, holdout = (np.zeros(len(result.dataset), dtype=bool) for _ in range(2))
     train[result.split.train] = True
     holdout[result.split.holdout] = True

@@ -39,7 +39,6 @@ def _percent(shares: Sequence[float | None]) -> tuple[str, ...]:
 
 
 def level_names() -> tuple[str, ...]:
-    """Of the columns of the table."""
     return (*(f"{100 * level:g} %" for level in LEVELS), "95 % radius")
 
 
@@ -102,7 +101,6 @@ def profile_rows(result: RunResult) -> list[tuple[str, ...]]:
 
 
 def profile_figures(result: RunResult) -> tuple[Figure, ...]:
-    """The curve of each profile with the parabola of its standard deviation."""
     return tuple(_curve(result, number, profile) for number, profile in enumerate(result.profiles))
 
 
@@ -140,5 +138,4 @@ def _curve(result: RunResult, number: int, profile: Profile) -> Figure:
 
 
 def _shown(result: RunResult, profile: Profile) -> tuple[float, str]:
-    """Factor from SI to a customary unit, and the unit."""
     return shown_unit(result.estimate.parameters[profile.name].unit)

@@ -28,7 +28,6 @@ def fixed(value: float | None, decimals: int, signed: bool = False) -> str:
 
 
 def significant(value: float, digits: int = 3) -> str:
-    """A number with so many significant digits, scientific when very large or very small."""
     if not math.isfinite(value):
         return fixed(value, 0)
     if value == 0:
@@ -48,13 +47,11 @@ def decimals_for(size: float, digits: int = 2) -> int:
 
 
 def common_decimals(values: Iterable[float | None], most: int = 4) -> int:
-    """Decimals that show two digits of the smallest of the values."""
     sizes = [abs(v) for v in values if v is not None and math.isfinite(v) and v != 0]
     return min(max(decimals_for(min(sizes)), 2), most) if sizes else 2
 
 
 def count(number: int) -> str:
-    """A whole number with narrow spaces between thousands."""
     return f"{number:,}".replace(",", "\u202f")
 
 
@@ -64,7 +61,6 @@ def plural(number: int, noun: str) -> str:
 
 
 def unbroken(words: str) -> str:
-    """Numbers kept together with their units at the end of a line."""
     return re.sub(r"(\d) (mm|%|times)", "\\1\u00a0\\2", words)
 
 

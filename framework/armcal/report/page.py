@@ -81,13 +81,11 @@ def render(result: RunResult, sections: Sequence[PluginSection] = ()) -> str:
 
 
 def rendered(template: str, content: Mapping[str, Any], *folders: Path) -> str:
-    """A page of this folder's templates, or of others' that stand before them."""
     return str(_templates(folders).get_template(template).render(content))
 
 
 @lru_cache(maxsize=4)
 def _templates(folders: tuple[Path, ...]) -> Any:
-    """What compiles each template once."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     loader = FileSystemLoader([*folders, Path(__file__).parent])

@@ -50,7 +50,6 @@ class Axis:
     log: bool = False
 
     def at(self, values: Array | Sequence[float]) -> Array:
-        """Pixels of values, held inside the axis."""
         inside = np.clip(np.asarray(values, dtype=float), self.low, self.high)
         low, high = self.low, self.high
         if self.log:
@@ -58,7 +57,6 @@ class Axis:
         return np.asarray(self.start + (inside - low) / (high - low) * (self.end - self.start))
 
     def of(self, value: float) -> float:
-        """The pixel of one value."""
         return float(self.at([value])[0])
 
     def ticks(self, about: int) -> list[tuple[float, str]]:
@@ -90,7 +88,6 @@ def nice_step(rough: float, steps: Sequence[float] = (1, 2, 5, 10, 20)) -> float
 
 
 def document(ident: str, size: tuple[float, float], title: str, desc: str, parts: Iterable[str]) -> Markup:
-    """A whole figure with its title and description for those who hear the page."""
     width, height = size
     return Markup(
         f'<svg role="img" aria-labelledby="{escape(ident)}-t {escape(ident)}-d" viewBox="0 0 {width:.0f} {height:.0f}" '
@@ -119,7 +116,6 @@ def both(
 
 
 def text(x: float, y: float, content: object, css: str = "", anchor: str = "start", turn: float = 0) -> str:
-    """Text, escaped."""
     turned = f' transform="rotate({turn:g} {x:.1f} {y:.1f})"' if turn else ""
     css = f' class="{css}"' if css else ""
     anchored = f' text-anchor="{anchor}"' if anchor != "start" else ""
@@ -127,7 +123,6 @@ def text(x: float, y: float, content: object, css: str = "", anchor: str = "star
 
 
 def line(x1: float, y1: float, x2: float, y2: float, css: str) -> str:
-    """A straight line."""
     return f'<path class="{css}" d="M{x1:.1f} {y1:.1f}L{x2:.1f} {y2:.1f}"/>'
 
 
@@ -138,18 +133,15 @@ def rect(x: float, y: float, width: float, height: float, fill: str, title: str 
 
 
 def circle(x: float, y: float, radius: float, css: str) -> str:
-    """A circle."""
     return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" class="{css}"/>'
 
 
 def polyline(x: Array, y: Array, css: str) -> str:
-    """A line through points."""
     points = "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
     return f'<path class="{css}" d="M{points}"/>' if points else ""
 
 
 def band(x: Array, low: Array, high: Array, css: str) -> str:
-    """The area between two lines."""
     return polyline(np.concatenate([x, x[::-1]]), np.concatenate([low, high[::-1]]), css)
 
 
@@ -167,7 +159,6 @@ def marks(x: Array, y: Array, shape: str, css: str) -> str:
 
 
 def segments(x1: Array, y1: Array, x2: Array, y2: Array, css: str) -> str:
-    """Many straight lines."""
     rows = zip(x1.tolist(), y1.tolist(), x2.tolist(), y2.tolist(), strict=True)
     path = "".join(f"M{a:.1f} {b:.1f}L{c:.1f} {d:.1f}" for a, b, c, d in rows)
     return f'<path class="{css}" d="{path}"/>' if path else ""
@@ -205,5 +196,4 @@ def legend(x: float, width: float, entries: Sequence[tuple[str, str]]) -> tuple[
 
 
 def shorten(name: str, most: int = 26) -> str:
-    """A long name with its middle left out."""
     return name if len(name) <= most else f"{name[: most // 2 - 1]}…{name[-(most - most // 2) :]}"

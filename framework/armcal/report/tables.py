@@ -163,7 +163,6 @@ def _row(estimate: Estimate, i: int, si_unit: str, raw: RawParameter, decimals: 
 
 
 def fixed_rows(estimate: Estimate) -> list[tuple[str, str, str]]:
-    """Name, value and unit of each fixed canonical entry."""
     rows = []
     for block in estimate.parameters.blocks:
         if block.free:
@@ -176,7 +175,6 @@ def fixed_rows(estimate: Estimate) -> list[tuple[str, str, str]]:
 
 
 def worst_records(result: RunResult) -> Indices:
-    """The indices with the largest calibrated errors, the largest first; errors that are no number lead."""
     errors = result.errors.calibrated_mm
     ranked = np.where(np.isnan(errors), np.inf, errors)
     return np.argsort(-ranked, kind="stable")[:_WORST].astype(np.intp)
@@ -225,12 +223,10 @@ class Fact:
 
     @property
     def long(self) -> bool:
-        """Whether it is better shown as a block."""
         return "\n" in self.value
 
 
 def provenance_facts(provenance: Mapping[str, Any], prefix: str = "") -> tuple[Fact, ...]:
-    """Nested hashes and versions as a flat list."""
     facts: list[Fact] = []
     for key, value in provenance.items():
         name = f"{prefix}{key}".replace("_", " ")
@@ -258,7 +254,6 @@ def group_rows(groups: Sequence[GroupError]) -> list[tuple[str, str, int, list[s
 
 
 def part_of(group: GroupError) -> str:
-    """Which part its records took."""
     if not group.trained:
         return "judged"
     return "trained" if group.trained == group.records else "both"

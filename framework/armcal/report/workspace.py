@@ -39,7 +39,6 @@ class Coloured:
 
 
 def views(result: RunResult) -> list[Figure]:
-    """What is left of the error, from above (x, y) and from the side (x, z); empty when no position is known."""
     errors = result.errors
     return _views(
         result, Coloured("workspace", errors.calibrated_mm, errors.unit, "calibrated error", _vectors(result))
@@ -119,7 +118,6 @@ def _view(position: Array, what: Coloured, chosen: Indices, total: int, axes: tu
 
 
 def _enlargement(shown: Array, vectors: Array | None) -> float:
-    """A round factor that makes long residuals about a fifteenth of the view."""
     if vectors is None:
         return 0.0
     long = float(np.percentile(np.linalg.norm(vectors, axis=0), 95))
@@ -128,7 +126,6 @@ def _enlargement(shown: Array, vectors: Array | None) -> float:
 
 
 def _equal_axes(shown: Array, width: float) -> tuple[Box, Axis, Axis]:
-    """Axes of one scale around the points."""
     middle = (shown.max(axis=1) + shown.min(axis=1)) / 2
     extent = np.maximum(np.ptp(shown, axis=1) * 1.08, 10.0)
     left, right, top, tallest = 58.0, width - 16, 10.0, width * 0.86

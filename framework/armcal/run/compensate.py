@@ -150,7 +150,6 @@ def assess(bench: Bench, compensator: Compensator, targets: Targets, commands: C
 
 
 def commanded(compensator: Compensator, targets: Targets, commands: Commands) -> Dataset:
-    """Commands as records, with what acts on the arm in each."""
     name, joints = compensator.expression.name, compensator.joints
     channels: dict[str, Array] = {f"{name}.{joint}": commands.joint_angles[:, i] for i, joint in enumerate(joints)}
     channels |= {f"{name}.{APPROACH}{joint}": commands.approach[:, i] for i, joint in enumerate(joints)}
@@ -256,5 +255,4 @@ def _pose(name: str, poses: Array) -> Iterator[tuple[str, tuple[str, ...]]]:
 
 
 def short_texts(values: NDArray[Any]) -> tuple[str, ...]:
-    """Short numbers; empty where there is none."""
     return tuple(f"{value:.6g}" if np.isfinite(value) else "" for value in values.tolist())

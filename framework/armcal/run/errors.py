@@ -142,7 +142,6 @@ class ErrorTable:
     turns: Self | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
         return {
             model: {name: summary.as_dict() for name, summary in table.items()}
             for model, table in (("nominal", self.nominal), ("calibrated", self.calibrated), ("at_rest", self.at_rest))

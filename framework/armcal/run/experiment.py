@@ -210,7 +210,6 @@ class Experiment:
 
 
 def with_data(source: ConfigSource, data: str | Path) -> ConfigSource:
-    """The configuration with another data file, given on the command line and so free to lie anywhere."""
     section: dict[str, Any] = dict(source.data.get("data") or {"type": "csv"})
     section["path"] = ConfigText(str(data))
     return replace(source, data={**source.data, "data": section})
@@ -230,7 +229,6 @@ def _gravity_warnings(settings: ExperimentSettings, gravity: Array) -> list[str]
 
 
 def _version(package: str) -> str:
-    """Of an installed package; empty of one that is not, as an extra's may be."""
     try:
         return version(package)
     except PackageNotFoundError:

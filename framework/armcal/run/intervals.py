@@ -64,7 +64,6 @@ class IntervalResult:
         return (self.holdout, "held-out records") if self.holdout else (self.crossed, "cross-validated records")
 
     def findings(self) -> list[Finding]:
-        """Whether intervals cover their share."""
         coverages, words = self.judged
         state = (
             "State what the joints are off between those angles as arms.NAME.joint_noise_deg, or measure poses between."
@@ -87,7 +86,6 @@ class IntervalResult:
         return text
 
     def as_dict(self) -> dict[str, Any]:
-        """For metrics.json."""
         content = {}
         for name in self.half_width_mm:
             content[_NAMED[name]] = {
@@ -191,7 +189,6 @@ def _crossed(
 
 
 def _filled(before: Scores | None, own: Scores, places: Indices, count: int) -> Scores:
-    """Scores of some records among those of all."""
     result = before
     if result is None:
         errors, reaches = (np.full((len(rows), count), np.nan) for rows in (own.errors, own.reaches))

@@ -132,7 +132,6 @@ def _of_records(system: System, run: FittedRecords) -> list[Finding]:
 
 
 def _accuracies(run: FittedRecords, parts: Halves | None) -> list[Finding]:
-    """How well the poses of measurements are known that are what a user wants to know."""
     estimate = run.fitted.estimate
     if not estimate.verdict.converged or not estimate.names:
         return []
@@ -248,7 +247,6 @@ def _gross(
 
 
 def _for_held(problem: Problem, acting: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
-    """Records enough to judge what was held."""
     return problem.subset(acting, thinned(np.arange(acting[0].count), MOST_FOR_HELD))
 
 

@@ -67,7 +67,6 @@ def compare(
 
 
 def _inside(train: Indices, settings: ModelStudySettings, poses: Indices) -> tuple[Split, ...]:
-    """Folds of the training records of a fold."""
     inner = folds(len(train), settings.folds, settings.seed, poses[train])
     return tuple(Split(train[split.train], train[split.holdout]) for split in inner)
 
@@ -107,7 +106,6 @@ def _judged(name: str, ready: Prepared, fits: Sequence[JudgedFit], drawn: Sequen
 
 
 def _averaged(summaries: Sequence[ErrorSummary]) -> ErrorSummary:
-    """The mean of each figure over the repeats that have it."""
     means = {}
     for field in fields(ErrorSummary):
         known = [value for s in summaries if (value := getattr(s, field.name)) is not None]
@@ -161,7 +159,6 @@ def simplest_good(means: Array, freedoms: Sequence[int], changes: Sequence[Chang
 
 
 def _choices(variants: Sequence[VariantResult], settings: ModelStudySettings, ids: Sequence[str]) -> tuple[str, str]:
-    """The variant with the lowest mean error, and the simplest that is as good; of those whose fits all converged."""
     whole = [v for v in variants if v.converged and not v.failed_folds]
     if not whole:
         raise NotConvergedError(

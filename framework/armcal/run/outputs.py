@@ -262,7 +262,6 @@ def bootstrap_text(resampled: Bootstrap, result: RunResult) -> str:
 
 
 def log_text(result: RunResult) -> str:
-    """What happened, in sentences."""
     lines = [f"experiment: {result.name}", f"command: {result.command}", f"verdict: {result.verdict.headline}"]
     lines += [f"{finding.grade}: {finding.whole}" for finding in result.verdict.findings]
     lines += [f"warning: {text}" for text in result.warnings]

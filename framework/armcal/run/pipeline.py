@@ -150,7 +150,6 @@ def _fitted(context: RunContext, ready: Prepared) -> WeighedFit:
 
 
 def _widened(ready: Prepared, fitted: WeighedFit) -> WeighedFit:
-    """A fit to the training records, as sure as records that may err alike allow."""
     position = recorded_position(ready.dataset)[ready.split.train]
     acting = ready.problem.weighted(fitted.records, fitted.weights)
     return replace(fitted, estimate=widened(ready.problem, acting, fitted.estimate, position))
@@ -180,7 +179,6 @@ def _with_pose_residual(context: RunContext, run: FittedRecords) -> tuple[Fitted
 
 
 def _notify_rejected(registry: PluginRegistry, records: Sequence[SetAside | SuspiciousRecord]) -> list[str]:
-    """Observers hear of each record that takes no part; their faults."""
     return [
         fault
         for record in records

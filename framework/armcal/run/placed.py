@@ -82,7 +82,6 @@ def nominal_errors(run: FittedRecords, splits: Sequence[Split]) -> NominalErrors
 
 
 def _placed(problem: Problem, names: set[str], records: Sequence[FactorRecords], start: Array) -> tuple[Problem, Array]:
-    """The problem with what places the arm free, and its values by these records."""
     groups = {block.name for block in problem.parameters.free if block.nuisance}
     own = restricted(with_free(problem, names | groups), records)
     if not own.parameters.free:

@@ -144,7 +144,6 @@ def make_plan(
 
 
 def _identifiability(task: Task, chosen: Indices, parameters: Parameters) -> Identifiability:
-    """What a plan determines, with what is known before."""
     names = parameters.coordinate_names
     return analyse(task.candidates.triangles(chosen)[0], np.ones(len(names)), names, measures_of(parameters))
 

@@ -27,12 +27,10 @@ _SAME_LEVEL = 0.02
 
 
 def depends_on_approach(problem: Problem) -> bool:
-    """Whether a measurement depends on the side from which a joint came."""
     return any(".approach." in channel for kernel in problem.kernels for channel in kernel.factor.channels)
 
 
 def approach_channels(space: JointSpace) -> tuple[str, ...]:
-    """Of all joints, in their order."""
     parts = (channel.partition(".") for channel in space.channels)
     return tuple(f"{arm}.approach.{joint}" for arm, _, joint in parts)
 

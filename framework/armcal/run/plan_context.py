@@ -45,7 +45,6 @@ class PlanContext:
     base: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
     def about(self, draws: tuple[Array, ...]) -> Self:
-        """The same at these value vectors."""
         here = replace(self, draws=draws)
         if self.given is None:
             return replace(here, base=np.array([self.priors] * len(draws)))
@@ -99,7 +98,6 @@ def values_about(experiment: Experiment, calibration: Path | None) -> Parameters
 
 
 def problem_of(experiment: Experiment, parameters: Parameters, dataset: Dataset) -> Problem:
-    """Compiled for a dataset's channels."""
     system, evaluator = experiment.system, experiment.settings.evaluator
     return Problem.build(system.arms, system.measurements, parameters, system.environment, dataset, evaluator)
 

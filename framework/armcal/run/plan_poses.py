@@ -50,7 +50,6 @@ class JointSpace:
 
     @classmethod
     def of(cls, experiment: Experiment) -> Self:
-        """That of an experiment's arms."""
         arms = experiment.system.arms
         commands = command_channels(arms)
         return cls(tuple(commands), tuple(shown_joint(c, arms) for c in commands), tuple(commands.values()))
@@ -259,7 +258,6 @@ def dataset_of(poses: Array, space: JointSpace) -> Dataset:
 
 
 def counts_text(left_out: Mapping[str, int]) -> str:
-    """How many poses were left out by each reason, in words."""
     return ", ".join(f"{count} {reason}" for reason, count in left_out.items()) or "none was given"
 
 

@@ -69,12 +69,10 @@ class Comparison:
 
     @property
     def gain(self) -> float:
-        """Share of the error that it takes away."""
         return 1 - self.with_it / self.without
 
 
 def _sure(gains: Array) -> float:
-    """The mean of gains, those that are a number, in standard errors."""
     gains = gains[np.isfinite(gains)]
     error = float(np.std(gains, ddof=1) / np.sqrt(len(gains))) if len(gains) > 1 else np.inf
     return float(np.mean(gains)) / max(error, 1e-300) if len(gains) else 0.0
@@ -113,7 +111,6 @@ class ResidualOutcome:
     moved: Moved | None = None
 
     def system(self, system: System) -> System:
-        """With what was learned."""
         if self.residual is None:
             return system
         arms = {**system.arms, self.arm: replace(system.arms[self.arm], residual=self.residual)}
@@ -175,7 +172,6 @@ class Layer:
     def learned(
         self, problem: Problem, fitted: WeighedFit, records: tuple[FactorRecords, ...], places: Indices
     ) -> PoseResidual | None:
-        """From what a fit leaves of its records."""
         errors = model_errors(problem, fitted, records, problem.blueprint.arms[self.arm], self.postures.subset(places))
         return None if errors is None else self.residual.learned(errors)
 

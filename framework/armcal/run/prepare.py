@@ -52,13 +52,11 @@ class Stopwatch:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time a stage; a stage entered twice adds up."""
         start = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
     def total(self) -> float:
-        """Since it was made."""
         return time.perf_counter() - self.began
 
 
@@ -86,7 +84,6 @@ class Prepared:
 
     @property
     def training(self) -> tuple[FactorRecords, ...]:
-        """The training records."""
         return self.problem.subset(self.records, self.split.train)
 
 
@@ -153,7 +150,6 @@ def _assembled(experiment: Experiment, dataset: Dataset, watch: Stopwatch, accep
 
 
 def acting(problem: Problem, records: tuple[FactorRecords, ...], dataset: Dataset) -> tuple[FactorRecords, ...]:
-    """Records with the noise of joint readings and the drift that they share."""
     records = with_joint_noise(problem, records, problem.parameters.nominal())
     return with_drift(problem, records, dataset, problem.parameters.nominal())
 
@@ -182,7 +178,6 @@ def split_of(experiment: Experiment, dataset: Dataset) -> Split:
 
 
 def folds_of(experiment: Experiment, ready: Prepared) -> tuple[Split, ...]:
-    """Folds of the training records."""
     settings, training = experiment.settings.validation, ready.dataset.subset(ready.split.train)
     return folds(len(training), settings.folds, settings.seed, experiment.poses(training))
 
@@ -250,7 +245,6 @@ def check_permuted_axes(
 
 
 def still_joints(system: System, dataset: Dataset) -> dict[str, str]:
-    """Channels of joints that stood still in all records, and where, as people read it."""
     still = {}
     for channel, dimension in command_channels(system.arms).items():
         unit, least = _STILL[dimension]
@@ -278,7 +272,6 @@ def still_findings(system: System, dataset: Dataset) -> list[Finding]:
 
 
 def same_pose_findings(system: System, dataset: Dataset, split: Split) -> list[Finding]:
-    """A warning of held-out records at poses that trained, as a stated split may have them."""
     pose = first_of_pose(dataset, [*filter(dataset.has, command_channels(system.arms))])
     count, held = int(np.isin(pose[split.holdout], pose[split.train]).sum()), len(split.holdout)
     if not count:

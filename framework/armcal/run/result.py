@@ -50,12 +50,10 @@ class SuspiciousRecord:
 
     @property
     def reason(self) -> str:
-        """Why it is suspicious."""
         return f"{self.deviations:.1f} standard deviations from the fit (limit {self.limit:.1f})"
 
     @property
     def fate(self) -> str:
-        """In words."""
         return "set aside" if self.weight == 0 else f"weight {self.weight:.2g}"
 
 
@@ -81,7 +79,6 @@ class NoiseResult:
 
     @property
     def set_aside(self) -> tuple[SuspiciousRecord, ...]:
-        """Those that took no part in the fit."""
         return tuple(record for record in self.suspicious if record.weight == 0)
 
     def as_dict(self) -> dict[str, Any]:
@@ -137,7 +134,6 @@ class GroupError:
     distance_error_mm: float | None
 
     def as_dict(self) -> dict[str, Any]:
-        """For metrics.json."""
         return {key: value for key, value in self.__dict__.items() if key != "name"}
 
 
@@ -149,7 +145,6 @@ class RunGroups:
     keys: Groups = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
-        """For metrics.json."""
         return {error.name: error.as_dict() for error in self.errors}
 
 

@@ -177,12 +177,10 @@ def _judged(judging: tuple[FitTask, Layer | None]) -> JudgedFit:
 
 
 def _compile(problem: Problem) -> None:
-    """Leave the library in the cache."""
     problem.evaluated_by("compiled")
 
 
 def naming(name: str, work: Callable[[], R]) -> R:
-    """Do some work; its refusals name the variant."""
     try:
         return work()
     except InputError as fault:

@@ -141,7 +141,6 @@ class _Judged:
     unit: str = "mm"
 
     def content(self, kind: str, **own: Any) -> dict[str, Any]:
-        """For JSON, with what is this kind's own."""
         ends = {"warnings": list(self.warnings), "seconds": dict(self.seconds), "provenance": self.provenance}
         return dict(in_unit({"study": self.name, "kind": kind, **own, **ends}, self.unit))
 
@@ -167,7 +166,6 @@ class StudyResult(_Judged):
     nested: NestedResult | None
 
     def variant(self, name: str) -> VariantResult:
-        """One by its name."""
         return next(v for v in self.variants if v.name == name)
 
     def as_dict(self) -> dict[str, Any]:
@@ -202,7 +200,6 @@ class TransferCell:
     turns: ErrorSummary | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
         return {
             "variant": self.variant,
             "trained_at_g": list(self.trained_g),
@@ -225,7 +222,6 @@ class TransferResult(_Judged):
     errors_mm: dict[tuple[str, tuple[float, ...]], Array]
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
         return self.content(
             "load_transfer",
             simulated=self.simulated,
@@ -236,7 +232,6 @@ class TransferResult(_Judged):
 
 
 def files(result: StudyResult | TransferResult, study: Study, page: str) -> dict[str, str]:
-    """The texts of all files by their names."""
     return {
         "experiment.yaml": dump(self_contained(study)),
         "study.csv": _csv_text(result),

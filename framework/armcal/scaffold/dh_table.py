@@ -47,7 +47,6 @@ class _Line:
     columns: dict[Key, tuple[str, Unit | None]]
 
     def refuse(self, key: Key | None, message: str, hint: str) -> NoReturn:
-        """Raise a DataError here."""
         refuse(self.source, message, hint, self.line, self.columns[key][0] if key else None)
 
     def number(self, stem: str, dimension: str) -> float | None:
@@ -68,7 +67,6 @@ class _Line:
         return value
 
     def required(self, stem: str, dimension: str) -> float:
-        """A number that has to be there."""
         number = self.number(stem, dimension)
         if number is None:
             self.refuse((stem, dimension), "found nothing, expected a number.", "Write 0 for none.")

@@ -22,7 +22,6 @@ _DIGITS = 12
 
 
 def rendered(folder: str, context: Mapping[str, Any]) -> dict[str, str]:
-    """Every template of a folder, by the path of what it makes."""
     root = TEMPLATES / folder
     names = [path.relative_to(root).as_posix() for path in sorted(root.rglob(f"*{SUFFIX}"))]
     return {name.removesuffix(SUFFIX): rendered_file(f"{folder}/{name}", context) for name in names}

@@ -148,7 +148,6 @@ def _write(place: Path, robot: Robot, choice: MinimalSet, true: Mapping[str, str
 
 
 def _shown(value: float, dimension: str) -> str:
-    """A number in the unit that people read."""
     return number(to_unit(value, display_unit(dimension).name))
 
 

@@ -63,7 +63,6 @@ def made_up(
 
 
 def as_text(parameters: Parameters, values: Mapping[str, float]) -> dict[str, str]:
-    """Values with their units, as people write them."""
     lines = {}
     for name, value in values.items():
         factor, unit = shown_unit(parameters[name].unit)

@@ -34,7 +34,6 @@ def check_simulator(record: Recorder, subject: Subject) -> None:
 
 
 def _suited(simulator: Simulator) -> tuple[SimulationRequest, Dataset]:
-    """What a simulator's EXAMPLE suits, an instrument or a contact, and its records of it."""
     arms, refused = planar_arms([ARM]), []
     choices: tuple[Mapping[str, Measurement], ...] = ({TRACKER: Tip()}, {WALLS: Walls()})
     for measurements in choices:

@@ -169,14 +169,12 @@ class _MemoryLink:
         return LinkIdentity("", "registers of the contract's checks")
 
     def write(self, address: int, data: bytes) -> None:
-        """Keep the bytes after the first, from the register that the first one names."""
         self._answer()
         memory = self._of(address)
         for place, value in enumerate(data[1:], start=data[0]):
             memory[place % _REGISTERS] = value
 
     def read(self, address: int, register: int, count: int) -> bytes:
-        """What is kept there; zeros at first."""
         self._answer()
         memory = self._of(address)
         return bytes(memory[(register + i) % _REGISTERS] for i in range(count))
@@ -185,11 +183,9 @@ class _MemoryLink:
         """Nothing: what is kept stays."""
 
     def snapshot(self) -> Mapping[int, bytes]:
-        """All registers, by address."""
         return {address: bytes(memory) for address, memory in self._registers.items()}
 
     def restore(self, snapshot: Mapping[int, bytes]) -> None:
-        """Put registers back as they were, as if another program had."""
         self._registers = {address: bytearray(memory) for address, memory in snapshot.items()}
 
     def _answer(self) -> None:

@@ -150,7 +150,6 @@ def _displacement(effect: JointEffect, values: Mapping[str, Expression]) -> tupl
 
 
 def _shape(effect: JointEffect, conditions: Mapping[str, Expression], values: Mapping[str, Expression]) -> Expression:
-    """What an effect makes of a chain of links of any length."""
     links = [se3.translation_along("x", ca.SX.sym(f"l{i}")) for i in range(len(JOINTS) + 1)]
     joints = tuple(Joint(name, link) for name, link in zip(JOINTS, links, strict=False))
     shaped = effect.shaped(Chain(se3.identity(), joints, Attachment(len(JOINTS), links[-1])), conditions, values)
@@ -167,7 +166,6 @@ def _condition_symbols(effect: JointEffect) -> dict[str, Expression]:
 
 
 def _picture(effect: JointEffect, blocks: tuple[ParameterBlock, ...]) -> Array:
-    """Displacements and deflections of an effect at one point."""
     expect(tuple(effect.parameters()) == blocks, "found other parameters another time")
     values = symbols(blocks)
     entries = near_nominal(blocks, np.random.default_rng(4))

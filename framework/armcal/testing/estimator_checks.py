@@ -32,7 +32,6 @@ class _Case:
 
     @property
     def parameters(self) -> Parameters:
-        """Of the problem."""
         return self.problem.parameters
 
 

@@ -105,19 +105,16 @@ def _expect_movable(block: ParameterBlock) -> None:
 
 
 def near_nominal(blocks: Sequence[ParameterBlock], random: np.random.Generator) -> Array:
-    """Canonical entries an ordinary correction away from the nominal ones, in their domains."""
     parameters = Parameters(tuple(replace(block, free=True) for block in blocks))
     delta = random.uniform(-1, 1, len(parameters.scales())) * parameters.scales()
     return parameters.retract(np.clip(delta, *parameters.increment_bounds()))
 
 
 def entry_names(blocks: Sequence[ParameterBlock]) -> tuple[str, ...]:
-    """The names of all canonical entries."""
     return Parameters(tuple(blocks)).entry_names
 
 
 def symbols(blocks: Sequence[ParameterBlock]) -> dict[str, Expression]:
-    """A symbol for every block, as a component is given its values."""
     return {block.name: ca.SX.sym(block.name, block.size) for block in blocks}
 
 
@@ -193,7 +190,6 @@ def expect_repeated(picture: Callable[[C], Array], made: C, other: C) -> None:
 
 
 def scalars(blocks: Sequence[ParameterBlock], *units: str) -> list[tuple[int, ParameterBlock]]:
-    """Blocks of one number in one of these units, each with the place of its entry among all entries."""
     scalars, place = [], 0
     for block in blocks:
         if isinstance(block.domain, Interval) and block.unit in units:

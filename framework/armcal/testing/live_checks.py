@@ -43,7 +43,6 @@ def check_tracker(record: Recorder, subject: Subject) -> None:
 
 
 def check_joint_stream(record: Recorder, subject: Subject) -> None:
-    """The same of a stream of joint readings, and that it reports its end."""
     _check_source(record, subject, "samples", JointSample, CHANNELS)
 
 
@@ -133,7 +132,6 @@ def _listed(source: Any, take: Callable[[Any], Any]) -> list[Any]:
 
 
 def _counted(refused: Any) -> int:
-    """How many were passed over; a mapping from reason to count."""
     expect(isinstance(refused, Mapping), f"found {type(refused).__name__}, expected a mapping from reason to count")
     for reason, count in refused.items():
         expect(isinstance(reason, str) and isinstance(count, int), f"found {reason!r}: {count!r}")
@@ -160,7 +158,6 @@ def _expect_damage_counted(source: Any, take: Callable[[Any], Any], path: Path) 
 
 
 def _settings_to_feed(subject: Subject, path: Path) -> Mapping[str, Any]:
-    """Settings with a free port, or with a file to which the checks append."""
     example, fields = dict(subject.example), type(subject.settings).model_fields
     if isinstance(example.get("port"), int):  # not that of a serial line
         return {**example, "port": 0, **({"host": "127.0.0.1"} if "host" in fields else {})}

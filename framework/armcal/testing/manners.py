@@ -45,7 +45,6 @@ def watched(record: Recorder) -> Iterator[Callable[[Any], None]]:
 
 
 def _process() -> dict[str, Any]:
-    """What belongs to everybody in this process."""
     return {
         "numpy.random (use numpy.random.default_rng(seed))": _picture(np.random.get_state(), 0),
         "random (use numpy.random.default_rng(seed))": hash(random.getstate()),
@@ -84,7 +83,6 @@ def _expect_same(before: Mapping[str, Any], after: Mapping[str, Any], what: str)
 
 
 def _picture(value: Any, depth: int) -> Any:
-    """Something that compares equal as long as a variable holds the same, deep inside too."""
     if value is None or isinstance(value, (str, bytes, int, float, complex)):
         return repr(value)
     if isinstance(value, np.ndarray):

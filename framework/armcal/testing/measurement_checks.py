@@ -54,7 +54,6 @@ class _Case:
 
     @property
     def arm_blocks(self) -> tuple[ParameterBlock, ...]:
-        """The arms' parameters."""
         return self.parameters.blocks[: len(self.parameters.blocks) - len(self.own)]
 
     @property
@@ -64,7 +63,6 @@ class _Case:
         return (*own, *_group_blocks(self.measurement))
 
     def point(self, seed: int = 1) -> tuple[Array, Array]:
-        """Values, and a record with random joint angles whose measured channels have what would be read."""
         random = np.random.default_rng(seed)
         values = near_nominal((*self.arm_blocks, *self.other_blocks), random)
         record = random.uniform(-1, 1, self.factor.record.numel())
@@ -73,7 +71,6 @@ class _Case:
         return values, np.array([read.get(name, record[i]) for i, name in enumerate(self.factor.channels)])
 
     def function(self, expression: Expression) -> ca.Function:
-        """An expression as a function of values and record, one below the other."""
         return ca.Function("shown", [stacked([self.factor.values, self.factor.record])], [stacked([expression])])
 
     def numbers(self, expression: Expression, at: tuple[Array, Array]) -> Array:
@@ -210,12 +207,10 @@ def _case(
 
 
 def _group_blocks(measurement: Measurement) -> tuple[ParameterBlock, ...]:
-    """Of one group that is not known beforehand."""
     return tuple(measurement.group_parameters(_GROUP)) if isinstance(measurement, GroupedMeasurement) else ()
 
 
 def _picture(made: Measurement, case: _Case, names: tuple[str, ...]) -> Array:
-    """Residual, outputs, starts and noise of a measurement at one point of a case."""
     same = tuple(made.parameters()) == tuple(case.own)
     expect(same, "found other parameters another time, expected them from its settings alone")
     again = _case(made, planar_arms(names), case.own, tuple(made.channels()))

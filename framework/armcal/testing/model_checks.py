@@ -46,7 +46,6 @@ class _Kinematics:
     poses: ca.Function
 
     def point(self, random: np.random.Generator) -> Array:
-        """Random parameters near the nominal ones, and random displacements."""
         reach = [2.0 if joint.is_revolute else 0.2 for joint in self.chain.joints]
         return np.concatenate([near_nominal(self.blocks, random), random.uniform(-1, 1, len(reach)) * reach])
 
@@ -158,7 +157,6 @@ def _kinematics(blocks: tuple[ParameterBlock, ...], values: dict[str, Expression
 
 
 def _picture(model: ArmModel, blocks: tuple[ParameterBlock, ...]) -> Array:
-    """The poses of a model at one point."""
     expect(tuple(model.parameters()) == blocks, "found other parameters another time")
     values = symbols(blocks)
     known = _kinematics(blocks, values, model.chain(values))

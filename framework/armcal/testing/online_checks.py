@@ -120,7 +120,6 @@ def _known(prior: Gaussian, lines: Sequence[_Line]) -> Gaussian:
 
 
 def _expect_refusal(estimator: OnlineEstimator, prior: Gaussian, line: _Line) -> None:
-    """A direction that no record sees keeps the variance that it had, which is below zero."""
     covariance = np.diag([1.0, 1.0, 1.0, -0.5])
     blind = _Line(line.measured, line.slope * [1, 1, 1, 0], line.noise)
     try:

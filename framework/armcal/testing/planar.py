@@ -32,11 +32,9 @@ class PlanarArm:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Two."""
         return ("q1", "q2")
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """Link lengths, zero angles and the shift."""
         return (
             scalar("a1", "m", 0.3, 0.01),
             scalar("a2", "m", 0.25, 0.01),
@@ -60,7 +58,6 @@ class SkewedArm(PlanarArm):
     """The same, but that q1 turns about z: every point of the tool moves in a way of its own."""
 
     def chain(self, values: Mapping[str, Expression]) -> Chain:
-        """As the planar arm's, with another first axis."""
         chain = super().chain(values)
         first, second = chain.joints
         return replace(chain, joints=(replace(first, angular=(0.0, 0.0, 1.0)), second))
@@ -77,8 +74,6 @@ class Springs(JointEffect):
         return (scalar("k", "rad_per_Nm", 1e-3, 1e-3),)
 
     def springs(self, values: Mapping[str, Expression]) -> tuple[Spring, ...]:
-        """The base's first."""
-
         def law(load: Expression, command: JointCommand) -> Expression:
             return values["k"] * load
 
@@ -93,11 +88,9 @@ class Walls(Contact):
     group_labels = ("wall",)
 
     def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
-        """A wall's height."""
         return (replace(scalar("height", "m", 0.0, 0.01), free=True),)
 
     def group_starts(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> dict[str, Expression]:
-        """The tool is at the wall's height."""
         return {"height": arms[ARM].base_T_tool.translation[2]}
 
     def residual(
@@ -106,11 +99,9 @@ class Walls(Contact):
         measured: Mapping[str, Expression],
         values: Mapping[str, Expression],
     ) -> Expression:
-        """How far the tool is above the wall (m)."""
         return arms[ARM].base_T_tool.translation[2] - values["height"]
 
     def noise(self) -> tuple[float, ...]:
-        """Of the height."""
         return (NOISE_M,)
 
 
@@ -122,7 +113,6 @@ class Tip:
 
     @property
     def arms(self) -> tuple[str, ...]:
-        """One."""
         return (self.arm,)
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
@@ -130,11 +120,9 @@ class Tip:
         return ()
 
     def channels(self) -> tuple[Channel, ...]:
-        """Three coordinates."""
         return tuple(Channel(axis, "length") for axis in _TIP)
 
     def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> dict[str, Expression]:
-        """In the base frame (m)."""
         return {axis: arms[self.arm].base_T_tool.translation[i] for i, axis in enumerate(_TIP)}
 
     def residual(
@@ -143,7 +131,6 @@ class Tip:
         measured: Mapping[str, Expression],
         values: Mapping[str, Expression],
     ) -> Expression:
-        """Measured minus predicted (m)."""
         predicted = self.outputs(arms, values)
         return ca.vertcat(*[measured[axis] - predicted[axis] for axis in _TIP])
 
@@ -157,7 +144,6 @@ class Body(Tip):
     """The tool's position and orientation, without parameters of its own."""
 
     def channels(self) -> tuple[Channel, ...]:
-        """Three coordinates and a unit quaternion."""
         return (*super().channels(), *(Channel(name, "dimensionless") for name in QUATERNION))
 
     def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> dict[str, Expression]:
@@ -168,17 +154,14 @@ class Body(Tip):
 
 
 def planar_arms(names: Sequence[str]) -> dict[str, Arm]:
-    """A planar arm under each of these names, without springs."""
     return {name: Arm(name, "planar", PlanarArm(), {}, ()) for name in names}
 
 
 def skewed_arms(names: Sequence[str]) -> dict[str, Arm]:
-    """A skewed arm under each of these names, with the parameters of a planar one."""
     return {name: Arm(name, "planar", SkewedArm(), {}, ()) for name in names}
 
 
 def all_parameters(arms: Mapping[str, Arm]) -> Parameters:
-    """Every block of the arms."""
     return Parameters(tuple(block for arm in arms.values() for block in arm.parameters()))
 
 
@@ -192,6 +175,5 @@ def commands(arms: Mapping[str, Arm], count: int, random: np.random.Generator) -
 
 
 def dataset(channels: Mapping[str, Array]) -> Dataset:
-    """Channels as records."""
     count = len(next(iter(channels.values())))
     return Dataset(tuple(str(i) for i in range(1, count + 1)), dict(channels), source="contract check")

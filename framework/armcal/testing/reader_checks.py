@@ -53,7 +53,6 @@ class _Source:
 
     @property
     def count(self) -> int:
-        """How many records."""
         return len(next(iter(self.channels.values())))
 
 
@@ -88,7 +87,6 @@ def check_reader(record: Recorder, subject: Subject) -> None:
 
 
 def _read(subject: Subject, path: Path, measurements: Mapping[str, Measurement]) -> Dataset:
-    """What a reader makes of a path; its refusals pass, any other fault is one of its own."""
     if "path" not in type(subject.settings).model_fields:
         raise NotRun("its settings have no path")
     arms = planar_arms([ARM])

@@ -86,12 +86,10 @@ def _levers(commands: Array) -> Array:
 
 
 def _away(postures: Postures) -> Postures:
-    """The same poses half a turn further."""
     return Postures(postures.commands + np.pi, postures.approaches)
 
 
 def _left(postures: Postures, learned: PoseResidual | None) -> float:
-    """Root mean square of what is left of the tool's position (m)."""
     levers = _levers(postures.commands)
     left = levers[:, :, 1] * _truth(postures.commands)[:, None]
     if learned is not None:

@@ -63,7 +63,6 @@ class Recorder:
 
     @contextmanager
     def group(self) -> Iterator[None]:
-        """Checks of which some build on others; a fault that escapes them becomes a result."""
         try:
             yield
         except _Ended:
@@ -73,7 +72,6 @@ class Recorder:
 
 
 def said(fault: BaseException) -> str:
-    """What a fault says, on one line of bounded length."""
     try:
         text = " ".join(str(fault).split())
     except PLUGIN_FAULTS:

@@ -34,7 +34,6 @@ class Subject:
     settings: Settings
 
     def build(self, *arguments: Any) -> Any:
-        """A component of the example settings."""
         return self.made(self.settings, *arguments)
 
 
@@ -102,7 +101,6 @@ def _expect_units(settings_class: type[Settings]) -> None:
 
 
 def _holds_floats(*parts: Any) -> bool:
-    """Whether a type is a float, or holds some; a name that maps to floats counts too."""
     inner = [part_type for part in parts for part_type in (part if isinstance(part, list) else (part,))]
     return any(
         part_type is float or (get_args(part_type) and _holds_floats(*get_args(part_type))) for part_type in inner

@@ -158,7 +158,6 @@ class AcquisitionRun:
         return {i: pose_of(measured[name]) for i, name in enumerate(self._ids) if name in measured}
 
     def _sees_again(self) -> bool:
-        """Whether the tracker is well, or soon, while the arm rests."""
         until = self._gate.clock.now() + self._settings.settle.longest
         while self._gate.clock.now() < until:
             self._drive.tick(self._gate.resting)
@@ -228,7 +227,6 @@ class AcquisitionRun:
         return {"angles": drive.angles, "warmth": drive.thermal_state.by_joint, "at": self._gate.clock.wall()}
 
     def _try_later(self, pose: int, why: str) -> None:
-        """At the end of what is left; after the last try it is left out."""
         self._tries[pose] = self._tries.get(pose, 0) + 1
         if self._tries[pose] >= _TRIES:
             self._leave_out(pose, why)
@@ -256,7 +254,6 @@ class AcquisitionRun:
         return self._end(Ending(how, why))
 
     def _park_after(self, fault: Exception) -> None:
-        """Park, as far as what went wrong still lets it; else the arm holds."""
         try:
             self._park_and_end("parked", str(fault))
         except Exception as again:

@@ -44,7 +44,6 @@ class Evidence:
             self._stands.append((pose, stand))
 
     def succeeded(self, pose: int) -> None:
-        """A pose counts as measured."""
         self._failed = 0
         self.doubted.pop(pose, None)
 

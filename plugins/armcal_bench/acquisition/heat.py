@@ -88,7 +88,6 @@ class HeatModel:
         return np.asarray(steady + (thermal_state - steady) * np.exp(-seconds / self.times))
 
     def over(self, thermal_state: Array) -> bool:
-        """Whether a servo is above its budget."""
         return bool(np.any(self.heat(thermal_state) > self.budget))
 
     def too_hot_for_ever(self, torque: Array, part: float = 1.0) -> int | None:
@@ -114,7 +113,6 @@ class HeatModel:
 
 
 def holding_torques(arm: Arm, environment: Environment) -> Torques:
-    """What the joints of an arm hold against gravity and its configured load."""
     function = holding_function(arm, environment.gravity, environment.payload_mass, environment.payload_com)
 
     def torques(pose: Array) -> Array:
@@ -162,7 +160,6 @@ class ThermalState:
 
     @property
     def by_joint(self) -> dict[str, list[float]]:
-        """Of winding and case, by joint."""
         return dict(zip(self._joints, self.warmth.tolist(), strict=True))
 
     def check(self) -> None:
@@ -176,12 +173,10 @@ class ThermalState:
 
     @property
     def must_rest(self) -> bool:
-        """Whether a servo is near its budget."""
         return bool(np.any(self.model.heat(self.warmth) > _ENOUGH * self.model.budget))
 
     @property
     def rest_s(self) -> float:
-        """How long to rest; infinite where the servos would not cool."""
         return self.model.cooled_in(self.warmth, self._at_rest, COOLED_TO * self.model.budget)
 
     @property
@@ -198,7 +193,6 @@ class ThermalState:
 
     @property
     def hottest(self) -> str:
-        """The servo that is nearest to its budget, in words."""
         joint, share = self._hottest
         return f"that of {joint} is at {100 * share:.0f} % of its budget"
 

@@ -60,7 +60,6 @@ class PathPlanner:
         return ", ".join([*parts, *filter(None, [self._check.worst(pose) if self._check else ""])])
 
     def clear(self, start: Array, goal: Array) -> bool:
-        """Whether the straight line between two poses is clear, its ends included."""
         if self._check is None:
             return True
         low, high = sorted((start.tobytes(), goal.tobytes()))

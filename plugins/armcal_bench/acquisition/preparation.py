@@ -56,7 +56,6 @@ class Prepared:
 
     @property
     def settings(self) -> AcquisitionSettings:
-        """Those of the run."""
         return self.bench.settings.acquisition
 
 

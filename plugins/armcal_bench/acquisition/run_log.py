@@ -74,7 +74,6 @@ class Progress:
         return self
 
     def at_the_end(self, total: int) -> tuple[EndedHow, str]:
-        """How a run of so many poses ends that are all measured or left out, and why."""
         left_out = len(self.left_out)
         some = f"{total - left_out} of {total} poses are measured, {left_out} were left out"
         if 2 * left_out > total:
@@ -83,7 +82,6 @@ class Progress:
 
 
 def progress_of(entries: tuple[Entry, ...]) -> Progress:
-    """After all entries."""
     progress = Progress()
     for entry in entries:
         progress = progress.after(entry.kind, entry.content)

@@ -65,7 +65,6 @@ class Sag:
 
     @property
     def mend(self) -> str:
-        """What to do, a full sentence."""
         which = self.joints[0] if self.joints else "the joint"
         return (
             f"Look at the screw of {which}'s horn, at its gear and its supply; a servo that is too weak for its load "
@@ -74,7 +73,6 @@ class Sag:
 
     @property
     def content(self) -> dict[str, Any]:
-        """For programs."""
         return {
             "joints": list(self.joints),
             "deg_per_min": None if math.isnan(self.rate) else _MINUTE * math.degrees(self.rate),

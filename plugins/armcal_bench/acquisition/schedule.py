@@ -77,7 +77,6 @@ class Scheduler:
             candidates = [left[i] for i in np.argsort(away, kind="stable")[:_CONSIDERED]]
 
         def cost(step: Measure) -> float:
-            """Its own time, and the time that its heat will take to go again (s)."""
             warmed = np.maximum(self.model.shares * (step.thermal_state - thermal_state), 0.0)
             return step.seconds + float(np.max((warmed / self.model.budget[:, None] * self.model.times).sum(axis=1)))
 

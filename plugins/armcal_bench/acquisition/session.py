@@ -117,7 +117,6 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
 
 
 def _summary(prepared: Prepared, ending: Ending, progress: Progress) -> dict[str, Any]:
-    """How a run ended, and what became of each pose of its plan."""
     return {
         "how": ending.how,
         "why": ending.sentence,
@@ -130,7 +129,6 @@ def _summary(prepared: Prepared, ending: Ending, progress: Progress) -> dict[str
 
 
 def _digests(identity: DeviceIdentity, header: Mapping[str, Any]) -> dict[str, str]:
-    """Of the board and the configuration, short, as the data has them."""
     return {"board": identity.digest[:16], "config": header["config"][:16]}
 
 

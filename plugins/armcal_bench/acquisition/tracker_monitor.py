@@ -53,7 +53,6 @@ class Waits:
 
 
 def duration(seconds: float) -> str:
-    """For people."""
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
 
 
@@ -132,7 +131,6 @@ class TrackerMonitor:
             )
 
     def look(self) -> None:
-        """Take in the frames that came."""
         frames, refused = frames_of(self._tracker), refused_by(self._tracker)
         for health in (self._health, self._with_base):
             health.feed(frames, refused)
@@ -160,7 +158,6 @@ class TrackerMonitor:
         return self._settling.stand()
 
     def close(self) -> None:
-        """Stop listening."""
         self._tracker.close()
 
 

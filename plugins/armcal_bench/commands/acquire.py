@@ -67,7 +67,6 @@ def acquire_command(
 
 
 def exit_code_of(outcome: Outcome) -> int:
-    """Done, done with something missing or a joint that gives way, failed, refused, or stopped before the end."""
     if outcome.ending.how == "refused":
         return EXIT_BAD_INPUT
     if outcome.ending.how == "failed":
@@ -78,7 +77,6 @@ def exit_code_of(outcome: Outcome) -> int:
 
 
 def schedule_forecast(prepared: Prepared) -> ScheduleForecast:
-    """What the whole plan would take, from the park pose and cold servos."""
     scheduler = prepared.scheduler
     return forecast_schedule(scheduler, scheduler.park, scheduler.model.cold, list(range(len(scheduler.ids))))
 
@@ -86,7 +84,6 @@ def schedule_forecast(prepared: Prepared) -> ScheduleForecast:
 def driven(
     console: Console, prepared: Prepared, plan: Path, to: tuple[Path, Start], question: Question, *, unchecked: bool
 ) -> Outcome:
-    """The run, into a folder, with a progress line, and signals that park the arm."""
     with Signals() as signals, console.progress() as show:
 
         def on_progress(progress: Progress) -> None:

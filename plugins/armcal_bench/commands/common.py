@@ -25,19 +25,16 @@ def on_bench(command: F) -> F:
 
 
 def plan_option(command: F) -> F:
-    """The option --plan."""
     text = "The poses to measure: a CSV, as armcal plan writes it."
     return click.option("--plan", required=True, type=FILE, help=text)(command)
 
 
 def load(console: Console, config: Path, overrides: tuple[str, ...]) -> Experiment:
-    """The experiment of CONFIG; plugins that are broken are named."""
     registry = console.registry()
     return Experiment.load(config, overrides, registry=registry)
 
 
 def always(motion: FirstMotion) -> bool:
-    """Without a question."""
     return True
 
 
@@ -77,7 +74,6 @@ def waits(console: Console) -> Waits:
 
 
 def show_hazards(console: Console, hazards: Iterable[Hazard]) -> None:
-    """A warning line each."""
     for hazard in hazards:
         console.warn(hazard.sentence)
 

@@ -76,7 +76,6 @@ def rehearse(console: Console, config: Path, plan: Path, out: Path, overrides: t
 
 
 def _amount(kind: str, entry: dict[str, Any]) -> str:
-    """The joint, and how much it was, with its unit."""
     factor, unit = _UNITS.get(kind, (1.0, ""))
     return f"{entry['joint'] or 'the arm'} {factor * entry['value']:.1f} {unit}".rstrip()
 

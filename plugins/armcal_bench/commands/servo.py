@@ -143,7 +143,6 @@ def _check_joints(console: Console, config: Path, overrides: tuple[str, ...], ma
 
 @contextmanager
 def _stoppable(console: Console) -> Iterator[None]:
-    """Where it is stopped, say what that means."""
     try:
         yield
     except StopRequested as stop:

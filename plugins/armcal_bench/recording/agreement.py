@@ -101,7 +101,6 @@ class AgreementJudge:
         return replace(self._settled(disagreeing), newest=None if newest is None else _offset(newest))
 
     def anew(self) -> Agreement:
-        """Judge all, of which none was in doubt."""
         return self._settled(set())
 
     def _active(self, doubtful: frozenset[int] | set[int]) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -159,7 +158,6 @@ def _offset(predicted: PredictedResidual) -> Offset:
 
 
 def _short(number: float) -> str:
-    """Two digits."""
     return f"{number:.2g}" if number < 10 else f"{number:.0f}"
 
 
@@ -210,7 +208,6 @@ class Assessor:
         self._values: Mapping[str, tuple[float, ...]] = {}
 
     def with_newest(self, postures: Sequence[Posture]) -> Assessment:
-        """Judge the last posture, and those before in its light."""
         places = {p.name: i for i, p in enumerate(postures)}
         doubtful = frozenset(places[name] for name in self._doubtful if name in places)
         return self._assessed(postures, lambda judge: judge.with_newest(doubtful))
@@ -220,7 +217,6 @@ class Assessor:
         return self._assessed(postures, lambda judge: judge.anew())
 
     def tried(self, postures: Sequence[Posture]) -> Assessment:
-        """What it would be with the last posture, of which nothing is remembered."""
         remembered = self._doubtful, self._values
         try:
             return self.with_newest(postures)

@@ -97,7 +97,6 @@ def explained(
 
 
 def _training(experiment: Experiment, dataset: Dataset) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """The postures that a run would train on; all while none would be."""
     settings, chosen = experiment.settings.validation, np.arange(len(dataset), dtype=np.intp)
     if settings.train_groups:
         labels = labels_of(experiment, dataset)

@@ -28,7 +28,6 @@ class Labels:
 
     @property
     def shown(self) -> str:
-        """The present name, for people."""
         return "/".join(self.present.get(column, "?") for column in self.columns)
 
     def name(self, text: str) -> str:
@@ -65,7 +64,6 @@ class Labels:
         return labels, self._fault(labels)
 
     def known_labels_text(self) -> str:
-        """What the digits stand for."""
         return ", ".join(f"{i} {name}" for i, name in enumerate(self.known, start=1))
 
     def _fault(self, labels: Mapping[str, str]) -> str:

@@ -117,7 +117,6 @@ class QuickFitter:
         self._x = parameters.local(start) / parameters.increment_scales()
 
     def free_values(self, fitted: Fitted) -> dict[str, tuple[float, ...]]:
-        """What was fitted, by parameter."""
         parameters = self._weak.parameters
         return {b.name: tuple(fitted.values[parameters.entries_of(b.name)].tolist()) for b in parameters.free}
 
@@ -166,7 +165,6 @@ class QuickFitter:
         return PredictedResidual(back @ whitened, back @ covariance @ back.T, distance, numbers, np.array(dimensions))
 
     def _numbers(self, one: int) -> int:
-        """How many numbers a posture gives that err by themselves."""
         count = 0
         for kernel, record in zip(self._weak.kernels, self.records, strict=True):
             if record.weight[one] > 0:

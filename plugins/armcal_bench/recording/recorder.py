@@ -94,7 +94,6 @@ def _added(after: Advice, before: Advice) -> str:
 
 
 def _advised(after: Advice, before: Advice) -> list[Message]:
-    """How well an instrument's own parameters are known, and which posture to take next."""
     messages, text = [], _added(after, before)
     if text:
         messages.append(Message("known", f"{text}.", {"accuracy": list(after.accuracy), "fell": after.fell_by(before)}))
@@ -148,7 +147,6 @@ class Recorder:
             self.labels.present.update(log.last.labels)
 
     def begin(self) -> list[Message]:
-        """Where an earlier part of the recording had come to."""
         postures = self._log.postures
         if not postures:
             return []
@@ -230,7 +228,6 @@ class Recorder:
         return [_refused(f"found {text.strip()[:40]!r}: {KEYS}.")]
 
     def finished(self) -> Message:
-        """How it ended."""
         postures, assessment = self._log.postures, self._assessment
         doubts = sorted(assessment.doubts, key=int)
         sentence = f"{len(postures)} postures are recorded"
@@ -318,7 +315,6 @@ class Recorder:
         return [Message("status", "\n".join((*lines, *missing)), content), *self._known()]
 
     def _warnings(self, posture: Posture) -> list[Message]:
-        """About a posture much like one before, or beyond the joints' limits."""
         messages = []
         for other in self._log.postures[:-1]:
             apart = self._apart(posture.angles, other.angles)

@@ -50,7 +50,6 @@ class Posture:
 
     @property
     def place(self) -> str:
-        """The name of its group, for people."""
         return "/".join(self.labels.values())
 
     def as_dict(self) -> dict[str, Any]:
@@ -78,11 +77,9 @@ class RecordingLog:
 
     @property
     def postures(self) -> tuple[Posture, ...]:
-        """All that stand, in the order of capture."""
         return tuple(self._postures.values())
 
     def next_posture(self, mean: Mean, labels: Mapping[str, str], values: Mapping[str, float]) -> Posture:
-        """The posture that a capture would make now."""
         at = max(time.time(), self.last.at if self.last else 0.0)
         name = str(self._count + 1)
         return Posture(name, dict(mean.angles), mean.spread, mean.readings, at, dict(labels), mean.stamp, values=values)

@@ -33,14 +33,12 @@ class JointKinds:
 
     @classmethod
     def of(cls, arms: Mapping[str, Arm]) -> Self:
-        """Those of arms by name."""
         dimensions = command_channels(arms)
         endless = {f"{name}.{j.name}" for name, arm in arms.items() for j in arm.nominal_chain.joints if j.endless}
         return cls(dimensions, frozenset(endless & set(dimensions)))
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """In order."""
         return tuple(self.dimensions)
 
     def fault_of(self, angles: Mapping[str, float]) -> str:
@@ -105,12 +103,10 @@ class SampleWindow:
             self._samples.popleft()
 
     def clear(self) -> None:
-        """Forget all."""
         self._samples.clear()
 
     @property
     def is_filling(self) -> bool:
-        """Whether there are too few readings for a posture, or over too short a time."""
         lasts = self._samples[-1][0] - self._samples[0][0] if self._samples else 0.0
         return len(self._samples) < self._least or lasts < _LONG_ENOUGH * self._length
 

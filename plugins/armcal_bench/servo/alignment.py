@@ -46,17 +46,14 @@ class Alignment:
 
     @classmethod
     def of(cls, nominal: NominalArm) -> Self:
-        """The model as it is."""
         return cls(np.zeros(len(_sds(nominal))), np.zeros(len(nominal.compliances)))
 
     @property
     def tool_R_body(self) -> Array:  # noqa: N802
-        """The seat, as far as it is known."""
         return np.eye(3) if self.seat is None else self.seat
 
 
 def shifted(nominal: NominalArm, alignment: Alignment) -> NominalArm:
-    """The arm at the numbers of an alignment."""
     values, place = {}, 0
     for name in nominal.angles:
         stated = nominal.parameters[name].nominal

@@ -42,7 +42,6 @@ class Sweeps:
 
     @property
     def joint(self) -> str:
-        """Whose."""
         return str(self.lines[0]["joint"])
 
     @property
@@ -52,7 +51,6 @@ class Sweeps:
 
     @property
     def counts(self) -> list[int]:
-        """Of each pulse."""
         return [int(line["counts"]) for line in self.lines]
 
     @property

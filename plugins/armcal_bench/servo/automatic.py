@@ -53,7 +53,6 @@ def sweep(mover: Mover, joint: str) -> list[Point]:
 
 
 def left(points: Iterable[Point], entries: Iterable[Mapping[str, Any]]) -> list[Point]:
-    """Those that no line of the record is about."""
     done = {Point(e["joint"], e["counts"], e["came"]) for e in entries if "counts" in e}
     return [point for point in points if point not in done]
 

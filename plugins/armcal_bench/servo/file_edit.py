@@ -76,7 +76,6 @@ def _value(node: yaml.Node | None, field: str) -> yaml.Node:
 
 
 def _end(node: yaml.Node) -> int:
-    """Where a value ends; a block's own mark lies after the comments that follow it."""
     if not isinstance(node, yaml.CollectionNode) or _is_flow(node) or not node.value:
         return int(node.end_mark.index)
     last = node.value[-1]

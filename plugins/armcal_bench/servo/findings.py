@@ -15,7 +15,6 @@ _SAG_WORTH = math.radians(0.1)
 
 
 def is_usable(servo: FittedServo) -> bool:
-    """Whether the pulses make a table."""
     try:
         PulseTable(servo.angles, servo.pulses)
     except ValueError:

@@ -24,7 +24,6 @@ class Target:
 
     @property
     def key(self) -> tuple[str, int, int]:
-        """Tells it from others, angles to a hundredth of a degree."""
         return (self.joint, round(math.degrees(self.angle) * 100), self.came)
 
 
@@ -117,7 +116,6 @@ class Guided:
         return stepped
 
     def _within(self, joint: str, counts: int) -> int:
-        """The nearest counts that are allowed."""
         low, high = self.mover.setup.pulses_of(joint)
         tick = self.mover.pulse(joint, 1)
         return min(max(counts, math.ceil(low / tick)), math.floor(high / tick))

@@ -76,7 +76,6 @@ class Mover(Motion):
         return _counts(*self.servos[joint], angle)
 
     def pulse(self, joint: str, counts: int) -> float:
-        """The pulse of so many counts (s), by the stated oscillator."""
         return counts * self.servos[joint][1].tick
 
     def _counts_per_rad(self, joint: str) -> float:
@@ -85,7 +84,6 @@ class Mover(Motion):
         return table.least_slope / clock.tick
 
     def approach_counts(self, joint: str) -> int:
-        """How many counts a joint comes from aside before it is measured; at most what a sweep leaves room for."""
         return max(int(self.setup.settings.approach * self._counts_per_rad(joint)) - 1, 1)
 
     def energise(self, joint: str, counts: int) -> None:
@@ -188,7 +186,6 @@ class Mover(Motion):
             self.guard(self._guarded)
 
     def _running(self) -> dict[str, int]:
-        """The counts of the joints that get pulses."""
         angles = state_of(self.device).angles
         moved = {joint: angle for joint, angle in angles.items() if joint in self.setup.base}
         return {joint: _counts(*self.setup.table_of(joint), angle) for joint, angle in moved.items()}

@@ -80,12 +80,10 @@ class NominalArm:
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Those that are commanded."""
         return tuple(self.arm.commanded)
 
     @cached_property
     def compliances(self) -> tuple[str, ...]:
-        """The arm's springs, by parameter."""
         return tuple(b.name for b in self.parameters.free if b.unit == _COMPLIANCE_UNIT and b.size == 1)
 
     def compliance(self, name: str) -> float:
@@ -94,7 +92,6 @@ class NominalArm:
 
     @cached_property
     def angles(self) -> tuple[str, ...]:
-        """The parameters of its geometry that are angles."""
         scope = f"{self.arm.name}.{self.arm.model_name}."
         return tuple(b.name for b in self.parameters.free if b.unit == "rad" and b.name.startswith(scope))
 
@@ -107,7 +104,6 @@ class NominalArm:
         return self.axes(pose)[joint]
 
     def axes(self, pose: Pose) -> dict[str, tuple[Array, Array]]:
-        """The same of all joints."""
         _, axes, origins = (np.asarray(dm.full()) for dm in self._rigid(self._commands(pose)))
         return {name: (axes[:, i], origins[:, i]) for i, name in enumerate(self.arm.joint_names)}
 
@@ -198,7 +194,6 @@ class NominalArm:
         return self.parameters.nominal()[list(self.parameters.free_entries)]
 
     def _entries(self, names: Sequence[str]) -> list[int]:
-        """Where parameters' numbers stand among the kernel's values."""
         owners = [block.name for block in self.parameters.free for _ in range(block.size)]
         return [i for name in names for i, owner in enumerate(owners) if owner == name]
 

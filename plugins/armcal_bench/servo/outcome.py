@@ -159,7 +159,6 @@ def _swept(
     settings: ServoCalibrationSettings,
     springs: Mapping[str, Springs],
 ) -> tuple[dict[str, Sweeps], dict[str, str]]:
-    """Sweeps by joint, and why others have none."""
     swept = {s.joint: sweeps_of(entries, s.joint, nominal, settings, springs.get(s.joint)) for s in servos}
     sweeps = {joint: sweep for joint, sweep in swept.items() if isinstance(sweep, Sweeps)}
     return sweeps, {joint: why for joint, why in swept.items() if isinstance(why, str)}

@@ -122,7 +122,6 @@ def _text_of(path: Path, before: str, file: ServoFile) -> str:
 
 
 def results(outcome: Outcome, changed: ServoFile) -> dict[str, Any]:
-    """Tables, boards, springs and findings, for programs; units are in the names."""
     return {
         "servos": {joint: _servo(servo, outcome, changed) for joint, servo in outcome.fit.servos.items()},
         "boards": {

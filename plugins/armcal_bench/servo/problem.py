@@ -116,11 +116,9 @@ class FitTask:
     springs: SpringRows | None = None
 
     def of(self, joint: str) -> tuple[Observation, ...]:
-        """A joint's observations."""
         return tuple(observation for observation in self.observations if observation.joint == joint)
 
     def knots_of(self, servo: KnownServo) -> Array:
-        """A trusted table keeps its own."""
         return np.array((servo.trusted_sd is None and servo.knots) or servo.table.angles)
 
 
@@ -145,11 +143,9 @@ class Unknowns:
 
     @cached_property
     def compliances(self) -> tuple[str, ...]:
-        """Parameters of the arm that are fitted beside the tables."""
         return tuple(dict.fromkeys(name for observation in self.task.observations for name in observation.sag_slopes))
 
     def pulses(self, x: Any, servo: KnownServo) -> Any:
-        """A servo's pulses at its knots (s), of a vector of floats or symbols."""
         first = self.place[servo.joint, "pulse0"]
         return x[first : first + len(self.task.knots_of(servo))] * US
 
@@ -159,7 +155,6 @@ class Unknowns:
         return 0.0 if place is None else x[place]
 
     def clock(self, x: Array, board: str) -> PulseClock:
-        """A board's clock."""
         stated = self.task.boards[board].clock
         return PulseClock(stated.oscillator_hz * float(1.0 + self.one(x, board, "clock")), stated.prescale)
 
@@ -214,15 +209,12 @@ class Residuals:
         self._values = ca.Function("residuals", [x], [ca.densify(ca.vertcat(*rows, *self._priors(x)))])
 
     def __call__(self, x: Array) -> Array:
-        """All."""
         return np.asarray(self._values(x).full()).ravel()
 
     def jacobian(self, x: Array) -> Array:
-        """Of all (residuals x unknowns)."""
         return np.asarray(self._slopes(x, 0).full())
 
     def observed(self, x: Array) -> dict[str, Array]:
-        """Of the observations, by joint."""
         parts = np.split(self(x), np.cumsum(list(self._counts.values())))[:-1]
         return dict(zip(self._counts, parts, strict=True))
 
@@ -245,7 +237,6 @@ class Residuals:
         return piecewise_linear(angles, self._unknowns.task.knots_of(servo).tolist(), pulses)
 
     def _tick(self, x: Any, board: str) -> Any:
-        """The length of a count (s)."""
         return self._unknowns.task.boards[board].clock.tick / (1.0 + self._unknowns.one(x, board, "clock"))
 
     def _priors(self, x: Any) -> Iterator[Any]:

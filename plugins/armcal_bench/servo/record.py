@@ -142,7 +142,6 @@ class Record:
 
     @property
     def entries(self) -> tuple[Mapping[str, Any], ...]:
-        """All lines, in their order."""
         return tuple(self._entries)
 
     @property
@@ -152,7 +151,6 @@ class Record:
 
     @property
     def is_measured(self) -> bool:
-        """Whether there is any line beside the first."""
         return len(self._entries) > 1
 
     def set_aside(self) -> Path:

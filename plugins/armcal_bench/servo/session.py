@@ -150,7 +150,6 @@ def _opened(
 
 @contextmanager
 def _held(mover: Mover) -> Iterator[None]:
-    """Where it is stopped the arm holds, as far as the board is there."""
     try:
         yield
     except StopRequested as stop:
@@ -165,7 +164,6 @@ def _held(mover: Mover) -> Iterator[None]:
 
 @contextmanager
 def _monitored(mover: Mover) -> Iterator[None]:
-    """With the tracker, once it gives frames that can be used."""
     gate, monitor = mover.gate, TrackerMonitor(mover.setup.bench, mover.clock)
     with closing(monitor):
         monitor.open()

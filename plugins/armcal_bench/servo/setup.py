@@ -98,12 +98,10 @@ class Setup:
         return replace(setup, ranges=setup._clear_ranges(experiment, limits))
 
     def known(self, joint: str) -> KnownServo:
-        """A servo as the file states it."""
         servo = self.file.servos[joint]
         return KnownServo(joint, servo.board, servo.table, self.settings.trusted.get(joint), self.knots_of(joint))
 
     def table_of(self, joint: str) -> tuple[PulseTable, PulseClock]:
-        """A servo's table, and the clock of its board, as the file states them."""
         servo = self.file.servos[joint]
         return servo.table, self.file.boards[servo.board].clock
 
@@ -125,7 +123,6 @@ class Setup:
         return max(borne[0], allowed[0]), min(borne[1], allowed[1])
 
     def boards(self) -> dict[str, KnownBoard]:
-        """The boards as the file states them, with the pulses measured at their pins."""
         measured: dict[str, tuple[MeasuredPulse, ...]] = {}
         for pulse in self.settings.measured_pulses:
             known = MeasuredPulse(pulse.counts, 1e-6 * pulse.microseconds, 1e-6 * pulse.sd_microseconds)
@@ -165,7 +162,6 @@ class Setup:
         return {joint: (self._end(joint, limits[joint][0]), self._end(joint, limits[joint][1])) for joint in self.base}
 
     def _end(self, joint: str, limit: float) -> float:
-        """The last angle before something comes too near, on the way from the base pose to a limit."""
         if self.planner.clear(self._pose({}), self._pose({joint: limit})):
             return limit
         start = self.base[joint]

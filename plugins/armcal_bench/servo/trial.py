@@ -81,7 +81,6 @@ class Move:
 
     @property
     def is_little(self) -> bool:
-        """Whether next to nothing moved."""
         apart = float(np.linalg.norm(self.after[:3, 3] - self.before[:3, 3]))
         if not self.has_rotations:
             return apart < _STILL_M
@@ -89,12 +88,10 @@ class Move:
 
     @property
     def has_rotations(self) -> bool:
-        """Whether the tracker sees them."""
         return not (np.isnan(self.before[0, 0]) or np.isnan(self.after[0, 0]))
 
     @cached_property
     def turn(self) -> Rotation:
-        """What takes the rotation before to the one after (one rotation); every wiring is compared with it."""
         return Rotation.from_matrix((self.after[:3, :3] @ self.before[:3, :3].T)[None])
 
 
@@ -107,7 +104,6 @@ class _Wiring:
 
     @property
     def faults(self) -> int:
-        """How many commands do not do what they should."""
         return sum(a != b for a, b in self.moves.items()) + sum(sign < 0 for sign in self.signs.values())
 
     def pose(self, base: Mapping[str, float]) -> dict[str, float]:
@@ -183,7 +179,6 @@ def permuted(entries: Sequence[Mapping[str, Any]], joints: Sequence[str], nomina
 
 
 def _score(wiring: _Wiring, seen: Sequence[Move], base: Mapping[str, float], nominal: NominalArm) -> float:
-    """How badly a wiring explains moves; less is better."""
     axes = nominal.axes(wiring.pose(base))
     score = _EACH_FAULT * wiring.faults
     for move in seen:
@@ -195,7 +190,6 @@ def _score(wiring: _Wiring, seen: Sequence[Move], base: Mapping[str, float], nom
 
 
 def _wirings(joints: tuple[str, ...]) -> Iterator[_Wiring]:
-    """All with up to three joints exchanged and up to two reversed."""
     for count in (0, 2, 3):
         for chosen in combinations(joints, count):
             for order in permutations(chosen):
@@ -223,7 +217,6 @@ def wrapped(joint: str, table: tuple[float, ...], limits: tuple[float, float]) -
 
 
 def answered(joint: str, commanded: float, ask: Callable[[str], str]) -> Verdict:
-    """The verdict of somebody who watches the arm."""
     size = f"{math.degrees(commanded):+.0f} deg"
     wish = ask(
         f"{joint} was commanded to turn by {size}. y: it did, r: the other way, o: another joint did, n: nothing moved"
@@ -234,7 +227,6 @@ def answered(joint: str, commanded: float, ask: Callable[[str], str]) -> Verdict
 
 
 def swapped(verdicts: list[Verdict]) -> list[str]:
-    """Pairs of joints that moved instead of each other, in sentences."""
     went = {v.joint: v.other for v in verdicts if v.kind == "another"}
     return [
         f"{a} and {b} are swapped: exchange their channels in the servo file, or their plugs."

@@ -50,7 +50,6 @@ class Assessment:
 
 
 def assess(visits: Visits, comparisons: Mapping[str, Comparison]) -> Assessment:
-    """All that the visits give; single models' figures by the names of the comparisons."""
     return Assessment(
         tuple(_of_pose(group, comparisons) for group in visits.groups),
         tuple(_distances(visits, comparisons)),
@@ -136,7 +135,6 @@ def _drifts(visits: Visits, comparisons: Mapping[str, Comparison]) -> Iterator[R
 
 
 def series_of(visits: Visits, group: Group) -> list[Indices]:
-    """A group's records in series of ten, in order of time; what is left over at the end belongs to none."""
     time = visits.dataset.column("time")
     ordered = group.members[np.argsort(time[group.members], kind="stable")]
     return [ordered[start : start + SERIES] for start in range(0, len(ordered) - SERIES + 1, SERIES)]

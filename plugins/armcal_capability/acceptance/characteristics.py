@@ -28,7 +28,6 @@ class Figure:
         return Figure(self.value * factor, self.low * factor, self.high * factor)
 
     def as_dict(self) -> dict[str, float | None]:
-        """For JSON, which knows no infinity."""
         return {"value": self.value, "low": self.low, "high": self.high if np.isfinite(self.high) else None}
 
 
@@ -85,13 +84,11 @@ def turn_repeatability(turns: Array) -> tuple[Figure, ...]:
 
 
 def mean_figure(values: Array) -> Figure:
-    """A mean (AD of distances, APa of angles), with Student's t."""
     half = float(quantile(RADIUS_LEVEL, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values)))
     return Figure(float(np.mean(values)), float(np.mean(values)) - half, float(np.mean(values)) + half)
 
 
 def spread_figure(values: Array) -> Figure:
-    """Three standard deviations (RD of distances, RPa of angles), with chi-square."""
     size, freedom = _TIMES * float(np.std(values, ddof=1)), len(values) - 1
     low, high = (np.sqrt(freedom / chi2.ppf(share, freedom)) for share in (_HIGH, _LOW))
     return Figure(size, size * float(low), size * float(high))

@@ -184,7 +184,6 @@ def _turns(commanded: Array, attained: Array) -> Array:
 
 
 def _left_over(fitted: int, poses: int) -> tuple[str, ...]:
-    """A warning that few numbers are left to judge by."""
     left = 1 - fitted / (3 * poses)
     if left > 0.75:
         return ()

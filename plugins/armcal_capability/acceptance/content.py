@@ -156,7 +156,6 @@ def _heading(name: str, model: str) -> str:
 
 
 def _text(figure: Figure) -> str:
-    """A number with its interval, and decimals that show two digits of the interval below it."""
     decimals = min(decimals_for(max(figure.value - figure.low, abs(figure.value) / 100)), 4)
     high = f"{figure.high:.{decimals}f}" if figure.high < _LARGEST else "?"
     return f"{figure.value:.{decimals}f} ({figure.low:.{decimals}f} to {high})"

@@ -69,16 +69,13 @@ class Visits:
 
     @property
     def poses(self) -> tuple[str, ...]:
-        """Names, in the order in which they first appear."""
         return tuple(dict.fromkeys(group.pose for group in self.groups))
 
     def main(self, pose: str) -> Group:
-        """The visits of a pose from the direction that has most of them."""
         return max((group for group in self.groups if group.pose == pose), key=len)
 
     @property
     def timed(self) -> bool:
-        """Whether the times of records are known."""
         return self.dataset.has("time")
 
 
@@ -207,7 +204,6 @@ def _split(raw: bytes, delimiter: str) -> list[str]:
 
 
 def _require_whole(dataset: Dataset, names: Sequence[str]) -> None:
-    """All columns of a commanded pose, or none."""
     there = [name for name in names if dataset.has(name)]
     if there and len(there) < len(names):
         missing = next(name for name in names if name not in there)

@@ -43,7 +43,6 @@ class ArmToJudge:
 
     @property
     def measurement(self) -> tuple[str, Measurement]:
-        """The one that is judged."""
         return next(iter(self.system.measurements.items()))
 
     @classmethod

@@ -95,7 +95,6 @@ def _evaluated(settings: RecalibrateSettings, evaluator: str | None) -> Recalibr
 
 
 def _check_out(out: Path | None, folder: Path) -> None:
-    """Nothing of a recalibration is written over."""
     if out is None:
         return
     place = out.resolve()
@@ -108,7 +107,6 @@ def _check_out(out: Path | None, folder: Path) -> None:
 
 
 def _leave(held: KeptJournal, done: JournalReplayer) -> None:
-    """End with what the replay found."""
     context = click.get_current_context()
     if held.damage is not None:
         say(f"armcal: {held.damage}", err=True)

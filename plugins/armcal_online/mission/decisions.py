@@ -37,17 +37,14 @@ class Occurrence:
 
     @property
     def time(self) -> float:
-        """When, s since the mission began."""
         return self.events[0].time
 
     @property
     def label(self) -> str:
-        """A few words."""
         return " and ".join(event.label for event in self.events)
 
     @property
     def ends(self) -> float:
-        """Until when a decision is in time (s)."""
         return max(event.until for event in self.events) + IN_TIME_S
 
     @property
@@ -56,11 +53,9 @@ class Occurrence:
         return any(event.until > event.time for event in self.events)
 
     def is_open(self, time: float) -> bool:
-        """Whether a decision now may be about it."""
         return self.time <= time < self.ends
 
     def naming(self, subject: str) -> frozenset[MissionEvent]:
-        """Those of its events that this joint, or this other thing, has."""
         return frozenset(event for event in self.events if subject in _subjects(event))
 
 
@@ -80,7 +75,6 @@ class Finding:
 
 
 def occurrences(events: Iterable[MissionEvent]) -> tuple[Occurrence, ...]:
-    """Events by their moments, in order."""
     ordered = sorted(events, key=lambda event: event.time)
     return tuple(Occurrence(tuple(group)) for _, group in groupby(ordered, key=lambda event: event.time))
 

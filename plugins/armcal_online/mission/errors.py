@@ -127,11 +127,9 @@ class Seen(Contact):
     def residual(
         self, arms: Mapping[str, ArmState], measured: Mapping[str, Expression], values: Mapping[str, Expression]
     ) -> Expression:
-        """What the instrument would read (m)."""
         return ca.vertcat(*self._instrument.outputs(arms, values).values())
 
     def noise(self) -> tuple[float, ...]:
-        """Of no meaning."""
         return (1.0,) * self._width
 
 
@@ -162,7 +160,6 @@ class Tips:
         return cls(problem, problem.records(poses))
 
     def again(self, poses: Dataset) -> Tips:
-        """The same, with deflections of its own."""
         return Tips(self.problem, self.problem.records(poses))
 
     def at(self, values: Array) -> Array:
@@ -175,7 +172,6 @@ class Tips:
 
 
 def random_poses(records: Dataset, joints: Sequence[str], arm: str, count: int, seed: int) -> Dataset:
-    """Poses uniform within the span of some records, each approached from a random side."""
     random, channels = np.random.default_rng(seed), {}
     for joint in joints:
         angles = records.column(f"{arm}.{joint}")

@@ -54,7 +54,6 @@ def write_files(folder: Path, plan: MissionPlan, result: MissionResult, content:
 
 
 def surprise_text(plan: MissionPlan) -> str:
-    """A configuration that plants the same again, beside the one that it extends."""
     name = plan.experiment.source.path.name
     above = f"# What was planted. Beside {name} this file repeats the mission, whatever later versions would draw.\n"
     content = {"extends": name, **plan.planted}

@@ -37,12 +37,10 @@ class ErrorCurve:
 
     @property
     def frozen(self) -> Array:
-        """Of the calibration before launch, m (T)."""
         return self.errors["frozen"]
 
     @property
     def recalibrated(self) -> Array:
-        """Of the recalibrated one, m (T)."""
         return self.errors[FILTER]
 
 
@@ -102,11 +100,9 @@ class Judgement:
     worst: WorstRatio | None
 
     def within(self, name: str) -> float:
-        """The share of all hours in which the error of a calibration was within the limit."""
         return float((self.curve.errors[name] <= self.limit)[self.curve.is_hour].mean())
 
     def count(self, verdict: Verdict) -> int:
-        """How many moments have this verdict."""
         return sum(report.finding.verdict == verdict for report in self.events)
 
 

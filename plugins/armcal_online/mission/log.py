@@ -45,12 +45,10 @@ class MissionLog:
     resumed: int
 
     def levels_at(self, times: Array) -> tuple[str, ...]:
-        """The level at these times."""
         return tuple(self.levels[i][1] for i in newest([time for time, _ in self.levels], times))
 
 
 def newest(known: Sequence[float], times: Array) -> list[int]:
-    """The number of the newest of some moments at each time; the first before all of them."""
     numbers: list[int] = np.maximum(np.searchsorted(np.array(known), times, side="right") - 1, 0).tolist()
     return numbers
 

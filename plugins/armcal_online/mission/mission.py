@@ -150,7 +150,6 @@ def before_launch(plan: MissionPlan, folder: Path, progress: Progress = no_progr
 def recalibrated(
     mission: Mission, calibration: Path, settings: RecalibrateSettings, session: Session, folder: Path
 ) -> MissionLog:
-    """All records through sessions that power cuts end; each resumes from the one before it."""
     incoming = as_incoming(mission.records, mission.times, mission.began)
     every = settings.model_copy(update={"output": settings.output.model_copy(update={"estimate_every_records": 1})})
     cuts = [int(np.searchsorted(mission.times, time)) for time in mission.power_cuts]

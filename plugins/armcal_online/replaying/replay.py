@@ -58,7 +58,6 @@ class JournalReplayer:
 
     @property
     def is_done(self) -> bool:
-        """Whether the replay has come to the last entry that it was given."""
         return self._until is not None and self.last >= self._until
 
     def segment(self, segment: Segment) -> None:
@@ -91,14 +90,12 @@ class JournalReplayer:
             self.last = entry.sequence
 
     def _is_beyond(self, sequence: int) -> bool:
-        """Whether an entry lies beyond the last one of the replay, which is then reached."""
         if self._until is None or sequence <= self._until:
             return False
         self.last = max(self.last, self._until)
         return True
 
     def _hold_before(self, sequence: int) -> None:
-        """Hold the state for rollbacks to come."""
         while self._targets and self._targets[0] < sequence:
             target = self._targets.pop(0)
             if target >= self.first and not self._is_lost:

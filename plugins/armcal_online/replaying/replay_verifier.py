@@ -35,11 +35,9 @@ class Distance:
 
     @property
     def is_small(self) -> bool:
-        """Whether another evaluator explains it."""
         return self.values <= BOUND and self.covariance <= BOUND
 
     def widest(self, other: Distance) -> Distance:
-        """The larger of each."""
         return Distance(max(self.values, other.values), max(self.covariance, other.covariance))
 
 
@@ -89,7 +87,6 @@ class ReplayVerifier:
         self.others: tuple[str, ...] = ()
 
     def begin_segment(self, segment: Segment) -> None:
-        """A segment, whose checkpoint comes next."""
         writer = segment.header.get("evaluator")
         self._is_new = self._writer is not None and writer != self._writer
         self._writer = writer
@@ -131,7 +128,6 @@ class ReplayVerifier:
             raise DiffersError(sequence, f"The state is {digest}, {noted} was noted.")
 
     def compare_events(self, sequence: int, noted: list[Event], replayed: list[Event]) -> None:
-        """The events of a record that were noted, and those of the replay."""
         self.decisions += len(noted)
         compared = (noted, replayed) if self._is_ours else (_without_digits(noted), _without_digits(replayed))
         if compared[0] != compared[1]:

@@ -30,7 +30,6 @@ def control_server(folder: Path, answer: Answer) -> JsonServer:
 
 
 def is_running(folder: Path) -> bool:
-    """Whether somebody listens at the socket in a folder."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         try:
             with short_address(folder / SOCKET) as address:

@@ -67,12 +67,10 @@ class Recalibration:
 
     @property
     def journal_folder(self) -> Path:
-        """Where its journal is."""
         return self._journal.folder
 
     @property
     def paused(self) -> bool:
-        """Whether records are passed over, or left where they are."""
         return self._state_replayer.progress.paused
 
     def run(self) -> None:
@@ -141,12 +139,10 @@ class Recalibration:
             self._write_status()
 
     def pause(self) -> None:
-        """Pass records over, or leave them in the source."""
         if not self.paused:
             self._command(PAUSE)
 
     def resume(self) -> None:
-        """Take records again."""
         if self.paused:
             self._command(RESUME)
 
@@ -174,7 +170,6 @@ class Recalibration:
         return str(event["sentence"])
 
     def status(self) -> dict[str, Any]:
-        """Of session, journal and source now, as JSON."""
         return {
             **self.session.status(),
             "sequence": self.sequence,
@@ -185,7 +180,6 @@ class Recalibration:
         }
 
     def write_calibration(self) -> None:
-        """Replace the updated calibration."""
         self._since_calibration = 0
         self._calibrated = time.monotonic()
         self._is_written = self._outputs.calibration(self.session.calibration_text())

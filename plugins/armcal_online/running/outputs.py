@@ -43,17 +43,14 @@ class Outputs:
 
     @property
     def calibration_path(self) -> Path:
-        """Where the calibration is."""
         return self._folder / CALIBRATION
 
     def event(self, event: Mapping[str, Any]) -> None:
-        """One event, everywhere."""
         line = as_line(event)
         self._stream_line(line)
         self._attempt("events", lambda: self._events.write(line))
 
     def status(self, status: Mapping[str, Any]) -> None:
-        """The newest status, in place of the one before."""
         data = as_line(status).encode() + b"\n"
         self._attempt("status", lambda: write_whole(self._files, self._folder / STATUS, data))
 
@@ -70,26 +67,21 @@ class Outputs:
                 write_whole(self._files, reserve, b"\0" * (len(data) + len(data) // 4 + 4096))
 
     def rotate(self) -> None:
-        """Begin a new file of events."""
         with contextlib.suppress(OSError):
             self._events.rotate()
 
     def alarm(self, sentence: str) -> None:
-        """An event for the operator."""
         self.event({"event": "alarm", "at": time.time(), "sentence": sentence})
 
     def retry(self) -> None:
-        """Try everything again that could not be written."""
         self._silent_until.clear()
 
     def make_room(self) -> None:
-        """Give up the reserve, for what is written last."""
         self.retry()
         with contextlib.suppress(OSError):
             self._files.remove(self._folder / RESERVE)
 
     def close(self) -> None:
-        """Close the file of events."""
         self._events.close()
 
     def _stream_line(self, line: str) -> None:

@@ -56,7 +56,6 @@ class Progress:
 
     @property
     def positions(self) -> dict[str, int]:
-        """The last row taken, by file; a key that begins with a slash says that all files up to a name were."""
         return {**self.rows, **({THROUGH + self.through: 0} if self.through else {})}
 
     def take(self, incoming: Incoming, sequence: int) -> None:
@@ -79,7 +78,6 @@ class Progress:
         return None if incoming.source_key or incoming.fault else self.recent.get(_mark(incoming))
 
     def as_dict(self) -> dict[str, Any]:
-        """As JSON."""
         return {
             "records": self.records,
             "paused": self.paused,
@@ -96,7 +94,6 @@ class Progress:
 
 
 def _mark(incoming: Incoming) -> str:
-    """The same for two copies of a record, and different for any others."""
     content = incoming.as_dict()
     numbers = json.dumps([content["channels"], content["labels"]], sort_keys=True)
     return f"{crc32(numbers.encode()):08x} {incoming.record_id}"
@@ -139,7 +136,6 @@ class StateReplayer:
         self.is_exact = True
 
     def checkpoint(self) -> dict[str, Any]:
-        """The whole state, for the journal."""
         return {
             "state": self._session.snapshot(),
             "digest": self._session.digest(),

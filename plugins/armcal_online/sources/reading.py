@@ -39,7 +39,6 @@ class LineReading:
 
     @property
     def begun(self) -> bool:
-        """Whether the last line has no end yet."""
         return self._cutter.begun
 
     def next(self) -> Incoming | None:
@@ -108,7 +107,6 @@ class WholeReading:
 
     @property
     def begun(self) -> bool:
-        """Whether it may yet become what it is not: it was cut short."""
         return bool(self._fault)
 
     def next(self) -> Incoming | None:

@@ -78,7 +78,6 @@ class RowParser:
         return self._record(table.plan, cells, place)
 
     def json_text(self, text: str, place: Place) -> Incoming:
-        """The record in the text of a JSON object."""
         try:
             fields = json.loads(text, object_pairs_hook=_without_repeats)
         except (ValueError, RecursionError) as fault:
@@ -167,7 +166,6 @@ class LineParser:
 
     @property
     def needs_header(self) -> bool:
-        """Whether no row can be read before the header was."""
         return self._kind == "csv" and self._table is None
 
     def record(self, line: bytes | None, place: Place) -> Incoming | None:
@@ -222,7 +220,6 @@ def _number(value: Any) -> float | CellFault:
 
 
 def _text(value: Any) -> str:
-    """A label; empty for what is none."""
     if isinstance(value, str):
         return "" if is_missing(value) else _clean(value)
     return "" if value is None or isinstance(value, dict | list) else _clean(json.dumps(value))
@@ -238,7 +235,6 @@ def _short(text: str, length: int) -> str:
 
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object, each of whose names is given once."""
     fields = dict(pairs)
     if len(fields) != len(pairs):
         names = [name for name, _ in pairs]

@@ -81,7 +81,6 @@ class Udp(Source):
 
     @property
     def address(self) -> tuple[str, int]:
-        """Host and port."""
         host, port, *_ = self._socket.getsockname()
         return str(host), int(port)
 

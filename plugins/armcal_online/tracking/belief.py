@@ -31,17 +31,14 @@ class Belief:
     gaussian: Gaussian
 
     def values(self, space: StateSpace) -> Array:
-        """Its mean as a value vector; numbers and matrices may lie outside of their domain."""
         return space.moved(self.origin, self.gaussian.mean[: len(space.scales)])
 
     def updated(self, space: StateSpace, posterior: Gaussian) -> Belief:
-        """Another belief, about an origin that has moved as the mean did, as far as the domains allow."""
         n = len(space.scales)
         step = posterior.mean[:n] - self.gaussian.mean[:n]
         return Belief(self.origin, posterior).about(space, space.inside(space.moved(self.origin, step)))
 
     def about(self, space: StateSpace, origin: Array) -> Belief:
-        """The same belief about another origin."""
         n, mean = len(space.scales), self.gaussian.mean.copy()
         mean[:n] = space.left(self.origin, mean[:n], origin)
         return Belief(origin, Gaussian(mean, self.gaussian.covariance))

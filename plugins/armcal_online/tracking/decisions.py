@@ -245,28 +245,23 @@ class Decision:
 
     @property
     def level(self) -> Level:
-        """Of health that it means."""
         return KINDS[self.kind].level or "nominal"
 
     @property
     def sentence(self) -> str:
-        """What happened, how sure that is, and why."""
         return f"{self.what}. {sure(self.log_odds)}: {self.why}."
 
 
 def per_cent(log_odds: float) -> float:
-    """The probability of something by its log odds, in per cent."""
     return 100 / (1 + math.exp(-min(max(log_odds, -700.0), 700.0)))
 
 
 def log_odds_of(by_chance: float) -> float:
-    """Log odds of what chance alone explains with a probability."""
     chance = min(max(by_chance, 1e-300), 1.0)
     return math.log1p(-chance) - math.log(chance) if chance < 1 else -700.0
 
 
 def sure(log_odds: float) -> str:
-    """How sure, in words."""
     return sure_to(per_cent(log_odds))
 
 

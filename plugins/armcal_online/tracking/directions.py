@@ -60,7 +60,6 @@ def find_causes(calibration: Calibration, space: StateSpace, offsets: Collection
 
 
 def _links(arm: Arm, space: StateSpace) -> Iterator[tuple[str, list[str]]]:
-    """The free numbers of each link, by the joint that carries it."""
     symbols = {block.name: ca.SX.sym(block.name, block.size) for block in arm.parameters()}
     chain = arm.chain(symbols)
     single = {block.name for block in space.parameters.free if block.size == 1 and block.unit in ("m", "rad")}
@@ -169,7 +168,6 @@ def _seen_causes(causes: Sequence[Cause], slopes: Array) -> tuple[Cause, ...]:
 
 
 def _probing_poses(arms: Iterable[Arm]) -> Dataset:
-    """Poses about zero within the joints' limits, approached from either side; always the same ones."""
     random, channels = np.random.default_rng(0), {}
     for arm in arms:
         limits = {joint.name: joint.limits for joint in arm.nominal_chain.joints}
@@ -184,7 +182,6 @@ def _probing_poses(arms: Iterable[Arm]) -> Dataset:
 def _whitened(
     problem: Problem, values: Array, records: Sequence[FactorRecords], channels: Sequence[str]
 ) -> list[Array]:
-    """d residual / d channels in units of the noise, by kernel (records x n_r x n_c)."""
     slopes = zip(problem.kernels, problem.channel_slopes(values, records, channels), strict=True)
     return [np.moveaxis(slope / np.array(kernel.factor.noise)[:, None, None], 2, 0) for kernel, slope in slopes]
 

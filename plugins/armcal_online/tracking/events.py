@@ -52,7 +52,6 @@ def started(
 
 
 def ignored(incoming: Incoming, state: State, why: str) -> dict[str, Any]:
-    """A record that was passed over."""
     return {**_record(incoming, state, "ignored"), "why": f"Passed over: {why.rstrip('.')}."}
 
 
@@ -125,19 +124,16 @@ def decided(state: State, decision: Decision, tip: TipError | None, calm: int) -
 
 
 def noted(state: State, kind: str, text: str, calm: int) -> dict[str, Any]:
-    """Something odd that did no harm."""
     sentence = f"{text[:1].upper()}{text[1:]}."
     texts = advice(kind, _names(state.good_before(state.sequence + 1), calm))
     return _event("decision", state, kind=kind, what=sentence, **texts, sentence=sentence)
 
 
 def last_good(state: State) -> dict[str, Any] | None:
-    """The last record that was accepted while the level was nominal and nothing was decided."""
     return _named(state.good_before(state.sequence + 1))
 
 
 def level_changed(state: State, before: str, health: Health, calm: int) -> dict[str, Any]:
-    """Health got better or worse; what to do, and the last good record."""
     good, newest = state.good_before(state.sequence), state.known(state.sequence)
     return {
         **_event("level", state),
@@ -166,7 +162,6 @@ def rolled_back(state: State, sequence: int, to: int, calm: int) -> dict[str, An
 
 
 def record_name(sequence: int, arrival: Arrival | None) -> str:
-    """A record by its own name and time, beside its number."""
     if arrival is None:
         return f"entry {sequence}"
     return f"record {arrival.record_id} ({spoken_time(arrival.at)}, entry {sequence})"
@@ -180,7 +175,6 @@ def spoken_time(at: float) -> str:
 
 
 def _names(good: Arrival | None, calm: int) -> dict[str, Any]:
-    """What an advice names."""
     if good is None:
         return {"calm": calm, "good": "the calibration that it began from"}
     return {"calm": calm, "good": record_name(good.sequence, good)}

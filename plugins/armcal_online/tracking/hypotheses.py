@@ -52,12 +52,10 @@ class Hypothesis:
 
     @property
     def singles(self) -> tuple[Hypothesis, ...]:
-        """The single changes in it."""
         return self.parts or (self,)
 
     @property
     def is_simple(self) -> bool:
-        """Whether it is one change, of a joint, an instrument or everything."""
         return not self.parts and self.kind not in CAUSES
 
 
@@ -166,7 +164,6 @@ def slow_changes(
 
 
 def _deviations(cause: Cause, space: StateSpace, settings: ChangeSettings) -> dict[int, float]:
-    """Standard deviations of what a cause changes, by coordinate (scaled)."""
     payload, units = settings.payload, [block.unit for block in space.parameters.coordinate_blocks]
     by_unit = {"kg": payload, "kg_m": payload * settings.payload_lever}
     by_unit |= {"m": settings.link_length, "rad": settings.link_angle}

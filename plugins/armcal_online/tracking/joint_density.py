@@ -58,7 +58,6 @@ class JointDensity:
 
 
 def _solved(covariance: Array, innovation: Array) -> tuple[float, float]:
-    """Squared Mahalanobis distance, and the covariance's log determinant."""
     if not len(innovation):
         return 0.0, 0.0
     root, weighted, fault = dposv(covariance, innovation)

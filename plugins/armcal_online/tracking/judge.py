@@ -149,7 +149,6 @@ class Judge:
         return sorted([*singles, *double], key=lambda explanation: -explanation.log_odds)
 
     def _is_explaining(self, state: State, best: Explanation) -> bool:
-        """Whether enough records agree on a change, and it explains enough of their misfit."""
         # Where the model is slightly wrong, as neighbours that err alike show, large NIS alone are no evidence.
         agreeing = best.rejected if self._filter.is_model_wrong else best.large
         late = state.changes and state.sequence - state.changes[-1] < 2 * self._settings.gate.window
@@ -302,7 +301,6 @@ class Judge:
 
 
 def _others(explanations: Sequence[Explanation], alike: Sequence[Explanation]) -> list[Explanation]:
-    """What else it may have been; a change with another one beside it is nothing else."""
     subjects = {explanation.hypothesis.subject for explanation in alike}
     return [
         explanation

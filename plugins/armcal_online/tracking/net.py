@@ -87,7 +87,6 @@ class Net:
         return after, (decision,)
 
     def _predicted(self, state: NetState, record: NetRecord, filtered: Belief) -> NetState:
-        """With a record predicted by all, before any of them has used it; the filter knows what neighbours share."""
         beside = np.zeros(self._beside)
         points = [(refit.origin, np.concatenate([refit.mean, beside])) for refit in state.refits]
         errors = [self._miss(*point, record) for point in ((filtered.origin, filtered.gaussian.mean), *points)]

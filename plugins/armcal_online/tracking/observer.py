@@ -150,7 +150,6 @@ class Observer:
         return tuple(added)
 
     def _repeated(self, values: Array, reading: Reading) -> tuple[Kernel, Array, Array, Array]:
-        """A reading's kernel, its values, and as many copies of record and state as a compiled function takes."""
         kernel, grouped = self.problem.kernels[reading.factor], self.problem.grouped[reading.factor]
         record = np.repeat(reading.record[:, None], LANES, axis=1)
         return kernel, grouped.values(values, reading.group), record, np.zeros((kernel.factor.state.numel(), LANES))
@@ -187,7 +186,6 @@ class Observer:
         return residual, slope.reshape(*jacobian.shape[:2], -1)
 
     def observation(self, belief: Belief, readings: tuple[Reading, ...], noise: JointNoise = ()) -> RecordObservation:
-        """A record for estimators whose belief this is."""
         return RecordObservation(self, belief.origin, belief.gaussian.mean, readings, noise)
 
 
@@ -222,7 +220,6 @@ class RecordObservation(Observation):
         return self._last[key]
 
     def _place(self, point: Array) -> tuple[Array, Array]:
-        """Values within their domains at which a point is evaluated, and scaled coordinates of the way on to it."""
         observer, space = self.observer, self.observer.space
         n = len(space.scales)
         which, coordinate, size = observer.drifts

@@ -63,12 +63,10 @@ class GaussMarkovStates:
         return np.array(which, dtype=np.intp), np.array(coordinate, dtype=np.intp), np.array(size)
 
     def shifts(self, instance: str, rows: int) -> Array:
-        """How they shift one measurement's residual (rows x m)."""
         columns = [s.shift if s.instance == instance else (0.0,) * rows for s in self.states]
         return np.array(columns).reshape(len(self.states), rows).T
 
     def kept(self, passed: Mapping[str, float]) -> Array:
-        """How much of each is left after some distance in each channel (m)."""
         return kept(np.array([max(passed.get(s.channel, 0.0), 0.0) / s.over for s in self.states]))
 
 

@@ -86,7 +86,6 @@ class Recalibrator:
 
     @property
     def request(self) -> ReadRequest:
-        """The channels that its records may hold."""
         return self.setup.request
 
     @property
@@ -96,7 +95,6 @@ class Recalibrator:
 
     @property
     def values(self) -> Array:
-        """The most likely values within all bounds (all canonical entries)."""
         return most_likely(self.setup.space, self.state.belief)
 
     @property
@@ -200,7 +198,6 @@ class Recalibrator:
         return tuple(record_events)
 
     def _beside_model_error(self, decision: Decision, gated: State, after: Belief) -> Decision:
-        """A decision that names something, with the model's own error considered too."""
         if not (decision.subject or decision.candidates or decision.kind == "general_change"):
             return decision
         since = [record for record in gated.recent if record.sequence >= decision.since]
@@ -252,7 +249,6 @@ class Recalibrator:
         return (*ignored, *(events.decided(self.state, decision, None, calm) for decision in decisions))
 
     def started_event(self, resumed: bool) -> dict[str, Any]:
-        """The first event of a process."""
         slowest = self._slow.slowest(_WEEK, self.settings.changes.odds)
         return events.started(self.state, self.setup, self.settings, self.estimate, resumed, self.steps, slowest)
 
@@ -261,7 +257,6 @@ class Recalibrator:
         return events.rolled_back(self.state, sequence, to, self.settings.levels.calm)
 
     def status(self) -> dict[str, Any]:
-        """Health, counts and estimate now, as JSON."""
         state = self.state
         return {
             "level": state.health.level,
@@ -274,7 +269,6 @@ class Recalibrator:
         }
 
     def snapshot(self) -> dict[str, Any]:
-        """The state as JSON, to the last bit."""
         return self.state.as_dict()
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -300,11 +294,9 @@ class Recalibrator:
         self.state = state
 
     def digest(self) -> str:
-        """A hash of the state."""
         return self.state.digest()
 
     def calibration_text(self) -> str:
-        """The updated calibration, as the text of its file."""
         state = self.state
         source = {
             "records": dict(state.counts),

@@ -74,7 +74,6 @@ class Innovations:
 
     @property
     def whole(self) -> bool:
-        """Whether all are finite."""
         return bool(np.isfinite(self.numbers).all() and np.isfinite(self.slopes).all())
 
     def scale(self, taken: float = 0.0) -> float:
@@ -101,7 +100,6 @@ class Prior:
 
     @classmethod
     def of(cls, belief: Belief) -> Prior:
-        """With directions that are known exactly made known to a millionth of their typical scale."""
         covariance = belief.gaussian.covariance + _FLOOR * np.eye(len(belief.gaussian.mean))
         information = cho_solve(cho_factor(covariance), np.eye(len(covariance)))
         return cls(belief, 0.5 * (information + information.T))
@@ -176,7 +174,6 @@ class Refitter:
         return float(relative) / median_norm(len(dimensions)), float(np.linalg.norm(lengths))
 
     def started(self, starts: Sequence[Refit], records: Sequence[NetRecord]) -> Refit:
-        """The start at which the median innovation is smallest, the first of those that are alike."""
         best, least = starts[0], np.inf
         for start in starts:
             try:
@@ -259,7 +256,6 @@ class Refitter:
         return refit.mean - prior.belief.about(self._observer.space, refit.origin).gaussian.mean
 
     def _moved(self, refit: Refit, step: Array) -> Refit:
-        """A step further, its origin within the domains."""
         space = self._observer.space
         origin = space.inside(space.moved(refit.origin, step))
         return replace(refit, origin=origin, mean=space.left(refit.origin, refit.mean + step, origin))

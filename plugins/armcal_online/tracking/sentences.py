@@ -73,7 +73,6 @@ def together(
 
 
 def slow(change: Hypothesis, size: Size, since: int, records: int, log_odds: float, next_likeliest: str) -> Decision:
-    """A small or slow change that many records speak for."""
     why = f"no single one of the {records} records since shows it, but all of them together do"
     why += f"; the next likeliest is {spoken(next_likeliest)}" if next_likeliest else ""
     return Decision(change.kind, _happened(change, size), why, log_odds, since, change.subject, (change.subject,), size)
@@ -100,7 +99,6 @@ def named(state: State, change: Hypothesis, others: Sequence[str], margin: float
 
 
 def drift(state: State, count: int, ratio: float, by_chance: float, factor: float) -> Decision:
-    """The NIS as a whole is too large."""
     what = f"The last {count} records miss by more than stated, although no single one does by much"
     why = (
         f"their mean normalised innovation squared is {ratio:.1f} times what chance makes it; parameters move faster "
@@ -120,7 +118,6 @@ def unexplained(state: State, rejected: int, by_chance: float, best: Explanation
 
 
 def no_longer_fits(state: State, steps: Steps, why: str, log_odds: float, since: int | None = None) -> Decision:
-    """No change that is followed here explains the records."""
     unfollowed = f"; steps of {', '.join(steps.unfollowed)} cannot be followed" if steps.unfollowed else ""
     first = _first_rejected(state) if since is None else since
     return Decision("model_no_longer_fits", "The model no longer fits the records", why + unfollowed, log_odds, first)
@@ -143,7 +140,6 @@ def beside_model_error(decision: Decision, far: float, log_likelihood: float, se
 
 
 def _against(alike: Sequence[Explanation], others: Sequence[Explanation]) -> float:
-    """Log odds of some hypotheses together against no change and all others."""
     rest = [0.0, *(explanation.log_odds for explanation in others)]
     return float(logsumexp([explanation.log_odds for explanation in alike]) - logsumexp(rest))
 
@@ -153,7 +149,6 @@ def _first_rejected(state: State) -> int:
 
 
 def first_of(state: State, count: int) -> int:
-    """The number of the first of the last records, as far as they are remembered."""
     return state.ids[-min(count, len(state.ids))].sequence if state.ids else state.sequence
 
 

@@ -62,7 +62,6 @@ def size_of(space: StateSpace, steps: Steps, before: Belief, after: Belief, chan
 
 
 def rate_of(steps: Steps, change: Hypothesis, size: Array, covariance: Array) -> Size:
-    """How fast a gradual change goes on, by its size and covariance in standard deviations (k, k x k)."""
     rates = np.array(change.rates)
     moved, own = size * rates, covariance * np.outer(rates, rates)
     is_length = change.kind == "sensor_drifting" or steps.dimension(change.subject) == "length"
@@ -100,7 +99,6 @@ def _of_link(space: StateSpace, steps: Steps, moved: Array, covariance: Array, s
 
 
 def _along(along: Array, moved: Array, covariance: Array) -> tuple[float, float]:
-    """The length of a motion along a direction, and its standard deviation."""
     return float(along @ moved), math.sqrt(max(float(along @ covariance @ along), 0.0))
 
 

@@ -103,7 +103,6 @@ class SlowChanges:
         return replace(state, tracks=tracks)
 
     def carried(self, state: SlowState, belief: Belief, seconds: float) -> Belief:
-        """A belief that trends have carried on for some time."""
         if state.trend is None or state.wander is None or seconds <= 0:
             return belief
         n, mean, covariance = len(state.trend), belief.gaussian.mean.copy(), belief.gaussian.covariance.copy()

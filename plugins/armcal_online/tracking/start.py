@@ -113,7 +113,6 @@ def filter_setup(
 
 
 def _calibrated(calibration: Calibration) -> set[str]:
-    """The parameters that were free in the calibration."""
     return {entry.name.partition("[")[0] for entry in calibration.record.parameters if entry.free}
 
 
@@ -207,7 +206,6 @@ def _freedoms(calibration: Calibration, names: Iterable[str]) -> dict[str, float
 
 
 def _drifts(calibration: Calibration, space: StateSpace) -> tuple[GaussMarkovState, ...]:
-    """The parameters that drifted in the calibration drift anew."""
     recording = calibration.uncertainty.record.recording
     if recording is None:
         return ()
@@ -219,7 +217,6 @@ def _drifts(calibration: Calibration, space: StateSpace) -> tuple[GaussMarkovSta
 
 
 def _noise_scale(calibration: Calibration) -> float:
-    """Of the residuals against the noise that was stated."""
     return float(calibration.record.noise.get("scale") or 1.0)
 
 
@@ -234,7 +231,6 @@ def _full_record(calibration: Calibration, measurements: Mapping[str, Measuremen
 
 
 def _defaults(calibration: Calibration) -> dict[str, float]:
-    """Channels that a record may leave out, and what then holds."""
     environment = calibration.system.environment
     vectors = (environment.gravity, environment.payload_com, environment.force, environment.torque)
     components = {

@@ -151,11 +151,9 @@ class State:
     slow: SlowState = field(default_factory=SlowState)
 
     def following(self, belief: Belief, **changes: Any) -> State:
-        """With another belief in place of what the records made, and of those that the estimator holds."""
         return replace(self, belief=belief, anchor=belief, held=(), **changes)
 
     def known(self, sequence: int) -> Arrival | None:
-        """The record of a number, if it is remembered."""
         return next((arrival for arrival in reversed(self.ids) if arrival.sequence == sequence), None)
 
     def good_before(self, sequence: int) -> Arrival | None:
@@ -164,7 +162,6 @@ class State:
         return next(earlier, self.good if self.good is not None and self.good.sequence < sequence else None)
 
     def as_dict(self) -> dict[str, Any]:
-        """As JSON, to the last bit."""
         content = _encoded(self)
         content["nis"] = content.pop("nis_window")
         return {**content, "anchor": content["anchor"] if self.held else None}
@@ -200,7 +197,6 @@ class State:
 
 
 def remembering(state: State, arrival: Arrival) -> State:
-    """The state with one more record; the oldest is forgotten, but for the last good one."""
     ids = (*state.ids, arrival)
     gone = [earlier for earlier in ids[:-REMEMBERED] if earlier.is_good]
     return replace(state, ids=ids[-REMEMBERED:], good=gone[-1] if gone else state.good)

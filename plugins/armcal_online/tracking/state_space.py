@@ -35,23 +35,19 @@ class StateSpace:
 
     @cached_property
     def entries(self) -> Indices:
-        """Positions of the free entries in a value vector."""
         return np.array(self.parameters.free_entries, dtype=np.intp)
 
     @cached_property
     def _blocks(self) -> tuple[tuple[ParameterBlock, slice, slice], ...]:
-        """The free blocks, with their places in a value vector and among the coordinates."""
         own = self.parameters
         return tuple((block, own.entries_of(block.name), own.coordinates_of[block.name]) for block in own.free)
 
     @cached_property
     def _turning(self) -> tuple[tuple[ParameterBlock, slice, slice], ...]:
-        """Blocks that do not just add."""
         return tuple(b for b in self._blocks if not isinstance(b[0].domain, (Interval, Semidefinite)))
 
     @cached_property
     def _adding(self) -> tuple[Indices, Indices]:
-        """Positions in a value vector, and among the coordinates, of numbers that add."""
         adding = [b for b in self._blocks if isinstance(b[0].domain, (Interval, Semidefinite))]
         return _positions(entries for _, entries, _ in adding), _positions(coordinates for _, _, coordinates in adding)
 
@@ -83,7 +79,6 @@ class StateSpace:
         return left
 
     def by_coordinates(self, values: Array, jacobian: Array) -> Array:
-        """A Jacobian by free entries at a value vector (m x n_v) as one by scaled coordinates (m x n)."""
         chain = self.chain(values)
         return np.asarray(jacobian * self.scales if chain is None else jacobian @ chain)
 
@@ -109,7 +104,6 @@ class StateSpace:
         return np.asarray(inverse @ covariance @ inverse.T)
 
     def to_entries(self, values: Array, covariance: Array) -> Array:
-        """A covariance of scaled coordinates as one of the free entries."""
         chain = self.chain(values)
         if chain is None:
             return np.asarray(covariance * np.outer(self.scales, self.scales))
@@ -117,7 +111,6 @@ class StateSpace:
 
     @cached_property
     def cones(self) -> tuple[tuple[slice, slice], ...]:
-        """Of semidefinite blocks, the places in a value vector and among the coordinates."""
         return tuple((e, c) for block, e, c in self._blocks if isinstance(block.domain, Semidefinite))
 
     @cached_property

@@ -25,7 +25,6 @@ _LEAST_MASS = 0.005
 
 
 def deviations(space: StateSpace, belief: Belief) -> Array:
-    """Standard deviations of the free entries."""
     n = len(space.scales)
     covariance = space.to_entries(belief.values(space), belief.gaussian.covariance[:n, :n])
     return np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -119,7 +118,6 @@ def _statics(calibration: Calibration, setup: FilterSetup, values: Array) -> dic
 
 
 def _square_root(scales: Array, covariance: Array) -> tuple[tuple[float, ...], ...]:
-    """R with R'R the information on the coordinates; directions that are known exactly are left out."""
     size, directions = np.linalg.eigh(covariance)
     known = size > _FLOOR * max(float(size[-1]), _FLOOR)
     inverse = np.where(known, 1 / np.sqrt(np.where(known, size, 1.0)), 0.0)

@@ -233,7 +233,6 @@ class HypothesisFilter:
         return candidate
 
     def step(self, candidate: Candidate, record: Recent) -> Candidate:
-        """A hypothesis after the next record."""
         return self._absorbed(
             replace(candidate, belief=self._process_noise.faded(candidate.belief, record.passed)), record
         )
@@ -255,7 +254,6 @@ class HypothesisFilter:
         return Candidate(candidate.place, candidate.log_evidence + float(max(within, outside)), belief)
 
     def freedom(self, record: Recent) -> float:
-        """Degrees of freedom with which the noise of a record is known."""
         return self._observer.freedom(record.readings)
 
     def _outlier_covariance(self, record: Recent) -> Array:

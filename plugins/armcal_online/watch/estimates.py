@@ -33,7 +33,6 @@ class Thinned(Generic[T]):
         self._shorten = shorten
 
     def add(self, item: T) -> None:
-        """The newest item."""
         self._recent.append(item)
         if len(self._recent) <= self._most[0]:
             return
@@ -111,7 +110,6 @@ class Estimates:
         return self._row(event, estimates, step)
 
     def state(self) -> dict[str, Any]:
-        """For pages."""
         return {"parameters": [followed.state() for followed in self._followed.values()], "rows": list(self._rows)}
 
     @property
@@ -163,7 +161,6 @@ class Estimates:
 
 
 def _shown(unit: Any) -> tuple[str, str, float]:
-    """The unit as given, the one shown, and the factor between them."""
     name = text(unit) or ""
     if name not in UNITS:
         return name, name, 1.0

@@ -33,7 +33,6 @@ def parsed(line: bytes | str) -> Mapping[str, Any] | None:
 
 
 def number(value: Any) -> float | None:
-    """A finite number."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return None
     try:
@@ -72,7 +71,6 @@ def scalar(value: Any) -> bool | float | str | None:
 
 
 def vector(value: Any) -> list[float] | None:
-    """A list of three finite numbers."""
     if not isinstance(value, (list, tuple)) or len(value) != 3:
         return None
     known = [finite for item in value if (finite := number(item)) is not None]
@@ -119,7 +117,6 @@ def named_record(value: Any) -> Message | None:
 
 
 def shortened(record: Message) -> Message:
-    """What is kept of a record that is no longer one of the newest."""
     keys = ("event", "step", "sequence", "at", "verdict", "nis", "limit", "id", "level", "off_mm")
     return {key: record[key] for key in keys if key in record}
 
@@ -142,7 +139,6 @@ def message_of(event: Mapping[str, Any]) -> Message | None:
 
 
 def _sentence(message: Message) -> str:
-    """For an event that brings none."""
     if message["event"] == "started":
         return "The recalibration went on." if "resumed" in message else "The recalibration started."
     if message["event"] == "calibration":

@@ -152,17 +152,14 @@ class Feed:
         return f"{self._run}-{self._number}"
 
     def _renew(self) -> None:
-        """There is something new for pages."""
         self._number += 1
         self._changed.notify_all()
 
     @staticmethod
     def _since(moment: float) -> float:
-        """Seconds; none where clocks disagree."""
         return round(max(0.0, time.time() - moment), 1)
 
     def _find_units(self) -> None:
-        """In the calibration, those of parameters that no event gave."""
         estimates, path = self.history.estimates, self.folder / CALIBRATION
         if not estimates.without_unit or time.monotonic() < self._units_after or not path.exists():
             return
@@ -170,7 +167,6 @@ class Feed:
         estimates.add_units(units_of(path))
 
     def _read_truth(self) -> bool:
-        """Whether a simulated mission has another truth."""
         try:
             written = (self.folder.parent / MISSION).stat().st_mtime_ns
         except OSError:

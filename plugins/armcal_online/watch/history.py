@@ -94,7 +94,6 @@ class History:
         return {**known, "life": life, "over": ending}
 
     def over_time(self, truth: Truth | None, since: int = 0) -> dict[str, Any]:
-        """How far off, hour by hour; of the hours those after a step, and the truth with all of them."""
         known = over_time(self.hours, truth)
         return {**known, "rows": _newer(known["rows"], since), "truth": None if since else known["truth"]}
 
@@ -169,5 +168,4 @@ class History:
 
 
 def _newer(items: Iterable[Message], since: int) -> list[Message]:
-    """What was taken after a step."""
     return [item for item in items if item["step"] > since or not since]

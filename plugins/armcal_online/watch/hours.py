@@ -42,14 +42,12 @@ class Hour:
     _median: float | None = None
 
     def take(self, off_mm: float, level: int, step: int) -> None:
-        """A reading."""
         self.count, self.step = self.count + 1, step
         self.level = max(self.level, level)
         if len(self.sizes) < _MOST_SIZES:
             self.sizes.append(off_mm)
 
     def close(self) -> None:
-        """Keep the median alone."""
         self._median, self.sizes = self.median, []
 
     @property
@@ -59,7 +57,6 @@ class Hour:
 
     @property
     def row(self) -> dict[str, Any]:
-        """For pages."""
         known = {"at": self.at, "mm": rounded(self.median, 4), "count": self.count, "level": LEVELS[self.level]}
         return {**known, "step": self.step}
 
@@ -84,7 +81,6 @@ class Hours:
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """All hours, in order."""
         return [hour.row for hour in self._hours]
 
 
@@ -142,7 +138,6 @@ def over_time(hours: Hours, truth: Truth | None) -> dict[str, Any]:
 
 
 def _spans(off: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Hours that follow each other, as spans with the largest error."""
     spans: list[dict[str, Any]] = []
     for row in off:
         if spans and row["at"] <= spans[-1]["to"] + 0.5 * HOUR_S:

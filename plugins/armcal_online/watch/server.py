@@ -68,7 +68,6 @@ class Access:
 
     @classmethod
     def of(cls, host: str) -> Access:
-        """With a new token where others can reach the address."""
         return cls(host, None if is_loopback(host) else token_urlsafe(24))
 
     def allows(self, host_header: str | None, token: str | None) -> bool:
@@ -84,7 +83,6 @@ class Access:
 
 
 def page() -> tuple[bytes, str]:
-    """The page as it is sent, put together from the files of this package, and its Content-Security-Policy."""
     style, script = _file("page.css"), "\n".join(_file(name) for name in SCRIPTS)
     html = _file("page.html").replace("/* style */", style).replace("/* script */", script)
     policy = (
@@ -139,14 +137,12 @@ class WatchServer(ThreadingHTTPServer):
 
     @property
     def address(self) -> str:
-        """What to open in a browser."""
         host = socket.gethostname() if self.access.host in ("0.0.0.0", "::") else self.access.host
         host = f"[{host}]" if ":" in host else host
         query = f"?token={self.access.token}" if self.access.token else ""
         return f"http://{host}:{self.server_port}/{query}"
 
     def server_bind(self) -> None:
-        """Without asking a name server for this machine's name."""
         socket.socket.setsockopt(self.socket, socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
         self.server_address = self.socket.getsockname()
@@ -163,11 +159,9 @@ class WatchServer(ThreadingHTTPServer):
         super().process_request(request, client_address)
 
     def service_actions(self) -> None:
-        """However slowly a request trickles in, its time ends."""
         self._drop_unfinished(time.monotonic(), MOST_CONNECTIONS)
 
     def _drop_unfinished(self, until: float, most: int) -> None:
-        """The oldest connections whose request had to be here by then; their threads read an end and leave."""
         late = [request for request, due in [*self.due.items()] if due < until]
         for request in late[:most]:
             self.due.pop(request, None)
@@ -175,7 +169,6 @@ class WatchServer(ThreadingHTTPServer):
                 request.shutdown(socket.SHUT_RDWR)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Give the place back when a connection ends."""
         try:
             super().process_request_thread(request, client_address)
         finally:
@@ -190,7 +183,6 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "armcal", ""
 
     def setup(self) -> None:
-        """A client that stalls is dropped."""
         super().setup()
         self.connection.settimeout(self.server.patience)
 

@@ -61,7 +61,6 @@ class Trouble:
         self._events: deque[Message] = deque(maxlen=_MOST)
 
     def take(self, message: Message) -> None:
-        """A decision or a change of level, in order."""
         level = meant_level(message)
         if (message["event"] == "level" and level == "nominal") or message.get("kind") == "rollback":
             self.first, self.over = None, message
@@ -140,7 +139,6 @@ def _first_record(message: Message) -> int:
 
 
 def _what(decision: Message) -> str:
-    """What was decided, and how sure that is."""
     sure = f" {sure_to(decision['sure_percent'])}." if decision.get("sure_percent") is not None else ""
     return f"{decision.get('what') or decision['sentence']}{sure}"
 

@@ -88,7 +88,6 @@ def _off(now: Mapping[str, Any]) -> str:
 
 
 def _off_at_nominal(known: Mapping[str, Any]) -> str:
-    """The hours in which the level was nominal, and the tip off all the same."""
     spans = known["off"]
     if not spans:
         return ""
@@ -98,7 +97,6 @@ def _off_at_nominal(known: Mapping[str, Any]) -> str:
 
 
 def _known(record: Mapping[str, Any] | None) -> str:
-    """A record by its own name, its time and its entry."""
     if not record:
         return ""
     own = [str(record["id"])] if "id" in record else []
@@ -116,7 +114,6 @@ def _span(seconds: float) -> str:
 
 
 def _strip(records: Sequence[Mapping[str, Any]], width: int) -> Text:
-    """NIS against the gate, a character a record; a full block is at the gate or above."""
     text = Text("NIS to gate, logarithmic: ", style="dim")
     for record in records[-max(10, width - 28) :]:
         nis, limit, bar = record.get("nis") or 0.0, record.get("limit") or 0.0, "."

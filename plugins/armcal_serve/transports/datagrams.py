@@ -49,7 +49,6 @@ class Datagrams(Transport):
     @property
     @override
     def clients(self) -> int:
-        """Those that wait for an answer."""
         return len(self._senders)
 
     @property
@@ -62,7 +61,6 @@ class Datagrams(Transport):
         self._poller.watch(self._socket, self._read)
 
     def poll(self) -> None:
-        """Forget senders that were answered."""
         for sender, conversation in [*self._senders.items()]:
             if not conversation.open:
                 del self._senders[sender]

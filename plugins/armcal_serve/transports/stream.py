@@ -59,12 +59,10 @@ class StreamClient:
 
     @property
     def finished(self) -> bool:
-        """Whether all requests were answered, and the answers taken."""
         return not (self._lines or self.conversation.open or self._out)
 
     @property
     def stuck_s(self) -> float:
-        """How long answers have been unread (s)."""
         return time.monotonic() - self.progress_at if self._out else 0.0
 
     @property
@@ -74,21 +72,17 @@ class StreamClient:
 
     @property
     def line_pending(self) -> bool:
-        """Whether it has yet to end its first line, or one that it began."""
         return not self.input_ended and (not self.has_sent_line or self._cutter.begun)
 
     def dismiss(self, why: ArmcalError) -> None:
-        """Answer with the reason, and read no further requests."""
         self._dispatcher.refuse(self.conversation, why)
         self.stop_reading()
 
     def stop_reading(self) -> None:
-        """Take no further requests."""
         self.input_ended = True
         self.arrange()
 
     def end(self) -> None:
-        """Drop its requests and answers."""
         self.ended = True
         self.conversation.end()
         self._out.clear()

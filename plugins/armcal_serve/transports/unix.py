@@ -96,7 +96,6 @@ class UnixSocket(Transport):
             client.stop_reading()
 
     def close(self) -> None:
-        """Take the socket away."""
         for connection, client in self._clients.items():
             if not client.ended:
                 client.end()

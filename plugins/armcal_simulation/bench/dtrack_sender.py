@@ -116,7 +116,6 @@ class DTrackSender:
                 self._socket.sendto(self._under_way.popleft()[1], self._address)
 
     def close(self) -> None:
-        """Let go of the socket; may be called twice."""
         self._socket.close()
 
     def _seen(self, bodies: Mapping[str, Array | None], elapsed: float) -> dict[int, Array | None]:

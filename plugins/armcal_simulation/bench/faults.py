@@ -83,10 +83,8 @@ class FaultCalendar:
             heappush(self._waiting, (fault.at, self._planned, fault))
 
     def next_event(self) -> float:
-        """When the next is due."""
         return self._waiting[0][0] if self._waiting else math.inf
 
     def run(self) -> None:
-        """Do what is due."""
         while self._waiting and self._waiting[0][0] <= self._clock():
             self._apply(heappop(self._waiting)[2])

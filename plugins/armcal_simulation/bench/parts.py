@@ -31,7 +31,6 @@ _JointSettings = TypeVar("_JointSettings", bound=ServoJointSettings)
 
 
 def merged(joints: Mapping[str, _JointSettings], joint: str, made: type[_JointSettings]) -> _JointSettings:
-    """A joint's own settings above those of all."""
     stated = [joints[name] for name in (ALL, joint) if name in joints]
     return made.si(**{key: getattr(settings, key) for settings in stated for key in settings.model_fields_set})
 
@@ -149,7 +148,6 @@ def physics_of(
 
 
 def bounds_of(experiment: Experiment, pulses: Mapping[str, tuple[float, float]]) -> Bounds:
-    """What the plan allows, and what the servos bear (pulses, s)."""
     plan = experiment.settings.plan
     if plan is None:
         return Bounds({}, None, pulses)

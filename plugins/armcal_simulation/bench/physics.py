@@ -29,7 +29,6 @@ class Torques:
         self._function = BoundFunction(function)
 
     def __call__(self, angles: Sequence[float]) -> list[float]:
-        """See above."""
         self._function.inputs[0][:] = angles
         self._function.evaluate()
         return [float(torque) for torque in self._function.outputs[0][0]]
@@ -75,12 +74,10 @@ class BenchPhysics:
             servo.approach = 0
 
     def next_event(self) -> float:
-        """When something of the physics is due (s)."""
         due = min(self._frames * self._frame_s, self._slow * SLOW_S)
         return min(due, self._now + FALL_STEP_S) if self._yielding else due
 
     def commands_changed(self) -> None:
-        """To be called when servos are sent elsewhere, or are let go."""
         self._yielding = self._gives_way()
 
     def move_to(self, now: float) -> None:

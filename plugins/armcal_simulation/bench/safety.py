@@ -122,7 +122,6 @@ class Safety:
         self._moved = True
 
     def failed(self, joint: str, now: float, heat: float) -> None:
-        """A servo burnt out."""
         self._offend("heat", joint, now, heat, 1.0)
 
     def passed(self, now: float) -> None:
@@ -139,7 +138,6 @@ class Safety:
                 self.judge_clearance()
 
     def judge_clearance(self) -> None:
-        """Judge the poses that wait for it; many at once are cheaper."""
         check, poses = self._bounds.clearance, self._poses
         if check is None or not poses:
             return
@@ -194,8 +192,6 @@ class Safety:
 
 
 def appended_to(path: Path) -> Callable[[str], None]:
-    """A log that appends lines to a file."""
-
     def log(line: str) -> None:
         with path.open("a", encoding="utf-8") as file:
             file.write(line + "\n")

@@ -32,7 +32,6 @@ Split = Callable[[bytes], tuple[list[bytes], bytes]]
 
 
 def delimited(delimiter: int) -> Split:
-    """How messages are told apart that end with a byte."""
     end = bytes((delimiter,))
 
     def split(data: bytes) -> tuple[list[bytes], bytes]:
@@ -67,7 +66,6 @@ class FaultyStream:
         self._plans.append(_Plan(kind, after, count, frames))
 
     def clear(self) -> None:
-        """No more faults; what was held back is lost."""
         self._plans.clear()
         self._unfinished = self._held = self._late = b""
 
@@ -147,7 +145,6 @@ class SerialLine:
         return int.from_bytes(fcntl.ioctl(self._master, _TCGETS2, bytes(_TERMIOS2_SIZE))[-4:], sys.byteorder)
 
     def plug_in(self) -> None:
-        """A new pty under the path; the one before is gone."""
         self.unplug()
         self._master, slave = os.openpty()
         self._ports += 1
@@ -201,7 +198,6 @@ class SerialLine:
         self._waiting = self._waiting[-_MOST_WAITING:]
 
     def flush(self) -> None:
-        """Try again to send what the host's buffer had no room for."""
         while self._waiting and self._master is not None:
             try:
                 self._waiting = self._waiting[os.write(self._master, self._waiting) :]

@@ -81,7 +81,6 @@ class JointServo:
 
     @property
     def powered(self) -> bool:
-        """Whether it holds anything."""
         return self.target is not None and not self.failed
 
     def angle_of(self, command: float) -> float:
@@ -149,7 +148,6 @@ class ServoModel(JointServo):
         return a0 + (command - p0) * (a1 - a0) / (p1 - p0)
 
     def set_pulse(self, pulse: float | None) -> None:
-        """Other pulses (s), or none."""
         low, high = self.stops
         self.target = None if pulse is None else min(max(self.angle_of(pulse), low), high)
 

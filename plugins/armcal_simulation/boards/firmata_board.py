@@ -29,7 +29,6 @@ class FirmataBoard:
         self._buffer = bytearray(_LONGEST_SYSEX)
 
     def boot(self) -> None:
-        """Forget all, and report version and firmware."""
         self._sysex, self._configured = None, False
         self._report_version()
         self._report_firmware()
@@ -53,7 +52,6 @@ class FirmataBoard:
                     self._sysex = None
 
     def next_event(self) -> float:
-        """It does nothing by itself."""
         return math.inf
 
     def run_timers(self) -> None:
@@ -104,12 +102,10 @@ class FirmataBoard:
 
 
 def unpaired(data: bytes) -> bytes:
-    """Each byte as two of seven bits, the lower first."""
     return bytes(part for byte in data for part in (byte & 0x7F, byte >> 7))
 
 
 def paired(data: bytes) -> bytes:
-    """The other way round; an odd byte at the end is left out."""
     return bytes((low | high << 7) & 0xFF for low, high in _pairs(data))
 
 

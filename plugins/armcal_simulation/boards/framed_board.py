@@ -69,21 +69,17 @@ class FramedBoard:
         self._forget()
 
     def boot(self) -> None:
-        """Forget all but the counter; send nothing until the host does."""
         self.boots += 1
         self._forget()
 
     def receive(self, data: bytes) -> None:
-        """Frames from the host; what is damaged is dropped."""
         for frame in self._decoder.feed(data):
             self._take(frame)
 
     def next_event(self) -> float:
-        """The watchdog's."""
         return self.guard.next_event()
 
     def run_timers(self) -> None:
-        """The watchdog's."""
         self.guard.run()
 
     def _forget(self) -> None:

@@ -45,11 +45,9 @@ class BoardGuard:
 
     @property
     def is_set(self) -> bool:
-        """Whether it watches."""
         return self._guard is not None
 
     def heard(self) -> None:
-        """The host lives."""
         self._heard = self._clock()
 
     def set(self, guard: Guard) -> None:
@@ -71,7 +69,6 @@ class BoardGuard:
         self._leg, self._left, self._next_tick = None, [], math.inf
 
     def next_event(self) -> float:
-        """When it next acts."""
         if self.took_over or self._guard is None:
             return self._next_tick
         return self._heard + self._guard.after_ms / 1000

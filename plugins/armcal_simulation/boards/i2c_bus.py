@@ -28,12 +28,10 @@ class I2cBus:
         self._planned.append((after, byte))
 
     def hold_down(self, seconds: float) -> None:
-        """SDA stays low for so long; it resets no chip."""
         self._stuck_until = self._clock() + seconds
 
     @property
     def stuck(self) -> bool:
-        """Whether SDA is held down."""
         return self._clock() < self._stuck_until
 
     def write(self, address: int, data: bytes) -> int:

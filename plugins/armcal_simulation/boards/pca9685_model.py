@@ -125,7 +125,6 @@ class Pca9685Model:
 
     @property
     def period_s(self) -> float:
-        """Of the pulses, by the clock that runs them."""
         clock_hz = self._external_hz if self._mode1 & EXTCLK and self._external_hz else self.oscillator_hz
         return COUNTS * (self._prescale + 1) / clock_hz
 

@@ -54,7 +54,6 @@ class BusJointSettings(BusMotorSettings):
 
     @property
     def table(self) -> ServoTable:
-        """Its registers."""
         return TABLES[self.model]
 
 
@@ -80,7 +79,6 @@ class BusBenchSettings(BenchTruthSettings):
         return self
 
     def servo_of(self, joint: str) -> BusJointSettings:
-        """A joint's servo."""
         return merged(self.joints, joint, BusJointSettings)
 
     def baud_code(self, servo: BusJointSettings) -> int:

@@ -59,7 +59,6 @@ class BusMotor(JointServo):
 
     @property
     def moving(self) -> bool:
-        """Whether its profile is under way."""
         return self.setpoint is not None and abs(self.goal - self.setpoint) > _NEAR
 
     @property

@@ -65,7 +65,6 @@ class Protocol1(Framing):
     head = re.compile(rb"\xff\xff(?!\xff)")
 
     def instruction(self, packet: bytes) -> Instruction:
-        """See ``Framing``."""
         return Instruction(packet[2], packet[4], packet[5:-1], damaged=packet[-1] != _check_sum(packet[2:-1]))
 
     def status(self, servo: int, error: int, params: bytes) -> bytes:

@@ -33,7 +33,6 @@ class Register:
     high: int | None = None
 
     def encoded(self, value: int) -> bytes:
-        """A value as its bytes, cut to what they hold."""
         if isinstance(self.sign, int):
             most = (1 << self.sign) - 1
             raw = min(abs(value), most) | ((1 << self.sign) if value < 0 else 0)
@@ -44,7 +43,6 @@ class Register:
         return raw.to_bytes(self.size, "little")
 
     def decoded(self, data: bytes) -> int:
-        """The other way round."""
         if self.sign == "complement":
             return int.from_bytes(data, "little", signed=True)
         raw = int.from_bytes(data, "little")
@@ -78,16 +76,13 @@ class ServoTable:
 
     @cached_property
     def by_name(self) -> dict[str, Register]:
-        """The registers."""
         return {register.name: register for register in self.registers}
 
     @cached_property
     def size(self) -> int:
-        """Bytes of memory."""
         return max(register.address + register.size for register in self.registers)
 
     def touched(self, address: int, count: int) -> list[Register]:
-        """Registers of which a byte lies there."""
         return [r for r in self.registers if r.address < address + count and address < r.address + r.size]
 
 

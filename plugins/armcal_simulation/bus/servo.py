@@ -61,22 +61,18 @@ class BusServo:
 
     @property
     def id(self) -> int:
-        """What it answers to."""
         return self.get("id")
 
     @property
     def baud(self) -> int:
-        """At which it listens."""
         return self.table.bauds.get(self.get("baud"), 0)
 
     @property
     def amperes(self) -> float:
-        """What it draws from the supply."""
         return 0.02 + abs(self.motor.load) * self.motor.settings.stall_A
 
     @property
     def exact_position(self) -> float:
-        """The present position (counts), neither rounded nor noisy."""
         raw = self._zero + self._direction * self.motor.shaft / self.table.count
         if self._protocol == "feetech":
             return (raw - self.offset) % self.table.counts
@@ -88,7 +84,6 @@ class BusServo:
         return self.get("homing_offset") if "homing_offset" in self.table.by_name else 0
 
     def get(self, name: str) -> int:
-        """A register's value."""
         register = self.table.by_name[name]
         return register.decoded(self._memory[register.address : register.address + register.size])
 
@@ -171,13 +166,11 @@ class BusServo:
         return self.status(error), data
 
     def status(self, error: int = 0) -> int:
-        """A status byte with this error, and with what ails the servo."""
         if self._protocol == "dynamixel2":
             return error | (ALERT if self._faults else 0)
         return error | self._faults
 
     def answers(self, code: int) -> bool:
-        """Whether it sends an answer, by its return level."""
         level = self.get("return_level")
         if self._protocol == "feetech":
             return level > 0 or code in (PING, READ)

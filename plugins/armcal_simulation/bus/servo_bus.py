@@ -64,17 +64,14 @@ class ServoBus:
             servo.volts = self.volts
 
     def volts(self) -> float:
-        """At the servos, under what all of them draw."""
         volts, ohms = self._supply
         return volts - ohms * sum(servo.amperes for servo in self.servos)
 
     @property
     def protocol(self) -> ProtocolName:
-        """What is spoken."""
         return self.servos[0].table.protocol
 
     def split(self, data: bytes) -> tuple[list[bytes], bytes]:
-        """Whole packets, and the beginning of one."""
         return self._framing.split(data)
 
     def boot(self) -> None:
@@ -84,7 +81,6 @@ class ServoBus:
             servo.power_cycle()
 
     def receive(self, data: bytes) -> None:
-        """Bytes from the host."""
         if self._echo:
             self._send(data)
         if data.startswith(b"\xff\xff"):
@@ -94,11 +90,9 @@ class ServoBus:
             self._take(self._framing.instruction(packet))
 
     def next_event(self) -> float:
-        """When servos next look after themselves."""
         return self._looked + LOOK_S
 
     def run_timers(self) -> None:
-        """Do what is due."""
         seconds, self._looked = self._clock() - self._looked, self._clock()
         for servo in self.servos:
             servo.pass_time(seconds)
@@ -135,7 +129,6 @@ class ServoBus:
             self._answer([pair for pair in answers if pair[0].answers(instruction.code)], instruction.servo)
 
     def _spans(self, instruction: Instruction) -> list[tuple[int, bytes]]:
-        """Who is to be read, and the parameters of each reading."""
         size, params = self._sizes, instruction.params
         if instruction.code == SYNC_READ:
             return [(number, params[: 2 * size]) for number in params[2 * size :]]

@@ -68,12 +68,10 @@ class MovingTruth:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The canonical entries of all parameters."""
         return self.parameters.entry_names
 
     @property
     def moving(self) -> tuple[str, ...]:
-        """Those that change, in the order of all."""
         entries = {change.entry for change in (*self.paths, *self.warmings)}
         return tuple(self.names[i] for i in sorted(entries))
 
@@ -203,7 +201,6 @@ def _creep(parameters: Parameters, name: str, text: str) -> tuple[float, float, 
 
 
 def _entry(parameters: Parameters, name: str) -> int:
-    """Where a parameter of one number stands among the entries."""
     place = parameters.entries_of(parameters.select([name])[0])
     if place.stop - place.start != 1:
         raise ConfigError(f"simulation: {name} is no single number.", hint="Only single numbers move in a mission.")

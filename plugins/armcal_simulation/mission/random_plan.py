@@ -70,7 +70,6 @@ def befallen(request: SimulationRequest, poses: Dataset) -> tuple[Joint, ...]:
 
 
 def _columns(blocks: Sequence[Array], noise: Sequence[Sequence[float]] | None) -> Array:
-    """Slopes (rows of all records x columns), raw; the records of a row run fastest."""
     parts = []
     for place, block in enumerate(blocks):
         raw = block if noise is None else block * np.array(noise[place])[:, None, None]
@@ -92,12 +91,10 @@ class Dice:
     random: np.random.Generator
 
     def size(self, low: float, high: float) -> float:
-        """Between two sizes, each factor as likely as every other; either sign."""
         drawn = math.exp(self.random.uniform(math.log(low), math.log(high))) * self.random.choice([-1, 1])
         return float(f"{drawn:.2g}")
 
     def vector(self, low: float, high: float) -> list[float]:
-        """Of such a length in a random direction."""
         direction = self.random.normal(size=3)
         return [float(f"{x:.2g}") for x in direction / np.linalg.norm(direction) * abs(self.size(low, high))]
 
@@ -160,7 +157,6 @@ def random_plan(joints: Sequence[Joint], days: float, bends: bool, seed: int) ->
 
 
 def _drawn(dice: Dice, joints: Sequence[Joint], bends: bool, count: int) -> list[dict[str, Any]]:
-    """Events of joints, all different, in the order of the draws."""
     drawn: list[dict[str, Any]] = []
     while len(drawn) < count:
         kind = _KINDS[dice.random.integers(len(_KINDS))]
@@ -173,6 +169,5 @@ def _drawn(dice: Dice, joints: Sequence[Joint], bends: bool, count: int) -> list
 
 
 def probing_poses(commands: Dataset, arm: Arm, random: np.random.Generator) -> Dataset:
-    """The same poses, each joint approached from a random side."""
     sides = {f"{arm.name}.approach.{j}": random.choice([-1.0, 1.0], len(commands)) for j in arm.commanded}
     return replace(with_channels(commands, sides), source="surprise")

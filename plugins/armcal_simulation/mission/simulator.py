@@ -65,7 +65,6 @@ class Stands:
     def drawn(
         cls, days: float, tilt: TiltSettings, hours: tuple[float, float], gravity: Array, random: np.random.Generator
     ) -> Self:
-        """Tilts about random level axes, uniform up to the most; a new one after each drive in working hours."""
         drives = random.poisson(tilt.drives_per_day * days) if tilt.drives_per_day else 0
         day, hour = random.integers(0, int(np.ceil(days)), drives), random.uniform(*hours, drives)
         since = np.concatenate([[0.0], np.sort(day * DAY_S + hour * _HOUR_S)])
@@ -78,7 +77,6 @@ class Stands:
         return cls(since, turns, (Rotation.from_rotvec(turns) * error).as_rotvec())
 
     def at(self, times: Array, turns: Array) -> Rotation:
-        """level_R_rover at these times, by the true turns or by the readings."""
         return Rotation.from_rotvec(turns[np.searchsorted(self.since, times, side="right") - 1])
 
     def gravity(self, times: Array, level: Array, turns: Array) -> Array:
@@ -114,7 +112,6 @@ class MissionOfDays:
         self._settings = settings
 
     def simulate(self, request: SimulationRequest) -> Dataset:
-        """The records that arrive; see ``mission``."""
         return self.mission(request).records
 
     def mission(self, request: SimulationRequest) -> Mission:

@@ -313,19 +313,16 @@ class _TargetKind:
 
     @cached_property
     def solver(self) -> Solver:
-        """Of one search."""
         arm, options = self._arm, self._arm.options
         tolerance, length = (options.reach_m, options.reach_rad), arm._seeds.spread / 2
         return Solver(arm.expression, arm.limits, self._turns, length, tolerance, arm._held, arm._choice)
 
     @cached_property
     def finder(self) -> Finder:
-        """Of many."""
         return Finder(self.solver, self._arm._seeds, self._arm._allowed)
 
     @cached_property
     def descent(self) -> Descent:
-        """To better commands for the same target."""
         arm = self._arm
         return Descent(arm.expression, arm.options.redundancy, self.solver, arm._choice)
 

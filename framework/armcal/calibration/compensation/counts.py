@@ -118,7 +118,6 @@ def _sums(slopes: Array, moved: Array, joints: Sequence[int]) -> tuple[Array, In
 
 
 def _piecewise(x: Array, at: Sequence[float], values: Sequence[float]) -> Array:
-    """Linear between points, and beyond the ends as before them."""
     knots, known = np.asarray(at), np.asarray(values)
     cell = np.clip(np.searchsorted(knots, x) - 1, 0, len(knots) - 2)
     slope = (known[cell + 1] - known[cell]) / (knots[cell + 1] - knots[cell])

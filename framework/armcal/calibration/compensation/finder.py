@@ -45,7 +45,6 @@ class Finder:
     """Searches of one solver from many starts."""
 
     def __init__(self, solver: Solver, seeds: Seeds, allowed: Allowed | None) -> None:
-        """Where the solver holds joints, every search needs a start."""
         self._solver, self._seeds, self._allowed, self._held = solver, seeds, allowed, solver.held
 
     def __call__(
@@ -76,7 +75,6 @@ class Finder:
         return solutions
 
     def spread(self, record: Array, target: Array) -> Solutions:
-        """Commands for the same target (columns alike), each from another seed, in whatever posture it leads to."""
         solutions = self._nothing(record.shape[1])
         apart = self._seeds.apart(target[:, :1], self._solver.length)[0]
         picks = np.argsort(apart)[: record.shape[1]]
@@ -205,7 +203,6 @@ class Finder:
     def _goal(
         self, record: Array, target: Array, rows: Rows, commands: Array, states: Array, start: Array | None
     ) -> Goal:
-        """Searches for targets (rows) from commands, but for joints that are held."""
         if self._held and start is not None:
             held = list(self._held)
             commands[held] = start[held][:, rows]
@@ -253,7 +250,6 @@ class Seeds:
 
     @property
     def spread(self) -> float:
-        """How far the tool typically is from the middle of all its places (m)."""
         places = self._tools[:, :3, 3]
         return float(np.median(np.linalg.norm(places - places.mean(axis=0), axis=1)))
 

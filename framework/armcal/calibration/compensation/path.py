@@ -88,7 +88,6 @@ class PathFinder:
         return np.stack(kept, axis=1) if kept else solutions.commands[:, :1]
 
     def _next(self, record: Array, target: Array, at: Array, side: Array) -> tuple[Solutions, Array]:
-        """The next target from each way's commands; the side from which joints come is told as they move."""
         if not self._tells_approach:
             solutions = self._finder.onward(record, target, at)
             return solutions, sides_of(solutions.commands - at, side)

@@ -40,7 +40,6 @@ class Goal:
     held: tuple[int, ...] = ()
 
     def subset(self, rows: Rows) -> Goal:
-        """Some of them."""
         towards = None if self.towards is None else chosen_of(self.towards, rows)
         record, state, target = (chosen_of(array, rows) for array in (self.record, self.state, self.target))
         return Goal(record, state, target, towards, self.held)
@@ -68,7 +67,6 @@ class Solutions:
 
     @classmethod
     def nothing(cls, joints: int, state: int, count: int) -> Solutions:
-        """Nothing found yet."""
         far = np.full((2, count), np.inf)
         no = np.zeros((2, count), dtype=bool)
         return cls(np.zeros((joints, count)), np.zeros((state, count)), far[0], far[1], no[0], no[1])
@@ -79,11 +77,9 @@ class Solutions:
         self.distances[at], self.turns[at] = attempt.distances[chosen], attempt.turns[chosen]
 
     def subset(self, chosen: Mask | Rows) -> Solutions:
-        """Some of them."""
         return Solutions(*(getattr(self, part.name)[..., chosen] for part in fields(self)))
 
     def replace(self, at: Rows, other: Solutions) -> None:
-        """Others' findings at their places."""
         for part in fields(self):
             getattr(self, part.name)[..., at] = getattr(other, part.name)
 
@@ -154,7 +150,6 @@ class Search:
 
     @property
     def compiled(self) -> bool:
-        """Whether C serves it."""
         return self._iteration.compiled
 
     def __call__(self, goal: Goal, manner: Manner, near: Near) -> Solutions:

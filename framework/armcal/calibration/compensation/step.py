@@ -213,7 +213,6 @@ class _Search:
         return {"commands": new, "state": ca.if_else(tame, ahead, 0), "free": ca.if_else(inside, free, 0)}
 
     def _pulled_back(self, pull: Expression, least: float) -> Expression:
-        """Which joints stand at a limit and are pulled away from it."""
         commands = self.now["commands"]
         from_low = ca.logic_and(commands <= self._low, pull > least)
         from_high = ca.logic_and(commands >= self._high, pull < -least)
@@ -236,7 +235,6 @@ def _largest(vector: Expression) -> Expression:
 
 
 def _shortening(size: Expression) -> Expression:
-    """Times a step of this size: none is longer than the longest."""
     return ca.if_else(size > _LONGEST, _LONGEST / size, 1)
 
 

@@ -75,7 +75,6 @@ class FrameDecoder:
         return frames
 
     def forget(self) -> None:
-        """Drop an unfinished piece, as after a line was opened anew."""
         self._rest = b""
 
 

@@ -63,12 +63,10 @@ _GUARD_CHANNEL = struct.Struct("<BBH")
 
 
 def packed_head(head: Head) -> bytes:
-    """A reply's first bytes."""
     return _HEAD.pack(head.boots, int(head.flags))
 
 
 def read_head(payload: bytes) -> tuple[Head, bytes]:
-    """A reply's head, and what follows."""
     if len(payload) < _HEAD.size:
         raise ValueError("the reply is shorter than its head")
     boots, flags = _HEAD.unpack_from(payload)
@@ -85,13 +83,11 @@ class HelloReply:
     firmware: str
 
     def pack(self) -> bytes:
-        """After the head."""
         name = self.board_id.encode()
         return struct.pack("<BIB", self.version, self.oscillator_hz, len(name)) + name + self.firmware.encode()
 
     @staticmethod
     def read(payload: bytes) -> HelloReply:
-        """From what follows the head."""
         if len(payload) < 6 or len(payload) < 6 + payload[5]:
             raise ValueError("the greeting is too short")
         version, oscillator_hz, length = struct.unpack_from("<BIB", payload)
@@ -106,12 +102,10 @@ class _Fixed:
     LAYOUT: ClassVar[struct.Struct]
 
     def pack(self) -> bytes:
-        """The payload; of a reply, what follows the head."""
         return self.LAYOUT.pack(*vars(self).values())
 
     @classmethod
     def read(cls, payload: bytes) -> Self:
-        """From these bytes."""
         if len(payload) != cls.LAYOUT.size:
             raise ValueError(f"found {len(payload)} bytes, expected {cls.LAYOUT.size}")
         return cls(*cls.LAYOUT.unpack(payload))
@@ -161,12 +155,10 @@ class Write:
     data: bytes
 
     def pack(self) -> bytes:
-        """The payload."""
         return bytes((self.address,)) + self.data
 
     @staticmethod
     def read(payload: bytes) -> Write:
-        """From the payload."""
         if not payload:
             raise ValueError("the write has no address")
         return Write(payload[0], payload[1:])
@@ -188,12 +180,10 @@ class Set:
     targets: tuple[ChannelTarget, ...]
 
     def pack(self) -> bytes:
-        """The payload."""
         return b"".join(_CHANNEL.pack(*target) for target in self.targets)
 
     @staticmethod
     def read(payload: bytes) -> Set:
-        """From the payload."""
         if not payload or len(payload) % _CHANNEL.size:
             raise ValueError("the targets are not whole")
         return Set(tuple(ChannelTarget(*fields) for fields in _CHANNEL.iter_unpack(payload)))
@@ -216,7 +206,6 @@ class Guard:
     waypoints: tuple[tuple[int, ...], ...] = ()
 
     def pack(self) -> bytes:
-        """The payload."""
         channels = b"".join(_GUARD_CHANNEL.pack(*channel) for channel in self.channels)
         counts = [count for waypoint in self.waypoints for count in waypoint]
         head = _GUARD_HEAD.pack(self.after_ms, len(self.channels))
@@ -224,7 +213,6 @@ class Guard:
 
     @staticmethod
     def read(payload: bytes) -> Guard:
-        """From the payload."""
         if len(payload) < _GUARD_HEAD.size + 1:
             raise ValueError("the guard is too short")
         after_ms, n = _GUARD_HEAD.unpack_from(payload)

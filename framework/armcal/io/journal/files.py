@@ -34,11 +34,9 @@ class FileLayer:
             return ()
 
     def read(self, path: Path) -> bytes:
-        """The whole of a file."""
         return path.read_bytes()
 
     def size(self, path: Path) -> int:
-        """Bytes in a file."""
         return path.stat().st_size
 
     def open_append(self, path: Path) -> int:
@@ -55,19 +53,15 @@ class FileLayer:
             left = left[written:]
 
     def truncate(self, descriptor: int, size: int) -> None:
-        """Cut a file to ``size`` bytes."""
         os.ftruncate(descriptor, size)
 
     def sync(self, descriptor: int) -> None:
-        """Return when the file's bytes would outlast a power loss."""
         os.fsync(descriptor)
 
     def close(self, descriptor: int) -> None:
-        """Give a descriptor back."""
         os.close(descriptor)
 
     def sync_folder(self, folder: Path) -> None:
-        """Return when names made, removed or changed in the folder would outlast a power loss."""
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             os.fsync(descriptor)
@@ -75,11 +69,9 @@ class FileLayer:
             os.close(descriptor)
 
     def rename(self, old: Path, new: Path) -> None:
-        """Give a file another name, in place of what had it."""
         old.rename(new)
 
     def remove(self, path: Path) -> None:
-        """Take a file away."""
         path.unlink()
 
 
@@ -93,7 +85,6 @@ def is_full(fault: OSError) -> bool:
 
 @contextmanager
 def opened(files: FileLayer, path: Path) -> Iterator[int]:
-    """A descriptor for appending, given back at the end."""
     descriptor = files.open_append(path)
     try:
         yield descriptor

@@ -43,7 +43,6 @@ def payload_of(content: Mapping[str, Any]) -> bytes:
 
 
 def encode_frame(sequence: int, payload: bytes, previous_crc: int) -> tuple[bytes, int]:
-    """The bytes of a frame, and its CRC, from which the next one's starts."""
     crc = _crc(sequence, payload, previous_crc)
     return b"%016x %08x %08x %b\n" % (sequence, len(payload), crc, payload), crc
 

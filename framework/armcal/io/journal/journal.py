@@ -116,17 +116,14 @@ class Journal:
 
     @property
     def folder(self) -> Path:
-        """Of its files."""
         return self._folder
 
     @property
     def sequence(self) -> int:
-        """The number of the last entry."""
         return self._writer.tail.sequence
 
     @property
     def wants_checkpoint(self) -> bool:
-        """The segment is full: a checkpoint begins the next one."""
         return self._writer.filled >= self._limits.segment_bytes
 
     def record(self, kind: str, content: Any) -> int:
@@ -182,7 +179,6 @@ class Journal:
         return self._segment
 
     def _written(self, write: Callable[[], int]) -> int:
-        """What was written; a full disk refuses it and leaves the journal as it was, after another fault it is over."""
         if self._failure:
             raise self._failed()
         try:

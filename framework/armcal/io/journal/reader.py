@@ -33,12 +33,10 @@ class Verified:
 
 
 def segment_path(folder: Path, number: int) -> Path:
-    """The file of a segment."""
     return folder / f"journal-{number:08d}.log"
 
 
 def segment_numbers(folder: Path, files: FileLayer = REAL_FILES) -> tuple[int, ...]:
-    """The segments in a folder, in order. Files of other names are nobody's business here."""
     matches = (_NAME.fullmatch(name) for name in files.names(folder))
     return tuple(sorted(int(match[1]) for match in matches if match))
 

@@ -81,7 +81,6 @@ class Cut:
 
     @property
     def sentence(self) -> str:
-        """What was cut off and what it may have been."""
         what = "its beginning" if self.offset == 0 else f"entry {self.sequence}"
         if not self.data:
             return f"{self.path} ends before {what}, which may have been under way when the writer stopped."
@@ -180,7 +179,6 @@ class _SegmentReader:
             raise self.damaged(self.reason) from fault
 
     def accept(self, frame: Frame, counted: int) -> int:
-        """Go on after a frame; the byte at which it began."""
         began = self.offset
         self.link = Link(frame.sequence, frame.crc, self.link.entries + counted)
         self.offset, self.line = frame.end, self.line + 1

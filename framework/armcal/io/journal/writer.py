@@ -84,7 +84,6 @@ class SegmentWriter:
 
     @property
     def filled(self) -> int:
-        """Bytes of entries after the checkpoint."""
         return self.tail.size - self.start
 
     def append(self, payload: bytes) -> int:
@@ -141,11 +140,9 @@ class SegmentWriter:
         return sequence
 
     def close(self) -> None:
-        """Give the file back."""
         self._files.close(self._descriptor)
 
     def _take_back(self, before: Tail, cause: BaseException) -> None:
-        """Leave no half frame, neither now nor after a power loss."""
         self.tail = before
         try:
             self._files.truncate(self._descriptor, before.size)
