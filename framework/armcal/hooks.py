@@ -1,8 +1,8 @@
 """The plugin contract: hook specifications and their version. Imports nothing heavy, so registration is instant.
 
 A plugin is a Python module named by an entry point in the group ``armcal``. It registers named components as
-``module:attribute``; a component is imported when a configuration asks for it. ``docs/hooks.md`` is made from this
-file: ``armcal plugins hooks --markdown``.
+``module:attribute``; a component is imported when a configuration asks for it. ``docs/tools/hooks_page.py`` makes
+``docs/hooks.md`` of this file.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ def _wrong_arguments(fault: BaseException, packages: tuple[str, ...]) -> PluginE
     root = called[1].partition(".")[0]
     for name, module in list(sys.modules.items()):
         if any(f"{name}.".startswith(f"{own}.") for own in packages) and hasattr(module, root):
-            hint = "Take the arguments that the contract names: armcal plugins hooks."
+            hint = "Take the arguments that the contract names: docs/hooks.md."
             return PluginError(f"{fault}.", where=Location(module.__file__), hint=hint)
     return None
 

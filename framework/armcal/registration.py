@@ -109,7 +109,7 @@ def _require_marks(module: Any) -> None:
         if hasattr(own, f"{hooks.PROJECT}_impl") and not hasattr(hooks, name):
             known = [hook for hook in dir(hooks) if hook.startswith(f"{hooks.PROJECT}_")]
             near = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {near[0]}" if near else "armcal plugins hooks lists them"
+            hint = f"did you mean {near[0]}" if near else "python -m pydoc armcal.hooks lists them"
             raise ValueError(f"unknown hook {name!r}: {hint}")
     for name in dir(hooks):
         specified = getattr(hooks, name)

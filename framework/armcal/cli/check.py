@@ -12,7 +12,7 @@ import numpy as np
 from armcal.arm.assembly import command_channels
 from armcal.base.units import digits, to_unit
 from armcal.cli.common import FILE, Console, data, overrides, speaking
-from armcal.cli.outlet import say
+from armcal.cli.console import say
 from armcal.config.system import System
 from armcal.errors import ProblemError
 from armcal.estimate.identifiability import Identifiability

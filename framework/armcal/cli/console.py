@@ -1,8 +1,11 @@
 """What a command shows on a screen: names are data, and a table that is too wide becomes a list of its rows."""
 
+import io
+import sys
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from typing import Any, TextIO
 
+import click
 from rich.console import Console, ConsoleOptions, Group, RenderableType
 from rich.padding import Padding
 from rich.segment import Segment
@@ -13,6 +16,37 @@ from armcal.base.config_text import shown
 
 _CUT = "\u2026"
 """What rich ends a word with that its column has no room for."""
+
+
+def say(text: str, err: bool = False) -> None:
+    click.echo(shown(text), err=err)
+
+
+class Output(io.FileIO):
+    """Standard output or error: nothing raises where it is written, so that `| head` ends no run half way.
+
+    Attributes:
+        fault: why nothing more can be written; None while it can.
+    """
+
+    fault: OSError | None = None
+
+    @classmethod
+    def instead_of(cls, stream: TextIO) -> io.TextIOWrapper:
+        buffer = io.BufferedWriter(cls(stream.fileno(), "wb", closefd=False))
+        return io.TextIOWrapper(buffer, stream.encoding, "backslashreplace", line_buffering=True)
+
+    def write(self, data: Any, /) -> int:
+        try:
+            return super().write(data)
+        except OSError as fault:
+            self.fault = fault
+            return len(data)
+
+
+def output_fault() -> OSError | None:
+    """Why standard output can no longer be written; None while it can."""
+    return getattr(getattr(getattr(sys.stdout, "buffer", None), "raw", None), "fault", None)
 
 
 class Screen(Console):
@@ -34,7 +68,7 @@ class Screen(Console):
         super().print(*fitting, **more)
 
     def on_broken_pipe(self) -> None:
-        """Nobody reads any longer: said to nobody, as ``Outlet`` has it."""
+        """Nobody reads any longer: said to nobody."""
         self.quiet = True
 
 

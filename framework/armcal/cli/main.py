@@ -1,6 +1,7 @@
 """The ``armcal`` command. Commands are imported when they are called, so that help is instant."""
 
 import difflib
+import errno
 import itertools
 import os
 import sys
@@ -10,7 +11,7 @@ import click
 from click.exceptions import Exit
 from click.shell_completion import CompletionItem
 
-from armcal.cli.outlet import Outlet, say
+from armcal.cli.console import Output, output_fault, say
 from armcal.errors import EXIT_DONE, EXIT_FAULT, EXIT_INTERRUPTED, ArmcalError
 from armcal.extras import missing_library
 from armcal.plugin_faults import plugin_fault
@@ -143,17 +144,18 @@ def main() -> None:
     # One BLAS thread: sums come out the same to the last bit whatever the number of processors.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    outlets = {name: Outlet(stream) for name in ("stdout", "stderr") if (stream := getattr(sys, name)) is not None}
-    for name, outlet in outlets.items():
-        setattr(sys, name, outlet)
-    try:
-        code = _exit_code()
-        if "stdout" in outlets and (lost := outlets["stdout"].lost()):
-            say(f"armcal: standard output cannot be written ({lost}).", err=True)
+    for name in ("stdout", "stderr"):
+        if (stream := getattr(sys, name)) is not None:  # None: closed by who called
+            setattr(sys, name, Output.instead_of(stream))
+    code = _exit_code()
+    if sys.stdout is not None:
+        sys.stdout.flush()
+        if (fault := output_fault()) is not None and fault.errno not in (
+            errno.EPIPE,
+            errno.EIO,
+        ):  # else a reader that went away
+            say(f"armcal: standard output cannot be written ({fault.strerror}).", err=True)
             code = code or EXIT_FAULT
-    finally:
-        for outlet in outlets.values():
-            outlet.finish()
     sys.exit(code)
 
 

@@ -13,7 +13,7 @@ from armcal.version import JSON_SCHEMA
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 def plugins() -> None:
-    """List plugins, check them, or show the hooks that they may have."""
+    """List plugins, or check them."""
 
 
 @plugins.command("list")
@@ -94,12 +94,3 @@ def check_plugin(name: str | None, as_json: bool, quiet: bool, verbose: bool) ->
         click.echo(f"armcal: {report['plugin']}: {report['fault'] or 'it breaks the plugin contract'}", err=True)
     if failed:
         sys.exit(EXIT_BAD_INPUT)
-
-
-@plugins.command("hooks")
-@click.option("--markdown", is_flag=True, help="As the page docs/hooks.md.")
-def show_hooks(markdown: bool) -> None:
-    """Show every hook and kind of component: what armcal hands over, and what a component must have."""
-    from armcal.cli.hook_reference import as_markdown, as_text, reference
-
-    click.echo(as_markdown(reference()) if markdown else as_text(reference()), nl=False)

@@ -13,8 +13,7 @@ from rich.text import Text
 from armcal.base.domains import Semidefinite, symmetric
 from armcal.base.units import shown_unit
 from armcal.cli.common import FILE, Console, command_line, data, overrides, parallel, speaking
-from armcal.cli.console import columned
-from armcal.cli.outlet import say
+from armcal.cli.console import columned, say
 from armcal.errors import EXIT_DO_NOT_USE, EXIT_NOT_CONVERGED
 from armcal.estimate.bootstrap import Bootstrap
 from armcal.estimate.estimator import CHECK_THE_DATA

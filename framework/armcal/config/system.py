@@ -204,7 +204,7 @@ def build_component(
         raise _broken(registered, f"it does not derive from armcal.{contract.__name__}")
     members = sorted(get_protocol_members(contract)) if is_protocol(contract) else []
     if lacking := [name for name in members if not (hasattr(type(built), name) or hasattr(built, name))]:
-        raise _broken(registered, f"it has no {', '.join(lacking)}; the contract is printed by armcal plugins hooks")
+        raise _broken(registered, f"it has no {', '.join(lacking)}; its contract stands in docs/hooks.md")
     return built, {"type": name, **settings.to_config()}
 
 

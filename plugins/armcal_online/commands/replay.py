@@ -8,7 +8,7 @@ from typing import Any, Literal, cast
 import click
 from armcal.base.config_text import finite
 from armcal.cli.common import Console, overrides, speaking
-from armcal.cli.outlet import say
+from armcal.cli.console import say
 from armcal.errors import EXIT_BAD_INPUT, EXIT_FAULT, InputError, Location
 from armcal.io.journal.files import REAL_FILES, write_whole
 from rich.table import Table

@@ -7,8 +7,7 @@ import threading
 from pathlib import Path
 
 import click
-from armcal.cli.console import Screen
-from armcal.cli.outlet import say
+from armcal.cli.console import Screen, output_fault, say
 from armcal.errors import InputError, Location
 from armcal.version import JSON_SCHEMA
 
@@ -75,7 +74,7 @@ def _terminal(feed: Feed, stop: threading.Event) -> None:
                 live.update(picture(feed.state(), console.width), refresh=True)
                 stop.wait(_REFRESH)
     shown: str | None = None
-    while not stop.is_set() and getattr(sys.stdout, "fault", None) is None:  # nobody reads lines after a fault
+    while not stop.is_set() and output_fault() is None:  # nobody reads lines after a fault
         messages = feed.step()
         for text in filter(None, map(line, messages)):
             say(text)

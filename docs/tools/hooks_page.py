@@ -1,16 +1,19 @@
-"""The reference of hooks and kinds of component, made from their specifications: signatures and docstrings.
+"""Make the page of hooks and kinds of component from their specifications: ``python docs/tools/hooks_page.py``.
 
-``docs/hooks.md`` is what ``as_markdown`` gives; a test compares the two.
+Signatures and docstrings become ``docs/hooks.md``; a test compares the two.
 """
+
+from __future__ import annotations
 
 import ast
 import inspect
 import re
 import textwrap
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from types import FunctionType, MappingProxyType
 from typing import Any
 
@@ -193,7 +196,7 @@ def as_markdown(reference: Reference) -> str:
     lines = [
         "# Hooks and kinds of component",
         "",
-        "This page is made from armcal's own specifications: `armcal plugins hooks --markdown > docs/hooks.md`. Do not",
+        "This page is made from armcal's own specifications by `docs/tools/hooks_page.py`. Do not",
         "edit it. How to write a plugin is in [write a plugin](write_a_plugin.md).",
         "",
         "A registration module marks each hook with `@hookimpl` and may leave out any hook, and any argument of one.",
@@ -249,18 +252,5 @@ def _marked(text: str) -> str:
     return text.replace("``", "`")
 
 
-def as_text(reference: Reference) -> str:
-    lines: list[str] = []
-    for kind in reference.kinds:
-        lines += [f"{kind.kind}: {kind.hook.name}", *_indented(kind.hook.text, 2)]
-        lines += [f"  built as {kind.built_as}; {kind.protocol.name}:"]
-        lines += [f"    {method.call}" for method in kind.protocol.methods]
-        lines += [f"  may have {protocol.name}" for protocol in kind.beside] + [""]
-    lines += ["observers:"]
-    for hook in reference.observers:
-        lines += [f"  {hook.call}", *_indented(hook.text, 4)]
-    return "\n".join(lines) + "\n"
-
-
-def _indented(text: str, depth: int) -> Sequence[str]:
-    return textwrap.wrap(" ".join(text.split()), 110, initial_indent=" " * depth, subsequent_indent=" " * depth)
+if __name__ == "__main__":
+    Path(__file__).resolve().parents[1].joinpath("hooks.md").write_text(as_markdown(reference()), encoding="utf-8")
