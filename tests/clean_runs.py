@@ -27,7 +27,7 @@ from armcal.errors import ArmcalError
 from armcal.estimate.simulation import SimulationRequest
 from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import requested_channels
-from armcal.plugin_files import use_plugins
+from armcal.plugins import use_plugins
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from click.testing import CliRunner

@@ -16,7 +16,7 @@ FRAMEWORK = ROOT / "framework" / "armcal"
 PLUGINS = ROOT / "plugins"
 
 ROOMS = (
-    ("version", "errors", "extras", "hooks", "plugin_files", "registration", "plugins", "plugin_faults"),
+    ("version", "errors", "hooks", "plugins"),
     ("base",),
     ("io",),
     ("functions",),

@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from armcal.measure.instrument import Instrument as Instrument
     from armcal.measure.instrument import InstrumentSettings as InstrumentSettings
     from armcal.measure.measurement import Channel as Channel
-    from armcal.plugin_files import use_plugins as use_plugins
+    from armcal.plugins import use_plugins as use_plugins
     from armcal.report.sections import ReportSection as ReportSection
     from armcal.run.pipeline import calibrate as calibrate
     from armcal.run.result import RunResult as RunResult
@@ -87,7 +87,7 @@ _FOR_PLUGINS = {
     "armcal.measure.contact": "Contact",
     "armcal.measure.instrument": "Instrument InstrumentSettings",
     "armcal.measure.measurement": "Channel",
-    "armcal.plugin_files": "use_plugins",
+    "armcal.plugins": "use_plugins",
     "armcal.report.sections": "ReportSection",
 }
 """What plugins are made of."""

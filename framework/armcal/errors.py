@@ -97,6 +97,10 @@ class PluginError(InputError):
     """A plugin that was asked for is missing, broken or ambiguous."""
 
 
+class BrokenPluginError(PluginError):
+    """A plugin's code failed; its cause is what Python raised, which is shown with its traceback."""
+
+
 class ProblemError(InputError):
     """The data and the parameters asked for do not make a problem that can be solved."""
 

@@ -12,9 +12,9 @@ from armcal.config.validate import validate
 from armcal.devices.clock import Clock, RealClock, SimulatedClock
 from armcal.devices.device import JointDevice
 from armcal.devices.live import JointStream, LiveCamera, Tracker
-from armcal.devices.returned import check_joint_names
 from armcal.devices.simulated import SimulatedBench
 from armcal.errors import ConfigError
+from armcal.plugins import refuse
 from armcal.run.experiment import Experiment
 from pydantic import Field
 
@@ -129,7 +129,8 @@ class Bench:
         link = None if self.settings.link is None else self._built("link")
         joints = tuple(self.arm.commanded)
         built: JointDevice = self._built("device", joints, link)
-        check_joint_names(built, joints)
+        if built.joint_names != joints:
+            refuse(type(built), f"{built.joint_names} as joint_names", f"{joints}, as it was given them")
         return built
 
     def tracker(self) -> Tracker:

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from armcal.arm.horn import TOOTH_DEG, teeth_text
 from armcal.base.arrays import Array
-from armcal.devices.device import MeasuringDevice
-from armcal.devices.returned import measured_angles, open_device
+from armcal.devices.device import MeasuringDevice, measured_angles, open_device
 from armcal.devices.wiring import WiringRecord
 from armcal.errors import ConfigError
 from armcal.io.journal.journal import Journal

@@ -12,7 +12,7 @@ from warnings import catch_warnings, simplefilter
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.errors import PluginError
-from armcal.extras import library
+from armcal.plugins import library
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 

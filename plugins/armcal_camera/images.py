@@ -7,7 +7,7 @@ from warnings import catch_warnings, simplefilter
 
 import numpy as np
 from armcal.errors import DataError, Location, PluginError
-from armcal.extras import library
+from armcal.plugins import library
 from numpy.typing import NDArray
 
 Grey = NDArray[np.uint8]

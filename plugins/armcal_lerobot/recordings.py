@@ -13,8 +13,8 @@ from typing import Any, NoReturn
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.errors import DataError, Location
-from armcal.extras import library
 from armcal.io.plain_files import input_bytes, text_of
+from armcal.plugins import library
 from numpy.typing import NDArray
 
 from armcal_lerobot.calibration_file import read_json

@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.errors import DataError, InputError, Location
-from armcal.extras import library
 from armcal.io.cells import csv_text
 from armcal.io.file_set import write_over
 from armcal.measure.rests import StillSettings, rests
+from armcal.plugins import library
 
 from armcal_lerobot.calibration_file import MotorFile
 from armcal_lerobot.gripper import Follows, require_single

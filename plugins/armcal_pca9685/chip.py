@@ -9,8 +9,8 @@ from armcal.arm.servo import COUNTS
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceError, DeviceRefusedError, DeviceResetError
 from armcal.devices.link import Link
-from armcal.devices.returned import bytes_from
 from armcal.errors import Location
+from armcal.plugins import refuse
 
 MODE1, MODE2, LED0, ALL_LED, PRE_SCALE = 0x00, 0x01, 0x06, 0xFA, 0xFE
 RESTART, EXTCLK, AUTO_INCREMENT, SLEEP, SUB_ADDRESSES, ALL_CALL = 0x80, 0x40, 0x20, 0x10, 0x0E, 0x01
@@ -193,7 +193,10 @@ class Chip:
             raise DeviceError(text, where=self.where, hint=hint)
 
     def _read(self, register: int, count: int) -> bytes:
-        return bytes_from(self._link, self._address, register, count)
+        data = self._link.read(self._address, register, count)
+        if len(data) != count:
+            refuse(self._link.read, f"{len(data)} bytes", f"{count} bytes")
+        return data
 
     def _write(self, register: int, value: int) -> None:
         self._link.write(self._address, bytes((register, value)))

@@ -20,7 +20,6 @@ from armcal.devices.device import (
     PulseDevice,
 )
 from armcal.devices.link import GuardedLink, Link
-from armcal.devices.returned import open_link
 from armcal.errors import Location
 from typing_extensions import override
 
@@ -137,7 +136,7 @@ class Pca9685Device(JointDevice, PulseDevice):
 
     @override
     def open(self, clock: Clock) -> DeviceIdentity:
-        identity = open_link(self._link, clock)
+        identity = self._link.open(clock)
         try:
             for name in {self._file.servos[joint].board for joint in self._servos}:
                 board_id = self._file.boards[name].id

@@ -11,7 +11,7 @@ from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError
 from armcal.devices.link import Link, LinkIdentity
 from armcal.errors import Location
-from armcal.extras import library
+from armcal.plugins import library
 from pydantic import Field
 from typing_extensions import override
 

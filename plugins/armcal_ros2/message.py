@@ -6,7 +6,7 @@ import io
 from functools import cache
 from typing import Any, NamedTuple
 
-from armcal.extras import library
+from armcal.plugins import library
 
 MAX_BYTES = 1 << 44
 JOINT_STATE = "sensor_msgs/msg/JointState"

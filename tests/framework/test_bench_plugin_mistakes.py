@@ -11,7 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from armcal import plugin_files
+from armcal import plugins
 from armcal.cli.main import cli
 from armcal_bench.bench import Bench
 
@@ -190,33 +190,33 @@ SAMPLE = "return [JointSample(%s)]"
 
 ACQUIRE = {  # the method, what it does from the second pose on, and what the sentence says
     "no state": ("D.state", "pass; return", "returned None, expected a DeviceState"),
-    "a mapping": ("D.state", "return self.clock.arm", "returned an object of type dict, expected a DeviceState"),
-    "no angles": ("D.state", "return DeviceState(None)", "returned DeviceState.angles None, expected a mapping"),
-    "NaN": ("D.state", "return DeviceState({'a': math.nan})", "returned DeviceState.angles ..a.: nan., expect"),
-    "other joints": ("D.state", "return DeviceState({'x': 0.0})", "returned angles of x, expected joints of a, b"),
+    "a mapping": ("D.state", "return self.clock.arm", "returned .'a': .*, expected a DeviceState"),
+    "no angles": ("D.state", "return DeviceState(None)", "returned None, expected finite angles .rad. of some of a, b"),
+    "NaN": ("D.state", "return DeviceState({'a': math.nan})", "returned ..a.: nan., expected finite angles"),
+    "other joints": ("D.state", "return DeviceState({'x': 0.0})", "returned ..x.: 0.0., expected finite angles .rad. "),
     "a fault": ("D.state", "return self.nothing", "raised AttributeError: 'D' object has no attribute 'nothing'"),
-    "no angle": ("D.standing", "return", "returned angles .rad. None, expected a mapping of names to numbers"),
-    "a list": ("D.standing", "return [0.0, 0.0]", "returned angles .rad. .0.0, 0.0., expected a mapping"),
-    "texts": ("D.standing", "return {'a': '1', 'b': '2'}", "returned angles .rad. ..a.: .1., 'b': '2'., exp"),
-    "one joint": ("D.standing", "return {'a': 0.0}", "returned angles of a, expected those of a, b"),
+    "no angle": ("D.standing", "return", "returned None, expected finite angles .rad. of all of a, b"),
+    "a list": ("D.standing", "return [0.0, 0.0]", "returned .0.0, 0.0., expected finite angles"),
+    "texts": ("D.standing", "return {'a': '1', 'b': '2'}", "returned ..a.: .1., 'b': '2'., expected finite"),
+    "one joint": ("D.standing", "return {'a': 0.0}", "returned ..a.: 0.0., expected finite angles .rad. of all of a, "),
     "division": ("D.command", "1 / 0", "raised ZeroDivisionError: division by zero. To check it by itself"),
     "an exit": ("D.command", "exit('bye')", "raised SystemExit: bye. To check it by itself"),
     "a key": ("D.keep_alive", "self.clock.arm['x']", "raised KeyError: 'x'"),
     "an end": ("D.keep_alive", "raise SystemExit(0)", "raised SystemExit: 0"),
     "a guard": ("D.guard", "len(rate)", "raised TypeError: object of type 'float' has no len"),
-    "encoders": ("D.measured", "return {'a': 0.0}", "returned angles of a, expected those of a, b"),
-    "no encoder": ("D.measured", "return", "returned angles .rad. None, expected a mapping of names to num"),
+    "encoders": ("D.measured", "return {'a': 0.0}", "returned ..a.: 0.0., expected finite angles .rad. of all of a, b"),
+    "no encoder": ("D.measured", "return", "returned None, expected finite angles .rad. of all of a, b"),
     "let go": ("D.release", "int('x')", "raised ValueError: invalid literal for int.. with base 10: 'x'"),
     "close": ("D.close", "self.port.close()", "raised AttributeError: 'D' object has no attribute 'port'"),
     "no frames": ("T.frames", "return", "returned None, expected a list of TrackerFrame"),
-    "one frame": ("T.frames", f"return {FRAME % None}", "returned an object of type TrackerFrame, expected a"),
-    "tuples": ("T.frames", "return [(1, 2)]", "returned an object of type tuple, expected a list of TrackerF"),
-    "positions": ("T.frames", f"return [{FRAME % 'np.zeros(3)'}]", "returned 'tool' as ndarray of the shape .3,."),
-    "rows": ("T.frames", f"return [{FRAME % 'np.eye(4).tolist()'}]", "returned 'tool' as list of the shape .4, 4"),
-    "unseen": ("T.frames", f"return [{FRAME % 'np.full((4, 4), np.nan)'}]", "returned 'tool' at .nan nan nan., e"),
-    "no time": ("T.frames", "return [TrackerFrame(1, None, None)]", "returned arrived None, expected seconds"),
-    "no bodies": ("T.frames", "return [TrackerFrame(1, 0.0, None, [])]", "returned .* bodies of type list, exp"),
-    "a counter": ("T.frames", "return [TrackerFrame('1', 0.0, None)]", "returned the counter '1' and bodies of"),
+    "one frame": ("T.frames", f"return {FRAME % None}", "returned TrackerFrame.*, expected a list of TrackerFrame"),
+    "tuples": ("T.frames", "return [(1, 2)]", "returned ..1, 2.., expected a list of TrackerF"),
+    "positions": ("T.frames", f"return [{FRAME % 'np.zeros(3)'}]", "returned 'tool' of the shape .3,.: .*, expected w"),
+    "rows": ("T.frames", f"return [{FRAME % 'np.eye(4).tolist()'}]", "returned list .*'shape'., expected a list of Tr"),
+    "unseen": ("T.frames", f"return [{FRAME % 'np.full((4, 4), np.nan)'}]", "returned 'tool' of the shape .4, 4.: ..n"),
+    "no time": ("T.frames", "return [TrackerFrame(1, None, None)]", "returned .*arrived=None, .*, expected a list of "),
+    "no bodies": ("T.frames", "return [TrackerFrame(1, 0.0, None, [])]", "returned .*bodies=...., expected a list of "),
+    "a counter": ("T.frames", "return [TrackerFrame('1', 0.0, None)]", "returned .*counter='1', .*, expected a list o"),
     "a socket": ("T.frames", "self.socket.recv()", "raised AttributeError: 'T' object has no attribute 'sock"),
     "its end": ("T.frames", "exit()", "raised SystemExit"),
     "inside": ("T.seen", "return self.count['x']", "raised TypeError: 'int' object is not subscriptable"),
@@ -232,16 +232,16 @@ SERVO = {
 }
 RECORD = {
     "none": ("J.samples", "return", "returned None, expected a list of JointSample"),
-    "one": ("J.samples", "return JointSample(0.0, None, {})", "returned an object of type JointSample, exp"),
-    "lists": ("J.samples", SAMPLE % "0.0, None, [1, 2]", "returned the angles .1, 2., expected a mapping of"),
-    "texts": ("J.samples", SAMPLE % "0.0, None, {'arm.a': '1'}", "returned the angles ..arm.a.: '1'., expec"),
-    "no time": ("J.samples", SAMPLE % "None, None, {}", "returned arrived None, expected seconds"),
-    "a label": ("J.samples", SAMPLE % "0.0, None, {}, {'plane': 1}", "returned the labels ..plane.: 1., exp"),
+    "one": ("J.samples", "return JointSample(0.0, None, {})", "returned JointSample.*, expected a list of JointSam"),
+    "lists": ("J.samples", SAMPLE % "0.0, None, [1, 2]", "returned .*angles=.1, 2.,.*, expected a list of Jo"),
+    "texts": ("J.samples", SAMPLE % "0.0, None, {'arm.a': '1'}", "returned .*'1'.*, expected a list of JointSample"),
+    "no time": ("J.samples", SAMPLE % "None, None, {}", "returned .*arrived=None, .*, expected a list of "),
+    "a label": ("J.samples", SAMPLE % "0.0, None, {}, {'plane': 1}", "returned .*'plane': 1.*, expected a list of Jo"),
     "a fault": ("J.samples", "1 / 0", "raised ZeroDivisionError"),
     "an exit": ("J.samples", "exit()", "raised SystemExit"),
     "ended": ("J.ended", "return self.x", "raised AttributeError: 'J' object has no attribute 'x'"),
     "no shot": ("C.shoot", "return", "returned None, expected a Shot"),
-    "a file": ("C.shoot", "return Shot('a.png', '.png', '')", "returned a str, '.png', '' and '', expected a Sho"),
+    "a file": ("C.shoot", "return Shot('a.png', '.png', '')", "returned Shot.content='a.png',.*, expected a Shot of b"),
     "unseen": ("C.shoot", "return Shot(b'', '.png', '', {'u': math.nan})", "returned Shot.values ..u.: nan., exp"),
     "a lens": ("C.shoot", "self.lens.focus()", "raised AttributeError: 'C' object has no attribute 'lens'"),
     "close": ("J.close", "self.x.close()", "raised AttributeError: 'J' object has no attribute 'x'"),
@@ -265,7 +265,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         yield clock
 
     monkeypatch.setattr(Bench, "clock", fake)
-    for variable in (plugin_files.CHOSEN, plugin_files.DISABLED):
+    for variable in (plugins.CHOSEN, plugins.DISABLED):
         monkeypatch.setenv(variable, "")
     with Path(os.devnull).open() as nobody:  # exit() closes it
         nothing = SimpleNamespace(fileno=nobody.fileno, isatty=lambda: False, close=lambda: None)
@@ -293,18 +293,6 @@ def ended(folder: Path, plugin: str, command: str, *more: str, measurement: str 
     [
         ("acquire", '("a", "b")', "None", "D returned None as joint_names, expected .'a', 'b'., as it was given them"),
         ("acquire", '("a", "b")', '("a",)', "D returned .'a',. as joint_names, expected .'a', 'b'., as it was given"),
-        (
-            "acquire",
-            "    refused = {}",
-            "    refused = 0",
-            "T returned 0 as refused, expected a mapping of reasons to co",
-        ),
-        (
-            "servo",
-            "    refused = {}",
-            "    refused = {'x': None}",
-            "T returned ..x.: None. as refused, expected a mapp",
-        ),
         ("record", '"touch"', '"board"', "C returned 'board' as measurement, expected one of touch"),
     ],
 )
@@ -348,7 +336,7 @@ def test_a_mistake(
     code = ended(tmp_path, mistaken(method, statement), command, *options, measurement=measurement)
     shown = capsys.readouterr().err
     last = [line for line in shown.splitlines() if line.startswith("armcal: ")]
-    assert code == 2 and len(last) == 1 and "Traceback" not in shown, shown
+    assert code == 2 and len(last) == 1 and ("Traceback" in shown) == sentence.startswith("raised"), shown
     assert re.search(rf"mine.py:\d+: {method} {sentence}", last[0]), last[0]
     assert clock.arm or all(abs(angle) < 1e-9 for angle in clock.let_go), "let go elsewhere than where it parks"
     before, clock.late = kept(tmp_path / "out"), float("inf")

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from armcal.plugin_files import use_plugins
+from armcal.plugins import use_plugins
 from clean_runs import KINDS, run
 
 RUNS = 4

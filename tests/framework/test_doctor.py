@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from armcal import extras
+from armcal import plugins
 from armcal.cli import doctor as module
 from armcal.cli.doctor import EXTRAS, Finding, components, examine, in_child, look_at
 from armcal.cli.main import cli
@@ -114,10 +114,10 @@ def test_a_calibration_that_is_off_is_a_fault(off_mm: float, works: bool, monkey
 
 def test_armcal_that_is_not_installed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> None:
-        raise extras.metadata.PackageNotFoundError(name)
+        raise plugins.metadata.PackageNotFoundError(name)
 
     for read in ("version", "requires"):
-        monkeypatch.setattr(extras.metadata, read, missing)
+        monkeypatch.setattr(plugins.metadata, read, missing)
     found = told_by(monkeypatch)
     itself = found["libraries", "armcal"]
     assert itself.state == "warning" and "not installed" in itself.text and "pip install -e ." in itself.hint
@@ -136,9 +136,9 @@ def test_requirements_are_read_as_metadata_writes_them(monkeypatch: pytest.Monke
     ]
     told = Message()
     told["Provides-Extra"], told["Provides-Extra"], told["Provides-Extra"] = "x", "y", "dev"
-    monkeypatch.setattr(extras.metadata, "requires", lambda name: texts)
-    monkeypatch.setattr(extras.metadata, "metadata", lambda name: told)
-    needs = extras.requirements()
+    monkeypatch.setattr(plugins.metadata, "requires", lambda name: texts)
+    monkeypatch.setattr(plugins.metadata, "metadata", lambda name: told)
+    needs = plugins.requirements()
     assert [(r.name, str(r.specifier)) for r in needs.pop("")] == [("numpy", ">=1.26"), ("a", "<2,>=1")]
     assert {name: [r.name for r in needed] for name, needed in needs.items()} == {
         "x": ["dask", "b"],
@@ -170,7 +170,7 @@ def test_versions_are_compared_with_the_range(
 
 
 def test_every_extra_that_is_declared_says_what_it_is_for() -> None:
-    declared = extras.requirements()
+    declared = plugins.requirements()
     assert set(declared) - {"", "all"} == set(EXTRAS)
     assert {"numpy", "casadi"} <= {r.name for r in declared[""]}
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armcal import plugin_files
+from armcal import plugins
 from armcal.cli.main import cli
 from click.testing import CliRunner, Result
 
@@ -160,7 +160,7 @@ def armcal_register_measurements(register):
 def test_ranges_and_bearings_are_no_errors_of_a_tip_or_of_an_orientation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(plugin_files.CHOSEN, "")
+    monkeypatch.setenv(plugins.CHOSEN, "")
     text = CONFIG.replace(
         "tip_pose, noise_mm: 0.1, orientation_noise_deg: 0.05", "range, noise_mm: 0.1, angle_noise: 0.01"
     )

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from armcal import JointCommand, plugin_files, use_plugins
+from armcal import JointCommand, plugins, use_plugins
 from armcal.cli.main import cli
 from armcal.errors import PluginError
 from armcal.plugins import PluginRegistry, discover
@@ -37,7 +37,7 @@ def armcal_register_effects(register):
 
 @pytest.fixture(autouse=True)
 def _forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    for variable in (plugin_files.CHOSEN, plugin_files.DISABLED):
+    for variable in (plugins.CHOSEN, plugins.DISABLED):
         monkeypatch.setenv(variable, "")
     yield
 

@@ -8,11 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from armcal import plugin_files, use_plugins
+from armcal import plugins, use_plugins
 from armcal.cli.main import cli
 from armcal.errors import PluginError
 from armcal.io.parallel import Workers
-from armcal.plugin_faults import blaming
+from armcal.plugins import blaming
 
 IMPORTS = """import math
 
@@ -65,7 +65,7 @@ LAW = "lambda load, command: values['s2'] * load"
 EFFECTS = {  # what stands in the place of what, and what the sentence says
     "another name": (MOVED, "s * command.angle", "E.displacement raised AttributeError: .* has no attribute 'angle'"),
     "unknown parameter": ('"s2"', '"k2"', "E.displacement .*found no parameter 'k2', expected one of s1, s2"),
-    "a list": (MOVED, "[s]", "E.displacement returned an object of type list, expected one number or expression"),
+    "a list": (MOVED, "[s]", r"E.displacement returned \[SX\(values\)\], expected one number or expression"),
     "a vector": (MOVED, "ca.vertcat(s, s)", "E.displacement returned 2 x 1 numbers, expected one number"),
     "no return": ("return s *", "s *", "E.displacement returned None, expected one number"),
     "not a number": (MOVED, "s * ca.sqrt(-9 - command.commanded ** 2)", "E.displacement returned nan for q2 comm.* 1"),
@@ -80,7 +80,7 @@ EFFECTS = {  # what stands in the place of what, and what the sentence says
     "nominal NaN": ("0.0,", "math.nan,", "E.parameters returned nominal nan and scale 0.01 of 's1', expected numbers"),
     "one name": ('f"s{joint}"', '"s2"', "E.parameters returned two parameters called 's2', expected names that differ"),
     "a dot": ('f"s{joint}"', 'f"s.{joint}"', "E.parameters returned the name 's.1', expected one without spaces, dots"),
-    "a text": (DECLARED, "'s2'", "E.parameters returned 's2', expected ParameterBlock, as scalar.. makes them"),
+    "a text": (DECLARED, "'s2'", "E.parameters returned .'s2', .*, expected a sequence of ParameterBl"),
     "none": ("return [", "[", "E.parameters returned None, expected a sequence of ParameterBlock"),
     "no springs": (NO_SPRINGS, "pass", "E.springs returned None, expected a sequence of Spring"),
     "no such site": (NO_SPRINGS, f"return [Spring(9, (), {LAW})]", "E.springs returned a spring at the site 9, expec"),
@@ -92,9 +92,9 @@ EFFECTS = {  # what stands in the place of what, and what the sentence says
 GAUGES = {
     "another channel": ('"r": ca', '"d": ca', "G.outputs returned the channels d, expected .* of each channel .* r"),
     "no channel": ('{"r": ', '{"r": 0} and {} and {"r": ', "G.outputs returned only none, expected every channel: r"),
-    "no mapping": ('{"r": ', "{", "G.outputs returned an object of type set, expected the expression of each channel"),
+    "no mapping": ('{"r": ', "{", "G.outputs returned set .*, expected the expression of each channel"),
     "a whole vector": ("ca.norm_2", "", "G.outputs returned 3 x 1 numbers, expected one number as 'r'"),
-    "a text": ('Channel("r", "length")', '"r"', "G.channels returned 'r', expected Channel.name, dimension., of"),
+    "a text": ('Channel("r", "length")', '"r"', "G.channels returned .'r'., expected a sequence of Channel.name, d"),
     "no dimension": ('"length"', '"mm"', "G.channels returned Channel.name='r', dimension='mm'., expected Chan"),
     "bare noise": ("(1e-4,)", "1e-4", "G.noise returned 0.0001, expected a sequence of standard deviations above zero"),
     "no noise": ("(1e-4,)", "(0.0,)", r"G.noise returned \(0.0,\), expected a sequence of standard deviations above z"),
@@ -143,22 +143,19 @@ def _beside(parts: str) -> str:
 
 READERS = {
     "none": ("return Dataset", "Dataset", "R.read returned None, expected a Dataset"),
-    "a mapping": (WHOLE, "values", "R.read returned an object of type dict, expected a Da"),
-    "lists": (": numbers for", ": list(numbers) for", "R.read returned the channel 'arm.q1' as list of the shape .3,."),
-    "few": ("[: len(angles)]", "[:2]", r"R.read returned the channel 'm.x' as ndarray of the shape \(2,\), expect"),
+    "a mapping": (WHOLE, "values", "R.read returned dict .*no attribute 'channels'., expected a Da"),
+    "lists": (": numbers for", ": list(numbers) for", "R.read returned Dataset .*no attribute 'shape'., exp"),
+    "few": ("[: len(angles)]", "[:2]", r"R.read returned the channel 'm.x' of the shape \(2,\), of float64, expect"),
     "NaN": ("0.5, 0.1, 0.2]", "math.nan] * 3", "no usable record: all 3 were set aside, the first because m.x is emp"),
     "a file": ("angles =", "open('no')\n        angles =", "R.read raised FileNotFoundError: .* 'no'. To che"),
     "ids twice": ('"c")', '"a")', "row 3: the id 'a' was given to another record before, at row 1, with other values"),
-    "numbers": ('("a", "b", "c")', "(1, 2, 3)", "R.read returned the ids .1, 2, 3., expected a tuple of texts"),
     "no joint": ("start=1)}", "start=1) if i < 3}", "R.read returned no channel 'arm.q3' among arm.q1, arm.q2, m.x, "),
     "no z": ('in "xyz"', 'in "xy"', "R.read returned no channel 'm.z' among .*, expected every channel of the request"),
     "degrees": ("np.radians", "np.array", "arm.q1: found -1718.87.* deg more than two turns. If the unit is wrong"),
     "time": (WHOLE, "Dataset(tuple('abc'), {**values, 'time': np.array([1.0, 3, 2])})", "row 3, time: .* out of order"),
-    "channels": (WHOLE, "Dataset(tuple('abc'), list(values))", "R.read returned the channels .'arm.q1', .*, expected"),
-    "few rows": (WHOLE, _beside("rows=(1,)"), "R.read returned the rows .1,., expected a tuple of 3 ints, or an emp"),
-    "a column": (WHOLE, _beside("extra={'t': ('x',)}"), "R.read returned extra as .*, expected a mapp.* of 3 texts"),
-    "a source": (WHOLE, _beside("source=None"), "R.read returned the source None and sha256 '', expected texts"),
-    "left": (WHOLE, _beside("set_aside=['x']"), "R.read returned the warnings .. and set_aside ..x.., expected a tupl"),
+    "channels": (WHOLE, "Dataset(tuple('abc'), list(values))", "R.read returned Dataset .'list' .*, expected a Datase"),
+    "few rows": (WHOLE, _beside("rows=(1,)"), "R.read returned 1 rows, expected 3 of them, or none"),
+    "a column": (WHOLE, _beside("extra={'t': ('x',)}"), "R.read returned 1 texts as 't', expected 3, one a record"),
 }  # fmt: skip
 MODEL = (
     IMPORTS
@@ -196,7 +193,7 @@ MODELS = {
         'in ("p1"',
         "M.chain returned the joints p1, q2, q3, expected a sequence of the joint",
     ),
-    "no names": ("    joint_names", "    names", "the plugin 'mine' is broken: it has no joint_names; the contract"),
+    "no names": ("    joint_names", "    names", "the plugin 'mine' is broken: it has no joint_names; its contract"),
     "an axis": (
         "(0, 0, 1)",
         "(0, 0, 2)",
@@ -205,15 +202,19 @@ MODELS = {
     "no transform": (
         "Attachment(3, link)",
         "Attachment(3, values['a2'])",
-        "M.chain returned the frame 'tool' as Attach",
+        "M.chain returned Chain .'SX' object has no attribute 'rotation'., expected a",
     ),
     "no joint": ("Attachment(3", "Attachment(4", "M.chain returned the frame 'tool' on the joint 4, expected 0 to 3"),
     "an offset": (
         "(0, 0, 1)",
         "(0, 0, 1), offset='a2'",
-        "M.chain returned the offset 'a2' of the joint q1, expected an",
+        "M.chain returned Chain .*, expected a Chain",
     ),
-    "no mount": ("Chain(at", "Chain(0", "M.chain returned 0, expected a Transform base_T_mount"),
+    "no mount": (
+        "Chain(at",
+        "Chain(0",
+        "M.chain returned Chain .'int' object has no attribute 'rotation'., expected a",
+    ),
 }
 REGISTRATIONS = {
     "another hook": (
@@ -230,7 +231,7 @@ REGISTRATIONS = {
 
 @pytest.fixture(autouse=True)
 def _forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    for variable in (plugin_files.CHOSEN, plugin_files.DISABLED):
+    for variable in (plugins.CHOSEN, plugins.DISABLED):
         monkeypatch.setenv(variable, "")
     yield
 
@@ -276,6 +277,8 @@ KINDS: dict[str, tuple[str, dict[str, tuple[str, str, str]], dict[str, str]]] = 
 }
 OF_NO_LINE = ("derivative", "the measurement", "row", "no usable", "arm.q1", "'mine'")
 """Sentences about numbers, records or a name that no single line of a plugin gave."""
+RAISED = re.compile(r"raised|found no parameter|takes|ZeroDivision")
+"""Sentences about what the plugin's own code raised, which stand below its traceback."""
 
 
 @pytest.mark.parametrize(("kind", "mistake"), [(kind, name) for kind, (_, table, _) in KINDS.items() for name in table])
@@ -286,7 +289,7 @@ def test_a_mistake(kind: str, mistake: str, tmp_path: Path, capsys: pytest.Captu
     assert ended(tmp_path, plugin.replace(right, wrong, 1), **options) == 2
     shown = capsys.readouterr().err
     last = [line for line in shown.splitlines() if line.startswith("armcal: ")]
-    assert len(last) == 1 and "Traceback" not in shown
+    assert len(last) == 1 and ("Traceback" in shown) == bool(RAISED.search(sentence))
     assert re.search(sentence, last[0]) and (sentence.startswith(OF_NO_LINE) or "mine.py" in last[0]), last[0]
 
 

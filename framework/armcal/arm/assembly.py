@@ -9,10 +9,10 @@ from typing import Any, Protocol, runtime_checkable
 import casadi as ca
 import numpy as np
 
-from armcal.arm.effects import Condition, JointCommand, JointEffect, Spring, spring_fault
+from armcal.arm.effects import Condition, JointCommand, JointEffect, Spring, check_springs
 from armcal.arm.elastic import deflections, elastic_sites, split_deflection
 from armcal.arm.environment import Environment
-from armcal.arm.model import ArmModel, Chain, chain_fault, forward
+from armcal.arm.model import ArmModel, Chain, check_chain, forward
 from armcal.arm.pose_residual import OF_TOOL, SURROUNDINGS, PoseResidual, Postures, corrected, correction_names
 from armcal.arm.statics import Load, MassSpec, joint_efforts, wrenches
 from armcal.base.arrays import Array, Mask
@@ -21,7 +21,6 @@ from armcal.base.parameters import ParameterBlock, declared, scalar
 from armcal.base.poses import pose_transform
 from armcal.base.se3 import Expression, Transform, column, evaluated
 from armcal.errors import ConfigError, DataError, Location
-from armcal.plugin_faults import refuse
 
 PLACEMENT = "placement"
 """What the blocks of an arm's placement are called."""
@@ -180,8 +179,7 @@ class Arm:
 
     def chain(self, values: Mapping[str, Expression]) -> Chain:
         chain = self.model.chain(scoped(values, self._scope(self.model_name)))
-        if fault := chain_fault(chain, self.joint_names):
-            refuse(self.model.chain, *fault)
+        check_chain(self.model.chain, chain, self.joint_names)
         if self.couplings:
             joints = (replace(joint, couplings=self.couplings.get(joint.name, {})) for joint in chain.joints)
             chain = replace(chain, joints=tuple(joints))
@@ -194,11 +192,7 @@ class Arm:
         every: list[Spring] = []
         for name, effect in self.effects.items():
             springs = effect.springs(scoped(values, self._scope(name)))
-            if not isinstance(springs, Iterable):
-                refuse(effect.springs, springs, "a sequence of Spring")
-            every += springs
-            for fault in filter(None, (spring_fault(spring, len(self.joint_names)) for spring in springs)):
-                refuse(effect.springs, *fault)
+            every += check_springs(effect.springs, springs, len(self.joint_names))
         return tuple(every)
 
     @cached_property
@@ -267,8 +261,7 @@ class Arm:
                     f"the effect {self._scope(name)[:-1]} reads {missing}, which is not recorded.",
                     hint=f"Add a column {missing} with its unit.",
                 ) from fault
-            if wrong := chain_fault(shaped, self.joint_names):
-                refuse(effect.shaped, *wrong)
+            check_chain(effect.shaped, shaped, self.joint_names)
             chain = shaped
         return chain
 

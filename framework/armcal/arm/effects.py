@@ -11,6 +11,7 @@ from armcal.arm.model import Z_AXIS, Chain, Vector3
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression
 from armcal.base.settings import Settings
+from armcal.plugins import expecting, refuse
 
 JointChoice = Literal["all"] | tuple[str, ...]
 """All joints, or some by name."""
@@ -63,18 +64,22 @@ class Spring:
         return max(1, len(self.directions))
 
 
-def spring_fault(spring: Any, joints: int) -> tuple[str, str] | None:
-    """What is wrong with a spring of an arm of so many joints, and what was expected; None if nothing is."""
-    if not isinstance(spring, Spring):
-        return type(spring).__name__, "Spring"
-    if not 0 <= spring.site <= joints:
-        return f"a spring at the site {spring.site}", f"0 to {joints}: 0 is the mount, i is joint i"
-    if spring.site == 0 and not spring.directions:
-        return "a spring at the mount without directions", "directions: the mount has no axis of its own"
-    for direction in spring.directions:
-        if np.shape(direction) != (3,) or abs(np.linalg.norm(direction) - 1) > _UNIT:
-            return f"the direction {direction}", "a unit vector of three numbers"
-    return None if callable(spring.law) else (f"a law of type {type(spring.law).__name__}", "a function")
+def check_springs(method: Callable[..., Any], given: Any, joints: int) -> tuple[Spring, ...]:
+    """What a method gave as springs of an arm of so many joints, or refuse other sites, directions and laws."""
+    with expecting(method, given, "a sequence of Spring(site, directions, law)"):
+        springs: tuple[Spring, ...] = tuple(given)
+        for spring in springs:
+            if not 0 <= spring.site <= joints:
+                refuse(method, f"a spring at the site {spring.site}", f"0 to {joints}: 0 is the mount, i is joint i")
+            if spring.site == 0 and not spring.directions:
+                odd = "a spring at the mount without directions"
+                refuse(method, odd, "directions: the mount has no axis of its own")
+            for direction in spring.directions:
+                if np.shape(direction) != (3,) or abs(np.linalg.norm(direction) - 1) > _UNIT:
+                    refuse(method, f"the direction {direction}", "a unit vector of three numbers")
+            if not callable(spring.law):
+                refuse(method, f"a law of type {type(spring.law).__name__}", "a function of load and command")
+    return springs
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Arm models: the chain of joints that a model describes, and the pose of every frame of it."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -10,10 +10,11 @@ import numpy as np
 from armcal.base import se3
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression, Transform
+from armcal.plugins import expecting, refuse
 
 Vector3 = tuple[float, float, float]
 Z_AXIS: Vector3 = (0.0, 0.0, 1.0)
-_UNIT, _SHOWN = 1e-9, 80
+_UNIT = 1e-9
 
 
 @dataclass(frozen=True)
@@ -108,25 +109,29 @@ class Chain:
     frames: Mapping[str, Attachment] = field(default_factory=dict)
 
 
-def chain_fault(chain: Any, joint_names: Sequence[str]) -> tuple[Any, str] | None:
-    """What is wrong with what a model gives as the chain of these joints, and what was expected; None if nothing is."""
-    if not isinstance(chain, Chain):
-        return chain, f"a Chain of the joints {', '.join(joint_names)}"
-    for joint in (joints := tuple(chain.joints) if isinstance(chain.joints, Iterable) else (chain.joints,)):
-        if not isinstance(joint, Joint) or not isinstance(joint.parent_T_joint, Transform):
-            return repr(joint)[:_SHOWN], "a Joint(name, parent_T_joint) with a Transform"
-        if abs(np.linalg.norm(joint.axis) - 1) > _UNIT:
-            return f"the joint {joint.name} about {joint.angular}, along {joint.linear}", "one of them of length 1"
-        if not isinstance(joint.offset, ca.SX | ca.DM | float | int):
-            return f"the offset {joint.offset!r} of the joint {joint.name}", "an expression (rad or m)"
-    if not isinstance(chain.joints, Sequence) or [joint.name for joint in joints] != list(joint_names):
-        return f"the joints {', '.join(j.name for j in joints)}", f"a sequence of the joints {', '.join(joint_names)}"
-    for name, frame in {"tool": chain.tool, **chain.frames}.items():
-        if not isinstance(frame, Attachment) or not isinstance(frame.joint_T_frame, Transform):
-            return f"the frame {name!r} as {frame!r}"[:_SHOWN], "an Attachment(joint, joint_T_frame) with a Transform"
-        if not 0 <= frame.joint <= len(joints):
-            return f"the frame {name!r} on the joint {frame.joint}", f"0 to {len(joints)}: 0 is the mount"
-    return None if isinstance(chain.base_T_mount, Transform) else (repr(chain.base_T_mount), "a Transform base_T_mount")
+def check_chain(method: Callable[..., Any], chain: Any, joint_names: Sequence[str]) -> None:
+    """Refuse what a method gave as the chain of these joints: other joints, axes, frames or shapes."""
+    with expecting(method, chain, f"a Chain of the joints {', '.join(joint_names)}: mount, joints, tool and frames"):
+        frames, count = {"tool": chain.tool, **chain.frames}, len(chain.joints)
+        for joint in chain.joints:
+            if abs(np.linalg.norm(joint.axis) - 1) > _UNIT:
+                refuse(
+                    method,
+                    f"the joint {joint.name} about {joint.angular}, along {joint.linear}",
+                    "one of them of length 1",
+                )
+            if ca.SX(joint.offset).shape != (1, 1):
+                refuse(method, f"the offset {joint.offset!r} of the joint {joint.name}", "one expression (rad or m)")
+        if [joint.name for joint in chain.joints] != list(joint_names):
+            given = f"the joints {', '.join(joint.name for joint in chain.joints)}"
+            refuse(method, given, f"a sequence of the joints {', '.join(joint_names)}")
+        for name, frame in frames.items():
+            if not 0 <= frame.joint <= count:
+                refuse(method, f"the frame {name!r} on the joint {frame.joint}", f"0 to {count}: 0 is the mount")
+        moved = (joint.parent_T_joint for joint in chain.joints), (frame.joint_T_frame for frame in frames.values())
+        for transform in (chain.base_T_mount, *moved[0], *moved[1]):
+            if transform.rotation.shape != (3, 3) or transform.translation.shape != (3, 1):
+                refuse(method, f"the transform {transform!r}", "a rotation of 3 x 3 and a translation of 3 x 1")
 
 
 class ArmModel(Protocol):

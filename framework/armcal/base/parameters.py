@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from armcal.base.arrays import Array, Indices
 from armcal.base.domains import Domain, Interval, Rotation
 from armcal.base.units import SI_UNITS, UNITS, si_unit
 from armcal.errors import ConfigError
-from armcal.plugin_faults import refuse
+from armcal.plugins import expecting, refuse
 
 FIT_NAME = re.compile(r"""[^\s.*?\[\]<>"'\\@]+""")
 """What a part of a parameter's name may be: dots join parts, brackets name entries, the others make patterns."""
@@ -97,12 +97,15 @@ def declared(component: DeclaresParameters) -> tuple[ParameterBlock, ...]:
         PluginError: they are no blocks, or a name, a unit, a nominal value or a scale makes no sense.
     """
     blocks, method = component.parameters(), component.parameters
-    if not isinstance(blocks, Iterable):
-        refuse(method, blocks, "a sequence of ParameterBlock, as scalar() makes them")
-    blocks, names = tuple(blocks), set[str]()
+    with expecting(method, blocks, "a sequence of ParameterBlock, as scalar() makes them"):
+        blocks = tuple(blocks)
+        _check_blocks(method, blocks)
+    return blocks
+
+
+def _check_blocks(method: Callable[..., Any], blocks: Sequence[ParameterBlock]) -> None:
+    names = set[str]()
     for block in blocks:
-        if not isinstance(block, ParameterBlock):
-            refuse(method, repr(block), "ParameterBlock, as scalar() makes them")
         if not FIT_NAME.fullmatch(block.name):
             refuse(method, f"the name {block.name!r}", "one without spaces, dots, quotes and * ? [ ] < > @ \\")
         if block.name in names:
@@ -115,7 +118,6 @@ def declared(component: DeclaresParameters) -> tuple[ParameterBlock, ...]:
         if not (all(map(math.isfinite, block.nominal)) and 0 < block.scale < math.inf):
             numbers = f"nominal {', '.join(map(str, block.nominal))} and scale {block.scale} of {block.name!r}"
             refuse(method, numbers, "numbers, and a scale above zero: the size of an ordinary correction")
-    return blocks
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from armcal.base.arrays import Array
-from armcal.plugin_faults import refuse
+from armcal.plugins import refuse
 
 Expression = Any
 """A CasADi ``SX`` (or a number where a constant is meant)."""
@@ -70,7 +70,7 @@ def column(method: Callable[..., Any], returned: Any, rows: int | None, expected
     try:
         given = ca.SX(returned)
     except (NotImplementedError, TypeError):
-        refuse(method, returned, expected)
+        refuse(method, f"{returned!r}", expected)
     if given.shape != (given.shape[0] if rows is None else rows, 1):
         refuse(method, " x ".join(map(str, given.shape)) + " numbers", expected)
     return given

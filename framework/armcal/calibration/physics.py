@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from armcal import plugin_files
+from armcal import plugins
 from armcal.arm import assembly
 from armcal.arm.assembly import command_channels
 from armcal.arm.environment import Environment
@@ -250,7 +250,7 @@ def _source(module: str) -> str:
         return ""
     path, digest = Path(file), hashlib.sha256()
     try:
-        packaged = getattr(loaded, "__package__", "") not in ("", plugin_files.__name__)
+        packaged = getattr(loaded, "__package__", "") not in ("", plugins.__name__)
         for module_file in sorted(path.parent.glob("*.py")) if packaged else [path]:
             digest.update(f"{module_file.name}\0".encode() + module_file.read_bytes() + b"\0")
     except OSError:

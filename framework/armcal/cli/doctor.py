@@ -19,9 +19,7 @@ import click
 from packaging.requirements import Requirement
 
 from armcal.errors import EXIT_BAD_INPUT
-from armcal.extras import DISTRIBUTIONS, extra_of, requirements
-from armcal.plugins import discover
-from armcal.registration import said
+from armcal.plugins import DISTRIBUTIONS, discover, extra_of, requirements, said
 from armcal.version import JSON_SCHEMA, SOURCES, __version__
 
 LARGEST_MM = 1.0

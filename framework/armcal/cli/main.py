@@ -5,6 +5,7 @@ import errno
 import itertools
 import os
 import sys
+import traceback
 from importlib import import_module
 
 import click
@@ -12,11 +13,8 @@ from click.exceptions import Exit
 from click.shell_completion import CompletionItem
 
 from armcal.cli.console import Output, output_fault, say
-from armcal.errors import EXIT_DONE, EXIT_FAULT, EXIT_INTERRUPTED, ArmcalError
-from armcal.extras import missing_library
-from armcal.plugin_faults import plugin_fault
-from armcal.plugin_files import use_plugins
-from armcal.plugins import discover
+from armcal.errors import EXIT_DONE, EXIT_FAULT, EXIT_INTERRUPTED, ArmcalError, BrokenPluginError
+from armcal.plugins import discover, missing_library, plugin_fault, use_plugins
 from armcal.version import JSON_SCHEMA, __version__
 
 COMMANDS = {
@@ -179,6 +177,8 @@ def _exit_code() -> int:
 
 def _report(fault: ArmcalError) -> None:
     notes = getattr(fault, "__notes__", [])
+    if isinstance(fault, BrokenPluginError) and fault.__cause__ is not None:
+        say("".join(traceback.format_exception(fault.__cause__)).rstrip(), err=True)
     if "--json" in sys.argv:
         import json
 

@@ -19,10 +19,10 @@ from armcal.calibration.recorded_range import beyond_records
 from armcal.cli.common import FILE, Console, accept, spare_inputs, speaking
 from armcal.errors import DataError, InputError, Location
 from armcal.io.plain_files import input_file
+from armcal.measure.checks import records_of
 from armcal.measure.csv_writer import column_names, write_csv
 from armcal.measure.environment import noticed
 from armcal.measure.reader import ReadRequest, RequestedChannel, requested_channels
-from armcal.measure.returned import records_of
 from armcal.plugins import PluginRegistry
 from armcal.run.compensate import short_texts
 

@@ -9,7 +9,6 @@ from typing import Any, Literal, TypeVar
 from pydantic import Field, field_validator
 from typing_extensions import get_protocol_members, is_protocol
 
-from armcal import plugin_files
 from armcal.arm.assembly import PLACEMENT, Arm, MassiveModel, prefixed
 from armcal.arm.environment import STATICS, Environment, gravity_tilt
 from armcal.arm.joints import require_couplings
@@ -18,15 +17,15 @@ from armcal.arm.statics import MassSpec, frame_names
 from armcal.base.parameters import FIT_NAME, ParameterBlock, Parameters, declared
 from armcal.base.poses import PoseSettings
 from armcal.base.settings import Acceleration3, Angle, Force3, Length3, Mass, Settings, Torque3
+from armcal.base.units import DIMENSIONS
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource
-from armcal.errors import ArmcalError, ConfigError, Location, PluginError
+from armcal.errors import ArmcalError, BrokenPluginError, ConfigError, Location, PluginError
 from armcal.hooks import COMPONENTS
 from armcal.measure.groups import Groups, group_blocks
 from armcal.measure.measurement import Borrowing, Carried, Measurement
 from armcal.measure.reader import surroundings
-from armcal.measure.returned import check_channels
-from armcal.plugins import Component, PluginRegistry, spoken
+from armcal.plugins import Component, PluginRegistry, expecting, plugin_files, refuse, spoken
 
 T = TypeVar("T")
 Path = tuple[str | int, ...]
@@ -149,7 +148,7 @@ def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
     for name in settings.measurements:
         at: Path = ("measurements", name)
         measurements[name], described[name] = build_component(source, registry, "measurement", at, tuple(arms))
-        check_channels(measurements[name])
+        _check_channels(measurements[name])
         carried = measurements[name]
         if isinstance(carried, Carried):
             carrier = arms[measurements[name].arms[0]]
@@ -208,9 +207,17 @@ def build_component(
     return built, {"type": name, **settings.to_config()}
 
 
+def _check_channels(measurement: Measurement) -> None:
+    channels = measurement.channels()
+    with expecting(measurement.channels, channels, "a sequence of Channel(name, dimension)"):
+        for channel in channels:
+            if channel.dimension not in DIMENSIONS:
+                refuse(measurement.channels, f"{channel!r}", f"Channel(name, dimension), of {', '.join(DIMENSIONS)}")
+
+
 def _broken(component: Component, fault: str) -> PluginError:
-    file = plugin_files.files().get(component.plugin)
-    return PluginError(
+    file = plugin_files().get(component.plugin)
+    return BrokenPluginError(
         f"the {component.kind} {component.name!r} of the plugin {component.plugin!r} is broken: {fault}.",
         where=Location(str(file)) if file else None,
         hint=f"See armcal plugins check {component.plugin}.",

@@ -1,11 +1,13 @@
 """What moves the joints of a bench, and what goes wrong with it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from math import isfinite
+from typing import Any, Protocol, runtime_checkable
 
 from armcal.devices.clock import Clock
 from armcal.errors import ArmcalError, InputError
+from armcal.plugins import expecting, refuse
 
 
 class DeviceError(ArmcalError):
@@ -132,3 +134,42 @@ class MeasuringDevice(Protocol):
 
     def measured(self) -> dict[str, float]:
         """Where all joints stand by their own encoders (rad)."""
+
+
+def open_device(device: JointDevice, clock: Clock) -> DeviceIdentity:
+    """The device, opened; see ``JointDevice.open`` for what it raises."""
+    identity = device.open(clock)
+    with expecting(device.open, identity, "a DeviceIdentity of texts"):
+        _ = identity.name + identity.digest + identity.adapter
+    return identity
+
+
+def state_of(device: JointDevice) -> DeviceState:
+    state = device.state()
+    with expecting(device.state, state, "a DeviceState"):
+        _check_angles(device.state, state.angles, device.joint_names)
+    return state
+
+
+def standing_at(device: JointDevice, angles: Mapping[str, float]) -> dict[str, float]:
+    """The angles that pulses can set nearest to these (rad)."""
+    standing = device.standing(angles)
+    _check_angles(device.standing, standing, angles, whole=True)
+    return standing
+
+
+def measured_angles(device: JointDevice) -> dict[str, float]:
+    """Where the joints stand (rad), by servos that know; empty for others."""
+    if not isinstance(device, MeasuringDevice):
+        return {}
+    measured = device.measured()
+    _check_angles(device.measured, measured, device.joint_names, whole=True)
+    return measured
+
+
+def _check_angles(method: Callable[..., Any], angles: Any, joints: Collection[str], *, whole: bool = False) -> None:
+    expected = f"finite angles (rad) of {'all' if whole else 'some'} of {', '.join(joints)}"
+    with expecting(method, angles, expected):
+        others = angles.keys() ^ set(joints) if whole else angles.keys() - set(joints)
+        if others or not all(map(isfinite, angles.values())):
+            refuse(method, f"{angles}", expected)

@@ -1,12 +1,16 @@
 """What a bench is measured with, live: joint readings of arms guided by hand, trackers, cameras."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from math import isfinite, isnan
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
 
 from armcal.base.arrays import Array
 from armcal.devices.clock import Clock
 from armcal.measure.measurement import Measurement
+from armcal.plugins import expecting, refuse
 
 
 @dataclass(frozen=True)
@@ -165,3 +169,52 @@ class LiveCamera(Protocol):
 
     def close(self) -> None:
         """Stop. May be called twice."""
+
+
+def frames_of(tracker: Tracker) -> list[TrackerFrame]:
+    """All frames that came since the last call."""
+    frames = tracker.frames()
+    with expecting(tracker.frames, frames, "a list of TrackerFrame(counter, arrived, stamp, bodies)"):
+        frames = list(frames)
+        for frame in frames:
+            _check_moments(tracker.frames, frame.arrived, frame.stamp, frame.counter)
+            for name, pose in frame.bodies.items():
+                if pose is not None and not (pose.shape == (4, 4) and np.isfinite(pose[:3, 3]).all()):
+                    given = f"{name!r} of the shape {pose.shape}: {pose}"
+                    refuse(tracker.frames, given, "world_T_body (4 x 4, m), or None of a body that is not seen")
+    return frames
+
+
+def samples_of(stream: JointStream, which: Literal["samples", "lasting"] = "samples") -> list[JointSample]:
+    """All joint readings that came since the last call; or the rest that lasts, of a stream that gives rests."""
+    method = stream.lasting if which == "lasting" and isinstance(stream, RestStream) else stream.samples
+    samples = method()
+    with expecting(method, samples, "a list of JointSample(arrived, stamp, angles, labels), of numbers and texts"):
+        samples = list(samples)
+        for sample in samples:
+            _check_moments(method, sample.arrived, sample.stamp)
+            _ = [isnan(angle) for angle in sample.angles.values()], "".join(sample.labels.values())
+    return samples
+
+
+def shots_of(camera: LiveCamera) -> list[Shot]:
+    """All images that came by themselves since the last call."""
+    return [_checked(camera.shots, shot) for shot in camera.shots()]
+
+
+def shot_of(camera: LiveCamera) -> Shot:
+    return _checked(camera.shoot, camera.shoot())
+
+
+def _checked(method: Callable[..., Any], shot: Any) -> Shot:
+    with expecting(method, shot, "a Shot of bytes and texts: suffix, seen, fault"):
+        _ = memoryview(shot.content), shot.suffix + shot.seen + shot.fault
+        if not all(map(isfinite, shot.values.values())):
+            refuse(method, f"Shot.values {shot.values}", "finite numbers by channel")
+        checked: Shot = shot
+    return checked
+
+
+def _check_moments(method: Callable[..., Any], arrived: float, stamp: float | None, counter: int = 0) -> None:
+    if not (isfinite(arrived) and isfinite(counter) and (stamp is None or isfinite(stamp))):
+        refuse(method, f"arrived {arrived}, stamp {stamp} and counter {counter}", "finite numbers; stamp may be None")

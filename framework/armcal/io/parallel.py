@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 from armcal.errors import ArmcalError, InputError, Location
-from armcal.plugin_faults import blaming
+from armcal.plugins import blaming
 
 T = TypeVar("T")
 R = TypeVar("R")

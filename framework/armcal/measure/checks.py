@@ -18,13 +18,15 @@ from armcal.errors import DataError, Location
 from armcal.measure.groups import first_of_pose
 from armcal.measure.layout import Layout, joints_by_arm, layout_of, set_aside, warned
 from armcal.measure.missing import set_aside_not_finite
-from armcal.measure.reader import CYCLE, RequestedChannel
+from armcal.measure.reader import CYCLE, Reader, ReadRequest, RequestedChannel
+from armcal.plugins import expecting, refuse
 
 __all__ = [
     "Layout",
     "check_dataset",
     "check_records",
     "layout_of",
+    "records_of",
     "refuse_approaches",
     "refuse_conflicting_ids",
     "refuse_impossible_surroundings",
@@ -55,6 +57,33 @@ _MAX_DEGREES = 720.0
 _LATEST_S, _HOTTEST_C = 1e11, 150.0
 _VARIES_AT_REST = ("time", "temperature")
 """Channels that may differ between a record and its copy."""
+
+
+def records_of(reader: Reader, request: ReadRequest) -> Dataset:
+    """The records of a reader, checked whether or not it checked them; all that ask one for records ask here.
+
+    Raises:
+        DataError: the source is refused.
+        PluginError: it returned no dataset, or one without a required channel, or columns of other lengths.
+    """
+    dataset = reader.read(request)
+    with expecting(reader.read, dataset, "a Dataset: ids, and numpy arrays of numbers by channel, one a record"):
+        count = len(dataset)
+        for name, values in dataset.channels.items():
+            if values.shape != (count,) or values.dtype != np.float64:
+                given = f"the channel {name!r} of the shape {values.shape}, of {values.dtype}"
+                refuse(reader.read, given, f"a numpy array of {count} numbers (float64), one a record")
+        if len(dataset.rows) not in (0, count):
+            refuse(reader.read, f"{len(dataset.rows)} rows", f"{count} of them, or none")
+        for name, texts in {**dataset.extra, **dataset.files}.items():
+            if len(texts) != count:
+                refuse(reader.read, f"{len(texts)} texts as {name!r}", f"{count}, one a record")
+        for requested in request.channels:
+            if requested.required and not requested.effects and not dataset.has(requested.channel):
+                given = f"no channel {requested.channel!r} among {', '.join(dataset.channels) or 'none'}"
+                refuse(reader.read, given, "every channel of the request that is required")
+    layout = layout_of(request.channels, dataset, {}, {}, by_line=False)
+    return check_records(dataset, replace(layout, units=dict.fromkeys(layout.revolute, "deg")))
 
 
 def check_dataset(dataset: Dataset, layout: Layout) -> Dataset:

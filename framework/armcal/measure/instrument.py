@@ -12,7 +12,7 @@ from armcal.base.se3 import Expression, Transform
 from armcal.base.settings import Settings
 from armcal.measure.contact import named_arm
 from armcal.measure.measurement import Channel
-from armcal.plugin_faults import refuse
+from armcal.plugins import refuse
 
 _Settings = Settings
 

@@ -27,7 +27,9 @@ from armcal.arm.pose_residual import SURROUNDINGS, correction_names
 from armcal.arm.statics import LOAD_CHANNELS, Load
 from armcal.base.arrays import Array
 from armcal.base.parameters import ParameterBlock, Parameters
-from armcal.base.se3 import Expression
+from armcal.base.se3 import Expression, column
+from armcal.base.units import ERROR_UNITS
+from armcal.errors import ProblemError
 from armcal.measure.measurement import (
     GroupedMeasurement,
     Measurement,
@@ -37,7 +39,7 @@ from armcal.measure.measurement import (
 )
 from armcal.measure.partners import OTHER
 from armcal.measure.points import LimitedView, PointMeasurement
-from armcal.measure.returned import checked_outputs, checked_residual
+from armcal.plugins import expecting, refuse
 
 _POINT = "point."
 
@@ -283,9 +285,9 @@ def _reading(
 ) -> _Reading:
     """Of the whole record, or of one point, whose numbers are channels, where there are points."""
     if unrolled or not isinstance(measurement, PointMeasurement):
-        shown = checked_outputs(measurement, measurement.outputs(states, local))
+        shown = _checked_outputs(measurement, measurement.outputs(states, local))
         measured = {c.name: records.optional(f"{name}.{c.name}", 0.0) for c in measurement.channels()}
-        residual = checked_residual(name, measurement, measurement.residual(states, measured, local))
+        residual = _checked_residual(name, measurement, measurement.residual(states, measured, local))
         return _Reading(tuple(shown), ca.vertcat(*shown.values()), residual)
     points = measurement.points
     point = ca.vertcat(*[records.number(f"{name}.{_POINT}{i}") for i in range(points.shape[1])])
@@ -358,3 +360,47 @@ def _arm_states(
         inputs = ArmInputs(angles, approach, load, deflections[-1], conditions, correction)
         states[name] = replace(arm, residual=None).state(values, inputs)  # records carry what it has learned
     return records, states, deflections
+
+
+def _checked_outputs(measurement: Measurement, outputs: Any) -> dict[str, Expression]:
+    """The outputs of a measurement, each an expression (1 x 1), by local names of its channels.
+
+    Raises:
+        PluginError: they are none.
+    """
+    channels = [channel.name for channel in measurement.channels()]
+    expected = f"the expression of each channel by name: {', '.join(channels)}"
+    with expecting(measurement.outputs, outputs, expected):
+        if not set(outputs.keys()) <= set(channels):
+            refuse(measurement.outputs, f"the channels {', '.join(outputs)}", expected)
+        return {name: column(measurement.outputs, own, 1, f"one number as {name!r}") for name, own in outputs.items()}
+
+
+def _checked_residual(name: str, measurement: Measurement, residual: Expression) -> Expression:
+    """The residual of a measurement whose noise, dimensions and noise columns are those of its entries.
+
+    Raises:
+        PluginError: the residual is no column, or noise is none.
+        ProblemError: with what differs.
+    """
+    residual, noise = column(measurement.residual, residual, None, "a column of m or rad"), measurement.noise()
+    expected = "a sequence of standard deviations above zero, one a residual entry"
+    with expecting(measurement.noise, noise, expected):
+        if not all(0 < sd < math.inf for sd in noise):
+            refuse(measurement.noise, f"{noise}", expected)
+    rows, dimensions, own = residual.numel(), residual_dimensions(measurement), noise_channels(measurement)
+    counts = {"noise": len(noise), "dimensions": len(dimensions), "noise columns": len(own) or rows}
+    odd = [f"{kind} of {count} entries" for kind, count in counts.items() if count != rows]
+    odd += [f"dimension {kind!r}" for kind in dimensions if kind not in ERROR_UNITS]
+    odd += [
+        f"noise column {channel.name} of dimension {channel.dimension}"
+        for channels, kind in zip(own, dimensions, strict=False)
+        for channel in channels
+        if channel.dimension != kind
+    ]
+    if odd:
+        raise ProblemError(
+            f"the measurement {name} has a residual of {rows} entries ({', '.join(dimensions)}), and {', '.join(odd)}.",
+            hint="Correct noise(), dimensions() or noise_channels() in its plugin.",
+        )
+    return residual

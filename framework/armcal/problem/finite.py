@@ -9,7 +9,7 @@ from armcal.arm.assembly import scoped
 from armcal.arm.effects import JointCommand
 from armcal.base.dataset import Dataset
 from armcal.errors import DataError, ProblemError
-from armcal.plugin_faults import refuse
+from armcal.plugins import refuse
 from armcal.problem.factor_records import FactorRecords
 from armcal.problem.problem import Problem
 

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from armcal.plugins import PluginRegistry
-from armcal.registration import said
+from armcal.plugins import PluginRegistry, said
 from armcal.run.result import RunResult
 
 

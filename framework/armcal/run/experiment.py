@@ -24,10 +24,10 @@ from armcal.errors import ConfigError
 from armcal.estimate.estimator import Estimator, Progress, no_progress
 from armcal.estimate.simulation import SimulationRequest, Simulator
 from armcal.estimate.weighing import weighed
+from armcal.measure.checks import records_of
 from armcal.measure.environment import noticed, require_conditions, warn_beyond_limits
 from armcal.measure.groups import grouped_instances, groups_of, pose_numbers, unmatched
 from armcal.measure.reader import Reader, ReadRequest, evidence_channels, requested_channels
-from armcal.measure.returned import records_of
 from armcal.plugins import PluginRegistry, discover
 from armcal.run.settings import ExperimentSettings
 

@@ -18,9 +18,9 @@ from armcal.calibration.compensation.finder import Allowed
 from armcal.config.system import build_component
 from armcal.errors import ConfigError, DataError, Location, ProblemError
 from armcal.io.plain_files import input_file
+from armcal.measure.checks import records_of
 from armcal.measure.environment import TOLERANCE, own_limits, span_text
 from armcal.measure.reader import MAX_ID_LIST_BYTES, Reader, read_ids
-from armcal.measure.returned import records_of
 from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment, with_data
 from armcal.run.plan_clearance import clearance_check

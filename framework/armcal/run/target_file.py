@@ -16,9 +16,9 @@ from armcal.calibration.compensation.reach import Reach
 from armcal.calibration.compensation.request import FARTHEST_M, Targets
 from armcal.calibration.tool_expression import APPROACH, ToolExpression
 from armcal.errors import DataError, Location
+from armcal.measure.checks import records_of
 from armcal.measure.environment import noticed
 from armcal.measure.reader import ReadRequest, RequestedChannel, surroundings
-from armcal.measure.returned import records_of
 from armcal.plugins import PluginRegistry
 
 QUATERNION = ("qw", "qx", "qy", "qz")

@@ -32,7 +32,7 @@ _CHECKS: Mapping[str, tuple[int, Callable[[Recorder, Subject], None] | None]] = 
     {
         "model": (28, check_model),
         "effect": (26, check_effect),
-        "residual": (22, check_residual),
+        "residual": (23, check_residual),
         "measurement": (28, check_measurement),
         "reader": (23, check_reader),
         "estimator": (22, check_estimator),

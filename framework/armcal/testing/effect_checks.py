@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from armcal.arm.assembly import Arm
-from armcal.arm.effects import MOUNT, JointCommand, JointEffect, Spring, reshapes, spring_fault
+from armcal.arm.effects import MOUNT, JointCommand, JointEffect, Spring, check_springs, reshapes
 from armcal.arm.model import Attachment, Chain, Joint
 from armcal.base import se3
 from armcal.base.arrays import Array
@@ -58,10 +58,7 @@ def check_effect(record: Recorder, subject: Subject) -> None:
     if reshapes(effect) or effect.conditions:
         _check_columns(record, effect, values)
     with record.needed("its springs have a site and unit directions"):
-        springs = tuple(effect.springs(values))
-        for spring in springs:
-            fault = spring_fault(spring, len(JOINTS))
-            expect(fault is None, "found {}, expected {}".format(*(fault or ("", ""))))
+        springs = check_springs(effect.springs, effect.springs(values), len(JOINTS))
     if springs:
         _check_laws(record, springs, blocks, stacked(list(values.values())))
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from armcal import plugin_files
+from armcal import plugins
 from armcal.testing.results import Recorder, expect
 
 _DEEPEST = 4
@@ -58,7 +58,7 @@ def _places(made: Any) -> Iterator[tuple[str, _Place]]:
     """Every variable of the modules of a component's package, and of the classes in them."""
     own = str(getattr(made, "__module__", ""))
     package = own.partition(".")[0]
-    if own.startswith(f"{plugin_files.__name__}."):
+    if own.startswith(f"{plugins.__name__}."):
         modules = [sys.modules[own]]
     elif package in ("", "builtins", "armcal"):
         modules = []

@@ -8,8 +8,7 @@ from itertools import pairwise
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.devices.clock import Clock
-from armcal.devices.device import DeviceError, DeviceRefusedError, JointDevice
-from armcal.devices.returned import measured_angles, standing_at, state_of
+from armcal.devices.device import DeviceError, DeviceRefusedError, JointDevice, measured_angles, standing_at, state_of
 
 from armcal_bench.acquisition.heat import HeatModel, ThermalState
 from armcal_bench.acquisition.path_planner import JointPath, PathPlanner

@@ -11,8 +11,7 @@ from armcal.arm.joints import joint_limits, unknown_joint
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.calibration.rigid_chain import nominal_tools
-from armcal.devices.device import DeviceRefusedError, JointDevice, MeasuringDevice
-from armcal.devices.returned import standing_at
+from armcal.devices.device import DeviceRefusedError, JointDevice, MeasuringDevice, standing_at
 from armcal.errors import ConfigError, DataError, Location
 from armcal.run.experiment import Experiment
 from armcal.run.plan_approaches import approach_channels

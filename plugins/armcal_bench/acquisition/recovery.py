@@ -3,9 +3,15 @@
 from collections.abc import Callable
 from typing import TypeVar
 
-from armcal.devices.device import DeviceError, DeviceIdentity, DeviceRefusedError, DeviceUnwellError, JointDevice
-from armcal.devices.returned import open_device
-from armcal.plugin_faults import blaming
+from armcal.devices.device import (
+    DeviceError,
+    DeviceIdentity,
+    DeviceRefusedError,
+    DeviceUnwellError,
+    JointDevice,
+    open_device,
+)
+from armcal.plugins import blaming
 
 from armcal_bench.acquisition.tracker_monitor import MotionGate
 

@@ -12,8 +12,7 @@ import numpy as np
 from armcal.base.config_text import plain
 from armcal.calibration.calibration_file import identity_of
 from armcal.devices.clock import Clock
-from armcal.devices.device import DeviceIdentity
-from armcal.devices.returned import open_device, state_of
+from armcal.devices.device import DeviceIdentity, open_device, state_of
 from armcal.devices.wiring import wiring_of
 from armcal.errors import InputError, Location
 

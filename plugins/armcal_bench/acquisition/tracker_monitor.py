@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceRefusedError
-from armcal.devices.live import REPEATED, TrackerFrame
-from armcal.devices.returned import frames_of, refused_by
+from armcal.devices.live import REPEATED, TrackerFrame, frames_of
 
 from armcal_bench.acquisition.settings import LostSettings
 from armcal_bench.bench import Bench
@@ -131,7 +130,7 @@ class TrackerMonitor:
             )
 
     def look(self) -> None:
-        frames, refused = frames_of(self._tracker), refused_by(self._tracker)
+        frames, refused = frames_of(self._tracker), self._tracker.refused
         for health in (self._health, self._with_base):
             health.feed(frames, refused)
         self._settling.feed(frames)

@@ -5,9 +5,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from armcal.devices.clock import Clock
-from armcal.devices.live import JointStream, LiveCamera, RestStream
-from armcal.devices.returned import check_seen, samples_of
+from armcal.devices.live import JointStream, LiveCamera, RestStream, samples_of
 from armcal.errors import ConfigError
+from armcal.plugins import refuse
 
 from armcal_bench.bench import SECTION, Bench, closing
 from armcal_bench.journal_folder import Start, opened_journal
@@ -54,7 +54,9 @@ def record(
     with bench.clock() as clock, closing(stream, *(() if camera is None else (camera,))):
         if camera is not None:
             camera.open(clock, bench.experiment.system.measurements)
-            check_seen(camera, bench.experiment.system.measurements)
+            if camera.measurement not in bench.experiment.system.measurements:
+                known = ", ".join(bench.experiment.system.measurements)
+                refuse(type(camera), f"{camera.measurement!r} as measurement", f"one of {known}")
         contacts_of(bench.experiment, camera)
         stream.open(clock, channels)
         with opened_journal(*to, OURS, header, "recording", _SAME) as journal:

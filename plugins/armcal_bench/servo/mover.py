@@ -6,8 +6,15 @@ from itertools import pairwise, permutations
 from typing import Protocol, TypeVar
 
 from armcal.arm.servo import PulseClock, PulseTable
-from armcal.devices.device import DeviceError, DeviceIdentity, DeviceRefusedError, JointDevice, PulseDevice
-from armcal.devices.returned import open_device, state_of
+from armcal.devices.device import (
+    DeviceError,
+    DeviceIdentity,
+    DeviceRefusedError,
+    JointDevice,
+    PulseDevice,
+    open_device,
+    state_of,
+)
 from armcal.errors import InputError
 
 from armcal_bench.acquisition.drive import Motion

@@ -13,10 +13,10 @@ from armcal.base.units import DIMENSIONLESS
 from armcal.config.system import build_component
 from armcal.errors import DataError, Location
 from armcal.io.plain_files import input_file
+from armcal.measure.checks import records_of
 from armcal.measure.environment import noticed
 from armcal.measure.groups import pose_numbers
 from armcal.measure.reader import CYCLE, Reader, ReadRequest, RequestedChannel, requested_channels
-from armcal.measure.returned import records_of
 from armcal.plugins import PluginRegistry
 
 from armcal_capability.acceptance.subject import ArmToJudge
