@@ -27,7 +27,7 @@ LARGEST_MM = 1.0
 EXTRAS = {
     "online": "armcal recalibrate and mission",
     "convex": "the estimator cvxpy, certified bounds of a plan for E, cones in armcal recalibrate",
-    "figures": "the figures of armcal mission, capability and acceptance",
+    "figures": "the figures of armcal mission and capability",
     "lerobot": "LeRobot's data sets",
     "camera": "boards found in images, boards to print (armcal board)",
     "i2c": "servo boards on this computer's own I2C bus (link linux_i2c)",

@@ -1,0 +1,356 @@
+"""Areas, cell by cell: whether the tool reaches it, turned how, held by the servos, and how far it sags there.
+
+Each cell's centre is searched for by damped Gauss-Newton from the nearest of many postures, in elastic equilibrium, all
+at once: the step by commands is J^T (J J^T + |e|^2 I)^-1 e over the joints that are free to move [Nakamura1986]. A tool
+that points too far away from where it should adds one equation, and none where it points well enough.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+from armcal.arm.joints import unknown_joint
+from armcal.arm.statics import LOAD_CHANNELS
+from armcal.base.arrays import Array, Indices, Mask
+from armcal.calibration.compensation.step import slopes, twists
+from armcal.calibration.tool_expression import Equilibrium, ToolExpression
+from armcal.errors import ConfigError, ProblemError
+from armcal.estimate.estimator import Progress, no_progress
+from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
+from numpy.typing import NDArray
+
+from armcal_capability.designs import AreaSettings, CapabilitySettings, Design, LoadSettings, ToolDirectionSettings
+
+ORIENTATIONS = np.vstack([np.eye(3), -np.eye(3)])
+"""Directions of the base frame that the tool's axis points along, for the score."""
+MOST_IN_AREA = 500_000
+"""Cells of an area: each is searched for."""
+_WORTH_COMPILING = 20_000
+"""From this many postures on, waiting for the compiler costs less than CasADi's interpreter does."""
+_LENGTH = 0.1
+"""Metres that a radian counts for, where a tool's place and direction are taken together."""
+_MOST_STEPS, _LONGEST = 60, 0.4  # of a search; rad or m in one step
+_ARRIVED_M = 1e-5
+_PROGRESS, _PATIENCE = 0.8, 6  # a search that comes no nearer than by this factor in so many steps is given up
+_DAMPING = 1e-9
+_INSIDE = 1e-3  # rad: how far inside the required cone the tool is brought
+_ROUND = 4  # starts at once, where one way to reach a cell is enough
+_LANES, _MM = 8, 1000.0
+_FORCE = "force_x"
+
+
+@dataclass(frozen=True)
+class Mechanics:
+    """A loaded arm in elastic equilibrium at N commands."""
+
+    positions: Array  # of the tool (3 x N; m, base frame)
+    rotations: Array  # base_R_tool (3 x 3 x N)
+    slopes: Array  # of the tool by commands (N x 6 x n): metres, then rad about the axes of the base frame
+    efforts: Array  # about or along the axes of all joints (joints x N; N m, N)
+    states: Array  # deflections (n_d x N)
+    settled: Mask  # whether there is an equilibrium (N)
+
+
+class MechanicsFunction:
+    """``Mechanics`` of one arm under one load, for commands (n x N)."""
+
+    def __init__(self, expression: ToolExpression, load: LoadSettings, choice: EvaluatorChoice = "auto") -> None:
+        self._channels, self._joints = expression.channels, len(expression.joints)
+        self._record = expression.defaults.copy()
+        for channel, stated in (("payload", load.payload), ("payload_x", load.payload_com), (_FORCE, load.force)):
+            if stated is not None:
+                start, values = self._channels.index(channel), np.atleast_1d(stated)
+                self._record[start : start + len(values)] = values
+        self._equilibrium = Equilibrium(expression, choice)
+        tool = expression.base_T_tool
+        pose = ca.vertcat(ca.vec(tool.rotation), tool.translation)
+        by_commands = twists(replace(slopes(expression), corrected=pose))
+        outputs = [ca.densify(output) for output in (pose, ca.vec(by_commands), expression.efforts)]
+        function = ca.Function("capability", [expression.record, expression.state], outputs, {"cse": True})
+        sample = [
+            self._records(np.linspace(-1, 1, _LANES) * np.ones((self._joints, 1))),
+            np.zeros((expression.state.numel(), _LANES)),
+        ]
+        self._function = BatchFunction(function, sample, choice)
+
+    def __call__(self, commands: Array, states: Array | None = None) -> Mechanics:
+        """``states`` are where the search for an equilibrium begins."""
+        record, count = self._records(commands), commands.shape[1]
+        standing = self._equilibrium(record, states)
+        pose, by_commands, efforts = self._function(record, standing.states)
+        return Mechanics(
+            positions=pose[9:],
+            rotations=pose[:9].reshape(3, 3, count).swapaxes(0, 1),
+            slopes=by_commands.reshape(self._joints, 6, count).transpose(2, 1, 0),
+            efforts=efforts,
+            states=standing.states,
+            settled=np.asarray(standing.settled, dtype=bool),
+        )
+
+    def tools(self, commands: Array) -> tuple[Array, Mask]:
+        """Tools (N x 4 x 4), and which have an equilibrium."""
+        standing = self._equilibrium(self._records(commands))
+        return standing.base_T_tool, np.asarray(standing.settled, dtype=bool)
+
+    def without_load(self, commands: Array, states: Array) -> Array:
+        """Where the tool is under the arm's own weight alone (3 x N; m), from states near it."""
+        return self._place(commands, states, ("payload", _FORCE, "force_y", "force_z"))
+
+    def weightless(self, commands: Array) -> Array:
+        """Where the tool would be if nothing pulled at the arm (3 x N; m)."""
+        return self._place(commands, None, LOAD_CHANNELS)
+
+    def _place(self, commands: Array, states: Array | None, idle: tuple[str, ...]) -> Array:
+        record = self._records(commands)
+        record[[self._channels.index(channel) for channel in idle]] = 0.0
+        return np.asarray(self._equilibrium(record, states).base_T_tool[:, :3, 3].T)
+
+    def _records(self, commands: Array) -> Array:
+        record = np.repeat(self._record[:, None], commands.shape[1], axis=1)
+        record[: self._joints] = commands
+        return record
+
+
+@dataclass(frozen=True)
+class Pointing:
+    """Where an axis of the tool (0 to 2) is to point: a unit vector of the base frame, and how near (rad)."""
+
+    axis: int
+    along: Array
+    within: float
+
+    @classmethod
+    def of(cls, settings: ToolDirectionSettings) -> Pointing:
+        along = np.array(settings.along, dtype=float)
+        return cls("xyz".index(settings.axis), along / np.linalg.norm(along), settings.within)
+
+    def angles(self, rotations: Array) -> Array:
+        """Between the tool's axis and the direction (N; rad), of base_R_tool (3 x 3 x N)."""
+        axis = rotations[:, self.axis]
+        across = np.linalg.norm(np.cross(axis.T, self.along), axis=1)
+        return np.asarray(np.arctan2(across, axis.T @ self.along))
+
+
+@dataclass(frozen=True)
+class AreaMap:
+    """An area, cell by cell."""
+
+    centres: Array  # cells x 3; m, base frame
+    counts: NDArray[np.int64]  # postures found that bring the tool to the centre
+    orientations: NDArray[np.int64]  # along how many of ORIENTATIONS the tool's axis can point there
+    held: Mask | None  # whether in one posture no servo carries more than it holds; None where that is not stated
+    values: Mapping[str, Array]  # by quantity, mean of the postures; not a number where there is none
+
+    @property
+    def reached(self) -> Mask:
+        return np.asarray(self.counts > 0)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What one arm can do in areas."""
+
+    drawn: int  # postures
+    clear: int  # of which keep their clearance
+    settled: int  # of which have an elastic equilibrium
+    positions: Array  # of their tools (N x 3; m)
+    outline: Array  # mount, joints and tool at half of the travel, unloaded (points x 3; m)
+    areas: Mapping[str, AreaMap]
+
+
+def survey(design: Design, settings: CapabilitySettings, progress: Progress = no_progress) -> Survey:
+    """Survey an arm.
+
+    Raises:
+        ConfigError: ``holding`` names a joint that the arm has not.
+        ProblemError: no posture keeps its clearance, or none has an equilibrium; or there would be too many cells.
+    """
+    for name, area in settings.areas.items():
+        cells = float(np.prod(np.ceil(np.subtract(area.high, area.low) / settings.voxel)))
+        _require(
+            cells <= MOST_IN_AREA,
+            f"the area {name} would have {cells:.3g} cells, expected {MOST_IN_AREA} at most.",
+            "Make capability.voxel_mm larger, or the area smaller; check their units.",
+        )
+    search = AreaSearch(design, settings, "compiled" if settings.samples >= _WORTH_COMPILING else "interpreted")
+    areas = {}
+    for i, (name, area) in enumerate(settings.areas.items()):
+        progress("areas", i / len(settings.areas))
+        areas[name] = search(area)
+    expression, middle = design.expression, design.limits.mean(axis=1)
+    points = ca.horzcat(*expression.origins, expression.base_T_tool.translation)
+    function = ca.Function("outline", [expression.record, expression.state], [ca.densify(points)])
+    outline = function(expression.records(middle[:, None]), np.zeros(expression.state.numel())).full().T
+    return Survey(settings.samples, search.clear, len(search.positions), search.positions, outline, areas)
+
+
+def cells_of(area: AreaSettings, size: float) -> Array:
+    """Centres of equal cells that fill a box, none longer than ``size`` (cells x 3; m)."""
+    low, high = np.array(area.low), np.array(area.high)
+    numbers = np.maximum(np.ceil((high - low) / size - 1e-9), 1).astype(int)
+    axes = [low[i] + (np.arange(n) + 0.5) * (high[i] - low[i]) / n for i, n in enumerate(numbers)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def spread(limits: Array, count: int, seed: int) -> Array:
+    """So many commands (joints x count) between limits (joints x 2), by a scrambled Sobol sequence.
+
+    More of them begin with the same ones; the same seed gives the same.
+    """
+    from scipy.stats import qmc
+
+    drawn = qmc.Sobol(len(limits), rng=seed).random_base2(max(0, math.ceil(math.log2(count))))[:count]
+    return (limits[:, 0] + drawn * (limits[:, 1] - limits[:, 0])).T.copy()
+
+
+def quantities(function: MechanicsFunction, commands: Array, mechanics: Mechanics, holding: Array) -> dict[str, Array]:
+    """Sag by the arm's own weight, how much further the load moves the tool, and the largest share of ``holding``."""
+    unloaded = function.without_load(commands, mechanics.states)
+    values = {
+        "sag_mm": np.linalg.norm(unloaded - function.weightless(commands), axis=0) * _MM,
+        "deflection_mm": np.linalg.norm(mechanics.positions - unloaded, axis=0) * _MM,
+    }
+    if np.isfinite(holding).any():
+        values["effort_ratio"] = np.max(np.abs(mechanics.efforts) / holding[:, None], axis=0)
+    return values
+
+
+class AreaSearch:
+    """Searches areas for one arm, from postures spread over joint space."""
+
+    def __init__(self, design: Design, settings: CapabilitySettings, choice: EvaluatorChoice = "auto") -> None:
+        self._design, self._settings = design, settings
+        names = design.expression.arm.joint_names
+        if fault := unknown_joint(settings.holding, names):
+            raise ConfigError(f"holding: {fault}.")
+        self._holding = np.array([settings.holding.get(name, np.inf) for name in names])
+        self.function = MechanicsFunction(design.expression, settings.loads, choice)
+        commands = spread(design.limits, settings.samples, settings.seed)
+        commands = commands[:, self._allowed(commands)]
+        self.clear = commands.shape[1]
+        text = f"none of {settings.samples} postures keeps its clearance."
+        _require(self.clear > 0, text, "Check plan.clearance.")
+        tools, settled = self.function.tools(commands)
+        _require(
+            bool(settled.any()),
+            "no posture has an elastic equilibrium under the load.",
+            "Check the payload and the force, their units, and the compliances.",
+        )
+        self._commands, tools = commands[:, settled], tools[settled]
+        self.positions, self._rotations = tools[:, :3, 3], tools[:, :3, :3].transpose(1, 2, 0)
+
+    def __call__(self, area: AreaSettings) -> AreaMap:
+        centres = cells_of(area, self._settings.voxel)
+        pointing = Pointing.of(area.tool) if area.tool is not None else None
+        cell, commands = self._found(centres, self._nearest(centres, pointing), pointing)
+        mechanics = self.function(commands)
+        cell, settled = cell[mechanics.settled], mechanics.settled
+        counts = np.bincount(cell, minlength=len(centres)).astype(np.int64)
+        values, held = {}, None
+        for name, value in quantities(self.function, commands, mechanics, self._holding).items():
+            total = np.bincount(cell, weights=value[settled], minlength=len(centres))
+            values[name] = np.divide(total, counts, out=np.full(len(centres), np.nan), where=counts > 0)
+            if name == "effort_ratio":
+                held = np.zeros(len(centres), dtype=bool)
+                held[cell[value[settled] <= 1]] = True
+        axis = "xyz".index(area.tool.axis) if area.tool is not None else 2
+        return AreaMap(centres, counts, self._orientations(centres, axis), held, values)
+
+    def _orientations(self, centres: Array, axis: int) -> NDArray[np.int64]:
+        """Along how many of six directions the tool's axis can point at each centre."""
+        count = np.zeros(len(centres), dtype=np.int64)
+        for along in ORIENTATIONS:
+            pointing = Pointing(axis, along, self._settings.orientation_within)
+            nearest, remaining = self._nearest(centres, pointing), np.arange(len(centres))
+            for start in range(0, nearest.shape[1], _ROUND):
+                cell, _ = self._found(centres[remaining], nearest[remaining, start : start + _ROUND], pointing)
+                reached = np.unique(cell)
+                count[remaining[reached]] += 1
+                remaining = np.delete(remaining, reached)
+                if not len(remaining):
+                    break
+        return count
+
+    def _nearest(self, centres: Array, pointing: Pointing | None) -> Indices:
+        """The sampled postures nearest to each centre, the nearest first (cells x postures)."""
+        from scipy.spatial import cKDTree
+
+        where, targets = self.positions, centres
+        if pointing is not None:
+            away = np.maximum(pointing.angles(self._rotations) - pointing.within, 0.0) * _LENGTH
+            where, targets = np.column_stack([where, away]), np.column_stack([centres, np.zeros(len(centres))])
+        most = min(self._settings.postures, len(where))
+        return np.asarray(cKDTree(where).query(targets, k=most)[1]).reshape(len(centres), most)
+
+    def _found(self, centres: Array, starts: Indices, pointing: Pointing | None) -> tuple[Indices, Array]:
+        """Commands (n x found) that bring the tool to centres from some of ``starts`` (cells x k), and their cells."""
+        cell = np.repeat(np.arange(len(centres)), starts.shape[1])
+        commands = np.asarray(self._commands[:, starts.reshape(-1)])
+        commands, arrived = reach_for(self.function, centres[cell].T, commands, self._design.limits, pointing)
+        good = np.flatnonzero(arrived)
+        good = good[self._allowed(commands[:, good])] if len(good) else good
+        return cell[good], commands[:, good]
+
+    def _allowed(self, commands: Array) -> Mask:
+        if self._design.clearance is None:
+            return np.ones(commands.shape[1], dtype=bool)
+        return self._design.clearance(commands).allowed
+
+
+def reach_for(
+    function: MechanicsFunction, targets: Array, starts: Array, limits: Array, pointing: Pointing | None = None
+) -> tuple[Array, Mask]:
+    """Commands within limits (n x 2) that bring the tool to targets (3 x N; m) from starts (n x N); which arrive."""
+    commands, arrived = starts.copy(), np.zeros(starts.shape[1], dtype=bool)
+    remaining, states = np.arange(starts.shape[1]), None
+    nearest, stalled = np.full(starts.shape[1], np.inf), np.zeros(starts.shape[1], dtype=int)
+    for _ in range(_MOST_STEPS):
+        mechanics = function(commands[:, remaining], states)
+        error, slope = _equations(mechanics, targets[:, remaining], pointing)
+        away = np.linalg.norm(error, axis=1)
+        there = mechanics.settled & (away < _ARRIVED_M)
+        arrived[remaining[there]] = True
+        stalled[remaining] = np.where(away < _PROGRESS * nearest[remaining], 0, stalled[remaining] + 1)
+        nearest[remaining] = np.minimum(nearest[remaining], away)
+        going = mechanics.settled & ~there & (stalled[remaining] < _PATIENCE)
+        remaining, error, slope, states = remaining[going], error[going], slope[going], mechanics.states[:, going]
+        if not len(remaining):
+            break
+        commands[:, remaining] = _moved(commands[:, remaining], error, slope, limits)
+    return commands, arrived
+
+
+def _equations(mechanics: Mechanics, targets: Array, pointing: Pointing | None) -> tuple[Array, Array]:
+    """What is missing (N x m; m) and its slope by commands (N x m x n)."""
+    error, slope = (targets - mechanics.positions).T, mechanics.slopes[:, :3]
+    if pointing is None:
+        return error, slope
+    axis = mechanics.rotations[:, pointing.axis].T
+    away = pointing.angles(mechanics.rotations) - max(pointing.within - _INSIDE, 0.0)
+    about = np.cross(axis, pointing.along)
+    size = np.linalg.norm(about, axis=1, keepdims=True)
+    about = np.where(size > 1e-9, about / np.maximum(size, 1e-9), np.roll(axis, 1, axis=1))
+    weight = (away > 0).astype(float) * _LENGTH
+    turn = np.einsum("ni,nij->nj", about, mechanics.slopes[:, 3:]) * weight[:, None]
+    return np.column_stack([error, away * weight]), np.concatenate([slope, turn[:, None]], axis=1)
+
+
+def _moved(commands: Array, error: Array, slope: Array, limits: Array) -> Array:
+    pull = np.einsum("nmj,nm->jn", slope, error)
+    stuck = ((commands <= limits[:, :1]) & (pull < 0)) | ((commands >= limits[:, 1:]) & (pull > 0))
+    free = slope * ~stuck.T[:, None, :]
+    damping = np.sum(error**2, axis=1) + _DAMPING
+    square = free @ np.swapaxes(free, 1, 2) + damping[:, None, None] * np.eye(error.shape[1])
+    step = np.einsum("nmj,nm->jn", free, np.linalg.solve(square, error[..., None])[..., 0])
+    size = np.abs(step).max(axis=0, initial=0.0)
+    step *= _LONGEST / np.maximum(size, _LONGEST)
+    return np.asarray(np.clip(commands + step, limits[:, :1], limits[:, 1:]))
+
+
+def _require(holds: bool, message: str, hint: str) -> None:
+    if not holds:
+        raise ProblemError(message, hint=hint)
