@@ -1,4 +1,4 @@
-"""``armcal compensate`` and ``armcal correction-table`` as a user meets them: files, messages, exit codes."""
+"""``armcal compensate`` as a user meets it: files, messages, exit codes."""
 
 from __future__ import annotations
 
@@ -9,24 +9,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.compensation.compensator import Compensator
+from armcal.calibration.compensation.nominal import sent
 from armcal.calibration.compensation.request import Options
 from armcal.cli.main import cli
 from armcal.plugins import discover
 from armcal.run import compensate as run_compensate
 from armcal.run.compensate import Bench
-from armcal.run.correction_table import correction_table, read_table_settings
 from click.testing import CliRunner, Result
 from made_calibrations import made_calibration, written
 from scipy.interpolate import RegularGridInterpolator
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from small_arms import CONFIGS, calibration, compensator, drawn, predicted
-
-NODES = (3, 3, 3)
 
 
 @pytest.fixture(autouse=True)
@@ -211,13 +208,19 @@ def test_counts_and_pulses_stand_in_the_file_of_an_arm_with_servos(tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_what_to_tell_a_controller_of_the_nominal_arm(desk: Desk) -> None:
+def test_what_a_controller_of_the_nominal_arm_is_sent(desk: Desk) -> None:
     """Its own inverse kinematics turns that into the commands again."""
     told(desk.ask(desk.file()))
+    commands, stated = desk.commands(), [row["nominal_error_mm"] for row in desk.answers()]
+    told(desk.ask(desk.file(), "--for", "nominal"))
+    rows = desk.answers()
+    assert not {f"{joint}_deg" for joint in compensator("three").joints} & set(rows[0]) and "turn_x_rad" not in rows[0]
+    sent = np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in rows])
+    shifts = np.array([[float(row[f"d{axis}_mm"]) for axis in "xyz"] for row in rows])
+    assert sent - shifts == pytest.approx(desk.places_mm, abs=1e-9)
+    assert np.abs(shifts).max() > 0.5
     nominal = Bench.of(Calibration.load(desk.calibration), None, None, "nearest", discover()).nominal()
-    tell, commands = places(desk.answers(), "tell_nominal") / 1000, desk.commands()
-    assert np.abs(tell * 1000 - desk.places_mm).max() > 0.5
-    for place, start in zip(tell, commands, strict=True):
+    for place, start in zip(sent / 1000, commands, strict=True):
 
         def off(q: np.ndarray, place=place) -> np.ndarray:
             return nominal.forward(q)[0, :3, 3] - place
@@ -226,7 +229,6 @@ def test_what_to_tell_a_controller_of_the_nominal_arm(desk: Desk) -> None:
         assert np.abs(solved.x - start).max() < 1e-6
     wrong = nominal.solve(nominal.targets(desk.places_mm / 1000), commands)
     away = predicted(calibration("three"), wrong.joint_angles)[:, :3, 3] - desk.places_mm / 1000
-    stated = [row["nominal_error_mm"] for row in desk.answers()]
     assert [text != "" for text in stated] == wrong.reached.tolist()
     had = [float(text) for text in stated if text]
     assert had == pytest.approx(1000 * np.linalg.norm(away[wrong.reached], axis=1), rel=1e-3)
@@ -393,10 +395,11 @@ def test_nothing_is_printed_when_nothing_is_asked(desk: Desk) -> None:
     assert told(desk.ask(desk.file(), "-q")) == ""
 
 
-# -- correction tables ---------------------------------------------------------------------------------------------
+# -- poses for a controller of the nominal arm -----------------------------------------------------------------------
 
 
-BOX = {"low_mm": [170, -20, 160], "high_mm": [220, 20, 200], "nodes": list(NODES), "rpy_deg": [0, 90, 0], "tried": 25}
+AXES = ((170, 195, 220), (-20, 0, 20), (160, 180, 200))
+TURNED = Rotation.from_euler("xyz", [0, 90, 0], degrees=True)
 
 
 @pytest.fixture(scope="module")
@@ -404,112 +407,70 @@ def arms(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Compensator, C
     """The LRM arm's calibration as a file, the arm as it is, and what its controller takes it for."""
     given = made_calibration(CONFIGS / "lrm_arm" / "arm.yaml")
     path = written(given, tmp_path_factory.mktemp("table") / "calibration.yaml")
-    bench = Bench.of(Calibration.load(path), None, None, "nearest", discover())
-    nominal = bench.nominal()
+    nominal = Bench.of(Calibration.load(path), None, None, "nearest", discover()).nominal()
     return path, given.compensator(options=Options(), choice="interpreted"), nominal
 
 
-def grid(folder: Path, **changed) -> Path:
-    path = folder / "grid.yaml"
-    box = {key: value for key, value in {**BOX, **changed}.items() if value is not None}
-    path.write_text(yaml.safe_dump({"table": box}), encoding="utf-8")
+def box(folder: Path, axes=AXES) -> Path:
+    """The nodes of a grid, plane by plane and row by row."""
+    nodes = [(x, y, z) for x in axes[0] for y in axes[1] for z in axes[2]]
+    path = folder / "nodes.csv"
+    path.write_text(
+        "x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg\n" + "".join(f"{x},{y},{z},0,90,0\n" for x, y, z in nodes)
+    )
     return path
 
 
 @pytest.mark.slow
-def test_a_table_corrects_at_its_nodes_and_between_them(tmp_path: Path, arms) -> None:
+def test_nodes_of_a_grid_correct_a_region_at_them_and_between_them(tmp_path: Path, arms) -> None:
     path, real, nominal = arms
-    out = tmp_path / "table.csv"
-    result = armcal("correction-table", path, "--grid", grid(tmp_path), "--out", out, "--json")
-    told(result)
-    found = json.loads(result.stdout, parse_constant=pytest.fail)
-    assert found["nodes"] == found["reached"] == 27
-    assert found["error_mm"] < 0.2 * found["nominal_error_mm"]
+    out = tmp_path / "sent.csv"
+    told(armcal("compensate", path, "--targets", box(tmp_path), "--path", "--for", "nominal", "--out", out))
     rows = list(csv.DictReader(out.open(encoding="utf-8")))
-    table = np.array([[float(row[name]) for name in list(row)[1:]] for row in rows])
-    axes = [np.linspace(*ends) for ends in zip(BOX["low_mm"], BOX["high_mm"], NODES, strict=True)]
-    interpolated = RegularGridInterpolator(axes, table.reshape(*NODES, 9))
-    asked = Rotation.from_euler("xyz", [0, 90, 0], degrees=True)
+    names = ("dx_mm", "dy_mm", "dz_mm", "turn_x_rad", "turn_y_rad", "turn_z_rad")
+    table = np.array([[float(row[name]) for name in names] for row in rows])
+    interpolated = RegularGridInterpolator([np.array(axis, dtype=float) for axis in AXES], table.reshape(3, 3, 3, 6))
     points = np.array([[170.0, -20, 160], [195, 0, 180], [220, 20, 200], [181, 7, 171]])
-    start = None
+    told(armcal("compensate", path, "--targets", box(tmp_path), "--path", "--out", out))
+    first = next(csv.DictReader(out.open(encoding="utf-8")))
+    start = np.radians([float(first[f"q{i}_deg"]) for i in range(1, 7)])
     for i, point in enumerate(points):
         correction = interpolated(point)[0]
-        assert correction[:3] == pytest.approx(point, abs=1e-9)
-        place = (point + correction[3:6]) / 1000
-        turned = (Rotation.from_rotvec(correction[6:]) * asked).as_matrix()
+        place = (point + correction[:3]) / 1000
+        turned = (Rotation.from_rotvec(correction[3:]) * TURNED).as_matrix()
 
         def off(q: np.ndarray, place=place, turned=turned) -> np.ndarray:
             tool = nominal.forward(q)[0]
             left = Rotation.from_matrix(tool[:3, :3].T @ turned).as_rotvec()
             return np.concatenate([tool[:3, 3] - place, 0.2 * left])
 
-        if start is None:
-            start = real.solve(real.targets(point[None] / 1000, asked.as_matrix())).joint_angles[0]
         solved = least_squares(off, start, xtol=1e-14, ftol=1e-14, gtol=1e-14)
         assert np.abs(solved.fun).max() < 1e-9
         tool = real.forward(solved.x)[0]
         away = np.linalg.norm(1000 * tool[:3, 3] - point)
-        turn = Rotation.from_matrix(tool[:3, :3].T @ asked.as_matrix()).magnitude()
+        turn = Rotation.from_matrix(tool[:3, :3].T @ TURNED.as_matrix()).magnitude()
         assert (away < 1e-4 and turn < 1e-6) if i < 3 else (away < 1.0 and turn < 0.02)
         start = solved.x
 
 
-def test_nodes_that_cannot_be_had_are_left_empty(tmp_path: Path, arms) -> None:
-    path, _, _ = arms
-    out = tmp_path / "table.csv"
-    far = grid(tmp_path, high_mm=[520, 20, 200], nodes=[4, 2, 2])
-    text = told(armcal("correction-table", path, "--grid", far, "--out", out))
+def test_nothing_is_sent_for_targets_that_are_not_reached(tmp_path: Path, arms) -> None:
+    out = tmp_path / "sent.csv"
+    targets = box(tmp_path, ((170, 520), (0,), (180,)))
+    text = told(armcal("compensate", arms[0], "--targets", targets, "--for", "nominal", "--out", out))
     rows = list(csv.DictReader(out.open(encoding="utf-8")))
-    empty = [row["dx_mm"] == "" for row in rows]
-    assert 0 < sum(empty) < len(rows) == 16
-    assert f"{16 - sum(empty)} of 16 nodes are reached" in text
+    assert [row["reached"] for row in rows] == ["yes", "no"] and "1 of 2 targets are reached" in text
+    columns = [name for name in rows[0] if name.startswith(("d", "turn_", "q")) or name in ("x_mm", "y_mm", "z_mm")]
+    assert len(columns) == 13
+    assert all(rows[0][name] for name in columns) and not any(rows[1][name] for name in columns)
 
 
-@pytest.mark.parametrize(
-    ("changed", "said"),
-    [
-        ({"low_mm": [300, 0, 0]}, "low does not lie below high on every axis"),
-        ({"low_mm": [220, -20, 160]}, "low does not lie below high on every axis"),
-        ({"low_mm": [float("nan"), 0, 0]}, "not a finite number"),
-        ({"low_mm": [-1e300, 0, 0]}, "found a corner beyond 1e+06 m"),
-        ({"nodes": [1, 3, 3]}, "found 1, expected greater than or equal to 2"),
-        ({"nodes": [1000, 1000, 1000]}, "expected 200000 at most"),
-        ({"rpy_deg": None}, "table.rpy"),
-        ({"rpy_deg": [0, 90]}, "table.rpy_deg"),
-        ({"colour": "red"}, "unknown key 'colour'"),
-        ({"low_mm": [1500, 0, 0], "high_mm": [1600, 10, 10], "nodes": [2, 2, 2]}, "no node of the grid can be reached"),
-    ],
-)
-def test_grids_that_make_no_table(tmp_path: Path, arms, changed, said: str) -> None:
-    out = tmp_path / "table.csv"
-    text = told(armcal("correction-table", arms[0], "--grid", grid(tmp_path, **changed), "--out", out), 2)
-    assert said in text
-    assert "Traceback" not in text
-    assert not out.exists()
-
-
-def test_a_table_is_never_written_over_what_it_is_made_of(tmp_path: Path, arms) -> None:
-    asked = grid(tmp_path)
-    before = asked.read_bytes(), arms[0].read_bytes()
-    for out in (asked, arms[0]):
-        text = told(armcal("correction-table", arms[0], "--grid", asked, "--out", out), 2)
-        assert "it is one of the inputs" in text
-    assert (asked.read_bytes(), arms[0].read_bytes()) == before
-
-
-def test_an_arm_of_three_joints_has_no_table(desk: Desk) -> None:
-    text = told(armcal("correction-table", desk.calibration, "--grid", grid(desk.folder), "--out", desk.out), 2)
-    assert "the arm has 3 joints, expected 6 or more" in text
-
-
-def test_a_table_of_the_nominal_arm_itself_is_all_zeros(tmp_path: Path, arms) -> None:
+def test_the_nominal_arm_itself_is_sent_its_targets(arms) -> None:
     nominal = arms[2]
-    settings = read_table_settings(grid(tmp_path, nodes=[2, 2, 2], tried=5))
-    table = correction_table(nominal, nominal, settings)
-    assert table.reached.all()
-    assert np.abs(table.shifts).max() < 1e-8
-    assert np.abs(table.turns).max() < 1e-7
-    assert table.tried.max() < 1e-7
+    targets = nominal.targets(np.array([[0.17, -0.02, 0.16], [0.22, 0.02, 0.2]]), np.array([TURNED.as_matrix()] * 2))
+    commands = nominal.solve(targets)
+    poses = sent(nominal, targets, commands)
+    assert commands.reached.all()
+    assert np.abs(poses.shifts).max() < 1e-8 and np.abs(poses.turns).max() < 1e-7
 
 
 def test_assessing_needs_no_prediction_of_errors() -> None:

@@ -20,7 +20,6 @@ WHY = "4 of the last 8 records do not fit."
 COMMANDS = {
     "predict": ("predict", "{0}", "--poses", CONFIGS / "demo.csv", "--out", "{1}"),
     "compensate": ("compensate", "{0}", "--targets", CONFIGS / "targets.csv", "--out", "{1}"),
-    "correction-table": ("correction-table", "{0}", "--grid", CONFIGS / "grid.yaml", "--out", "{1}"),
     "export": ("export", "{0}", "--format", "yaml", "--out", "{1}"),
     "serve": ("serve", "{0}", "--evaluator", "interpreted"),
     "capability": ("capability", "{0}", "--out", "{1}"),

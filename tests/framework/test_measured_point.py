@@ -9,14 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from armcal.base.dataset import Dataset
 from armcal.calibration.measured_point import measured_point
 from armcal.cli.main import cli
 from armcal.errors import ConfigError
 from armcal.plugins import discover
 from armcal.run.compensate import Bench, commanded
-from armcal.run.correction_table import over_grid
 from armcal_serve.loaded import Order, loaded
 from click.testing import CliRunner, Result
 from made_calibrations import written
@@ -177,27 +175,30 @@ def test_a_program_and_a_server_can_ask_for_the_measured_target(tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_a_table_can_be_of_the_measured_target(tmp_path: Path) -> None:
-    """At a node the nominal arm's target is told the corrected place; the tracker then reads the node."""
+def test_a_controller_of_the_nominal_arm_can_be_sent_poses_of_the_measured_target(tmp_path: Path) -> None:
+    """The nominal arm's target is sent to the corrected place; the tracker then reads the place that was asked for."""
     lrm = calibration("lrm", OFF_MM)
-    box = {"low_mm": [170, -20, 160], "high_mm": [220, 20, 200], "nodes": [2, 2, 2], "rpy_deg": [0, 90, 0]}
-    (tmp_path / "grid.yaml").write_text(yaml.safe_dump({"table": {**box, "payload_g": 0, "tried": 5}}))
-    found, out = written(lrm, tmp_path / "calibration.yaml"), tmp_path / "table.csv"
-    table = ("correction-table", found, "--grid", tmp_path / "grid.yaml", "--out", out)
-    ran = armcal(*table, "--point", "target", "--json")
+    nodes = np.array([[170.0, -20, 160], [220, -20, 160], [220, 20, 160], [220, 20, 200]])
+    targets = "x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg,payload_g\n"
+    targets += "".join(f"{x},{y},{z},0,90,0,0\n" for x, y, z in nodes)
+    (tmp_path / "targets.csv").write_text(targets)
+    found, out = written(lrm, tmp_path / "calibration.yaml"), tmp_path / "sent.csv"
+    asked = ("compensate", found, "--targets", tmp_path / "targets.csv", "--path", "--out", out)
+    ran = armcal(*asked, "--point", "target", "--for", "nominal", "--json")
     assert ran.exit_code == 0, ran.output
     assert json.loads(ran.stdout)["point"] == "target" and "the tool frame's origin" not in ran.stderr
-    nodes, shifts = rows(out, "x_mm y_mm z_mm"), rows(out, "dx_mm dy_mm dz_mm")
+    places, shifts = rows(out, "x_mm y_mm z_mm"), rows(out, "dx_mm dy_mm dz_mm")
+    assert places - shifts == pytest.approx(nodes, abs=1e-9)
     bench = Bench.of(lrm, None, None, "nearest", discover(), "target")
     real, nominal = bench.compensator(), bench.nominal()
     turned = np.repeat(Rotation.from_euler("xyz", [0, 90, 0], degrees=True).as_matrix()[None], len(nodes), axis=0)
-    targets = real.targets(nodes / 1000, turned, payload=0.0)
-    commands = over_grid(real, targets, (2, 2, 2))  # all nodes in one posture
-    read = lrm.predict(commanded(real, targets, commands))[0]
+    given = real.targets(nodes / 1000, turned, payload=0.0)
+    commands = real.follow(given)
+    read = lrm.predict(commanded(real, given, commands))[0]
     assert 1000 * np.stack([read[f"tracker.{axis}"] for axis in "xyz"], axis=1) == pytest.approx(nodes, abs=1e-3)
-    assert 1000 * nominal.forward(commands.joint_angles)[:, :3, 3] == pytest.approx(nodes + shifts, abs=1e-3)
-    warned = armcal(*table)
-    assert "this table brings the tool frame's origin" in warned.stderr
+    assert 1000 * nominal.forward(commands.joint_angles)[:, :3, 3] == pytest.approx(places, abs=1e-3)
+    warned = armcal(*asked, "--for", "nominal")
+    assert "these commands bring the tool frame's origin" in warned.stderr
 
 
 def test_a_measured_body_arrives_with_its_rotation(tmp_path: Path) -> None:

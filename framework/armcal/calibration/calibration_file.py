@@ -209,6 +209,5 @@ def lost_calibration(record: CalibrationFile, path: str | Path) -> ConfigError:
         f"its level is lost, as of record {recalibrated.get('record') or recalibrated.get('sequence')}: {reason}.",
         where=Location(str(path)),
         hint="Roll its recalibration back to the last good record (armcal control DIR rollback good), or calibrate "
-        "again. To use it all the same: --accept of predict, compensate, "
-        "correction-table, export and serve.",
+        "again. To use it all the same: --accept of predict, compensate, export and serve.",
     )

@@ -12,7 +12,7 @@ from typing import Any, TypeVar, get_args
 import click
 
 from armcal.base.config_text import as_json
-from armcal.calibration.measured_point import MeasuredPoint, Point
+from armcal.calibration.measured_point import Point
 from armcal.cli.console import Screen, columned
 from armcal.errors import CalibrationWarning, DataError, Location
 from armcal.estimate.estimator import Progress, no_progress
@@ -22,7 +22,6 @@ from armcal.version import JSON_SCHEMA
 
 F = TypeVar("F", bound=Callable[..., Any])
 FILE = click.Path(path_type=Path)
-_SAME_POINT_M = 1e-5
 
 
 @dataclass(frozen=True)
@@ -176,18 +175,6 @@ def unwritten(files: Mapping[Path, bytes]) -> dict[Path, bytes]:
             return False
 
     return {file: content for file, content in files.items() if not is_there(file, content)}
-
-
-def warn_of_target(console: Console, subject: str, target: MeasuredPoint | None) -> None:
-    """Warn that no point to arrive was stated, where it matters."""
-    if target is not None and target.distance > _SAME_POINT_M:
-        x, y, z = 1000 * target.tool_T_target[:3, 3]
-        console.warn(
-            f"{subject} the tool frame's origin to the targets. The target that "
-            f"{target.measurement} measured sits at ({x:.3f}, {y:.3f}, {z:.3f}) mm on the tool and arrives "
-            f"{1000 * target.distance:.3g} mm away from them. "
-            "To bring that one there, give --point target; otherwise --point tool."
-        )
 
 
 def command_line() -> str:

@@ -11,14 +11,16 @@ from armcal.base.arrays import Array
 from armcal.base.units import parse_quantity
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.compensation.compensator import Compensator
+from armcal.calibration.compensation.nominal import sent
 from armcal.calibration.compensation.request import Redundancy
 from armcal.calibration.recorded_range import beyond_records
-from armcal.cli.common import FILE, Console, accept, arm, point, spare_inputs, speaking, warn_of_target, within
+from armcal.cli.common import FILE, Console, accept, arm, point, spare_inputs, speaking, within
 from armcal.errors import InputError, Location
 from armcal.run.compensate import Assessed, Bench, assess, commanded, summary, write_commands
 from armcal.run.target_file import TargetFile, check_units
 
 _SHOWN = 5
+_SAME_POINT_M = 1e-5
 _AT_THE_TARGET_MM = 1e-3
 """A command so near was found, and something else keeps the arm from it."""
 _ARRIVES = {"tool": "by the tool frame's origin", "target": "by the measured target"}
@@ -40,6 +42,12 @@ _ARRIVES = {"tool": "by the tool frame's origin", "target": "by the measured tar
     help="Which of many commands.",
 )
 @point
+@click.option(
+    "--for",
+    "controller",
+    type=click.Choice(["nominal"]),
+    help="Write poses for a controller that computes the nominal arm's inverse kinematics, in place of commands.",
+)
 @click.option("--angles", type=click.Choice(["deg", "rad"]), default="deg", show_default=True, help="Unit of commands.")
 @accept
 @speaking
@@ -60,16 +68,24 @@ def compensate(console: Console, calibration: Path, targets: Path, out: Path, an
     free = [joint for joint, ends in limits if not np.isfinite(ends).all()]
     if free:
         console.warn(f"no limits are known of {', '.join(free)}: commands may lie beyond them. Give --within CONFIG.")
-    if options["point"] is None:
-        warn_of_target(console, "these commands bring", bench.target)
+    target = bench.target
+    if options["point"] is None and target is not None and target.distance > _SAME_POINT_M:
+        x, y, z = 1000 * target.tool_T_target[:3, 3]
+        console.warn(
+            "these commands bring the tool frame's origin to the targets. The target that "
+            f"{target.measurement} measured sits at ({x:.3f}, {y:.3f}, {z:.3f}) mm on the tool and arrives "
+            f"{1000 * target.distance:.3g} mm away from them. "
+            "To bring that one there, give --point target; otherwise --point tool."
+        )
     start = _start(options["start"], compensator)
     reach = compensator.follow if options["kind"] == "path" else compensator.solve
     commands = reach(file.targets, start)
     assessed = assess(bench, compensator, file.targets, commands)
-    write_commands(out, compensator, file.targets, file.dataset, assessed, angles)
+    poses = sent(bench.nominal(), file.targets, commands) if options["controller"] else None
+    write_commands(out, compensator, file.targets, file.dataset, assessed, angles, poses)
     if kept := bench.calibration.record.prediction:
-        poses = commanded(compensator, file.targets, commands).subset(np.flatnonzero(commands.reached))
-        if text := beyond_records(kept.ranges, poses, {bench.arm: compensator.expression.arm})[1]:
+        given = commanded(compensator, file.targets, commands).subset(np.flatnonzero(commands.reached))
+        if text := beyond_records(kept.ranges, given, {bench.arm: compensator.expression.arm})[1]:
             console.warn(text)
     _show(console, file, assessed, bench, out)
 

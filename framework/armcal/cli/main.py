@@ -23,13 +23,12 @@ COMMANDS = {
     "run": ("armcal.cli.run:run", "Calibrate: load, check, fit, validate, report."),
     "check": ("armcal.cli.check:check", "Everything that can be known before solving."),
     "identify": ("armcal.cli.identify:identify", "Which parameters the poses determine; a minimal set of them."),
-    "study": ("armcal.cli.study:study", "Compare model variants by cross-validated error, or by load transfer."),
+    "study": (
+        "armcal.cli.study:study",
+        "Compare model variants by cross-validated error, or trained at one load each.",
+    ),
     "predict": ("armcal.cli.predict:predict", "Where a calibrated arm goes for commanded joint angles."),
     "compensate": ("armcal.cli.compensate:compensate", "What to command so that the real arm arrives at targets."),
-    "correction-table": (
-        "armcal.cli.correction_table:correction_table",
-        "What to send to a controller that only knows the nominal arm.",
-    ),
     "export": ("armcal.cli.export:export", "Write a calibrated arm in another program's format, such as URDF."),
     "calibration": ("armcal.cli.calibration:calibration", "Accept a calibration that was edited by hand."),
     "plan": ("armcal.cli.plan:plan", "Which poses to measure: the best few, and how good any could be."),

@@ -15,9 +15,10 @@ from armcal.base.quaternions import quaternion_of
 from armcal.base.units import UNITS
 from armcal.calibration.calibration import Calibration, arm_named
 from armcal.calibration.compensation.compensator import Compensator
+from armcal.calibration.compensation.nominal import Sent, nominal_arm
 from armcal.calibration.compensation.request import Commands, Options, Redundancy, Targets
-from armcal.calibration.measured_point import MeasuredPoint, Point, measured_point, pointed
-from armcal.calibration.tool_expression import APPROACH, arm_expression
+from armcal.calibration.measured_point import MeasuredPoint, Point, measured_point
+from armcal.calibration.tool_expression import APPROACH
 from armcal.errors import ArmcalError, ConfigError
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.measure.csv_writer import write_csv
@@ -28,6 +29,7 @@ from armcal.run.target_file import TargetFile, read_targets
 
 _WORTH_COMPILING = 5000
 """From this many targets on, waiting for the compiler costs less than doing without it."""
+Column = tuple[str, tuple[str, ...]]
 _ENGLISH = {False: "no", True: "yes"}
 
 
@@ -39,15 +41,12 @@ class Assessed:
         commands: found.
         nominal_distances: how far from its target the real arm is with the nominal arm's command (N; m); nan where the
             nominal arm has none.
-        nominal_T_tool: where the nominal arm's would be (N x 4 x 4): what to command to a controller that takes the
-            nominal arm for the real one.
         radii: of the ball about the expected place that holds a measurement of it with 95 % (N; m); None if unknown,
             as for a tool's origin that no measurement judges.
     """
 
     commands: Commands
     nominal_distances: Array
-    nominal_T_tool: Array
     radii: Array | None
 
 
@@ -124,11 +123,7 @@ class Bench:
             raise ConfigError(f"{fault}.", hint="Correct the limits in the plan.") from fault
 
     def nominal(self) -> Compensator:
-        """The arm as it was thought to be: nominal parameters, rigid, without effects."""
-        plain = replace(self.calibration.system.arms[self.arm], effects={}, masses=())
-        nominal, system = self.calibration.nominal, self.calibration.system
-        expression = pointed(arm_expression(plain, nominal, system.environment), self.point, system, nominal)
-        return Compensator(expression, nominal, Options(limits=self.options.limits))
+        return nominal_arm(self.calibration, self.arm, self.point, self.options)
 
 
 def assess(bench: Bench, compensator: Compensator, targets: Targets, commands: Commands) -> Assessed:
@@ -144,7 +139,6 @@ def assess(bench: Bench, compensator: Compensator, targets: Targets, commands: C
     return Assessed(
         commands=commands,
         nominal_distances=np.where(thought.reached & reached.settled, away, np.nan),
-        nominal_T_tool=nominal.of_tool(nominal.forward(commands.joint_angles)),
         radii=_radii(bench.calibration, compensator, targets, commands) if bench.is_judged else None,
     )
 
@@ -193,9 +187,15 @@ def summary(assessed: Assessed) -> Mapping[str, float | int | None]:
 
 
 def write_commands(
-    path: Path, compensator: Compensator, targets: Targets, given: Dataset, assessed: Assessed, angle_unit: str
+    path: Path,
+    compensator: Compensator,
+    targets: Targets,
+    given: Dataset,
+    assessed: Assessed,
+    angle_unit: str,
+    sent: Sent | None = None,
 ) -> None:
-    """Write commands beside the targets' own ids; angles in ``deg`` or ``rad``.
+    """Write commands beside the targets' own ids, angles in ``deg`` or ``rad``; or what a nominal controller is sent.
 
     Loads and surroundings are written where the targets state them, approaches where they are known.
 
@@ -207,12 +207,13 @@ def write_commands(
     channels = {
         channel: values
         for channel, values in commands.items()
-        if channel.removeprefix(f"{name}.") in compensator.joints
+        if (sent is None and channel.removeprefix(f"{name}.") in compensator.joints)
         or (given.has(channel) if channel in LOAD_CHANNELS else "." not in channel)
-        or (APPROACH in channel and values.any())
+        or (sent is None and APPROACH in channel and values.any())
     }
     requested = requested_channels({name: arm}, {}, measured=False)
-    extra = dict(_columns(compensator, assessed))
+    first = _counts(compensator, assessed.commands) if sent is None else _corrected(sent)
+    extra = dict([*first, *_columns(compensator, assessed)])
     # A target file may be a pose file: its commands, in whatever unit, give way to those that were found.
     own = {f"{joint}_{unit}" for joint in compensator.joints for unit in UNITS}
     kept = {column: texts for column, texts in given.extra.items() if column not in extra and column not in own}
@@ -220,16 +221,27 @@ def write_commands(
     write_csv(path, dataset, [c for c in requested if c.channel in channels], {"angle": angle_unit})
 
 
-def _columns(compensator: Compensator, assessed: Assessed) -> Iterator[tuple[str, tuple[str, ...]]]:
+def _counts(compensator: Compensator, commands: Commands) -> Iterator[Column]:
+    for i, joint in enumerate(compensator.joints):
+        if commands.counts is not None and joint in compensator.expression.servos:
+            tick = compensator.expression.servos[joint][1].tick
+            yield f"{joint}_counts", tuple(str(count) for count in commands.counts[:, i])
+            yield f"{joint}_pulse_us", short_texts(1e6 * tick * commands.counts[:, i])
+
+
+def _corrected(sent: Sent) -> Iterator[Column]:
+    yield from _pose("", sent.poses)
+    for i, axis in enumerate("xyz"):
+        yield f"d{axis}_mm", _exact(1000 * sent.shifts[:, i])
+    if sent.turns is not None:
+        for axis, turns in zip("xyz", sent.turns.T, strict=True):
+            yield f"turn_{axis}_rad", _exact(turns)
+
+
+def _columns(compensator: Compensator, assessed: Assessed) -> Iterator[Column]:
     commands = assessed.commands
-    if commands.counts is not None:
-        for i, joint in enumerate(compensator.joints):
-            if joint in compensator.expression.servos:
-                tick = compensator.expression.servos[joint][1].tick
-                yield f"{joint}_counts", tuple(str(count) for count in commands.counts[:, i])
-                yield f"{joint}_pulse_us", short_texts(1e6 * tick * commands.counts[:, i])
     yield "reached", tuple(_ENGLISH[bool(reached)] for reached in commands.reached)
-    yield from _pose("tool", assessed.commands.base_T_tool)
+    yield from _pose("tool_", assessed.commands.base_T_tool)
     yield "error_mm", short_texts(1000 * commands.distances)
     yield "error_deg", short_texts(np.asarray(np.degrees(commands.turns)))
     if assessed.radii is not None:
@@ -243,15 +255,18 @@ def _columns(compensator: Compensator, assessed: Assessed) -> Iterator[tuple[str
                 yield f"longest_move_{unit}", short_texts(scale * np.abs(commands.moves[:, own]).max(axis=1))
     yield "bound_mm", short_texts(1000 * commands.bounds)
     yield "reason", commands.reasons
-    yield from _pose("tell_nominal", assessed.nominal_T_tool)
 
 
-def _pose(name: str, poses: Array) -> Iterator[tuple[str, tuple[str, ...]]]:
+def _pose(prefix: str, poses: Array) -> Iterator[Column]:
     for i, axis in enumerate("xyz"):
-        yield f"{name}_{axis}_mm", tuple(repr(float(x)) for x in 1000 * poses[:, i, 3])
+        yield f"{prefix}{axis}_mm", _exact(1000 * poses[:, i, 3])
     turns = np.array([quaternion_of(pose[:3, :3]) for pose in poses]).reshape(-1, 4)
     for i, axis in enumerate("wxyz"):
-        yield f"{name}_q{axis}", tuple(repr(float(x)) for x in turns[:, i])
+        yield f"{prefix}q{axis}", _exact(turns[:, i])
+
+
+def _exact(values: Array) -> tuple[str, ...]:
+    return tuple(repr(float(value)) if np.isfinite(value) else "" for value in values)
 
 
 def short_texts(values: NDArray[Any]) -> tuple[str, ...]:
