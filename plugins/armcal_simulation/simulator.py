@@ -11,7 +11,7 @@ import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.settings import Angle, InputPath, Length, Settings
+from armcal.base.settings import Angle, InputPath, Length, Mass, Settings
 from armcal.errors import ConfigError
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.testing import EXAMPLE_TRUTH
@@ -71,13 +71,17 @@ class PoseSettings(Settings):
 
 
 class ElasticArmSettings(Settings):
-    """The truth and how it is measured; ``noise`` defaults to what each measurement declares."""
+    """The truth and how it is measured; ``noise`` defaults to what each measurement declares.
+
+    With ``payloads`` as many poses are measured at each, with a seed of its own.
+    """
 
     truth: InputPath
     poses: PoseSettings
     seed: Annotated[int, Field(ge=0)] = 0
     noise: Annotated[Length, Field(ge=0)] | None = None
     quantisation: Annotated[Angle, Field(ge=0)] = 0.0
+    payloads: tuple[Annotated[Mass, Field(ge=0)], ...] = ()
     outliers: OutlierSettings = Field(default_factory=OutlierSettings)
 
 
@@ -102,7 +106,20 @@ class ElasticArmSimulator:
         Raises:
             ConfigError: the truth names unknown parameters, or a joint has no levels.
         """
-        settings, random = self._settings, np.random.default_rng(self._settings.seed)
+        payloads = self._settings.payloads if request.poses is None else ()
+        parts = []
+        for number, payload in enumerate(payloads):
+            hung = replace(request, environment=replace(request.environment, payload_mass=payload))
+            part = self._simulated(hung, self._settings.seed + number)
+            parts.append(with_channels(part, {"payload": np.full(len(part), payload)}))
+        if not parts:
+            return self._simulated(request, self._settings.seed)
+        ids = tuple(f"{1000 * p:g}g-{i}" for p, part in zip(payloads, parts, strict=True) for i in part.ids)
+        channels = {name: np.concatenate([part.channels[name] for part in parts]) for name in parts[0].channels}
+        return Dataset(ids, channels, source="simulation")
+
+    def _simulated(self, request: SimulationRequest, seed: int) -> Dataset:
+        settings, random = self._settings, np.random.default_rng(seed)
         arm = next(iter(request.arms.values()))
         named = [*arm.command_channels]
         given, true = request.poses, at_truth(request, settings.truth)

@@ -22,7 +22,7 @@ from armcal.estimate.estimator import Solution, SolverVerdict, estimate
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.io.parallel import Workers
 from armcal.problem.correlation import Correlation
-from armcal.run.model_study import change, simplest_good
+from armcal.run.study import change, simplest_good
 from armcal.run.study_result import Change
 from click.testing import CliRunner
 

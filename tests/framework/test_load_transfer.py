@@ -1,4 +1,4 @@
-"""Load transfer: trained at one payload and judged at another, simulated and measured; no record judges its own fit."""
+"""Records held out by group: trained at one payload or place, judged at another; no record judges its own fit."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ import pytest
 from armcal.cli.main import cli
 from armcal.io.parallel import Sequential, Workers
 from armcal.run.experiment import Experiment
-from armcal.run.load_transfer import transfer
 from armcal.run.pipeline import calibrate
-from armcal.run.study import Study
-from armcal.run.study_result import TransferResult
+from armcal.run.study import Study, compare
+from armcal.run.study_result import StudyResult
 from click.testing import CliRunner, Result
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
@@ -48,12 +47,12 @@ def place(tmp_path: Path) -> Path:
     return folder
 
 
-def _run(path: Path, *overrides: str, data: Path | None = None, executor=None) -> TransferResult:
-    return transfer(Study.load(path, overrides, data), executor or Sequential())
+def _run(path: Path, *overrides: str, data: Path | None = None, executor=None) -> StudyResult:
+    return compare(Study.load(path, overrides, data), executor or Sequential())
 
 
-def _mean(result: TransferResult, variant: str, trained: tuple[float, ...], judged: float) -> float:
-    cells = [c for c in result.cells if (c.variant, c.trained_g, c.judged_g) == (variant, trained, judged)]
+def _mean(result: StudyResult, variant: str, trained: tuple[str, ...], judged: str) -> float:
+    cells = [c for c in result.cells if (c.variant, c.trained, c.judged) == (variant, trained, judged)]
     assert len(cells) == 1
     return cells[0].errors.mean
 
@@ -81,22 +80,22 @@ def _measured(place: Path, grams: dict[float, int], column: str = "payload_g") -
 @pytest.fixture
 def plain(place: Path) -> Path:
     """The study's configuration without its study, for runs and simulations."""
-    text = (place / "load_transfer.yaml").read_text()
+    text = (place / "load_transfer.yaml").read_text().replace("  payloads_g: [0, 66.3]\n", "")
     (place / "load_transfer.yaml").write_text(text.partition("\nstudy:")[0] + "\n")
-    (place / "study.yaml").write_text(STUDY.replace("study:\n", "study:\n  kind: load_transfer\n"))
+    (place / "study.yaml").write_text(STUDY.replace("study:\n", "study:\n  group_by: payload\n"))
     return place
 
 
 @pytest.mark.slow
 def test_only_the_elastic_model_carries_over(place: Path) -> None:
-    result = _run(place / "study.yaml", "study.payloads_g=[0, 250]")
-    assert result.simulated and result.counts == (60, 60) and result.payloads_g == (0.0, 250.0)
-    for trained, judged in ((0.0, 250.0), (250.0, 0.0)):
+    result = _run(place / "study.yaml", "simulation.payloads_g=[0, 250]")
+    assert result.simulated and result.groups == {"0 g": 60, "250 g": 60}
+    for trained, judged in (("0 g", "250 g"), ("250 g", "0 g")):
         at_home = _mean(result, "elastic", (judged,), judged)
         assert _mean(result, "elastic", (trained,), judged) < 1.15 * at_home < 1.15
         assert _mean(result, "kinematic", (trained,), judged) > 10 * at_home
-    assert _mean(result, "elastic", (0.0, 250.0), 250.0) < 1.0
-    assert _mean(result, "kinematic", (), 250.0) == _mean(result, "elastic", (), 250.0) > 10
+    assert _mean(result, "elastic", ("0 g", "250 g"), "250 g") < 1.0
+    assert _mean(result, "kinematic", (), "250 g") == _mean(result, "elastic", (), "250 g") > 10
 
 
 @pytest.mark.slow
@@ -104,13 +103,17 @@ def test_a_cell_at_another_load_is_a_run_at_one_judged_on_the_other(plain: Path)
     data = _measured(plain, {0: 40, 66.3: 30})
     result = _run(plain / "study.yaml", data=data)
     ids = [row["pose_id"] for row in csv.DictReader(data.open())]
-    for trained, judged, prefix in ((0.0, 66.3, "0-"), (66.3, 0.0, "1-")):
+    for trained, judged, prefix in (("0 g", "66.3 g", "0-"), ("66.3 g", "0 g", "1-")):
         train = plain / "train.csv"
         train.write_text("\n".join(["pose_id", *(i for i in ids if i.startswith(prefix))]) + "\n")
-        sets = ["parameters.free=['arm.mdh.theta?', 'arm.spring.k[0-4]']", f"validation.train_ids={train}"]
-        run = calibrate(Experiment.load(plain / "load_transfer.yaml", [*sets, "evaluator=interpreted"], data))
-        held = run.table.calibrated["holdout"]
-        cell = next(c for c in result.cells if (c.variant, c.trained_g, c.judged_g) == ("elastic", (trained,), judged))
+        sets = ["parameters.free=['arm.mdh.theta?', 'arm.spring.k[0-4]']", "evaluator=interpreted"]
+        by_payload = ("validation.group_by=payload", f"validation.train_groups=[{trained}]")
+        for asked in ((f"validation.train_ids={train}",), by_payload):
+            run = calibrate(Experiment.load(plain / "load_transfer.yaml", [*sets, *asked], data))
+            held = run.table.calibrated["holdout"]
+            assert held.mean == pytest.approx(_mean(result, "elastic", (trained,), judged), rel=1e-9)
+        assert [group.name for group in run.groups.errors] == ["0 g", "66.3 g"]
+        cell = next(c for c in result.cells if (c.variant, c.trained, c.judged) == ("elastic", (trained,), judged))
         assert not cell.seen and cell.errors.count == held.count
         assert cell.errors.mean == pytest.approx(held.mean, rel=1e-9)
         assert cell.errors.p95 == pytest.approx(held.p95, rel=1e-9)
@@ -134,10 +137,10 @@ def test_records_that_were_measured_give_what_their_simulation_gave(place: Path,
     measured = _run(place / "study.yaml", data=data)
     assert not measured.simulated and measured.dataset.ids == simulated.dataset.ids
     for one, other in zip(simulated.cells, measured.cells, strict=True):
-        assert (one.variant, one.trained_g, one.judged_g, one.seen) == (
+        assert (one.variant, one.trained, one.judged, one.seen) == (
             other.variant,
-            other.trained_g,
-            other.judged_g,
+            other.trained,
+            other.judged,
             other.seen,
         )
         assert one.errors.mean == pytest.approx(other.errors.mean, rel=1e-6)
@@ -159,41 +162,38 @@ def test_no_figure_rests_on_a_record_that_it_judges(plain: Path) -> None:
     spoilt = _run(plain / "study.yaml", data=data)
     here = np.arange(40) < 20
     for variant in ("elastic", "kinematic"):
-        key = (variant, (0.0,))
-        assert np.array_equal(clean.errors_mm[key][here], spoilt.errors_mm[key][here])
-        assert np.all(spoilt.errors_mm[key][~here] > clean.errors_mm[key][~here] + 20)
-        assert np.isfinite(clean.errors_mm[(variant, (0.0, 66.3))]).all()
+        key = (variant, ("0 g",))
+        assert np.array_equal(clean.trained_mm[key][here], spoilt.trained_mm[key][here])
+        assert np.all(spoilt.trained_mm[key][~here] > clean.trained_mm[key][~here] + 20)
+        assert np.array_equal(clean.trained_mm[variant, ("0 g", "66.3 g")], clean.variant(variant).errors_mm)
 
 
 @pytest.mark.slow
-def test_payloads_are_told_apart_to_a_tenth_of_a_gram_and_the_others_left_out(plain: Path) -> None:
-    data = _measured(plain, {0: 20, 66.3: 20, 120: 10})
-    everything = _run(plain / "study.yaml", data=data)
-    assert everything.payloads_g == (0.0, 66.3, 120.0) and everything.counts == (20, 20, 10)
-    assert {c.trained_g for c in everything.cells} == {(), (0.0,), (66.3,), (120.0,), (0.0, 66.3, 120.0)}
-    two = _run(plain / "study.yaml", "study.payloads_g=[66.32, 0]", data=data)
-    assert two.payloads_g == (66.3, 0.0) and two.counts == (20, 20)
-    assert np.isnan(two.errors_mm[("elastic", (0.0,))][40:]).all()
+def test_payloads_are_told_apart_to_a_tenth_of_a_gram(plain: Path) -> None:
+    everything = _run(plain / "study.yaml", data=_measured(plain, {120: 10, 66.3: 20, 66.32: 5, 0: 20}))
+    assert list(everything.groups.items()) == [("0 g", 20), ("66.3 g", 25), ("120 g", 10)]
+    assert {c.trained for c in everything.cells} == {(), ("0 g",), ("66.3 g",), ("120 g",), tuple(everything.groups)}
 
 
 @pytest.mark.slow
 def test_any_workers_give_the_same(place: Path) -> None:
     one, other = (_run(place / "study.yaml", executor=e) for e in (Sequential(), Workers("loky", 2)))
     assert one.cells == other.cells
-    assert all(np.array_equal(one.errors_mm[key], other.errors_mm[key], equal_nan=True) for key in one.errors_mm)
+    assert all(np.array_equal(one.trained_mm[key], other.trained_mm[key], equal_nan=True) for key in one.trained_mm)
 
 
 @pytest.mark.parametrize(
     "setting, says",
     [
-        ("study.payloads_g=[0]", "two different payloads"),
-        ("study.payloads_g=[0, 0.00001]", "two different payloads"),
-        ("study.payloads_g=[0, -5]", "two different payloads"),
-        ("study.payloads_g=null", "no payloads to simulate"),
-        ("study.payloads=[0, 66.3]", "found both payloads_g and payloads"),
-        ("study.payloads_mm=[0, 66.3]", "payloads"),
-        ("study.nested=true", "nested"),
-        ("simulation=null", "no simulation"),
+        ("simulation.payloads_g=[0]", "a second payload"),
+        ("simulation.payloads_g=[0, 0.00001]", "a second payload"),
+        ("simulation.payloads_g=[0, -5]", "payloads_g"),
+        ("simulation.payloads_g=[]", "a column payload_g"),
+        ("simulation.payloads=[0, 66.3]", "found both payloads_g and payloads"),
+        ("simulation.payloads_mm=[0, 66.3]", "payloads"),
+        ("study.kind=load_transfer", "kind"),
+        ("study.group_by=colour", "found no column colour"),
+        ("simulation=null", "found no data"),
         ("simulation.poses.count=2", "too few records"),
         ("study.variants.elastic.set={parameters.free: ['arm.mdh.*']}", "variant elastic"),
     ],
@@ -223,16 +223,16 @@ def test_the_files_agree_with_the_terminal(place: Path) -> None:
     done = armcal("study", str(place / "study.yaml"), "--out", str(out), "--json")
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout)
-    assert told["kind"] == "load_transfer" and told["payloads_g"] == [0, 66.3]
+    assert told["group_by"] == "payload" and told["groups"] == {"0 g": 60, "66.3 g": 60}
     rows = list(csv.DictReader((out / "study.csv").open()))
     for cell in told["cells"]:
-        if not cell["trained_at_g"]:
+        if not cell["trained_at"]:
             continue
-        at = "_and_".join(f"{g:g}" for g in cell["trained_at_g"])
-        column = f"{cell['variant']}_trained_at_{at}_g_mm"
-        errors = [float(r[column]) for r in rows if float(r["payload_g"]) == pytest.approx(cell["judged_at_g"])]
+        alone = len(cell["trained_at"]) == 1
+        trained = "_trained_at_" + cell["trained_at"][0].replace(" ", "_") if alone else ""
+        errors = [float(r[f"{cell['variant']}{trained}_mm"]) for r in rows if r["payload"] == cell["judged_at"]]
         assert np.mean(errors) == pytest.approx(cell["error_mm"]["mean"], abs=1e-5)
-        assert cell["cross_validated"] == (cell["judged_at_g"] in cell["trained_at_g"])
+        assert cell["cross_validated"] == (cell["judged_at"] in cell["trained_at"])
     shown = armcal("study", str(place / "study.yaml"), "--out", str(out))
     assert "elastic" in shown.output and "against" in shown.output and "*" in shown.output
     assert "66.3 g" in (out / "study.html").read_text()
@@ -243,9 +243,9 @@ def test_the_shipped_study_runs(tmp_path: Path) -> None:
     done = armcal("study", str(CONFIGS / "load_transfer.yaml"), "--out", str(tmp_path / "o"), "--json")
     assert done.exit_code == 0, done.output
     means = {
-        (c["variant"], tuple(c["trained_at_g"]), c["judged_at_g"]): c["error_mm"]["mean"]
+        (c["variant"], tuple(c["trained_at"]), c["judged_at"]): c["error_mm"]["mean"]
         for c in json.loads(done.stdout)["cells"]
     }
-    for trained, judged in ((0.0, 66.3), (66.3, 0.0)):
+    for trained, judged in (("0 g", "66.3 g"), ("66.3 g", "0 g")):
         assert means["elastic", (trained,), judged] < 1.1 * means["elastic", (judged,), judged] < 1.1
         assert means["kinematic", (trained,), judged] > 10

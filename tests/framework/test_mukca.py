@@ -404,3 +404,27 @@ def test_units_mean_nothing(run, tmp_path):
     again, others = run(tmp_path / "mukca" / "kuka.yaml", DATA / "kuka_14", "front")
     assert figures(again) == pytest.approx(figures(told), abs=1e-9)
     assert others == pytest.approx(values, abs=1e-9)
+
+
+# ---------------------------------------------------------------- the matrix of training positions
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param("kuka"), pytest.param("kinova", marks=SLOW), pytest.param("panda", marks=SLOW)]
+)
+def test_one_command_trains_at_each_position_and_judges_at_the_others(name, tmp_path):
+    data = DATA / ROBOTS[name].folder
+    asked = ["--set", "study.group_by=position", "--parallel", "1", "--json"]
+    done = CliRunner().invoke(
+        cli, ["study", str(CONFIGS / f"{name}.yaml"), "--data", str(data), "--out", str(tmp_path / "o"), *asked]
+    )
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    found = {(tuple(c["trained_at"]), c["judged_at"]): c["error_mm"]["mean"] for c in told["cells"]}
+    positions = list(told["groups"])
+    assert len(found) == len(positions) * (len(positions) + 2)
+    for (robot, trained), (before, others) in PUBLISHED.items():
+        if robot == name:
+            assert {p: found[(trained,), p] for p in others} == pytest.approx(others, abs=0.005)
+            assert found[(), trained] == pytest.approx(before[0], abs=0.005)
+            assert np.mean([found[(), p] for p in others]) == pytest.approx(before[2], abs=0.005)

@@ -18,9 +18,8 @@ from armcal.estimate.validation import FitTask, fit_and_judge, folds
 from armcal.io.parallel import Sequential, Workers
 from armcal.report.study_page import conclusions
 from armcal.run.experiment import Experiment
-from armcal.run.model_study import compare
 from armcal.run.pipeline import calibrate
-from armcal.run.study import Study
+from armcal.run.study import Study, compare
 from click.testing import CliRunner, Result
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
@@ -139,9 +138,7 @@ def test_a_variant_that_cannot_be_is_refused_in_its_own_words(place: Path, secti
     assert "study.yaml" in str(caught.value) or "option1" in str(caught.value)
 
 
-@pytest.mark.quick(
-    "change0-found no study", "change1-folds", "change2-folds", "change4-models or load_transfer", "change7-blocks"
-)
+@pytest.mark.quick("change0-found no study", "change1-folds", "change2-folds", "change4-kind", "change7-blocks")
 @pytest.mark.parametrize(
     "change, says",
     [
@@ -149,7 +146,7 @@ def test_a_variant_that_cannot_be_is_refused_in_its_own_words(place: Path, secti
         (("folds: 3", "folds: 1"), "folds"),
         (("folds: 3", "fold: 3"), "folds"),
         (("folds: 3", "reference: other"), "previous or one of none, angles, springs, lengths"),
-        (("folds: 3", "kind: model"), "models or load_transfer"),
+        (("folds: 3", "kind: models"), "kind"),
         (("folds: 3", "folds: 201"), "201 folds of 200 records"),
         (("folds: 3", "nested: 3"), "nested"),
         (("folds: 3", "blocks: long"), "blocks"),
@@ -342,7 +339,7 @@ def test_a_variant_whose_fits_fail_is_never_chosen(place: Path) -> None:
     assert any("lengths" in text and "not chosen" in text for text in result.warnings)
     done = armcal("study", str(path), "--out", str(place / "out"), "--set", FAST[0], "--json")
     shown = armcal("study", str(path), "--out", str(place / "shown"), "--set", FAST[0])
-    assert "(-)" in shown.output and "not chosen" in shown.output
+    assert "(\u2013)" in shown.output and "not chosen" in shown.output
     assert done.exit_code == 0 and json.loads(done.stdout)["variants"][3]["error_mm"]["cross_validated"]["mean"] is None
     alone = re.sub(r"    (none|angles): .*\n", "", SMALL).replace("extends: angles, ", "")
     with pytest.raises(NotConvergedError, match="of every variant"):

@@ -23,7 +23,7 @@ class Variants:
 
 
 def load_variants(path: str | Path, overrides: Sequence[str] = (), root: Path | None = None) -> Variants:
-    """Read ``study.variants`` of a YAML config.
+    """Read ``study.variants`` of a YAML config; without any, the config itself is the only one, called as the file.
 
     A variant is the rest of the config, then what it ``extends`` (an earlier variant by its name, files), then the
     overrides, then the values that it sets (``set: {a.b: value}``) and the entries that it adds to lists
@@ -43,6 +43,7 @@ def load_variants(path: str | Path, overrides: Sequence[str] = (), root: Path | 
     made: dict[str, Node] = {}
     for name, node in entries_of(listed).items() if listed else ():
         made[str(name)] = _variant(name, node, _without_section(tree), made, reader, outside)
+    made = made or {path.stem: _without_section(tree)}
     sources = {name: as_source(made[name], path, reader) for name in made}
     return Variants(as_source(tree, path, reader), sources)
 

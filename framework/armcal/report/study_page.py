@@ -1,34 +1,40 @@
-"""The page of a study: one table, one figure, what to conclude, and which records gain and lose."""
+"""The page of a study: its tables and figures, what to conclude, and which records gain and lose."""
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
-from armcal.report import study_figures
-from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural
+import numpy as np
+
+from armcal.base.arrays import Array
+from armcal.report import svg
+from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural, significant
 from armcal.report.page import rendered
+from armcal.report.svg import MONO, Axis, Box, Figure
 from armcal.report.tables import TextTable, provenance_facts
-from armcal.run.study_result import StudyResult, TransferCell, TransferResult, VariantResult
+from armcal.run.study_result import Cell, StudyResult, VariantResult
 from armcal.version import __version__
 
+PAGE_ONLY = ("Train 95 %", "RMS", "Max", "Fit")
+"""Columns of ``study_tables`` for which a terminal has no room."""
 _SAME_MM = 1e-6
+_FEW_GROUPS = 3
+_ROW = 34.0
+_LOG_FROM = 6.0
+_GAP = 46.0
+_DIAMOND = "m-4.2 0l4.2-4.2l4.2 4.2l-4.2 4.2z"
 
 
-def render_study(result: StudyResult | TransferResult) -> str:
-    """One self-contained HTML file of a comparison, or of a load transfer study."""
-    changes: list[tuple[str, Any]] = []
-    if isinstance(result, StudyResult):
-        title, sentences = f"{result.name}: {plural(len(result.variants), 'variant')}", conclusions(result)
-        table, figure = _variants(result), study_figures.ladder(result)
-        changes = [(v.name, v.change) for v in result.variants if v.change]
-    else:
-        title, sentences = f"{result.name}: trained at one load, judged at another", transfer_conclusions(result)
-        table, figure = transfer_table(result), study_figures.transfers(result)
-    content = {
+def render_study(result: StudyResult) -> str:
+    """One self-contained HTML file."""
+    title = f"{result.name}: {plural(len(result.variants), 'variant')}"
+    content: dict[str, Any] = {
         "result": result,
-        "title": title,
-        "sentences": sentences,
-        "table": table,
-        "figure": figure,
-        "changes": changes,
+        "title": title + (f", trained at one {result.group_by}, judged at another" if result.cells else ""),
+        "sentences": conclusions(result),
+        "tables": study_tables(result),
+        "figures": [_by_group(result), _ladder(result)] if result.cells else [_ladder(result)],
+        "changes": [(v.name, v.change) for v in result.variants if v.change],
         "version": __version__,
         "facts": [fact for fact in provenance_facts(result.provenance) if not fact.long],
         "seconds": [(name, duration(value)) for name, value in result.seconds.items()],
@@ -36,13 +42,19 @@ def render_study(result: StudyResult | TransferResult) -> str:
     return rendered("study.html.j2", content)
 
 
+def study_tables(result: StudyResult) -> list[TextTable]:
+    """Errors by what was trained and judged at, where records are grouped; then the variants."""
+    return [_cells(result), _variants(result)] if result.cells else [_variants(result)]
+
+
 def conclusions(result: StudyResult) -> list[str]:
-    """What to conclude from a comparison."""
     best = result.variant(result.best)
-    texts = [
-        f"Lowest cross-validated error: {best.name}, {_shown(best.crossed.mean, result.unit)} on average, 95 % below "
-        f"{_shown(best.crossed.p95, result.unit)}."
-    ]
+    texts = _transfers(result)
+    if len(result.variants) > 1 or not result.cells:
+        texts.append(
+            f"Lowest cross-validated error: {best.name}, {_shown(best.crossed.mean, result.unit)} on average, 95 % "
+            f"below {_shown(best.crossed.p95, result.unit)}."
+        )
     if result.simplest != result.best:
         simple = result.variant(result.simplest)
         texts.append(
@@ -84,73 +96,197 @@ def _nested_words(result: StudyResult, best: VariantResult) -> list[str]:
     ]
 
 
-def transfer_conclusions(result: TransferResult) -> list[str]:
-    """How much an error grows from the load that trained to another."""
-    texts = []
-    for name in dict.fromkeys(cell.variant for cell in result.cells):
-        single = [c for c in result.cells if c.variant == name and len(c.trained_g) == 1 and c.errors.mean is not None]
-        own = {c.judged_g: c.errors.mean for c in single if c.seen}
-        pairs = [
-            f"{c.trained_g[0]:g} g to {c.judged_g:g} g {_shown(c.errors.mean, result.unit)}, against "
-            f"{_shown(own.get(c.judged_g), result.unit)} there"
-            for c in single
-            if not c.seen
+def _transfers(result: StudyResult) -> list[str]:
+    """How much an error grows from the group that trained to another."""
+    texts, several = [], len(result.groups) > _FEW_GROUPS
+    for variant in result.variants:
+        single = [c for c in result.cells if c.variant == variant.name and len(c.trained) == 1]
+        own = {c.judged: c.errors.mean for c in single if c.seen}
+        pairs = [(c, own[c.judged]) for c in single if not c.seen and c.errors.mean is not None]
+        if several:  # the worst of many
+            pairs = sorted(pairs, key=lambda pair: -(pair[0].errors.mean or 0.0))[:1]
+        said = [
+            f"{c.trained[0]} to {c.judged} {_shown(c.errors.mean, result.unit)}, against "
+            f"{_shown(at_home, result.unit)} there"
+            for c, at_home in pairs
         ]
-        texts.append(f"{name}: from {'; from '.join(pairs)}.")
+        texts += [f"{variant.name}:{' at worst' if several else ''} from {'; from '.join(said)}."] if said else []
     return texts
 
 
 def _variants(result: StudyResult) -> TextTable:
-    numbers = [x for v in result.variants for x in (v.train.mean, v.crossed.mean)]
-    decimals = common_decimals(numbers, most=3)
     rows = []
     for v in result.variants:
-        moved = (NONE, NONE)
+        moved = [NONE] * 3
         if v.change:
-            spread = f"{fixed(v.change.mean, decimals, signed=True)} ± {fixed(v.change.standard_error, decimals)}"
-            moved = (spread, f"{v.change.helped:.0%}".replace("%", " %"))
-        train = [fixed(x, decimals) for x in (v.train.mean, v.train.p95)]
-        errors = (*train, *(fixed(x, decimals) for x in (v.crossed.mean, v.crossed.rms, v.crossed.p95, v.crossed.max)))
-        failed = v.failed_folds + (not v.converged)
-        remark = f"{plural(failed, 'fit')} failed, {plural(v.crossed.count, 'record')} judged" if failed else ""
-        turned = [] if v.turns is None else [fixed(x, 3) for x in (v.turns.crossed.mean, v.turns.crossed.p95)]
-        rows.append((v.name, count(v.free), *errors, *moved, *turned, duration(v.fit_seconds), remark))
-    words = f"Distance between measured and predicted, {result.unit}; "
+            spread = (fixed(v.change.mean, 3, signed=True), fixed(v.change.standard_error, 3))
+            moved = [*spread, f"{v.change.helped:.0%}".replace("%", " %")]
+        train = [fixed(x, 3) for x in (v.train.mean, v.train.p95)]
+        judged = [fixed(x, 3) for x in (v.crossed.mean, v.crossed.rms, v.crossed.p95, v.crossed.max)]
+        if v.failed_folds:  # over fewer records than the others
+            judged = [f"({text})" for text in judged]
+        turned = v.turns and [fixed(x, 3) for x in (v.turns["cross_validated"].mean, v.turns["cross_validated"].p95)]
+        rows.append((v.name, count(v.free), *train, *judged, *moved, *(turned or []), duration(v.fit_seconds)))
+    words = f"Distance between measured and predicted, {result.unit}; cross-validated but for training: "
     words += f"{plural(len(result.dataset), 'record')}, {result.folds} folds"
     words += f" drawn {result.repeats} times" if result.repeats > 1 else ""
-    turns = ("Turn mean, deg", "Turn 95 %, deg") if any(v.turns for v in result.variants) else ()
-    names = ("Free", "Train mean", "Train 95 %", "Mean", "RMS", "95 %", "Max", "Change", "Helps", *turns, "Fit")
-    return TextTable(words, (("Variant", False), *((n, True) for n in names), ("", False)), tuple(rows))
+    turns = ("Turn, deg", "Turn 95 %") if any(v.turns for v in result.variants) else ()
+    names = ("Free", "Train", "Train 95 %", "Mean", "RMS", "95 %", "Max", "Change", "± se", "Helps", *turns, "Fit")
+    return TextTable(words, (("Variant", False), *((n, True) for n in names)), tuple(rows))
 
 
-def transfer_table(result: TransferResult) -> TextTable:
-    """A row for each variant and what it was trained at, errors at each payload beside one another."""
-    decimals = common_decimals([c.errors.mean for c in result.cells], most=3)
-    groups: dict[tuple[str, tuple[float, ...]], list[TransferCell]] = {}
+def _rows(result: StudyResult) -> dict[tuple[str, tuple[str, ...]], list[Cell]]:
+    rows: dict[tuple[str, tuple[str, ...]], list[Cell]] = {}
     for cell in result.cells:
-        groups.setdefault((cell.variant, cell.trained_g), []).append(cell)
-    rows = []
-    for (variant, trained), cells in groups.items():
-        words = " and ".join(f"{g:g} g" for g in trained) or "nominal"
+        rows.setdefault((cell.variant, cell.trained), []).append(cell)
+    return rows
+
+
+def _trained(trained: Sequence[str], result: StudyResult) -> str:
+    if len(trained) == len(result.groups) > _FEW_GROUPS:
+        return "all"
+    return " and ".join(trained) or "nominal"
+
+
+def _cells(result: StudyResult) -> TextTable:
+    """A row for each variant and what it was trained at, errors at each group beside one another."""
+    decimals = common_decimals([c.errors.mean for c in result.cells], most=3)
+    few, rows = len(result.groups) <= _FEW_GROUPS, []
+    for (variant, trained), cells in _rows(result).items():
+        words = _trained(trained, result)
         words += f" ({plural(cells[0].failed_fits, 'fit')} failed)" if cells[0].failed_fits else ""
         figures = [
             fixed(x, digits) + ("*" if trained and not cell.seen else "")
             for cell in cells
             for x, digits in (
                 (cell.errors.mean, decimals),
-                (cell.errors.p95, decimals),
+                *([(cell.errors.p95, decimals)] if few else []),
                 *([(cell.turns.mean, 3)] if cell.turns else []),
             )
         ]
         rows.append((variant, words, *figures))
-    names = ("mean", "95 %", *(["turn mean, deg"] if any(c.turns for c in result.cells) else []))
+    names = ["mean", *(["95 %"] if few else []), *(["turn mean, deg"] if result.cells[0].turns else [])]
     headings = [("Variant", False), ("Trained at", False)]
-    headings += [(f"{g:g} g, {name}", True) for g in result.payloads_g for name in names]
-    counts = ", ".join(f"{n} at {g:g} g" for g, n in zip(result.payloads_g, result.counts, strict=True))
-    caption = f"error, {result.unit}; {'simulated' if result.simulated else 'measured'} records: {counts}. "
-    caption += "Cross-validated; with *, judged at another load than it trained at"
+    headings += [(f"{group}, {name}" if len(names) > 1 else group, True) for group in result.groups for name in names]
+    counts = ", ".join(f"{n} at {group}" for group, n in result.groups.items())
+    caption = f"{'Error' if few else 'Mean error'}, {result.unit}; "
+    caption += f"{'simulated' if result.simulated else 'measured'} records: {counts}. "
+    caption += f"Cross-validated; with *, judged at another {result.group_by} than it trained at"
     return TextTable(caption, tuple(headings), tuple(rows))
 
 
 def _shown(value: float | None, unit: str) -> str:
     return f"{value:.3f} {unit}" if value is not None else "not known"
+
+
+def _ladder(result: StudyResult) -> Figure:
+    """Errors of each variant, and beside them how each record's error changes."""
+    changed = [v for v in result.variants if v.change]
+    numbers = [x for v in result.variants for x in (v.train.mean, v.crossed.mean, v.crossed.p95) if x is not None]
+    spreads = {v.name: _spread(result, v) for v in changed}
+    said = "; ".join(
+        f"{v.name}: mean {_said(v.crossed.mean)}, 95 % {_said(v.crossed.p95)} {result.unit}" for v in result.variants
+    )
+    caption = "The further left, the better. Beside it, on a wide page, the change of each record's error: "
+    caption += "median, half and 90 % of the records; left of the line they gain."
+    entries = [
+        ('<circle cx="11" cy="0" r="5" class="solid"/>', "mean, cross-validated"),
+        ('<circle cx="11" cy="0" r="5" class="hollow"/>', "mean, training records"),
+        (f'<path class="diamond" d="M11 0{_DIAMOND}"/>', "95 %, cross-validated"),
+    ]
+
+    def draw(width: float) -> tuple[float, list[str]]:
+        narrow = width <= svg.NARROW
+        most = 14 if narrow else 26
+        left = MONO * max(len(svg.shorten(v.name, most)) for v in result.variants) + 18
+        start, parts = svg.legend(left, width - left - 8, entries)
+        bottom = start + 4 + _ROW * len(result.variants)
+        beside = 0.0 if narrow or not changed else 0.4 * (width - left)
+        box = Box(left, start + 4, width - beside - 14, bottom)
+        x = _axis(numbers, box)
+        parts += svg.frame(box, x, None, (f"error, {result.unit}", ""), (4 if narrow else 7, 0))
+        for place, v in enumerate(result.variants):
+            y = start + 4 + _ROW * (place + 0.5)
+            parts.append(svg.text(left - 9, y + 4, svg.shorten(v.name, most), "mono", "end"))
+            ends = [n for n in (v.train.mean, v.crossed.p95) if n is not None]
+            parts += [svg.line(x.of(min(ends)), y, x.of(max(ends)), y, "stem")] if ends else []
+            if v.crossed.p95 is not None:
+                parts.append(svg.marks(np.array([x.of(v.crossed.p95)]), np.array([y]), _DIAMOND, "diamond"))
+            if v.train.mean is not None:
+                parts.append(svg.circle(x.of(v.train.mean), y, 5, "hollow"))
+            if v.crossed.mean is not None:
+                parts.append(svg.circle(x.of(v.crossed.mean), y, 4, "solid"))
+        if beside:
+            right = Box(width - beside + _GAP - 14, start + 4, width - 14, bottom)
+            parts += _changes(result, spreads, right)
+        return bottom + 44, parts
+
+    return svg.both("ladder", ("Errors by variant", said, caption), draw)
+
+
+def _said(value: float | None) -> str:
+    return significant(value) if value is not None else "not known"
+
+
+def _axis(numbers: Sequence[float], box: Box) -> Axis:
+    high = max(numbers, default=1.0) or 1.0
+    low = min((n for n in numbers if n > 0), default=high)
+    if high / low > _LOG_FROM:
+        return Axis(low * 0.85, high * 1.15, box.left, box.right, log=True)
+    return Axis(0, high * 1.05, box.left, box.right)
+
+
+def _spread(result: StudyResult, v: VariantResult) -> Array:
+    """5, 25, 50, 75 and 95 % of the change of each record's error."""
+    other = result.variant(v.change.against if v.change else v.name)
+    difference = v.errors_mm - other.errors_mm
+    difference = difference[np.isfinite(difference)]
+    return np.percentile(difference, [5, 25, 50, 75, 95]) if len(difference) else np.full(5, math.nan)
+
+
+def _changes(result: StudyResult, spreads: dict[str, Array], box: Box) -> list[str]:
+    known = np.array([s for s in spreads.values() if np.isfinite(s).all()]).reshape(-1, 5)
+    low, high = min(known.min(initial=0.0), 0.0), max(known.max(initial=0.0), 0.0)
+    room = (high - low) * 0.06 or 1.0
+    x = Axis(low - room, high + room, box.left, box.right)
+    parts = svg.frame(box, x, None, (f"change of a record's error, {result.unit}", ""), (5, 0))
+    parts.append(svg.line(x.of(0), box.top, x.of(0), box.bottom, "bound"))
+    for place, v in enumerate(result.variants):
+        spread = spreads.get(v.name)
+        if spread is None or not np.isfinite(spread).all():
+            continue
+        y = box.top + _ROW * (place + 0.5)
+        at = x.at(spread)
+        parts.append(svg.line(at[0], y, at[4], y, "whisker"))
+        parts.append(svg.rect(at[1], y - 6, max(at[3] - at[1], 1), 12, "#cfe3f1"))
+        parts.append(svg.line(at[2], y - 8, at[2], y + 8, "running"))
+    return parts
+
+
+def _by_group(result: StudyResult) -> Figure:
+    """Mean error at each group, by variant and by what it was trained at."""
+    rows = _rows(result)
+    numbers = [c.errors.mean for c in result.cells if c.errors.mean is not None]
+    texts = [(f"{c.variant}, {_trained(c.trained, result)}", c.judged, _said(c.errors.mean)) for c in result.cells]
+    said = "; ".join(f"{trained}, judged at {at}: {mean} {result.unit}" for trained, at, mean in texts)
+    caption = "Mean errors. A filled dot: of records that also trained (cross-validated); a ring: of others."
+    labels = {key: f"{key[0]}, {_trained(key[1], result)}" for key in rows}
+
+    def draw(width: float) -> tuple[float, list[str]]:
+        most = 18 if width <= svg.NARROW else 44
+        left = MONO * max(len(svg.shorten(label, most)) for label in labels.values()) + 18
+        box = Box(left, 8, width - 14, 8 + _ROW * len(rows))
+        x = _axis(numbers, box)
+        parts = svg.frame(box, x, None, (f"mean error, {result.unit}", ""), (4 if width <= svg.NARROW else 8, 0))
+        for place, (key, cells) in enumerate(rows.items()):
+            y = box.top + _ROW * (place + 0.5)
+            parts.append(svg.text(left - 9, y + 4, svg.shorten(labels[key], most), "mono", "end"))
+            known = [c for c in cells if c.errors.mean is not None]
+            ends = [x.of(c.errors.mean or 0.0) for c in known]
+            parts.append(svg.line(min(ends, default=left), y, max(ends, default=left), y, "stem"))
+            for number, (cell, at) in enumerate(zip(known, ends, strict=True)):
+                parts.append(svg.circle(at, y, 5, "solid" if cell.seen else "hollow"))
+                parts.append(svg.text(at, y + (16 if number % 2 else -8), cell.judged, "tick", "middle"))
+        return box.bottom + 44, parts
+
+    return svg.both("transfer", (f"Errors by {result.group_by}", said, caption), draw)

@@ -39,6 +39,7 @@ _MEND = {
 }
 _STILL = {"angle": ("deg", 1.0), "length": ("mm", 1.0)}
 """A joint that moved by less stood still, but for the noise of its reading."""
+PAYLOAD = "payload"
 _DENSEST, _SHORTEST = 200.0, 0.4
 """kg for each cubic metre of an arm's length (industrial arms and palletisers: 5 to 90); m, what shorter arms count."""
 
@@ -88,31 +89,40 @@ class Prepared:
 
 
 def prepare(
-    experiment: Experiment, watch: Stopwatch, accept: bool = False, progress: Progress = no_progress
+    experiment: Experiment,
+    watch: Stopwatch,
+    accept: bool = False,
+    progress: Progress = no_progress,
+    dataset: Dataset | None = None,
 ) -> Prepared:
     """Everything that can be done and refused before solving; see ``assemble``.
 
     Raises:
         InputError: data, units, counts or rank do not allow a calibration.
     """
-    ready = assemble(experiment, watch, accept, progress)
+    ready = assemble(experiment, watch, accept, progress, dataset)
     with watch.stage("check"), noted(ready.warnings):
         problems = require_solvable(ready.problem, ready.training, ready.problem.parameters.nominal())
     return replace(ready, warnings=(*ready.warnings, *problems))
 
 
 def assemble(
-    experiment: Experiment, watch: Stopwatch, accept: bool = False, progress: Progress = no_progress
+    experiment: Experiment,
+    watch: Stopwatch,
+    accept: bool = False,
+    progress: Progress = no_progress,
+    dataset: Dataset | None = None,
 ) -> Prepared:
     """Data read and checked, and the problem that it makes, whether or not it can be solved.
 
-    With ``accept``, data that look mixed up are not refused, but a bad finding.
+    With ``accept``, data that look mixed up are not refused, but a bad finding. Records that are at hand
+    (``dataset``) are not read.
 
     Raises:
         InputError: data, units or counts do not allow a calibration; its notes are the warnings of the data.
     """
     with watch.stage("read"):
-        dataset = experiment.read(progress)
+        dataset = experiment.read(progress) if dataset is None else dataset
     with noted(dataset.warnings):
         return _assembled(experiment.of_records(dataset), dataset, watch, accept)
 
@@ -200,20 +210,29 @@ def labels_of(experiment: Experiment, dataset: Dataset) -> tuple[str, ...]:
 
     Raises:
         ConfigError: no column separates groups.
+        DataError: records are grouped by payload, and none states one.
     """
     label = label_of(experiment)
-    if label is None or label not in dataset.extra:
+    if label == PAYLOAD and not (dataset.has(PAYLOAD) or label in dataset.extra):
+        raise DataError(
+            "no column states what hung on the tool.",
+            where=Location(dataset.source),
+            hint="Add a column payload_g to the data, or payloads_g to a simulation.",
+        )
+    if label is None or not (label in dataset.extra or label == PAYLOAD):
         raise ConfigError(
             f"found no column {label or 'of groups'} in the records; they have {', '.join(dataset.extra) or 'none'}.",
             where=experiment.source.where(("validation",)),
-            hint="Name a text column of the data: group_by: NAME.",
+            hint=f"Name a text column of the data, or {PAYLOAD}: group_by: NAME.",
         )
     return group_texts(dataset, label)
 
 
 def group_texts(dataset: Dataset, label: str) -> tuple[str, ...]:
-    """A text column as groups are named by it: spaces about a text mean nothing."""
-    return tuple(text.strip() for text in dataset.extra[label])
+    """A text column as groups are named by it, without spaces about it; a payload to the nearest tenth of a gram."""
+    if label in dataset.extra:
+        return tuple(text.strip() for text in dataset.extra[label])
+    return tuple(f"{tenths / 10:g} g" for tenths in np.round(dataset.column(PAYLOAD) * 10_000).tolist())
 
 
 def check_permuted_axes(

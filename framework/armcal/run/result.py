@@ -28,7 +28,7 @@ from armcal.run.experiment import Experiment
 from armcal.run.intervals import IntervalResult
 from armcal.run.placed import FittedRecords
 from armcal.run.pose_residual import ResidualOutcome
-from armcal.run.prepare import group_texts, label_of
+from armcal.run.prepare import PAYLOAD, group_texts, label_of
 
 _MM = 1000.0
 
@@ -152,7 +152,7 @@ def run_groups(experiment: Experiment, run: FittedRecords, errors: RecordErrors)
     """Errors of each group, sorted by name (none if nothing separates groups), and the keys of the problem's groups."""
     problem, records, dataset, keys = run.problem, run.records, run.dataset, run.problem.blueprint.groups
     label = label_of(experiment)
-    if label is None or label not in dataset.extra:
+    if label is None or not (label in dataset.extra or (label == PAYLOAD and dataset.has(PAYLOAD))):
         return RunGroups((), keys)
     labels = np.array(group_texts(dataset, label))
     before = _distances(problem, settled(untrained(problem), problem.parameters.nominal(), records))

@@ -1,65 +1,76 @@
-"""A study: variants of one configuration, how they are judged, and what both kinds of study share."""
+"""A study: variants of one configuration, judged by cross-validation on the same folds of the same records.
+
+With ``group_by`` each variant is also trained at each group of records alone and judged at the others, each way.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
+import numpy as np
 from pydantic import Field
 
-from armcal.base.settings import Mass, Settings
+from armcal.base.arrays import Array, Indices
+from armcal.base.dataset import Dataset
+from armcal.base.settings import Settings
 from armcal.config.validate import validate
 from armcal.config.variants import load_variants
 from armcal.config.yaml_source import ConfigSource
-from armcal.errors import ConfigError, InputError
-from armcal.estimate.estimator import Progress
-from armcal.estimate.validation import FitTask, JudgedFit, Split, fit_and_judge
+from armcal.errors import ConfigError, DataError, InputError, Location, NotConvergedError, ProblemError
+from armcal.estimate.bootstrap import BlockLength, automatic_block_length, standard_error_of_mean
+from armcal.estimate.estimator import Progress, no_progress
+from armcal.estimate.nuisance import restricted, untrained
+from armcal.estimate.structure import require_solvable
+from armcal.estimate.validation import (
+    ErrorSummary,
+    FitTask,
+    JudgedFit,
+    Split,
+    error_unit,
+    errors_and_turns,
+    fit_and_judge,
+    folds,
+    summarise,
+)
 from armcal.io.parallel import Executor
 from armcal.plugins import PluginRegistry, discover
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal.run.pose_residual import Layer, judged_with, layer_of
-from armcal.run.prepare import Prepared, Stopwatch
+from armcal.run.prepare import Prepared, Stopwatch, labels_of, prepare
 from armcal.run.settings import ExperimentSettings, ValidationSettings
+from armcal.run.study_result import Cell, Change, NestedResult, StudyResult, VariantResult
 
 R = TypeVar("R")
 PREVIOUS = "previous"
 """As a reference: each variant is compared with the one before it."""
 WORTH_COMPILING = 1000
 """Records to fit: less than for a run, since the models of a study may be large and their fits long."""
+MOST_LISTED = 10
+_MM = 1000.0
 
 
-class ModelStudySettings(Settings):
+class StudySettings(Settings):
     """Variants compared by cross-validation, all on the same folds of the same records.
 
-    ``reference`` is what each is compared with: a variant, or ``previous`` for a ladder. ``repeats`` draws the folds
-    anew. ``nested`` chooses a variant inside each fold's training records and judges the choice on the fold.
-    ``blocks`` is the number of neighbouring records that are resampled together for standard errors.
+    Without ``variants`` the configuration itself is the only one. ``reference`` is what each is compared with: a
+    variant, or ``previous`` for a ladder. ``repeats`` draws the folds anew. ``nested`` chooses a variant inside each
+    fold's training records and judges the choice on the fold. ``blocks`` is the number of neighbouring records that
+    are resampled together for standard errors. ``group_by`` is a text column of the data, or ``payload``: each variant
+    is also trained at each of its groups, and judged at each.
     """
 
-    kind: Literal["models"] = "models"
-    variants: Annotated[dict[str, Any], Field(min_length=1)]
+    variants: dict[str, Any] = Field(default_factory=dict)
     reference: str = PREVIOUS
     folds: Annotated[int, Field(ge=2)] = 5
     repeats: Annotated[int, Field(ge=1, le=1000)] = 1
     seed: Annotated[int, Field(ge=0)] = 0
     nested: bool = False
     blocks: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
-
-
-class LoadTransferSettings(Settings):
-    """Variants trained at some payloads and judged at others.
-
-    ``payloads`` are simulated, or looked for in the records' payload column, to the nearest tenth of a gram (by
-    default all that are in it). Where a fit is judged at a payload it trained on, ``folds`` keep the two apart.
-    """
-
-    kind: Literal["load_transfer"]
-    variants: Annotated[dict[str, Any], Field(min_length=1)]
-    payloads: tuple[Mass, ...] = ()
-    folds: Annotated[int, Field(ge=2)] = 5
-    seed: Annotated[int, Field(ge=0)] = 0
+    group_by: str | None = None
 
 
 @dataclass(frozen=True)
@@ -68,7 +79,7 @@ class Study:
 
     name: str
     source: ConfigSource
-    settings: ModelStudySettings | LoadTransferSettings
+    settings: StudySettings
     experiments: Mapping[str, Experiment]
 
     @classmethod
@@ -87,61 +98,203 @@ class Study:
         """
         registry = registry or discover()
         read = load_variants(path, overrides)
-        settings = study_settings(read.base)
+        settings = _settings(read.base, tuple(read.variants))
         experiments = {}
         for name, source in read.variants.items():
-            experiment = naming(name, partial(Experiment.of, source, data, registry))
-            # Without the split that a run would make: a study draws its own folds.
-            whole = experiment.settings.model_copy(update={"validation": ValidationSettings()})
-            experiments[name] = replace(experiment, settings=whole)
+            experiment = _naming(name, partial(Experiment.of, source, data, registry))
+            # Without the split that a run would make, a study draws its own folds; nothing is compiled before
+            # everything is known to be solvable.
+            chosen: dict[str, Any] = {"validation": ValidationSettings(group_by=settings.group_by)}
+            experiments[name] = replace(experiment, settings=experiment.settings.model_copy(update=chosen))
         return cls(str(read.base.data.get("name") or Path(path).stem), read.base, settings, experiments)
 
+    def prepare(self, progress: Progress = no_progress) -> dict[str, Prepared]:
+        """The problem of each variant with its records: those that were measured, or else simulated.
 
-def study_settings(source: ConfigSource) -> ModelStudySettings | LoadTransferSettings:
-    """The checked section ``study`` of a configuration.
+        Raises:
+            InputError: a variant is refused, or variants do not use the same records.
+        """
+        ready = {}
+        for name, experiment in self.experiments.items():
+            open_choice: ExperimentSettings = experiment.settings
+            if open_choice.evaluator == "auto":
+                open_choice = open_choice.model_copy(update={"evaluator": "interpreted"})
+            ready[name] = _naming(name, partial(_prepared, replace(experiment, settings=open_choice), progress))
+        _require_same_records(ready)
+        return ready
 
-    Raises:
-        ConfigError: there is none, or it is refused.
-    """
-    section = source.data.get("study")
-    if not isinstance(section, dict):
+
+def _settings(source: ConfigSource, variants: Sequence[str]) -> StudySettings:
+    if not isinstance(source.data.get("study"), dict):
         raise ConfigError(
             "found no study.",
             where=source.where(("study",)),
             hint="Give study: {variants: {NAME: {extends: FILE}, ...}}; see docs/study.md.",
         )
-    kind = section.get("kind", "models")
-    if kind == "load_transfer":
-        transfer = validate(LoadTransferSettings, source, ("study",))
-        grams = [round(payload * 1e4) for payload in transfer.payloads]
-        if len(set(grams)) < len(grams) or len(grams) == 1 or min(grams, default=0) < 0:
-            raise ConfigError(
-                "expected at least two different payloads, none below zero.",
-                where=source.where(("study", "payloads")),
-                hint="Write for example payloads_g: [0, 66.3].",
-            )
-        return transfer
-    if kind != "models":
+    settings = validate(StudySettings, source, ("study",))
+    if settings.reference not in (PREVIOUS, *variants):
         raise ConfigError(
-            f"found kind {kind!r}, expected models or load_transfer.", where=source.where(("study", "kind"))
-        )
-    models = validate(ModelStudySettings, source, ("study",))
-    if models.reference not in (PREVIOUS, *models.variants):
-        names = ", ".join(models.variants)
-        raise ConfigError(
-            f"found the reference {models.reference!r}, expected {PREVIOUS} or one of {names}.",
+            f"found the reference {settings.reference!r}, expected {PREVIOUS} or one of {', '.join(variants)}.",
             where=source.where(("study", "reference")),
         )
-    return models
+    return settings
 
 
-def interpreted_first(experiment: Experiment) -> ExperimentSettings:
-    """Settings that compile nothing before everything is known to be solvable, unless they ask for it."""
-    settings = experiment.settings
-    return settings.model_copy(update={"evaluator": "interpreted"}) if settings.evaluator == "auto" else settings
+def _naming(name: str, work: Callable[[], R]) -> R:
+    try:
+        return work()
+    except InputError as fault:
+        raise type(fault)(f"variant {name}: {fault.message}", where=fault.where, hint=fault.hint) from fault
 
 
-def judged_fits(
+def _prepared(experiment: Experiment, progress: Progress) -> Prepared:
+    simulated = experiment.settings.data is None and experiment.settings.simulation is not None
+    made = experiment.simulator().simulate(experiment.simulation_request) if simulated else None
+    return prepare(experiment, Stopwatch(), progress=progress, dataset=made)
+
+
+def _require_same_records(ready: Mapping[str, Prepared]) -> None:
+    (first_name, first), *others = ready.items()
+    outputs = [c for k in first.problem.kernels for c in k.factor.output_channels]
+    for name, other in others:
+        same = other.dataset.ids == first.dataset.ids and other.dataset.sha256 == first.dataset.sha256
+        measured = [c for k in other.problem.kernels for c in k.factor.output_channels]
+        if not same or measured != outputs:
+            raise ProblemError(
+                f"the variants {first_name} and {name} are not judged on the same records: "
+                f"{len(first.dataset)} and {len(other.dataset)} are used, measured are {', '.join(outputs)} and "
+                f"{', '.join(measured)}.",
+                hint="Give every variant the same data and measurements.",
+            )
+
+
+@dataclass(frozen=True)
+class _Training:
+    """Records that train, all or those of one group; ``drawn`` are folds of them, drawing by drawing."""
+
+    groups: tuple[str, ...]
+    train: Indices
+    drawn: tuple[tuple[Split, ...], ...]
+    count: int  # of all records
+
+    @property
+    def splits(self) -> list[Split]:
+        """Judged everywhere by the fit to all that train; then the folds."""
+        return [Split(self.train, np.arange(self.count, dtype=np.intp)), *chain.from_iterable(self.drawn)]
+
+    def errors(self, fits: Sequence[JudgedFit]) -> tuple[Array, Array, Array]:
+        """Errors, the same at rest (mm) and turns (deg), by drawing and record, each of a fit that did not see it."""
+        rows = np.full((3, len(self.drawn), self.count), np.nan)
+        elsewhere, rest = np.ones(self.count, dtype=bool), iter(fits[1:])
+        elsewhere[self.train] = False
+        rows[:, :, elsewhere] = _stacked(fits[0])[:, None, elsewhere]
+        for number, splits in enumerate(self.drawn):
+            for split in splits:
+                rows[:, number, split.holdout] = _stacked(next(rest))
+        return rows[0], rows[1], rows[2]
+
+
+def _stacked(fit: JudgedFit) -> Array:
+    turns = np.full(len(fit.errors), np.nan) if fit.turns is None else np.degrees(fit.turns)
+    return np.stack([fit.errors * _MM, fit.at_rest * _MM, turns])
+
+
+def compare(
+    study: Study,
+    executor: Executor,
+    command: str = "",
+    progress: Progress = no_progress,
+    watch: Stopwatch | None = None,
+) -> StudyResult:
+    """Judge every variant by cross-validation.
+
+    Raises:
+        InputError: a variant cannot be solved, variants do not use the same records, or there are no two groups.
+        NotConvergedError: of every variant some fit failed.
+    """
+    watch, settings = watch or Stopwatch(), study.settings
+    with watch.stage("prepare"):
+        ready = study.prepare(progress)
+        some, first = next(iter(ready.values())), next(iter(study.experiments.values()))
+        dataset, poses = some.dataset, first.poses(some.dataset)
+        labels = () if settings.group_by is None else labels_of(first, dataset)
+        groups = _groups(labels, dataset, settings)
+        for name, own in ready.items():
+            for rows in groups.values():
+                _naming(name, partial(_require_solvable, own, rows))
+    whole, *parts = _trainings(groups, settings, poses)
+    inner = [_drawn(outer.train, settings, poses) for outer in whole.drawn[0]] if settings.nested else []
+    splits = [split for training in (whole, *parts) for split in training.splits]
+    plan = [(name, split) for name in ready for split in (*splits, *chain.from_iterable(inner))]
+    fits, count = _fits(study, ready, plan, executor, progress, watch), len(plan) // len(ready)
+    by_name = {name: fits[i * count : (i + 1) * count] for i, name in enumerate(ready)}
+    judged = [_judged(name, ready[name], by_name[name], whole) for name in ready]
+    variants = _compared(judged, settings, dataset.ids)
+    best, simplest = _choices(variants, settings, dataset.ids)
+    trained = {name: _by_training(by_name[name], (whole, *parts)) for name in ready} if parts else {}
+    return StudyResult(
+        name=study.name,
+        command=command,
+        dataset=dataset,
+        simulated=first.settings.data is None,
+        folds=settings.folds,
+        repeats=settings.repeats,
+        variants=variants,
+        best=best,
+        simplest=simplest,
+        nested=_nested(by_name, whole.drawn[0], inner, len(splits)) if inner else None,
+        group_by=settings.group_by,
+        labels=labels,
+        groups={name: len(rows) for name, rows in groups.items()},
+        cells=tuple(cell for name, own in trained.items() for cell in _cells(name, ready[name], own, groups)),
+        trained_mm={(n, at): o.errors_mm.mean(axis=0) for n, own in trained.items() for at, o in own.items()},
+        warnings=_warnings(ready, variants),
+        seconds=watch.seconds,
+        provenance=first.provenance(dataset),
+        unit=error_unit(some.problem),
+    )
+
+
+def _groups(labels: Sequence[str], dataset: Dataset, settings: StudySettings) -> dict[str, Indices]:
+    """Records of each group, payloads in rising order; none where nothing groups them."""
+    if settings.group_by is None:
+        return {}
+    names = list(dict.fromkeys(labels))
+    if settings.group_by not in dataset.extra:
+        names.sort(key=lambda name: float(name.partition(" ")[0]))
+    groups = {name: np.flatnonzero(np.array(labels) == name).astype(np.intp) for name in names}
+    few = [name for name, rows in groups.items() if len(rows) < settings.folds]
+    if few or len(groups) < 2:
+        counts = ", ".join(f"{name} ({len(rows)})" for name, rows in groups.items())
+        raise DataError(
+            f"too few records at {', '.join(few) or f'a second {settings.group_by}'}; there are records at {counts}.",
+            where=Location(dataset.source),
+            hint=f"Each {settings.group_by} needs at least as many records as there are folds ({settings.folds}).",
+        )
+    return groups
+
+
+def _require_solvable(ready: Prepared, rows: Indices) -> None:
+    problem = restricted(ready.problem, ready.problem.subset(ready.records, rows))
+    require_solvable(problem, problem.subset(ready.records, rows), problem.parameters.nominal())
+
+
+def _trainings(groups: Mapping[str, Indices], settings: StudySettings, poses: Indices) -> list[_Training]:
+    """All records, and those of each group."""
+    listed: dict[tuple[str, ...], Indices] = {tuple(groups): np.arange(len(poses), dtype=np.intp)}
+    listed |= {(name,): rows for name, rows in groups.items()}
+    return [
+        _Training(names, rows, tuple(_drawn(rows, settings, poses, r) for r in range(settings.repeats)), len(poses))
+        for names, rows in listed.items()
+    ]
+
+
+def _drawn(train: Indices, settings: StudySettings, poses: Indices, repeat: int = 0) -> tuple[Split, ...]:
+    inside = folds(len(train), settings.folds, settings.seed + repeat, poses[train])
+    return tuple(Split(train[split.train], train[split.holdout]) for split in inside)
+
+
+def _fits(
     study: Study,
     ready: Mapping[str, Prepared],
     plan: Sequence[tuple[str, Split]],
@@ -167,10 +320,10 @@ def judged_fits(
         task = FitTask(problems[name], study.experiments[name].estimator, start, ready[name].records, split)
         tasks.append((task, layers[name]))
     with watch.stage("fits"):
-        return executor.map(_judged, tasks, lambda done: progress("fits", done))
+        return executor.map(_fit, tasks, lambda done: progress("fits", done))
 
 
-def _judged(judging: tuple[FitTask, Layer | None]) -> JudgedFit:
+def _fit(judging: tuple[FitTask, Layer | None]) -> JudgedFit:
     """A fit judged, with the pose residual that it learns where one is to be learned."""
     task, layer = judging
     return fit_and_judge(task) if layer is None else judged_with(task, layer)
@@ -180,8 +333,170 @@ def _compile(problem: Problem) -> None:
     problem.evaluated_by("compiled")
 
 
-def naming(name: str, work: Callable[[], R]) -> R:
-    try:
-        return work()
-    except InputError as fault:
-        raise type(fault)(f"variant {name}: {fault.message}", where=fault.where, hint=fault.hint) from fault
+def _judged(name: str, ready: Prepared, fits: Sequence[JudgedFit], whole: _Training) -> VariantResult:
+    """A variant by its fit to all records, and by those of the folds."""
+    nominal, nominal_turns = _nominal(ready)
+    of_all, own = fits[0], fits[: len(whole.splits)]
+    errors, at_rest, turned = whole.errors(own)
+    turns = None
+    if nominal_turns is not None and of_all.turns is not None:
+        turns = {
+            "nominal": summarise(nominal_turns),
+            "train": summarise(np.degrees(of_all.turns)),
+            "cross_validated": _averaged(turned),
+        }
+    return VariantResult(
+        name=name,
+        free=ready.problem.increments,
+        nominal=summarise(nominal),
+        train=summarise(of_all.errors * _MM),
+        crossed=_averaged(errors),
+        at_rest=_averaged(at_rest),
+        errors_mm=errors.mean(axis=0),
+        change=None,
+        converged=of_all.converged,
+        failed_folds=sum(not fit.converged for fit in own[1:]),
+        fit_seconds=of_all.seconds,
+        seconds=sum(fit.seconds for fit in fits),
+        turns=turns,
+    )
+
+
+def _nominal(ready: Prepared) -> tuple[Array, Array | None]:
+    """Errors (mm) and, where they are measured, turns (deg) without calibration."""
+    problem = untrained(ready.problem)
+    errors, turns = errors_and_turns(problem, problem.parameters.nominal(), ready.records)
+    return errors * _MM, None if turns is None else np.degrees(turns)
+
+
+def _averaged(drawings: Array) -> ErrorSummary:
+    """Each figure's mean over the drawings of folds (drawings x N)."""
+    summaries, means = [summarise(row) for row in drawings], {}
+    for field in fields(ErrorSummary):
+        known = [value for s in summaries if (value := getattr(s, field.name)) is not None]
+        means[field.name] = float(np.mean(known)) if known else None
+    return ErrorSummary(means["mean"], means["rms"], means["p95"], means["max"], min(s.count for s in summaries))
+
+
+def _compared(plain: Sequence[VariantResult], settings: StudySettings, ids: Sequence[str]) -> tuple[VariantResult, ...]:
+    """Each with its change against the one before or the reference, unless it is that itself."""
+    by_name = {result.name: result for result in plain}
+    others = [plain[0], *plain] if settings.reference == PREVIOUS else [by_name[settings.reference]] * len(plain)
+    return tuple(
+        result
+        if other is result
+        else replace(result, change=change(result.errors_mm, other.errors_mm, other.name, ids, settings.blocks))
+        for result, other in zip(plain, others, strict=False)
+    )
+
+
+def change(errors: Array, others: Array, against: str, ids: Sequence[str], block: BlockLength = "auto") -> Change:
+    """Errors (N) of one model against those of another on the same records in recorded order; nan where not judged."""
+    both = np.flatnonzero(np.isfinite(errors) & np.isfinite(others))
+    gained = errors[both] - others[both]
+    length = automatic_block_length(gained) if block == "auto" else block
+    order = both[np.argsort(gained, kind="stable")]
+    listed = [(str(ids[i]), float(errors[i] - others[i])) for i in order]
+    return Change(
+        against=against,
+        mean=float(np.mean(gained)) if len(both) else float("nan"),
+        standard_error=standard_error_of_mean(gained, length),
+        block=length,
+        helped=float(np.mean(gained < 0)) if len(both) else float("nan"),
+        most_helped=tuple(pair for pair in listed[:MOST_LISTED] if pair[1] < 0),
+        most_hurt=tuple(pair for pair in listed[::-1][:MOST_LISTED] if pair[1] > 0),
+    )
+
+
+def simplest_good(means: Array, freedoms: Sequence[int], changes: Sequence[Change]) -> int:
+    """The model with the fewest parameters whose mean error is within one standard error of the lowest. [Hastie2009]
+
+    Args:
+        means: mean error of each model (M).
+        freedoms: how many parameters each has (M).
+        changes: each model against the one with the lowest mean (M).
+    """
+    best = int(np.nanargmin(means))
+    good = [i for i, c in enumerate(changes) if i == best or c.mean <= c.standard_error]
+    return min(good, key=lambda i: (freedoms[i], means[i]))
+
+
+def _choices(variants: Sequence[VariantResult], settings: StudySettings, ids: Sequence[str]) -> tuple[str, str]:
+    whole = [v for v in variants if v.converged and not v.failed_folds]
+    if not whole:
+        raise NotConvergedError(
+            "of every variant some fit did not converge.", hint="Check the data and the start values."
+        )
+    means = np.array([v.crossed.mean for v in whole], dtype=float)
+    best = whole[int(np.argmin(means))]
+    changes = [change(v.errors_mm, best.errors_mm, best.name, ids, settings.blocks) for v in whole]
+    return best.name, whole[simplest_good(means, [v.free for v in whole], changes)].name
+
+
+def _nested(
+    fits: Mapping[str, Sequence[JudgedFit]], outer: Sequence[Split], inner: Sequence[Sequence[Split]], offset: int
+) -> NestedResult:
+    """Each fold's choice, made by the mean error over the folds inside of it, judged by the fold. [Varma2006]"""
+    chosen, errors = [], np.full(sum(len(split.holdout) for split in outer), np.nan)
+    at = offset
+    for number, (split, inside) in enumerate(zip(outer, inner, strict=True)):
+        seen = {name: np.concatenate([f.errors for f in fit[at : at + len(inside)]]) for name, fit in fits.items()}
+        means = {name: float(np.mean(e)) if np.isfinite(e).all() else np.inf for name, e in seen.items()}
+        best = min(means, key=lambda name: means[name])
+        chosen.append(best)
+        errors[split.holdout] = fits[best][1 + number].errors * _MM
+        at += len(inside)
+    return NestedResult(summarise(errors), tuple(chosen), errors)
+
+
+@dataclass(frozen=True)
+class _Trained:
+    errors_mm: Array  # by drawing and record
+    turns_deg: Array
+    failed_fits: int
+
+
+def _by_training(fits: Sequence[JudgedFit], trainings: Sequence[_Training]) -> dict[tuple[str, ...], _Trained]:
+    """What each training of a variant says of every record: group by group, then all together."""
+    trained, at = {}, 0
+    for training in trainings:
+        own = fits[at : at + len(training.splits)]
+        errors, _, turns = training.errors(own)
+        trained[training.groups] = _Trained(errors, turns, sum(not fit.converged for fit in own))
+        at += len(own)
+    return dict([*list(trained.items())[1:], next(iter(trained.items()))])
+
+
+def _cells(
+    name: str, ready: Prepared, trained: Mapping[tuple[str, ...], _Trained], groups: Mapping[str, Indices]
+) -> list[Cell]:
+    """Without calibration, then by what was trained at, group by group."""
+    nominal, turned = _nominal(ready)
+    before = np.full(len(nominal), np.nan) if turned is None else turned
+    rows = {(): _Trained(nominal[None], before[None], 0), **trained}
+    return [
+        Cell(
+            name,
+            at,
+            group,
+            _averaged(own.errors_mm[:, members]),
+            group in at,
+            own.failed_fits,
+            None if turned is None else _averaged(own.turns_deg[:, members]),
+        )
+        for at, own in rows.items()
+        for group, members in groups.items()
+    ]
+
+
+def _warnings(ready: Mapping[str, Prepared], variants: Sequence[VariantResult]) -> tuple[str, ...]:
+    """Each once, with the variants it holds for unless these are all."""
+    holders: dict[str, list[str]] = {}
+    for name, prepared in ready.items():
+        for text in dict.fromkeys(prepared.warnings):
+            holders.setdefault(text, []).append(name)
+    listed = [text if len(names) == len(ready) else f"{', '.join(names)}: {text}" for text, names in holders.items()]
+    for v in variants:
+        if v.failed_folds or not v.converged:
+            listed.append(f"{v.name}: {v.failed_folds + (not v.converged)} fits did not converge; it is not chosen.")
+    return tuple(listed)

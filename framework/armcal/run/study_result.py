@@ -1,5 +1,6 @@
 """What a study knows when it ends, and the files that it leaves: numbers, a row a record, the configuration."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -8,9 +9,9 @@ from armcal.base.config_text import as_json
 from armcal.base.dataset import Dataset
 from armcal.calibration.calibration_file import dump
 from armcal.config.variants import SECTION
+from armcal.config.yaml_source import ConfigSource
 from armcal.estimate.validation import ErrorSummary, in_unit
 from armcal.io.cells import csv_text
-from armcal.run.study import Study
 
 FILES = ("experiment.yaml", "study.csv", "study.json", "study.html")
 
@@ -39,15 +40,6 @@ class Change:
 
 
 @dataclass(frozen=True)
-class VariantTurns:
-    """Errors of orientations (deg) of one variant, as its errors of lengths."""
-
-    nominal: ErrorSummary
-    train: ErrorSummary
-    crossed: ErrorSummary
-
-
-@dataclass(frozen=True)
 class VariantResult:
     """One variant, judged.
 
@@ -64,7 +56,8 @@ class VariantResult:
         failed_folds: how many fits of the cross-validation did not converge.
         fit_seconds: of the fit on all records.
         seconds: of all fits of this variant.
-        turns: errors of orientations, where they are measured beside lengths.
+        turns: errors of orientations (deg), where they are measured beside lengths: ``nominal``, ``train``,
+            ``cross_validated``.
     """
 
     name: str
@@ -79,16 +72,11 @@ class VariantResult:
     failed_folds: int
     fit_seconds: float
     seconds: float
-    turns: VariantTurns | None = None
+    turns: Mapping[str, ErrorSummary] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        turns = self.turns
-        turned = turns and {
-            "nominal": turns.nominal.as_dict(),
-            "train": turns.train.as_dict(),
-            "cross_validated": turns.crossed.as_dict(),
-        }
+        turned = {name: turns.as_dict() for name, turns in (self.turns or {}).items()}
         return {
             "name": self.name,
             "free": self.free,
@@ -118,82 +106,17 @@ class NestedResult:
     errors_mm: Array
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Judged:
-    """What every finished study has.
-
-    Attributes:
-        name: of the study.
-        command: how to repeat it.
-        dataset: the records.
-        warnings: of configs, data and problems.
-        seconds: of each stage.
-        provenance: hashes and versions.
-        unit: of all errors; ``mrad`` where nothing measured is a length.
-    """
-
-    name: str
-    command: str
-    dataset: Dataset
-    warnings: tuple[str, ...]
-    seconds: dict[str, float]
-    provenance: dict[str, Any]
-    unit: str = "mm"
-
-    def content(self, kind: str, **own: Any) -> dict[str, Any]:
-        ends = {"warnings": list(self.warnings), "seconds": dict(self.seconds), "provenance": self.provenance}
-        return dict(in_unit({"study": self.name, "kind": kind, **own, **ends}, self.unit))
-
-
-@dataclass(frozen=True, kw_only=True)
-class StudyResult(_Judged):
-    """A finished comparison.
-
-    Attributes:
-        folds: how many.
-        repeats: how often they were drawn.
-        variants: in the order written.
-        best: the variant with the lowest cross-validated mean error, of those whose fits all converged.
-        simplest: the one with the fewest parameters within one standard error of it.
-        nested: if it was asked for.
-    """
-
-    folds: int
-    repeats: int
-    variants: tuple[VariantResult, ...]
-    best: str
-    simplest: str
-    nested: NestedResult | None
-
-    def variant(self, name: str) -> VariantResult:
-        return next(v for v in self.variants if v.name == name)
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        nested = self.nested
-        return self.content(
-            "models",
-            records=len(self.dataset),
-            folds=self.folds,
-            repeats=self.repeats,
-            variants=[variant.as_dict() for variant in self.variants],
-            lowest=self.best,
-            simplest_within_one_standard_error=self.simplest,
-            nested=nested and {"error_mm": nested.crossed.as_dict(), "chosen": list(nested.chosen)},
-        )
-
-
 @dataclass(frozen=True)
-class TransferCell:
-    """One variant trained at some payloads and judged at one (mm).
+class Cell:
+    """One variant trained at some groups of records and judged at one (mm).
 
-    ``trained_g`` is empty for the nominal model; with ``seen`` the records that judge were at a payload that also
+    ``trained`` is empty for the nominal model; with ``seen`` the records that judge were of a group that also
     trained, and were kept out of the training by folds. ``turns`` are errors of orientations (deg), where measured.
     """
 
     variant: str
-    trained_g: tuple[float, ...]
-    judged_g: float
+    trained: tuple[str, ...]
+    judged: str
     errors: ErrorSummary
     seen: bool
     failed_fits: int
@@ -202,8 +125,8 @@ class TransferCell:
     def as_dict(self) -> dict[str, Any]:
         return {
             "variant": self.variant,
-            "trained_at_g": list(self.trained_g),
-            "judged_at_g": self.judged_g,
+            "trained_at": list(self.trained),
+            "judged_at": self.judged,
             "error_mm": self.errors.as_dict(),
             **({"orientation_error_deg": self.turns.as_dict()} if self.turns else {}),
             "cross_validated": self.seen,
@@ -212,61 +135,87 @@ class TransferCell:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TransferResult(_Judged):
-    """A finished load transfer study; ``errors_mm`` by variant and payloads trained at, record by record."""
+class StudyResult:
+    """A finished study."""
 
+    name: str
+    command: str  # that repeats it
+    dataset: Dataset
     simulated: bool
-    payloads_g: tuple[float, ...]
-    counts: tuple[int, ...]
-    cells: tuple[TransferCell, ...]
-    errors_mm: dict[tuple[str, tuple[float, ...]], Array]
+    folds: int
+    repeats: int
+    variants: tuple[VariantResult, ...]  # in the order written
+    best: str  # the lowest cross-validated mean error, of those whose fits all converged
+    simplest: str  # the fewest parameters within one standard error of it
+    nested: NestedResult | None
+    group_by: str | None
+    labels: tuple[str, ...]  # the group of each record
+    groups: Mapping[str, int]  # records of each; empty where nothing groups them
+    cells: tuple[Cell, ...]
+    trained_mm: Mapping[tuple[str, tuple[str, ...]], Array]  # by variant and groups trained at, record by record
+    warnings: tuple[str, ...]
+    seconds: dict[str, float]
+    provenance: dict[str, Any]
+    unit: str = "mm"  # of all errors; ``mrad`` where nothing measured is a length
+
+    def variant(self, name: str) -> VariantResult:
+        return next(v for v in self.variants if v.name == name)
 
     def as_dict(self) -> dict[str, Any]:
-        return self.content(
-            "load_transfer",
-            simulated=self.simulated,
-            payloads_g=list(self.payloads_g),
-            records=list(self.counts),
-            cells=[cell.as_dict() for cell in self.cells],
-        )
+        """For JSON."""
+        nested, grouped = self.nested, {}
+        if self.group_by is not None:
+            cells = [cell.as_dict() for cell in self.cells]
+            grouped = {"group_by": self.group_by, "groups": dict(self.groups), "cells": cells}
+        content = {
+            "study": self.name,
+            "records": len(self.dataset),
+            "simulated": self.simulated,
+            "folds": self.folds,
+            "repeats": self.repeats,
+            "variants": [variant.as_dict() for variant in self.variants],
+            "lowest": self.best,
+            "simplest_within_one_standard_error": self.simplest,
+            "nested": nested and {"error_mm": nested.crossed.as_dict(), "chosen": list(nested.chosen)},
+            **grouped,
+            "warnings": list(self.warnings),
+            "seconds": dict(self.seconds),
+            "provenance": self.provenance,
+        }
+        return dict(in_unit(content, self.unit))
 
 
-def files(result: StudyResult | TransferResult, study: Study, page: str) -> dict[str, str]:
+def files(result: StudyResult, study: ConfigSource, variants: Mapping[str, ConfigSource], page: str) -> dict[str, str]:
     return {
-        "experiment.yaml": dump(self_contained(study)),
+        "experiment.yaml": dump(_self_contained(study, variants)),
         "study.csv": _csv_text(result),
         "study.json": as_json(result.as_dict()) + "\n",
         "study.html": page,
     }
 
 
-def self_contained(study: Study) -> dict[str, Any]:
+def _self_contained(study: ConfigSource, variants: Mapping[str, ConfigSource]) -> dict[str, Any]:
     """The configuration with each variant as the sections in which it differs: no other file is needed."""
-    read = next((e.source.data["data"] for e in study.experiments.values() if "data" in e.source.data), None)
-    data = study.source.data if read is None else {**study.source.data, "data": read}
+    read = next((own.data["data"] for own in variants.values() if "data" in own.data), None)
+    data = study.data if read is None else {**study.data, "data": read}
     base = {key: section for key, section in data.items() if key != SECTION}
-    variants = {}
-    for name, experiment in study.experiments.items():
-        own = experiment.source.data
-        differing = {key: section for key, section in own.items() if base.get(key) != section}
-        variants[name] = {"set": differing | {key: None for key in base if key not in own}}
-    return {**data, SECTION: {**data[SECTION], "variants": variants}}
+    listed = {}
+    for name, own in variants.items():
+        differing = {key: section for key, section in own.data.items() if base.get(key) != section}
+        listed[name] = {"set": differing | {key: None for key in base if key not in own.data}}
+    return {**data, SECTION: {**data[SECTION], "variants": listed}}
 
 
-def _csv_text(result: StudyResult | TransferResult) -> str:
+def _csv_text(result: StudyResult) -> str:
     """A row a record, an error a variant, by a fit that did not see the record."""
-    if isinstance(result, StudyResult):
-        columns = {f"{v.name}_{result.unit}": v.errors_mm for v in result.variants}
-        if result.nested:
-            columns[f"chosen_inside_{result.unit}"] = result.nested.errors_mm
-    else:
-        columns = {
-            f"{name}_trained_at_{'_and_'.join(f'{g:g}' for g in trained)}_g_{result.unit}": errors
-            for (name, trained), errors in result.errors_mm.items()
-        }
+    columns: dict[str, Any] = {} if result.group_by is None else {result.group_by: result.labels}
+    columns |= {f"{v.name}_{result.unit}": v.errors_mm for v in result.variants}
+    if result.nested:
+        columns[f"chosen_inside_{result.unit}"] = result.nested.errors_mm
+    for (name, trained), errors in result.trained_mm.items():
+        if len(trained) < len(result.groups):
+            columns[f"{name}_trained_at_{'_and_'.join(trained).replace(' ', '_')}_{result.unit}"] = errors
     dataset = result.dataset
-    if isinstance(result, TransferResult):
-        columns = {"payload_g": dataset.column("payload") * 1000, **columns}
     rows = dataset.rows or ("",) * len(dataset)
     body = zip(dataset.ids, rows, *columns.values(), strict=True)
     return csv_text([["pose_id", "source_row", *columns], *body])
