@@ -15,12 +15,10 @@ from typing import Any
 
 import numpy as np
 import yaml
-from armcal.estimate.simulation import DAY_S
-from armcal.plugins import discover
-from armcal_online.commands.mission import loop_session
-from armcal_online.mission.judge import Judgement
-from armcal_online.mission.mission import before_launch, run_mission
-from armcal_online.mission.settings import MissionPlan
+from armcal_online.mission.mission import ErrorCurve, MissionPlan, before_launch, run_mission
+from armcal_online.mission.simulator import DAY_S
+
+from tests.mission_decisions import Decision, Occurrence, occurrences, verdicts
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "lrm_arm" / "mission.yaml"
 DAYS, DAY = 10, 4.0
@@ -46,8 +44,11 @@ def _vector(random: np.random.Generator, low: float, high: float) -> list[float]
 def two_slips(random: np.random.Generator) -> dict[str, Any]:
     """Two horns slip by 1 to 15 deg at the same moment."""
     joints = random.choice(6, 2, replace=False) + 1
-    slips = [{"kind": "slip", "day": DAY, "joint": f"arm.q{i}", "parameter": f"arm.mdh.theta{i}"} for i in joints]
-    return {"events": [{**slip, "angle_deg": _size(random, 1, 15)} for slip in slips]}
+    return {"events": [_turned("slip", i, f"{_size(random, 1, 15)} deg") for i in joints]}
+
+
+def _turned(kind: str, joint: int, change: str) -> dict[str, Any]:
+    return {"kind": kind, "day": DAY, "joint": f"arm.q{joint}", "changes": {f"arm.mdh.theta{joint}": change}}
 
 
 def outliers(random: np.random.Generator) -> dict[str, Any]:
@@ -63,8 +64,7 @@ def tracker_bias(random: np.random.Generator) -> dict[str, Any]:
 def creeping_joint(random: np.random.Generator) -> dict[str, Any]:
     """A joint creeps by 0.1 to 0.6 deg a day."""
     i, change = random.integers(1, 7), f"{_size(random, 0.1, 0.6):.3f} deg in 1 d"
-    creep = {"kind": "creep", "day": DAY, "joint": f"arm.q{i}", "parameter": f"arm.mdh.theta{i}", "change": change}
-    return {"events": [creep]}
+    return {"events": [_turned("creep", i, change)]}
 
 
 def untold_payload(random: np.random.Generator) -> dict[str, Any]:
@@ -83,8 +83,9 @@ def bent_link(random: np.random.Generator) -> dict[str, Any]:
 def unread_tilt(random: np.random.Generator) -> dict[str, Any]:
     """The rover reads its tilt wrong by 10 to 25 deg."""
     azimuth, size = random.uniform(0, 2 * np.pi), abs(_size(random, 10, 25))
-    turn = [float(size * np.cos(azimuth)), float(size * np.sin(azimuth))]
-    return {"events": [{"kind": "tilt", "day": DAY, "turn_deg": turn}]}
+    turns = {"statics.gravity_rx": size * np.cos(azimuth), "statics.gravity_ry": size * np.sin(azimuth)}
+    changes = {name: f"{turn} deg" for name, turn in turns.items()}
+    return {"events": [{"kind": "tilt", "day": DAY, "changes": changes}]}
 
 
 def nothing(random: np.random.Generator) -> dict[str, Any]:
@@ -105,7 +106,16 @@ def launch() -> Path:
     return before_launch(MissionPlan.load(CONFIG, (*SHORT, "simulation.events=[]")), folder)
 
 
-def flown(case: str, seed: int) -> Judgement:
+@dataclass(frozen=True)
+class Flown:
+    """One mission: errors, what happened, and what was decided."""
+
+    curve: ErrorCurve
+    happened: tuple[Occurrence, ...]
+    decisions: list[Decision]
+
+
+def flown(case: str, seed: int) -> Flown:
     """One mission through the loop that ``armcal recalibrate`` uses."""
     plan = CASES[case](np.random.default_rng([seed, list(CASES).index(case)]))
     texts = [
@@ -113,9 +123,9 @@ def flown(case: str, seed: int) -> Judgement:
     ]
     start = f"mission.calibration={launch()}"
     loaded = MissionPlan.load(CONFIG, (*SHORT, "mission.experiment=null", start, f"simulation.seed={seed}", *texts))
-    registry = discover()
     with tempfile.TemporaryDirectory() as folder:
-        return run_mission(loaded, Path(folder), loop_session(registry), registry).judgement
+        mission, curve, content = run_mission(loaded, Path(folder))
+    return Flown(curve, occurrences(mission.settings.events, DAYS), content["decisions"])
 
 
 @dataclass(frozen=True)
@@ -136,15 +146,17 @@ class Row:
         return self.filter_mm / self.recent_mm
 
 
-def row(judged: Judgement) -> Row:
+def row(made: Flown) -> Row:
     """From the event's moment on, or from the first refit on without one."""
-    curve = judged.curve
-    since = judged.events[0].occurrence.time if judged.events else judged.worst.since if judged.worst else 0.0
-    after = curve.is_hour & (curve.times >= since)
-    means = [float(1000 * curve.errors[name][after].mean()) for name in ("recalibrated", "refit_recent", "frozen")]
-    verdicts = tuple(report.finding.verdict for report in judged.events)
-    worst = judged.worst.ratio if judged.worst else np.nan
-    return Row(*means, worst, len(judged.false_alarms), judged.quiet / DAY_S, verdicts)
+    curve, (found, alarms) = made.curve, verdicts(made.happened, made.decisions)
+    recent, filtered, days = curve.errors["refit_recent"], curve.errors["recalibrated"], curve.times / DAY_S
+    first_refit = float(days[int(np.argmax(recent != curve.errors["frozen"]))])
+    after = curve.is_hour & (days >= (made.happened[0].day if made.happened else first_refit))
+    means = [float(1000 * errors[after].mean()) for errors in (filtered, recent, curve.errors["frozen"])]
+    inside = [curve.is_hour & (days >= day) & (days < day + 1) for day in np.arange(first_refit, days[-1])]
+    worst = max(float(filtered[day].mean() / recent[day].mean()) for day in inside if day.any())
+    quiet = [not any(o.is_open(day) for o in made.happened) for day in days[curve.is_hour]]
+    return Row(*means, worst, len(alarms), DAYS * float(np.mean(quiet)), tuple(found))
 
 
 def table(rows: dict[str, Sequence[Row]]) -> Iterator[str]:

@@ -7,7 +7,7 @@ _COMMANDS = {
     "control": ("control:control", "Query or command a running recalibration."),
     "replay": ("replay:replay_command", "Make every state of a recalibration again from its journal."),
     "watch": ("watch:watch", "Show a recalibration live, in the browser or the terminal."),
-    "mission": ("mission:mission", "Simulate a mission, recalibrate over it, judge it by its truth."),
+    "mission": ("mission:mission", "Simulate a mission, recalibrate over it, compare that with its truth."),
 }
 
 
@@ -15,3 +15,9 @@ _COMMANDS = {
 def armcal_register_commands(register: Register) -> None:
     for name, (target, summary) in _COMMANDS.items():
         register(name, f"armcal_online.commands.{target}", summary)
+
+
+@hookimpl
+def armcal_register_simulators(register: Register) -> None:
+    target = "armcal_online.mission.simulator:MissionOfDays"
+    register("mission", target, "a rover's arm over some days, and what befalls it")

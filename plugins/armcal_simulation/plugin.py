@@ -9,7 +9,6 @@ _HERE = "armcal_simulation"
 def armcal_register_simulators(register: Register) -> None:
     register("elastic_arm", f"{_HERE}.simulator:ElasticArmSimulator", "an arm with a stated truth")
     register("contacts", f"{_HERE}.contacts:ContactsSimulator", "postures in sockets and clamps")
-    register("mission", f"{_HERE}.mission.simulator:MissionOfDays", "a rover's arm over some days, and what befalls it")
 
 
 @hookimpl

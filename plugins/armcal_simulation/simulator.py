@@ -13,20 +13,19 @@ from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.settings import Angle, InputPath, Length, Mass, Settings
 from armcal.errors import ConfigError
-from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
+from armcal.estimate.simulation import (
+    OutlierSettings,
+    SimulationRequest,
+    approach_of,
+    at_truth,
+    measured_without_noise,
+    with_channels,
+    with_outliers,
+)
 from armcal.testing import EXAMPLE_TRUTH
 from pydantic import Field
 
-from armcal_simulation.readings import (
-    OutlierSettings,
-    approach_of,
-    at_truth,
-    disturbed,
-    is_orientation,
-    out_of_view,
-    seen_poses,
-    with_outliers,
-)
+from armcal_simulation.readings import disturbed, is_orientation, out_of_view, seen_poses
 
 _MOST_DRAWS = 100
 

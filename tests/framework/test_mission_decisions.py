@@ -3,28 +3,40 @@
 from __future__ import annotations
 
 import pytest
-from armcal.estimate.simulation import DAY_S, EventKind, MissionEvent
-from armcal_online.mission.decisions import findings, occurrences
-from armcal_online.mission.log import Decision
+from armcal_online.mission.simulator import ArmEventSettings, CameraSettings, Event, PayloadSettings
+from armcal_online.tracking.directions import LINK
+
+from tests.mission_decisions import Decision, occurrences, verdicts
+
+DAYS = 30
 
 
-def event(kind: EventKind, day: float, joint: str = "", until: float | None = None, beside: str = "") -> MissionEvent:
-    return MissionEvent(kind, day * DAY_S, joint, f"{kind} {joint}", (until or day) * DAY_S, beside)
+def event(kind: str, day: float, joint: str = "", until: float | None = None) -> Event:
+    """One that grows if it has an end."""
+    if kind == "payload":
+        return PayloadSettings.si(kind=kind, day=day, mass=0.1, until=until)
+    if kind in ("bump", "bias"):
+        return CameraSettings.si(kind=kind, day=day, per_day=(0.001 if kind == "bias" else 0.0, 0, 0), until=until)
+    change = "1 deg" if until is None else "1 deg in 1 d"
+    return ArmEventSettings.si(kind=kind, day=day, joint=joint, changes={"arm.mdh.theta1": change}, until=until)
 
 
 def decided(kind: str, day: float, joint: str = "", *candidates: str) -> Decision:
-    return Decision(day * DAY_S, kind, joint, "So it is.", candidates)
+    key = "link" if joint.startswith(LINK) else "joint"
+    return {"day": day, "kind": kind, key: joint.removeprefix(LINK), "candidates": candidates}
 
 
-def judged(events: list[MissionEvent], decisions: list[Decision]) -> tuple[list[str], int]:
+def judged(events: list[Event], decisions: list[Decision]) -> tuple[list[str], int]:
     """The verdict of each moment, and how many false alarms there are."""
-    found, alarms = findings(occurrences(events), decisions)
-    return [finding.verdict for finding in found], len(alarms)
+    found, alarms = verdicts(occurrences(events, DAYS), decisions)
+    return found, len(alarms)
 
 
-def test_only_what_goes_on_after_its_moment_grows() -> None:
-    slip, creep, both = occurrences([event("slip", 1, "arm.q1"), event("creep", 2, "arm.q1", 4), event("slip", 5)])
-    assert (slip.grows, creep.grows, both.grows) == (False, True, False)
+def test_a_payload_that_is_set_down_is_another_event_and_what_grows_is_open_to_its_end() -> None:
+    moments = occurrences(
+        [event("payload", 3, until=9), event("creep", 5, "arm.q1", 7), event("slip", 5, "arm.q2")], DAYS
+    )
+    assert [(moment.day, moment.ends, len(moment.subjects)) for moment in moments] == [(3, 5, 1), (5, 9, 2), (9, 11, 1)]
 
 
 SLIP = event("slip", 5, "arm.q3")
@@ -74,10 +86,10 @@ CREEP = event("creep", 5, "arm.q3", until=20)
         ([CREEP, event("slip", 8, "arm.q1")], [decided("joint_slipped", 8.1, "arm.q1")], ["missed", "right"], 0),
         ([CREEP, event("slip", 8, "arm.q1")], [decided("joint_slipped", 8.1, "arm.q2")], ["missed", "wrong"], 0),
         # A bent link lies between two joints.
-        ([event("bend", 5, "arm.q3", beside="arm.q4")], [decided("joint_slipped", 5.1, "arm.q4")], ["right"], 0),
-        ([event("bend", 5, "arm.q3", beside="arm.q4")], [decided("joint_slipped", 5.1, "arm.q5")], ["wrong"], 0),
-        ([event("bend", 5, "arm.q3", beside="arm.q4")], [decided("link_bent", 5.1, "link arm.q3")], ["right"], 0),
-        ([event("bend", 5, "arm.q3", beside="arm.q4")], [decided("link_bent", 5.1, "link arm.q4")], ["wrong"], 0),
+        ([event("bend", 5, "arm.q3")], [decided("joint_slipped", 5.1, "arm.q4")], ["right"], 0),
+        ([event("bend", 5, "arm.q3")], [decided("joint_slipped", 5.1, "arm.q5")], ["wrong"], 0),
+        ([event("bend", 5, "arm.q3")], [decided("link_bent", 5.1, "link arm.q3")], ["right"], 0),
+        ([event("bend", 5, "arm.q3")], [decided("link_bent", 5.1, "link arm.q4")], ["wrong"], 0),
         ([SLIP], [decided("link_bent", 5.1, "link arm.q3")], ["wrong"], 0),
         ([event("tilt", 5)], [decided("gravity_tilted", 5.1)], ["right"], 0),
         ([event("tilt", 5)], [decided("payload_changed", 5.1)], ["wrong"], 0),
@@ -94,6 +106,6 @@ CREEP = event("creep", 5, "arm.q3", until=20)
     ],
 )
 def test_a_decision_is_about_what_it_names_and_what_names_nothing_about_the_latest(
-    events: list[MissionEvent], decisions: list[Decision], verdicts: list[str], alarms: int
+    events: list[Event], decisions: list[Decision], verdicts: list[str], alarms: int
 ) -> None:
     assert judged(events, decisions) == (verdicts, alarms)

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
-from armcal_online.mission.mission import as_incoming, before_launch, simulated
-from armcal_online.mission.settings import MissionPlan
+from armcal_online.mission.mission import MissionPlan, before_launch
+from armcal_online.sources.source import Incoming
 from armcal_online.tracking.health import Health
 from armcal_online.tracking.recalibrator import Recalibrator
 from online_arm import AXES, JOINTS, World, begun, calibration, told
@@ -122,9 +122,12 @@ def launched(folder: Path) -> Calibration:
 def decided(folder: Path, *overrides: str) -> list[Mapping[str, Any]]:
     """The decisions of a mission."""
     plan = MissionPlan.load(CONFIG, (f"simulation.days={DAYS}", "evaluator=interpreted", *overrides))
-    mission, session = simulated(plan), Recalibrator(launched(folder), plan.recalibrate)
-    records = as_incoming(mission.records, mission.times, mission.began)
-    return [event for k, record in enumerate(records, 1) for event in told(session.take(record, k), "decision")]
+    mission, session = plan.simulated(), Recalibrator(launched(folder), plan.recalibrate)
+    decisions = []
+    for k, name in enumerate(mission.records.ids, 1):
+        channels = {channel: float(column[k - 1]) for channel, column in mission.records.channels.items()}
+        decisions += told(session.take(Incoming(name, channels, {}, channels["time"], "mission", k), k), "decision")
+    return decisions
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +159,7 @@ def test_outliers_of_a_mission_change_nothing_whatever_their_size(size_mm: int, 
 @pytest.mark.parametrize(("one", "other"), [(1, 4), (2, 3), (2, 6), (3, 5)])
 def test_two_slips_of_a_mission_are_both_named(one: int, other: int, bench: Path) -> None:
     slips = [
-        f"{{kind: slip, day: 3.4, joint: arm.q{joint}, parameter: arm.mdh.theta{joint}, angle_deg: {size}}}"
+        f"{{kind: slip, day: 3.4, joint: arm.q{joint}, changes: {{arm.mdh.theta{joint}: {size} deg}}}}"
         for joint, size in ((one, 6), (other, -10))
     ]
     found = decided(bench, f"simulation.events=[{', '.join(slips)}]")

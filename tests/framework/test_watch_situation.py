@@ -180,8 +180,7 @@ def test_hours_are_bounded_and_medians() -> None:
 def mission(folder: Path, mm: list[float], levels: list[str]) -> Path:
     """The files that a mission leaves beside its recalibration."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "truth.json").write_text(json.dumps({"began": START}))
-    (folder / "mission.json").write_text(json.dumps({"limit_mm": 3.0}))
+    (folder / "mission.json").write_text(json.dumps({"began": START, "limit_mm": 3.0}))
     with (folder / "mission.csv").open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["day", "moment", "frozen_mm", "recalibrated_mm", "level", "temperature_C"])

@@ -1,22 +1,24 @@
-"""Simulators: datasets, or whole missions with a truth over time, through the same model that is calibrated."""
+"""Simulators: datasets with a known truth, through the same model that is calibrated."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol, runtime_checkable
+from pathlib import Path
+from typing import Annotated, Protocol, Self, runtime_checkable
 
 import numpy as np
+from pydantic import Field, model_validator
 
 from armcal.arm.assembly import Arm
 from armcal.arm.environment import Environment
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
+from armcal.base.settings import Length, Settings
+from armcal.config.selection import with_values
+from armcal.config.yaml_source import load_config
 from armcal.measure.measurement import Measurement
 from armcal.problem.problem import Problem
 from armcal.problem.readings import disturbed_records
-
-DAY_S = 86400.0
-EventKind = Literal["slip", "swap", "bend", "creep", "play", "payload", "tilt", "bump", "bias", "climate"]
 
 
 @dataclass(frozen=True)
@@ -99,93 +101,57 @@ def with_channels(dataset: Dataset, channels: Mapping[str, Array]) -> Dataset:
     return replace(dataset, channels={**dataset.channels, **{k: np.asarray(v) for k, v in channels.items()}})
 
 
-@dataclass(frozen=True)
-class MissionEvent:
-    """Something that happened to the arm, its payload, the camera or the weather.
+class OutlierSettings(Settings):
+    """Some measurements are wrong: how many, and by how much at least (in a random direction).
 
-    Attributes:
-        kind: ``slip`` (a horn slipped on its shaft), ``swap`` (a servo was replaced), ``bend`` (a link is bent),
-            ``creep`` (a joint creeps), ``play`` (a joint's backlash grows), ``payload`` (picked up or set down, which
-            no record reports), ``tilt`` (gravity pulls from another direction than the records report), ``bump`` (the
-            camera moved), ``bias`` (the camera's readings move away), ``climate``
-            (days and nights change).
-        time: s since the mission began.
-        joint: whose, ``arm.q3``; empty where it is no joint's.
-        label: a few words for figures and tables.
-        until: when it no longer changes anything, s since the mission began; ``time`` of one that is over at once.
-        beside: another joint that it may be taken for: the one at the other end of a bent link.
+    They are off by once to twice the ``size``; with a ``largest`` by any size between the two, each factor as likely
+    as every other, so that few are very large (density 1 / size).
     """
 
-    kind: EventKind
-    time: float
-    joint: str
-    label: str
-    until: float
-    beside: str = ""
+    fraction: Annotated[float, Field(ge=0, le=1)] = 0.0
+    size: Annotated[Length, Field(gt=0)] = 0.03
+    largest: Length | None = None
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if self.largest is not None and self.largest < self.size:
+            raise ValueError(
+                f"found outliers of {1000 * self.size:g} mm at least and {1000 * self.largest:g} mm at most: "
+                "write a larger largest"
+            )
+        return self
 
 
-class MissionTruth(Protocol):
-    """The truth at any time of the mission (s since it began)."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The canonical entries of all parameters."""
-
-    @property
-    def moving(self) -> tuple[str, ...]:
-        """Those that change over the mission."""
-
-    def values_at(self, times: Array) -> Array:
-        """Value vectors (N x entries, SI)."""
-
-    def camera_T_base_at(self, times: Array) -> Array:  # noqa: N802
-        """Where what is measured in the base frame is seen, once the camera has moved (N x 4 x 4, m)."""
-
-    def temperature_at(self, times: Array) -> Array:
-        """N, degrees Celsius."""
-
-    def payload_at(self, times: Array) -> Array:
-        """What hangs on the tool without any record of it: mass (kg), centre in the tool frame (m) (N x 4)."""
+def with_outliers(
+    measured: Mapping[str, Array], outliers: OutlierSettings, random: np.random.Generator
+) -> tuple[dict[str, Array], Mask]:
+    """Channels (N each, m) with some records pushed away by a size as stated, and which those are (N)."""
+    count = len(next(iter(measured.values())))
+    wrong = random.random(count) < outliers.fraction
+    push = random.normal(size=(len(measured), count))
+    share, most = random.random(count), outliers.largest
+    times = 1 + share if most is None else (most / outliers.size) ** share
+    push *= outliers.size * times / np.linalg.norm(push, axis=0)
+    pushed = {
+        channel: values + np.where(wrong, push[row], 0.0) for row, (channel, values) in enumerate(measured.items())
+    }
+    return pushed, wrong
 
 
-@dataclass(frozen=True)
-class Mission:
-    """A simulated mission.
+def at_truth(request: SimulationRequest, truth: Path) -> SimulationRequest:
+    """The request at the parameter values of a file.
 
-    Attributes:
-        records: what arrived, in order.
-        times: of the records, s since the mission began (N).
-        outliers: which measurements were made wrong (N).
-        exchanged: which were delivered with the joints of another record (N).
-        truth: at any time.
-        events: in order.
-        power_cuts: s since the mission began, in order.
-        began: what the records' clock showed when the mission began, s.
-        seconds: how long it lasts.
-        lost: how many records never arrived.
+    Raises:
+        ConfigError: the file names unknown parameters.
     """
-
-    records: Dataset
-    times: Array
-    outliers: Mask
-    exchanged: Mask
-    truth: MissionTruth
-    events: tuple[MissionEvent, ...]
-    power_cuts: tuple[float, ...]
-    began: float
-    seconds: float
-    lost: int
+    source = load_config(truth)
+    return replace(request, parameters=with_values(request.parameters, source.data, source, ()))
 
 
-@runtime_checkable
-class MissionSimulator(Protocol):
-    """A simulator that knows the truth over time."""
-
-    def simulate(self, request: SimulationRequest) -> Dataset:
-        """The records alone."""
-
-    def mission(self, request: SimulationRequest) -> Mission:
-        """Records and truth; the same request gives the same mission."""
-
-    def planted(self, request: SimulationRequest, seed: int) -> Mapping[str, Any]:
-        """Keys of the simulator's settings that plant a random selection of what may happen; the same for a seed."""
+def approach_of(commands: Array) -> Array:
+    """The sign of each joint's last motion; 0 before its first (joints x poses)."""
+    moves = np.sign(np.diff(commands, axis=1, prepend=commands[:, :1]))
+    for column in range(1, moves.shape[1]):
+        still = moves[:, column] == 0
+        moves[still, column] = moves[still, column - 1]
+    return np.asarray(moves)

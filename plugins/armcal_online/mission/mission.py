@@ -1,134 +1,113 @@
-"""A mission: simulated, calibrated before launch, recalibrated record by record, and judged against the truth."""
+"""A simulated mission: calibrated before launch, recalibrated record by record, compared with its truth."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Self
 
 import numpy as np
-from armcal.base.arrays import Array
+from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
+from armcal.base.parameters import Parameters
+from armcal.base.settings import InputPath, Length, Settings
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import sealed
-from armcal.errors import ConfigError, InputError, NotConvergedError
-from armcal.estimate.estimator import Progress, no_progress
-from armcal.estimate.simulation import Mission
-from armcal.io.plain_files import check_output
+from armcal.config.validate import validate
+from armcal.config.yaml_source import load_config
+from armcal.errors import ConfigError, NotConvergedError
+from armcal.estimate.estimator import Progress, Solution, SolverVerdict, no_progress
+from armcal.estimate.polish import descended, polish
+from armcal.estimate.robust import reweighted
+from armcal.io.lines import StandardOutput
 from armcal.measure.csv_writer import write_csv
-from armcal.plugins import PluginRegistry
+from armcal.plugins import PluginRegistry, discover
+from armcal.problem.posed import PosedProblem
+from armcal.problem.problem import FactorRecords, Problem
 from armcal.run.experiment import Experiment
 from armcal.run.outputs import calibration_content
 from armcal.run.pipeline import calibrate
-from armcal.run.prepare import Stopwatch
+from pydantic import Field, model_validator
 from typing_extensions import override
 
-from armcal_online.mission.errors import error_curve
-from armcal_online.mission.judge import Judgement, judge
-from armcal_online.mission.log import MissionLog, read_mission_log
-from armcal_online.mission.references import refits
-from armcal_online.mission.settings import MissionPlan
-from armcal_online.sources.source import Incoming, Source
+from armcal_online.mission.simulator import DAY_S, HOUR_S, Event, Mission, MissionOfDays, with_payload
+from armcal_online.running.session import Setup, opened
+from armcal_online.sources.csv_file import CsvFile
+from armcal_online.sources.row_parser import RowParser
+from armcal_online.sources.source import Incoming
+from armcal_online.tracking.recalibrator import Recalibrator
+from armcal_online.tracking.settings import SECTION as RECALIBRATE
 from armcal_online.tracking.settings import RecalibrateSettings
 
-SOURCE_KEY = "mission"
-
-CALIBRATION = "calibration.yaml"
-BENCH = "bench.csv"
-RECORDS = "records.csv"
-RECALIBRATION = "recalibration"
-
-
-class PowerCutError(Exception):
-    """The power is gone: nothing is finished, nothing more is written."""
+SECTION = "mission"
+BENCH, CALIBRATION, RECORDS, RECALIBRATION = "bench.csv", "calibration.yaml", "records.csv", "recalibration"
+_MM = 1000.0
+Series = Sequence[tuple[float, Array]]  # value vectors in order, with the time from which on each is used (s)
+_GROWTH, _FIRST_STEPS, _DAMPING, _ENOUGH = 1.1, 5, 1e-3, 1e-3
+_DOUBTFUL = 2.0  # residuals so many times the noise: the fit may have come to rest at the wrong minimum
+_USABLE = ("nominal", "watch")
+_RECOVERED, _IN_A_ROW = 1.5, 3  # the error is within so many times that of the day before, so often in a row
 
 
-def as_incoming(records: Dataset, times: Array, began: float) -> tuple[Incoming, ...]:
-    """Records as they arrive, by the mission's clock (times in s since it began)."""
-    names = list(records.channels)
-    columns = [records.channels[name].tolist() for name in names]
-    labels = list(records.extra)
-    return tuple(
-        Incoming(
-            record_id=records.ids[i],
-            channels={name: column[i] for name, column in zip(names, columns, strict=True)},
-            labels={name: records.extra[name][i] for name in labels},
-            arrived=began + float(times[i]),
-            source_key=SOURCE_KEY,
-            source_row=i + 1,
-        )
-        for i in range(len(records))
-    )
+class RefitSettings(Settings):
+    """Robust fits that the recalibration is compared with: of the last ``records``, anew after ``every`` so many."""
+
+    records: Annotated[int, Field(ge=10, le=1000)] = 40
+    every: Annotated[int, Field(ge=1)] = 10
 
 
-class MissionSource(Source):
-    """Records one after another; see ``Source``. After row ``cut`` the power goes."""
+class MissionRunSettings(Settings):
+    """What the mission begins with, and how it is compared with the truth."""
 
-    keeps_records = True
+    experiment: InputPath | None = None  # a configuration whose simulated records are calibrated first
+    calibration: InputPath | None = None  # or a file that is there already
+    limit: Annotated[Length, Field(gt=0)] = 0.003  # of the mean tip error, for the arm to be used
+    poses: Annotated[int, Field(ge=1, le=5000)] = 200  # in which tips are compared
+    refit: RefitSettings = Field(default_factory=RefitSettings)
 
-    def __init__(self, records: Sequence[Incoming], cut: int | None = None) -> None:
-        self._records, self._cut = records, cut
-        self._next = 0
-
-    @property
-    @override
-    def ended(self) -> bool:
-        return self._next >= len(self._records) and self._cut is None
-
-    @override
-    def resume(self, positions: Mapping[str, int]) -> None:
-        self._next = positions.get(SOURCE_KEY, 0)
-
-    @override
-    def incoming(self, wait_s: float) -> Incoming | None:
-        """Raises:
-        PowerCutError: it is time.
-        """
-        if self._cut is not None and self._next >= self._cut:
-            raise PowerCutError
-        if self._next >= len(self._records):
-            return None
-        self._next += 1
-        return self._records[self._next - 1]
-
-
-Session = Callable[[Path, RecalibrateSettings, MissionSource, Path], Sequence[Mapping[str, Any]]]
-"""Recalibrates a calibration from a source until that ends, resuming what is in the folder; the events that it wrote,
-those up to a power cut, which it does not raise."""
+    @model_validator(mode="after")
+    def _one_start(self) -> Self:
+        if (self.experiment is None) == (self.calibration is None):
+            raise ValueError("found both or neither of experiment and calibration, expected one of them")
+        return self
 
 
 @dataclass(frozen=True)
-class MissionResult:
-    """A mission as it went."""
+class MissionPlan:
+    """A mission's configuration, checked and built, before anything is simulated."""
 
-    mission: Mission
-    calibration: Calibration
-    log: MissionLog
-    judgement: Judgement
+    experiment: Experiment
+    simulator: MissionOfDays
+    settings: MissionRunSettings
+    recalibrate: RecalibrateSettings
 
+    @classmethod
+    def load(cls, path: Path, overrides: Sequence[str] = (), registry: PluginRegistry | None = None) -> Self:
+        """Read a mission; its sections ``mission`` and ``recalibrate`` are no part of an experiment."""
+        source = load_config(path, overrides)
+        settings = validate(MissionRunSettings, source, (SECTION,))
+        stated = RECALIBRATE in source.data
+        recalibrate = validate(RecalibrateSettings, source, (RECALIBRATE,)) if stated else RecalibrateSettings()
+        rest = {key: value for key, value in source.data.items() if key not in (SECTION, RECALIBRATE)}
+        experiment = Experiment.of(replace(source, data=rest), registry=registry or discover())
+        simulator = experiment.simulator()
+        if not isinstance(simulator, MissionOfDays):
+            raise ConfigError(
+                "this simulator knows no truth over time.",
+                where=source.where(("simulation", "type")),
+                hint="Write simulation: {type: mission, ...}.",
+            )
+        return cls(experiment, simulator, settings, recalibrate)
 
-def simulated(plan: MissionPlan) -> Mission:
-    """The mission's records and truth.
-
-    Raises:
-        ConfigError: the simulation does not fit the arm.
-    """
-    mission = plan.simulator.mission(plan.experiment.simulation_request)
-    if not len(mission.records):
-        raise ConfigError(
-            "no record arrives in this mission.",
-            where=plan.experiment.source.where(("simulation",)),
-            hint="Make it longer, or lose fewer records.",
-        )
-    return mission
+    def simulated(self) -> Mission:
+        return self.simulator.mission(self.experiment.simulation_request)
 
 
 def before_launch(plan: MissionPlan, folder: Path, progress: Progress = no_progress) -> Path:
-    """The calibration to begin with: the one that is given, or that of simulated records of the bench.
-
-    Raises:
-        InputError: the experiment is refused.
-        NotConvergedError: it did not converge.
-    """
+    """The calibration to begin with: the one that is given, or that of simulated records of the bench."""
     settings = plan.settings
     if settings.calibration is not None:
         return settings.calibration
@@ -142,52 +121,299 @@ def before_launch(plan: MissionPlan, folder: Path, progress: Progress = no_progr
             "the calibration before launch did not converge.", hint=f"Try armcal run {settings.experiment}."
         )
     path = folder / CALIBRATION
-    check_output(path, InputError)
     path.write_text(sealed(calibration_content(result, again)), encoding="utf-8")
     return path
 
 
-def recalibrated(
-    mission: Mission, calibration: Path, settings: RecalibrateSettings, session: Session, folder: Path
-) -> MissionLog:
-    incoming = as_incoming(mission.records, mission.times, mission.began)
+class PowerCutError(Exception):
+    pass
+
+
+class CutSource(CsvFile):
+    """Records until, after so many, the power goes: nothing is finished, nothing more is written."""
+
+    def __init__(self, path: Path, rows: RowParser, count: float) -> None:
+        super().__init__(path, rows, "stop")
+        self._count = count
+
+    @override
+    def incoming(self, wait_s: float) -> Incoming | None:
+        incoming = super().incoming(wait_s)
+        if incoming is not None and incoming.source_row > self._count + 1:  # the first line is the header
+            raise PowerCutError
+        return incoming
+
+
+@dataclass
+class MissionLog:
+    """What a recalibration reported of each record, and what it estimated and decided when (s since the beginning)."""
+
+    verdicts: dict[str, str] = field(default_factory=dict)
+    estimates: dict[float, Mapping[str, float]] = field(default_factory=dict)
+    levels: list[tuple[float, str]] = field(default_factory=list)
+    decisions: list[tuple[float, Mapping[str, Any]]] = field(default_factory=list)
+    resumed: int = 0
+    _now: float = 0.0
+
+    def take(self, event: Mapping[str, Any], times: Mapping[str, float]) -> None:
+        """An event without a record of its own has the time of the last record before it."""
+        match event["event"]:
+            case "started":
+                self.resumed += event["resumed"]
+                self.estimates.setdefault(0.0, {p["name"]: float(p["value"]) for p in event["parameters"]})
+                self.levels = self.levels or [(0.0, event["level"])]
+            case "record":
+                self._now = times.get(event["id"], self._now)
+                self.verdicts[event["id"]] = event["verdict"]
+            case "estimate":
+                self.estimates[self._now] = {name: float(pair[0]) for name, pair in event["parameters"].items()}
+            case "level":
+                self.levels.append((self._now, event["to"]))
+            case "decision":
+                self.decisions.append((self._now, event))
+
+
+def recalibrated(plan: MissionPlan, mission: Mission, calibration: Path, folder: Path) -> MissionLog:
+    """Through the loop that ``armcal recalibrate`` uses, anew from its journal after each power cut."""
+    stream, registry, settings, log = io.BytesIO(), plan.experiment.registry, plan.recalibrate, MissionLog()
     every = settings.model_copy(update={"output": settings.output.model_copy(update={"estimate_every_records": 1})})
-    cuts = [int(np.searchsorted(mission.times, time)) for time in mission.power_cuts]
-    events: list[Mapping[str, Any]] = []
-    for cut in (*cuts, None):
-        events += session(calibration, every, MissionSource(incoming, cut), folder)
-    return read_mission_log(events, mission)
+    for cut in (*np.searchsorted(mission.times, mission.power_cuts).tolist(), np.inf):
+        session = Recalibrator(Calibration.load(calibration, registry), every, registry)
+        source = CutSource(folder / RECORDS, RowParser(session.request, settings.columns), cut)
+        setup = Setup(folder / RECALIBRATION, calibration, StandardOutput(stream))
+        with suppress(PowerCutError), opened(setup, session, source) as loop:
+            loop.run()
+            if not source.ended:
+                raise KeyboardInterrupt
+    times = dict(zip(mission.records.ids, mission.times.tolist(), strict=True))
+    for line in stream.getvalue().splitlines():
+        log.take(json.loads(line), times)
+    return log
+
+
+class GaussNewton:
+    """An estimator for fits that start near their solution: some damped steps, then undamped ones to the last digit."""
+
+    def solve(
+        self, problem: Problem, records: Sequence[FactorRecords], start: Array, progress: Progress = no_progress
+    ) -> Solution:
+        posed = PosedProblem(problem, tuple(records))
+        near = descended(posed, posed.x(start), _FIRST_STEPS, _DAMPING, _ENOUGH)
+        values = posed.values(polish(posed, near))
+        return Solution(values, SolverVerdict("Gauss-Newton", "at rest", True, _FIRST_STEPS, 0.0))
+
+
+def refits(plan: MissionPlan, parameters: Parameters, mission: Mission) -> dict[str, Series]:
+    """Robust fits (Cauchy) of all records so far, and of the most recent ones; none with too few records.
+
+    Nominal ``parameters`` are those of the calibration before launch. Each fit starts from the one before. That of the
+    recent ones is made anew every ``settings.every`` records, that of all whenever these are a tenth more.
+    """
+    system, settings, count = plan.experiment.system, plan.settings.refit, len(mission.records)
+    first = settings.records
+    if count < first:
+        return {}
+    parts = (system.arms, system.measurements, parameters, system.environment, mission.records)
+    problem = Problem.build(*parts, plan.experiment.settings.evaluator)
+    records, launch = problem.records(mission.records), parameters.nominal()
+    everything = [first]
+    while (following := max(int(_GROWTH * everything[-1]), everything[-1] + settings.every)) <= count:
+        everything.append(following)
+    spans = {
+        "refit": [(0, last) for last in everything],
+        "refit_recent": [(last - first, last) for last in range(first, count + 1, settings.every)],
+    }
+    earliest = robust_fit(problem, problem.subset(records, np.arange(first)), [launch])
+    made: dict[str, Series] = {}
+    for name, (_, *later) in spans.items():
+        series = [(0.0, launch), (float(mission.times[first - 1]), earliest)]
+        for begin, end in later:
+            starts = series[-1][1], launch
+            values = robust_fit(problem, problem.subset(records, np.arange(begin, end)), starts)
+            series.append((float(mission.times[end - 1]), values))
+        made[name] = series
+    return made
+
+
+def robust_fit(problem: Problem, records: Sequence[FactorRecords], starts: Sequence[Array]) -> Array:
+    """The values of a Cauchy fit; from the next start if the one before leads to residuals beyond the noise.
+
+    The smallest median residual wins. The first start itself, if none leads anywhere.
+    """
+    best, values = np.inf, starts[0]
+    for start in starts:
+        try:
+            first = Solution(start, SolverVerdict("start", "", True, 0, 0.0))
+            fit = reweighted(problem, records, GaussNewton(), first, "cauchy")
+        except NotConvergedError:
+            continue
+        if max(fit.scales) < best:
+            best, values = max(fit.scales), fit.solution.values
+        if best < _DOUBTFUL:
+            break
+    return values
+
+
+@dataclass(frozen=True)
+class ErrorCurve:
+    """Mean tip errors (m) by calibration, at every record and every hour (T, s since the mission began)."""
+
+    times: Array
+    is_hour: Mask
+    is_record: Mask
+    errors: Mapping[str, Array]
+    levels: tuple[str, ...]
+
+
+def error_curve(
+    plan: MissionPlan, launch: Parameters, mission: Mission, log: MissionLog, references: Mapping[str, Series]
+) -> ErrorCurve:
+    """Mean distance between a calibration's tip and the true one, as the camera sees it, in fixed random poses.
+
+    Nominal values of ``launch`` are those of the calibration before launch.
+    """
+    truth, system = mission.truth, plan.experiment.system
+    if truth.parameters.entry_names != launch.entry_names:
+        raise ConfigError(
+            "the calibration's parameters are not those of the simulated arm.",
+            hint="Let mission.experiment describe the same arm, effects and measurements as the mission.",
+        )
+    hours = np.arange(0.0, mission.settings.days * DAY_S, HOUR_S)
+    times = np.unique(np.concatenate([mission.times, hours]))
+    frozen, true = launch.nominal(), truth.values_at(times)
+    began = dict(zip(launch.entry_names, frozen.tolist(), strict=True))
+    estimates = [
+        (time, np.array([values.get(n, x) for n, x in began.items()])) for time, values in log.estimates.items()
+    ]
+    series: dict[str, Series] = {"frozen": [(0.0, frozen)], **references, "recalibrated": estimates}
+    differing = np.any(np.vstack([true, *(v for of_one in series.values() for _, v in of_one)]) != frozen, axis=0)
+    free = launch.with_free([b.name for b in launch.blocks if differing[launch.entries_of(b.name)].any()])
+    poses, instruments = random_poses(plan, mission), dict([next(iter(system.measurements.items()))])
+    parts = (system.arms, instruments, free, system.environment, poses)
+    problem = Problem.build(*parts, plan.experiment.settings.evaluator, groups={})
+    records, seen = problem.records(poses), np.zeros((len(times), len(poses), 3))
+    for i, camera in enumerate(truth.camera_T_base_at(times)):
+        seen[i] = -problem.residuals(true[i], records)[0].T @ camera[:3, :3].T + camera[:3, 3]
+    errors = {name: _errors(problem, poses, of_one, times, seen) for name, of_one in series.items()}
+    begun = np.searchsorted([time for time, _ in log.levels], times, side="right") - 1
+    levels = tuple(log.levels[i][1] for i in begun)
+    return ErrorCurve(times, np.isin(times, hours), np.isin(times, mission.times), errors, levels)
+
+
+def random_poses(plan: MissionPlan, mission: Mission) -> Dataset:
+    """Within the span of the records; a tip measured at zero leaves itself, negative, as the residual."""
+    random, arm = np.random.default_rng(0), next(iter(plan.experiment.system.arms.values()))
+    count, channels = plan.settings.poses, dict[str, Array]()
+    for joint in arm.commanded:
+        angles = mission.records.column(f"{arm.name}.{joint}")
+        channels[f"{arm.name}.{joint}"] = random.uniform(angles.min(), angles.max(), count)
+        channels[f"{arm.name}.approach.{joint}"] = random.choice([-1.0, 1.0], count)
+    instrument = next(iter(plan.experiment.system.measurements))
+    channels |= {name: np.zeros(count) for name in ("payload", *(f"{instrument}.{axis}" for axis in "xyz"))}
+    return Dataset(tuple(map(str, range(count))), channels, source="random poses")
+
+
+def _errors(problem: Problem, poses: Dataset, series: Series, times: Array, seen: Array) -> Array:
+    """Of a calibration whose springs do not hold the arm, and which predicts nothing: as much as the tips lie apart."""
+    errors, used, records = np.zeros(len(times)), -1, problem.records(poses)
+    for i, newest in enumerate(np.searchsorted([time for time, _ in series], times, side="right") - 1):
+        if newest != used:
+            used, now = newest, np.full_like(seen[i], np.nan)
+            with suppress(NotConvergedError):
+                now = -problem.residuals(series[newest][1], records)[0].T
+        off = float(np.linalg.norm(now - seen[i], axis=1).mean())
+        errors[i] = off if np.isfinite(off) else float(np.linalg.norm(np.ptp(seen[i], axis=0)))
+    return errors
+
+
+def figures(plan: MissionPlan, mission: Mission, log: MissionLog, curve: ErrorCurve) -> dict[str, Any]:
+    """Everything that terminal, figure and other programs show."""
+    limit, hour = plan.settings.limit, curve.is_hour
+    usable = np.array([level in _USABLE for level in curve.levels]) & (curve.errors["recalibrated"] <= limit)
+    verdicts = np.array([log.verdicts.get(text, "ignored") for text in mission.records.ids])
+    events = sorted(mission.settings.events, key=lambda event: event.day)
+    ends = [next((e.day for e in events if e.day > event.day), np.inf) * DAY_S for event in events]
+    return {
+        "mission": plan.experiment.name,
+        "days": mission.settings.days,
+        "began": mission.settings.began,
+        "limit_mm": limit * _MM,
+        "error_mm": {name: _summary(errors[hour] * _MM) for name, errors in curve.errors.items()},
+        "within_limit": {name: float((errors[hour] <= limit).mean()) for name, errors in curve.errors.items()},
+        "availability": float(usable[hour].mean()),
+        "events": [_event(*pair, log, curve) for pair in zip(events, ends, strict=True)],
+        "decisions": [{"day": time / DAY_S, **event} for time, event in log.decisions],
+        "records": {
+            "arrived": len(verdicts),
+            "lost": mission.lost,
+            **{verdict: int((verdicts == verdict).sum()) for verdict in ("accepted", "rejected", "ignored")},
+            "good_rejected": int(((verdicts == "rejected") & ~mission.outliers).sum()),
+            "outliers": int(mission.outliers.sum()),
+            "outliers_accepted": int(((verdicts == "accepted") & mission.outliers).sum()),
+        },
+        "outliers": [text for text, wrong in zip(mission.records.ids, mission.outliers, strict=True) if wrong],
+        "power_cuts": [time / DAY_S for time in mission.power_cuts],
+        "resumed": log.resumed,
+    }
+
+
+def _summary(mm: Array) -> dict[str, float]:
+    p95 = float(np.percentile(mm, 95))
+    return {"mean": mm.mean(), "median": float(np.median(mm)), "p95": p95, "max": mm.max(), "last": mm[-1]}
+
+
+def _event(event: Event, end: float, log: MissionLog, curve: ErrorCurve) -> dict[str, Any]:
+    """The first decision after an event, and what became of the error until the next one (s since the beginning)."""
+    begun, error = event.day * DAY_S, curve.errors["recalibrated"]
+    day_before = (curve.times < begun) & (curve.times >= begun - DAY_S)
+    before = float(np.median(error[day_before if day_before.any() else slice(1)]))
+    after = (curve.times >= begun) & (curve.times < end)
+    following = np.flatnonzero(after & curve.is_record)
+    good = error[following] <= _RECOVERED * before
+    runs = (i for i in range(len(good) - _IN_A_ROW + 1) if good[i : i + _IN_A_ROW].all())
+    first = None if event.grows else next(runs, None)
+    decided = next(((time, made) for time, made in log.decisions if begun <= time < end), None)
+    worst, count = float(error[after].max(initial=0.0)), 0 if first is None else first + 1
+    if event.grows:
+        aftermath = f"at worst {worst * _MM:.1f} mm"
+    else:
+        aftermath = f"recovered in {count} record{'s' if count > 1 else ''}" if count else "not recovered"
+    return {
+        "day": event.day,
+        "label": event.label,
+        "decision": decided and decided[1]["kind"],
+        "decided_after_hours": decided and (decided[0] - begun) / HOUR_S,
+        "aftermath": aftermath,
+        "worst_mm": worst * _MM,
+        "recovered_after_records": count or None,
+    }
+
+
+def curve_text(curve: ErrorCurve, mission: Mission) -> str:
+    """A CSV: errors, level and temperature over time, and the true values of what moves (SI)."""
+    truth, values = mission.truth, mission.truth.values_at(curve.times)
+    columns: dict[str, Sequence[Any]] = {
+        "day": (curve.times / DAY_S).round(6).tolist(),
+        "moment": ["record" if is_record else "hour" for is_record in curve.is_record],
+        **{f"{name}_mm": (errors * _MM).round(6).tolist() for name, errors in curve.errors.items()},
+        "level": curve.levels,
+        "temperature_C": truth.temperature_at(curve.times).round(3).tolist(),
+        **{truth.parameters.entry_names[i]: values[:, i].tolist() for i in np.flatnonzero(np.ptp(values, axis=0))},
+    }
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerows([columns, *zip(*columns.values(), strict=True)])
+    return stream.getvalue()
 
 
 def run_mission(
-    plan: MissionPlan,
-    folder: Path,
-    session: Session,
-    registry: PluginRegistry,
-    progress: Progress = no_progress,
-    watch: Stopwatch | None = None,
-) -> MissionResult:
-    """The whole mission in a folder, its records as a CSV that ``armcal recalibrate`` takes too.
-
-    Raises:
-        InputError: the mission, or what it begins with, is refused.
-        NotConvergedError: the calibration before launch did not converge.
-    """
-    watch = watch or Stopwatch()
-    with watch.stage("simulate"):
-        mission = simulated(plan)
-        write_csv(folder / RECORDS, mission.records, plan.experiment.request(measured=True).channels)
-    with watch.stage("calibrate"):
-        path = before_launch(plan, folder, progress)
-        calibration = Calibration.load(path, registry)
-    with watch.stage("recalibrate"):
-        log = recalibrated(mission, path, plan.recalibrate, session, folder / RECALIBRATION)
-    settings, experiment = plan.settings, plan.experiment
-    system, evaluator, start = experiment.system, experiment.settings.evaluator, calibration.parameters
-    with watch.stage("refit"):
-        at_launch = experiment.parameters.with_nominal(start.nominal())
-        references = refits(system, at_launch, mission, settings.refit, evaluator)
-    with watch.stage("judge"):
-        curve = error_curve(system, start, mission, log, settings, evaluator, references)
-        judged = judge(mission, log, curve, settings.limit, settings.recovered)
-    return MissionResult(mission, calibration, log, judged)
+    plan: MissionPlan, folder: Path, progress: Progress = no_progress
+) -> tuple[Mission, ErrorCurve, dict[str, Any]]:
+    """The whole mission in a folder, its records as a CSV that ``armcal recalibrate`` takes too."""
+    experiment, mission = plan.experiment, plan.simulated()
+    write_csv(folder / RECORDS, mission.records, experiment.request(measured=True).channels)
+    path = before_launch(plan, folder, progress)
+    launch = with_payload(Calibration.load(path, experiment.registry).parameters)
+    log = recalibrated(plan, mission, path, folder)
+    references = refits(plan, with_payload(experiment.parameters).with_nominal(launch.nominal()), mission)
+    curve = error_curve(plan, launch, mission, log, references)
+    return mission, curve, figures(plan, mission, log, curve)

@@ -23,7 +23,7 @@ _OFF = 2.0
 _MOST_SIZES = 1000
 _MOST_ROWS = 20_000
 _MOST_SPANS = 40
-MISSION, FIGURES, SCHEDULE = "mission.csv", "mission.json", "truth.json"
+MISSION, FIGURES = "mission.csv", "mission.json"
 _DAY_S = 86400.0
 
 
@@ -95,8 +95,8 @@ class Truth:
 def truth_beside(folder: Path) -> Truth | None:
     """The truth of the mission that a recalibration is part of; None where there is none that can be read."""
     try:
-        began = number(json.loads((folder.parent / SCHEDULE).read_text())["began"])
-        limit = number(json.loads((folder.parent / FIGURES).read_text())["limit_mm"])
+        known = json.loads((folder.parent / FIGURES).read_text())
+        began, limit = number(known["began"]), number(known["limit_mm"])
         with (folder.parent / MISSION).open(newline="", encoding="utf-8") as file:
             listed = [row for row, _ in zip(csv.DictReader(file), range(_MOST_ROWS), strict=False)]
         if began is None:

@@ -21,7 +21,6 @@ from armcal.problem.many_points import as_seen, with_few_points
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal_camera.intrinsics import normalised, pinhole, projected
-from armcal_simulation.readings import measured_while_moving
 from scipy.spatial.transform import Rotation
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -208,17 +207,3 @@ def test_a_hand_that_did_not_turn_is_refused_with_the_motion_that_is_missing(dat
     with pytest.raises(ProblemError, match="hardly turned") as refused:
         with_proposals(Start(problem), problem.records(records), records)
     assert "30 deg" in refused.value.hint
-
-
-def test_a_camera_on_an_arm_that_changes_reads_as_one_on_a_still_arm(experiment: Experiment, dataset: Dataset) -> None:
-    problem = problem_of(experiment, dataset)
-    values, poses = away(problem), dataset.subset(range(6))
-    moved = np.tile(values, (6, 1))
-    moved[3:, problem.parameters.entry_names.index("camera.fx")] += 0.01
-    request = replace(experiment.simulation_request, parameters=problem.parameters)
-    bare = replace(poses, channels={n: v for n, v in poses.channels.items() if not n.startswith("camera.")})
-    read = measured_while_moving(request, bare, moved)
-    for rows, own in ((slice(0, 3), values), (slice(3, 6), moved[5])):
-        (shown,) = problem.predict(own, problem.records(poses))
-        channels = problem.kernels[0].factor.output_channels
-        assert np.allclose([read[c][rows] for c in channels], shown.outputs[:, rows], atol=1e-12)

@@ -1,1 +1,0 @@
-"""A rover's arm over some days, and what befalls it."""
