@@ -19,9 +19,24 @@ from armcal.calibration.rigid_chain import (
 )
 from armcal.errors import ConfigError, ProblemError
 
-from armcal_makers.formats import HASH, MARK, read_text
-from armcal_makers.frames import KEYS, about_z, at_zero, between, differences, placed, six_of, tips
-from armcal_makers.nominal import FARTHEST_M, FARTHEST_RAD, UR, XARM, Family, Nominal, nearest, nominal_arms
+from armcal_makers.arms import (
+    FARTHEST_M,
+    FARTHEST_RAD,
+    KEYS,
+    UR,
+    XARM,
+    Family,
+    Nominal,
+    about_z,
+    at_zero,
+    differences,
+    nearest,
+    nominal_arms,
+    placed,
+    six_of,
+    tips,
+)
+from armcal_makers.kinematics import HASH, MARK, read_kinematics
 
 TOLERANCE = 1e-9
 """m and rad."""
@@ -69,12 +84,12 @@ class XarmExporter:
         shifted, turned = differences(flange[None], drawn[-1:])
         near = shifted[0] <= FARTHEST_M and turned[0] <= FARTHEST_RAD
         zero = placed(axes, flange if near else drawn[-1], drawn)
-        sixes = (dict(zip(KEYS, six_of(frame), strict=True)) for frame in between(zero))
+        sixes = (dict(zip(KEYS, six_of(frame), strict=True)) for frame in _between(zero))
         content = {"kinematics": {**dict(zip(nominal.keys, sixes, strict=True)), **self._more(request)}}
         head = f"{MARK}: {nominal.name}; roll, pitch and yaw are about the fixed axes, as in a URDF.\n"
         text = (head + yaml.safe_dump(content, sort_keys=False)).encode()
         left = np.linalg.solve(zero[-1], flange)
-        written = read_text(text.decode(), Path(request.out or "kinematics.yaml"), nominal.name)
+        written = read_kinematics(text.decode(), Path(request.out or "kinematics.yaml"), nominal.name)
         _compare(request, chain, self.family, written.frames, left)
         return Exported(text, changed_numbers(request), tuple(request.arm.effects), remarks=_of_tool(left))
 
@@ -87,7 +102,7 @@ class XarmExporter:
         for name, arm in nominal_arms().items():
             if arm.family is self.family and len(arm.frames) == len(axes):
                 drawn = at_zero(arm.frames)
-                candidates[name] = between(placed(axes, drawn[-1], drawn))
+                candidates[name] = _between(placed(axes, drawn[-1], drawn))
         return nearest(candidates, self._settings.robot)
 
 
@@ -107,6 +122,11 @@ class UrExporter(XarmExporter):
                 hint="Give --option hash=calib_..., as the robot's own kinematics YAML has it.",
             )
         return {"hash": own}
+
+
+def _between(zero: Array) -> Array:
+    """parent_T_joint (n x 4 x 4) of base_T_joint at zero angles."""
+    return np.concatenate([zero[:1], np.linalg.solve(zero[:-1], zero[1:])])
 
 
 def _flange_poses(chain: Chain, family: Family, commands: Array) -> tuple[Array, Array]:

@@ -4,23 +4,31 @@ from __future__ import annotations
 
 import json
 import re
+import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+import yaml
 from armcal.arm.assembly import Arm
 from armcal.calibration.calibration import Calibration
+from armcal.calibration.convert_check import reload
 from armcal.calibration.exporter import ExportRequest, effects_reach, random_commands, request_of, rigid_tools
+from armcal.calibration.rigid_chain import tool_poses
 from armcal.cli.main import cli
 from armcal.errors import ConfigError, ProblemError
+from armcal.plugins import discover
 from armcal.testing.planar import planar_arms
 from armcal_urdf import edit, export
 from armcal_urdf.encoding import decode
 from armcal_urdf.export import UrdfExporter, UrdfExportSettings
 from armcal_urdf.model import UrdfModel, UrdfSettings
 from click.testing import CliRunner
+from scipy.spatial.transform import Rotation
+
+from tests.made_calibrations import made_calibration
 
 STRANGE = """<?xml version="1.0"?>
 <!-- <joint name="turn"><origin xyz="9 9 9"/></joint> -->
@@ -352,3 +360,64 @@ def test_what_is_left_out_is_said_in_significant_digits(moved_m, words):
     _show(console, MagicMock(), exported, moved_m, [Path("out.urdf")], "urdf")
     (said,) = console.warn.call_args.args
     assert words in said and "cannot hold it: springs" in said
+
+
+def without_origins(text):
+    """All of a URDF but the origins of its joints."""
+    root = ElementTree.fromstring(text)
+    for joint in root.iter("joint"):
+        joint.find("origin").attrib.clear()
+    return ElementTree.tostring(root)
+
+
+PANDA = (
+    (0, 0, 0.333, 0, 0, 0),
+    (0, 0, 0, -np.pi / 2, 0, 0),
+    (0, -0.316, 0, np.pi / 2, 0, 0),
+    (0.0825, 0, 0, np.pi / 2, 0, 0),
+    (-0.0825, 0.384, 0, -np.pi / 2, 0, 0),
+    (0, 0, 0, np.pi / 2, 0, 0),
+    (0.088, 0, 0, np.pi / 2, 0, 0),
+)
+
+
+def panda_urdf():
+    """A Panda as Franka describes it, with made-up weights."""
+    text = '<robot name="panda"><link name="panda_link0"/>\n'
+    for i, row in enumerate(PANDA, start=1):
+        xyz, rpy = (" ".join(repr(float(x)) for x in part) for part in (row[:3], row[3:]))
+        text += (
+            f'<link name="panda_link{i}"><inertial><origin xyz="0.01 0 {i / 100}"/><mass value="{i / 2}"/>'
+            f'<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>\n'
+            f'<joint name="panda_joint{i}" type="revolute"><origin rpy="{rpy}" xyz="{xyz}"/>'
+            f'<parent link="panda_link{i - 1}"/><child link="panda_link{i}"/><axis xyz="0 0 1"/>'
+            f'<limit effort="87" lower="{-2.0 - i / 10}" upper="{2.0 + i / 10}" velocity="2.175"/>'
+            f'<dynamics damping="1.0"/></joint>\n'
+        )
+    return text + "</robot>\n"
+
+
+def test_a_frankas_urdf_comes_back_with_limits_and_inertials_and_its_calibrated_arm(tmp_path):
+    (tmp_path / "panda.urdf").write_text(panda_urdf())
+    model = {"type": "urdf", "path": "panda.urdf"}
+    config = {
+        "arms": {"arm": {"model": model, "effects": {"spring": {"type": "torsional_spring"}}}},
+        "measurements": {"t": {"type": "tip_position", "noise_mm": 1}},
+        "statics": {"gravity_m_s2": [0, 0, -9.81], "payload_g": 0},
+    }
+    (tmp_path / "arm.yaml").write_text(yaml.safe_dump(config))
+    request = request_of(made_calibration(tmp_path / "arm.yaml"), None)
+    exported = UrdfExporter(UrdfExportSettings()).export(request)
+    text = exported.content.decode()
+    assert without_origins(text) == without_origins(panda_urdf()) and text != panda_urdf()
+    keys = ("x", "y", "z", "roll", "pitch", "yaw")
+    q, expected = np.random.default_rng(7).uniform(-np.pi, np.pi, (1000, 7)), np.eye(4)
+    for i in range(1, 8):
+        x, y, z, *angles = (float(request.values[f"arm.urdf.panda_joint{i}_{key}"][0]) for key in keys)
+        origin, turns = np.eye(4), np.tile(np.eye(4), (len(q), 1, 1))
+        origin[:3, :3], origin[:3, 3] = Rotation.from_euler("xyz", angles).as_matrix(), (x, y, z)
+        turns[:, :3, :3] = Rotation.from_rotvec(np.outer(q[:, i - 1], (0, 0, 1))).as_matrix()
+        expected = expected @ origin @ turns
+    section = yaml.safe_dump({"model": {"type": "urdf", "text": text}})
+    assert np.abs(tool_poses(reload(section, discover()), q) - expected).max() < 1e-12
+    assert "spring" in exported.left_out

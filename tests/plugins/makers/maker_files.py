@@ -1,28 +1,49 @@
 """Makers' files as robots wrote them, and the forward kinematics that they mean, computed by other means.
 
-``UR5_CONF`` is the controller's file of a UR5, published by its owner in a thread of ur_modern_driver. ``UR5_YAML`` and
+``UR5_DELTAS`` are those of a UR5's controller, published by its owner in a thread of ur_modern_driver. ``UR5_YAML`` and
 ``UR5E_YAML`` are what ur_calibration wrote for a UR5 and a UR5e, as their owners published it. ``UR10_DELTAS`` are
 those of three UR10 in the tests of ur_calibration.
 """
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
-
 import numpy as np
-from armcal_makers.frames import six_of
-from armcal_makers.nominal import nominal_arms
+from armcal_makers.arms import nominal_arms, six_of
 
-UR5_CONF = """[mounting]
-## calibration_status: 2 == Linearised
-calibration_status = 2
-joint_checksum = [0xb630883c, 0xb61f6e2e, 0xb5484b61, 0xb612c3a2, 0xb62bd7bc, 0xb61c0e94]
-delta_theta = [2.07750978653505926e-05, 0.96821571555565844, -1.85685385014877657, 0.888647901450376643, 5.66106114887767484e-05, -7.46310764096455082e-05]
-delta_a = [0.000393621049984383038, 0.184093300397451837, 0.14493953300732923, -6.43297403642304399e-05, 7.76709040084077299e-06, 0]
-delta_d = [4.00263097760228392e-05, 278.244144925623573, -183.695513914913732, -94.5471513669751289, 0.000304782681775556119, 0.000123737941387466743]
-delta_alpha = [-0.000271624944216508624, 0.00125856505456124258, -0.00322052070697146503, 0.00065153016530383745, -0.00058700465721117645, 0]
-"""  # noqa: E501
-
+UR5_DELTAS = (
+    (
+        2.07750978653505926e-05,
+        0.96821571555565844,
+        -1.85685385014877657,
+        0.888647901450376643,
+        5.66106114887767484e-05,
+        -7.46310764096455082e-05,
+    ),
+    (
+        0.000393621049984383038,
+        0.184093300397451837,
+        0.14493953300732923,
+        -6.43297403642304399e-05,
+        7.76709040084077299e-06,
+        0,
+    ),
+    (
+        4.00263097760228392e-05,
+        278.244144925623573,
+        -183.695513914913732,
+        -94.5471513669751289,
+        0.000304782681775556119,
+        0.000123737941387466743,
+    ),
+    (
+        -0.000271624944216508624,
+        0.00125856505456124258,
+        -0.00322052070697146503,
+        0.00065153016530383745,
+        -0.00058700465721117645,
+        0,
+    ),
+)
 UR10_DELTAS = (
     (
         (
@@ -198,12 +219,6 @@ UR5E_YAML, UR5_YAML = yaml_of(UR5E_ROWS), yaml_of(UR5_ROWS, tail="  hash: calib_
 XARM6_YAML = yaml_of(XARM6_ROWS, [f"joint{i}" for i in range(1, 7)], tail="")
 
 
-def conf_of(deltas):
-    """A calibration.conf."""
-    names = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
-    return "[mounting]\n" + "\n".join(f"{n} = {list(row)}" for n, row in zip(names, deltas, strict=True)) + "\n"
-
-
 def turn(axis, angle):
     """About a coordinate axis, for each of some angles."""
     i = "xyz".index(axis)
@@ -260,11 +275,3 @@ def full_urdf():
             f'<origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="0 0 1"/>{limit}</joint>'
         )
     return "\n".join([*lines, "</robot>"])
-
-
-def without_origins(text):
-    """All of a URDF but the origins of its joints."""
-    root = ElementTree.fromstring(text)
-    for joint in root.iter("joint"):
-        joint.find("origin").attrib.clear()
-    return ElementTree.tostring(root)

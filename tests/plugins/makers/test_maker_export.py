@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from codecs import BOM_UTF8
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,12 +12,21 @@ import yaml
 from armcal.calibration.exporter import request_of
 from armcal.cli.main import cli
 from armcal.errors import ConfigError, InputError
+from armcal_makers.arms import ur_rows
 from armcal_makers.export import UrExporter, UrSettings, XarmExporter, XarmSettings
-from armcal_makers.nominal import ur_rows
 from click.testing import CliRunner
 
 from tests.made_calibrations import made_calibration
-from tests.plugins.makers.maker_files import UR5E_YAML, XARM6_YAML, dh_tip, full_urdf, poses, without_origins, yaml_tip
+from tests.plugins.makers.maker_files import (
+    UR5_DELTAS,
+    UR5E_YAML,
+    UR10_DELTAS,
+    XARM6_YAML,
+    dh_tip,
+    full_urdf,
+    poses,
+    yaml_tip,
+)
 
 KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 ROOT = Path(__file__).resolve().parents[3]
@@ -114,46 +122,18 @@ def test_of_the_makers_own_urdf_the_arm_alone_is_written(tmp_path):
     assert exported.remarks == ()
 
 
-@pytest.mark.slow
-def test_a_makers_file_goes_into_its_own_urdf_and_back(tmp_path):
-    """Only origins change; tool, limits and what stands around the arm stay, and the hash is known again."""
-    (tmp_path / "cell.urdf").write_text(full_urdf())
-    (tmp_path / "k.yaml").write_text(UR5E_YAML)
-    arguments = ("maker", tmp_path / "k.yaml", "--urdf", tmp_path / "cell.urdf", "--tip")
-    assert armcal(*arguments, "base_link_inertia", "--out", tmp_path / "new.urdf").exit_code == 2
-    marked = tmp_path / "marked.urdf"
-    marked.write_bytes(BOM_UTF8 + full_urdf().encode())
-    with_mark = (
-        "maker",
-        tmp_path / "k.yaml",
-        "--urdf",
-        marked,
-        "--tip",
-        "gripper",
-        "--out",
-        tmp_path / "of_marked.urdf",
+@pytest.mark.parametrize(("robot", "deltas"), [("ur5", UR5_DELTAS), *(("ur10", deltas) for deltas in UR10_DELTAS)])
+def test_rows_far_away_are_moved_back_to_the_links_and_the_arm_stays(tmp_path, robot, deltas):
+    """Rows put nearly parallel axes hundreds of metres along themselves, as in a controller's own file."""
+    request, names = made(tmp_path, ur_mdh(robot)), ("theta", "a", "d", "alpha")
+    rows = [np.add(row, delta) for row, delta in zip(ur_rows(robot), deltas, strict=True)]
+    values = {f"arm.mdh.{name}{i + 1}": row[[i]] for name, row in zip(names, rows, strict=True) for i in range(6)}
+    exported, q = (
+        UrExporter(UrSettings(hash=HASH)).export(replace(request, values={**request.values, **values})),
+        poses(),
     )
-    assert armcal(*with_mark).exit_code == 0 and b"calib_" in (tmp_path / "of_marked.urdf").read_bytes()
-    ran = armcal(*arguments, "gripper", "--out", tmp_path / "new.urdf")
-    assert ran.exit_code == 0, ran.output
-    assert without_origins((tmp_path / "new.urdf").read_text()) == without_origins(full_urdf())
-    request = made(tmp_path, {"type": "urdf", "path": "new.urdf"})
-    nominal = {block.name: np.array(block.nominal) for block in request.arm.parameters()}
-    content = UrExporter(UrSettings()).export(replace(request, values=nominal)).content
-    q = poses()
-    assert np.abs(tips_of(content, q) - tips_of(UR5E_YAML, q)).max() < 1e-12
-    assert yaml.safe_load(content)["kinematics"]["hash"] == HASH
-
-
-def test_a_urdf_without_the_makers_joints_is_refused(tmp_path):
-    (tmp_path / "cell.urdf").write_text(full_urdf())
-    (tmp_path / "k.yaml").write_text(XARM6_YAML)
-    ran = armcal("maker", tmp_path / "k.yaml", "--urdf", tmp_path / "cell.urdf", "--out", tmp_path / "new.urdf")
-    assert (ran.exit_code, "cell.urdf has no joint1" in ran.stderr, (tmp_path / "new.urdf").exists()) == (
-        2,
-        True,
-        False,
-    )
+    assert np.abs(tips_of(exported.content, q) - dh_tip(rows, q)).max() < 1e-11
+    assert np.abs([row[:3] for row in rows_of(exported.content)]).max() < 1  # and its links are where links are
 
 
 def test_effects_are_named(tmp_path):

@@ -14,21 +14,17 @@ from armcal.calibration.rigid_chain import tool_poses
 from armcal.cli.main import cli
 from armcal.errors import InputError
 from armcal.plugins import discover
-from armcal_makers.formats import read_text, text_in
-from armcal_makers.frames import at_zero, tips
-from armcal_makers.nominal import nominal_arms, ur_rows
+from armcal_makers.arms import at_zero, nominal_arms, tips, ur_rows
+from armcal_makers.kinematics import read_kinematics
 from click.testing import CliRunner
 
 from tests.plugins.makers.maker_files import (
-    UR5_CONF,
     UR5_ROWS,
     UR5_YAML,
     UR5E_ROWS,
     UR5E_YAML,
-    UR10_DELTAS,
     XARM6_ROWS,
     XARM6_YAML,
-    conf_of,
     dh_tip,
     poses,
     yaml_of,
@@ -36,7 +32,6 @@ from tests.plugins.makers.maker_files import (
 )
 
 EXACT = 1e-11
-"""m: 400 m of a shifted axis leave that much of a double."""
 
 
 def armcal(*arguments):
@@ -45,23 +40,13 @@ def armcal(*arguments):
 
 def read(folder, text, name="file.yaml", robot=None):
     (folder / name).write_text(text)
-    return read_text(text_in(folder / name), folder / name, robot)
+    return read_kinematics(text, folder / name, robot)
 
 
 def urdf_tips(path, q):
     """As the arm model ``urdf`` has it."""
     section = yaml.safe_dump({"model": {"type": "urdf", "text": path.read_text()}})
     return tool_poses(reload(section, discover()), q)
-
-
-@pytest.mark.parametrize(("robot", "text"), [("ur5", UR5_CONF), *(("ur10", conf_of(deltas)) for deltas in UR10_DELTAS)])
-def test_rows_far_away_are_moved_back_to_the_links_and_the_arm_stays(tmp_path, robot, text):
-    values = {line.split(" = ")[0]: line.split(" = ")[1] for line in text.splitlines() if line.startswith("delta")}
-    rows = [n + np.array(json.loads(v)) for n, v in zip(ur_rows(robot), values.values(), strict=True)]
-    arm, q = read(tmp_path, text, "calibration.conf", robot), poses()
-    wanted = dh_tip(rows, q)
-    assert np.abs(tips(arm.frames, q) - wanted).max() < EXACT
-    assert arm.nominal.off(arm.frames)[0] < 0.02  # and its links are where links are
 
 
 @pytest.mark.parametrize(
@@ -121,7 +106,6 @@ def without(text, start):
 
 
 DEGREES = yaml_of([(*row[:3], *map(math.degrees, row[3:])) for row in UR5E_ROWS])
-SMALL_DEGREES = conf_of([UR10_DELTAS[0][0], *UR10_DELTAS[0][1:3], tuple(map(math.degrees, UR10_DELTAS[0][3]))])
 WRONG = {
     "empty": ("", None, "no keys"),
     "not yaml": ("a: [1\n", None, "not valid YAML"),
@@ -139,15 +123,7 @@ WRONG = {
     "hash missing": (without(UR5E_YAML, "hash"), None, "no hash"),
     "hash wrong": (UR5E_YAML.replace("calib_1", "1"), None, "expected hash: calib_"),
     "twice": (UR5E_YAML + "  shoulder: {x: 1}\n", None, "here and at line 2"),
-    "conf without robot": (UR5_CONF, None, "expected a UR"),
-    "conf of another arm": (UR5_CONF, "ur3", "It fits ur5"),
-    "conf of an xArm": (UR5_CONF, "xarm6", "found xarm6"),
-    "conf section": (UR5_CONF.replace("[mounting]", "[mount]"), "ur5", "expected [mounting]"),
-    "conf length": (UR5_CONF.replace(", 0]", "]"), "ur5", "expected [six numbers]"),
-    "conf degrees": (SMALL_DEGREES, "ur10", "expected at most 0.1 rad"),
-    "conf not calibrated": (UR5_CONF.replace("status = 2", "status = 1"), "ur5", "expected 2"),
-    "conf key twice": (UR5_CONF + "delta_a = [0, 0, 0, 0, 0, 0]\n", "ur5", "found delta_a a second time"),
-    "conf no values": ("[mounting]\ndelta_theta\n", "ur5", "cannot be read"),
+    "calibration.conf": ("[mounting]\ndelta_theta = [0, 0, 0, 0, 0, 0]\n", None, "with ur_calibration"),
 }
 
 
@@ -157,7 +133,7 @@ def test_wrong_files_are_refused_and_named(tmp_path, case):
     path = tmp_path / "wrong.yaml"
     path.write_text(text)
     with pytest.raises(InputError) as refused:
-        read_text(text_in(path), path, robot)
+        read_kinematics(text, path, robot)
     assert expected in str(refused.value) and "wrong.yaml" in str(refused.value)
 
 
