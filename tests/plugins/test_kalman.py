@@ -225,11 +225,11 @@ class Keeps(_Faulty):
     fault = "keeps"
 
 
-@pytest.mark.quick("Keeps-keeps nothing")
+@pytest.mark.quick("Keeps-other beliefs")
 @pytest.mark.parametrize(
     ("name", "said"),
-    [("Wide", "prior and records"), ("Skew", "symmetric"), ("Changes", "changes nothing"), ("Keeps", "keeps nothing")],
+    [("Wide", "covariance"), ("Skew", "symmetric"), ("Changes", "changed the prior"), ("Keeps", "other beliefs")],
 )
 def test_the_contract_finds_what_breaks_it(name: str, said: str) -> None:
     results = check_component(Component("online", name, f"{__name__}:{name}", "", "faulty"))
-    assert any(said in r.check and r.fault for r in results), [r for r in results if r.fault]
+    assert any(said in r.fault for r in results), [r for r in results if r.fault]

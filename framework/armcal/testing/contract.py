@@ -1,60 +1,179 @@
-"""The plugin contract as checks: what every component must do before a configuration may name it."""
+"""The plugin contract as a list of checks a kind: what a component must do before a configuration may name it."""
 
 import inspect
+import io
+import os
+import pickle
+import random
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
 from pkgutil import resolve_name
-from types import MappingProxyType
-from typing import Any
+from typing import Any, get_args
 
 import click
+import numpy as np
+from pydantic import ValidationError
 
+from armcal.base.settings import Settings
+from armcal.base.units import split_suffix
+from armcal.errors import ArmcalError
 from armcal.hooks import KINDS
 from armcal.plugins import Component, PluginInfo, PluginRegistry
-from armcal.testing.arm_checks import check_exporter, check_simulator
-from armcal.testing.board_checks import check_bench, check_device, check_link
-from armcal.testing.effect_checks import check_effect
-from armcal.testing.estimator_checks import check_estimator
-from armcal.testing.live_checks import check_camera, check_joint_stream, check_tracker
-from armcal.testing.manners import watched
-from armcal.testing.measurement_checks import check_measurement
-from armcal.testing.model_checks import check_model
-from armcal.testing.online_checks import check_online
-from armcal.testing.reader_checks import check_reader
-from armcal.testing.residual_checks import check_residual
-from armcal.testing.results import CheckResult, ContractError, Recorder, expect
-from armcal.testing.settings_checks import Subject, check_settings
+from armcal.testing import arm_checks, bench_checks, data_checks
+from armcal.testing.checking import NEEDED, PLUGIN_FAULTS, Check, ContractError, NotRun, Subject, expect, needed
 
-__all__ = ["KNOWN_CHECKS", "CheckResult", "assert_contract", "check_component", "check_plugin"]
-
-_CHECKS: Mapping[str, tuple[int, Callable[[Recorder, Subject], None] | None]] = MappingProxyType(
-    {
-        "model": (28, check_model),
-        "effect": (26, check_effect),
-        "residual": (23, check_residual),
-        "measurement": (28, check_measurement),
-        "reader": (23, check_reader),
-        "estimator": (22, check_estimator),
-        "online": (20, check_online),
-        "simulator": (14, check_simulator),
-        "exporter": (15, check_exporter),
-        "link": (18, check_link),
-        "device": (31, check_device),
-        "tracker": (18, check_tracker),
-        "joints": (19, check_joint_stream),
-        "camera": (16, check_camera),
-        "bench": (13, check_bench),
-        "command": (2, None),
-        "report_section": (2, None),
-    }
-)
-"""Of each kind: how many checks there are for any component, and what does them on one that has settings."""
-KNOWN_CHECKS: Mapping[str, int] = MappingProxyType({kind: count for kind, (count, _) in _CHECKS.items()})
-"""How many checks there are for any component of a kind; what a component has beside the rest adds to them."""
-
-_MARK = "imported:"
+MOST_CHARACTERS = 400
 _LONGEST_IMPORT_S = 60
+_QUANTITIES = {
+    **dict.fromkeys(("length", "distance", "height", "width", "depth", "radius", "diameter", "noise"), "length"),
+    **dict.fromkeys(("angle", "angles", "rotation_vector"), "angle"),
+    **dict.fromkeys(("mass", "payload"), "mass"),
+    **{word: word for word in ("compliance", "force", "torque", "temperature", "acceleration")},
+    **dict.fromkeys(("duration", "timeout"), "time"),
+}
+"""Words in the names of settings that are quantities, and their dimension."""
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """What one check found: nothing, if ``fault`` is empty; ``not_run`` says why it could not run."""
+
+    component: str
+    check: str
+    fault: str = ""
+    not_run: str = ""
+
+
+# --- what every component must do -----------------------------------------------------------------------------------
+
+
+@needed
+def it_imports(s: Subject) -> None:
+    s.made = s.load()
+
+
+@needed
+def it_has_checked_settings_typed_and_with_units(s: Subject) -> None:
+    settings_class: Any = getattr(s.made, "Settings", None)
+    expect(
+        isinstance(settings_class, type) and issubclass(settings_class, Settings),
+        f"found Settings = {settings_class!r}, expected a class attribute: a subclass of armcal.base.settings.Settings",
+    )
+    quantities = settings_class.quantities()
+    for name, info in settings_class.model_fields.items():
+        bare = info.annotation in (None, Any, object) and not info.description
+        expect(not bare, f"found {name} without a type, expected one, or Field(description=...)")
+        if name in quantities or info.description or not _holds_floats(info.annotation, info.metadata):
+            continue
+        suffix, word = split_suffix(name), next((word for word in name.split("_") if word in _QUANTITIES), None)
+        dimension = suffix[1].dimension if suffix else _QUANTITIES[word] if word else ""
+        expect(
+            not dimension,
+            f"found {name}, a number without a unit; expected a type with one ({dimension}), such as Length or Angle "
+            "of armcal.base.settings, under a name without one, or Field(description=...) if it has none",
+        )
+
+
+@needed
+def its_example_is_accepted_kept_by_to_config_and_an_unknown_key_refused(s: Subject) -> None:
+    settings_class, example = s.made.Settings, getattr(s.made, "EXAMPLE", {})
+    expect(isinstance(example, Mapping), f"found an EXAMPLE that is no mapping of settings: {type(example).__name__}")
+    s.example = dict(example)
+    fields = settings_class.model_fields
+    if s.kind == "reader" and "path" in fields and fields["path"].is_required():
+        s.example.setdefault("path", data_checks.MISSING_FILE)
+    try:
+        s.settings = settings_class.model_validate(s.example)
+    except ValidationError as fault:
+        if hasattr(s.made, "EXAMPLE"):
+            raise
+        reason = "it has no EXAMPLE and needs settings"
+        if s.kind == "simulator":
+            raise NotRun(reason) from fault
+        add = "add the class attribute EXAMPLE, a mapping as a configuration would have it"
+        raise ContractError(f"{reason}: {add}") from fault
+    key = "no_component_has_this_key"
+    try:
+        settings_class.model_validate({**s.example, key: 1})
+    except ValidationError as fault:
+        named = any(key in map(str, error["loc"]) for error in fault.errors())
+        expect(named, "found an unknown key refused without being named, expected its name in the error")
+    else:
+        raise ContractError("found an unknown key accepted, expected it refused: keep extra='forbid'")
+    again = settings_class.model_validate(s.settings.to_config())
+    expect(again == s.settings, f"found {again!r} after to_config(), expected {s.settings!r}")
+
+
+def it_prints_nothing_and_leaves_the_process_alone(s: Subject) -> None:
+    """This check is the last; what is watched was noted before the first."""
+    shown = " ".join(s.heard.getvalue().split())[:60]
+    rule = "expected that it prints nothing: results are armcal's to print; raise errors or return"
+    expect(not s.heard.getvalue(), f"found {shown!r} printed, {rule}")
+    now = _process()
+    changed = [name for name, value in s.process.items() if now[name] != value]
+    expect(not changed, f"found {', '.join(changed)} changed, expected that it leaves the process alone")
+
+
+def _holds_floats(*parts: Any) -> bool:
+    inner = [part_type for part in parts for part_type in (part if isinstance(part, list) else (part,))]
+    return any(
+        part_type is float or (get_args(part_type) and _holds_floats(*get_args(part_type))) for part_type in inner
+    )
+
+
+def _process() -> dict[str, Any]:
+    return {
+        "numpy.random (use numpy.random.default_rng(seed))": pickle.dumps(np.random.get_state()),
+        "random (use numpy.random.default_rng(seed))": hash(random.getstate()),
+        "numpy.seterr (use numpy.errstate)": repr(np.geterr()),
+        "the working folder": str(Path.cwd()),
+        "os.environ": dict(os.environ),
+    }
+
+
+def it_is_a_click_command_that_says_what_it_does(s: Subject) -> None:
+    expect(isinstance(s.made, click.Command), f"found {type(s.made).__name__}, expected a click.Command")
+    expect(bool(s.made.help), f"found no help of the command {s.made.name!r}, expected a docstring")
+
+
+def it_is_a_function_of_a_runs_result(s: Subject) -> None:
+    expect(callable(s.made), f"found {type(s.made).__name__}, expected a function of a RunResult")
+    count = len([p for p in inspect.signature(s.made).parameters.values() if p.default is p.empty])
+    expect(count == 1, f"found {count} arguments without a default, expected one: the RunResult")
+
+
+_OF_ANY = (
+    it_imports,
+    it_has_checked_settings_typed_and_with_units,
+    its_example_is_accepted_kept_by_to_config_and_an_unknown_key_refused,
+)
+_MANNERS = it_prints_nothing_and_leaves_the_process_alone
+CHECKS: Mapping[str, Sequence[Check]] = {
+    "model": (*_OF_ANY, *arm_checks.MODEL, _MANNERS),
+    "effect": (*_OF_ANY, *arm_checks.EFFECT, _MANNERS),
+    "residual": (*_OF_ANY, *arm_checks.RESIDUAL, _MANNERS),
+    "measurement": (*_OF_ANY, *arm_checks.MEASUREMENT, _MANNERS),
+    "reader": (*_OF_ANY, *data_checks.READER, _MANNERS),
+    "estimator": (*_OF_ANY, *data_checks.ESTIMATOR, _MANNERS),
+    "online": (*_OF_ANY, *data_checks.ONLINE, _MANNERS),
+    "simulator": (*_OF_ANY, *data_checks.SIMULATOR, _MANNERS),
+    "exporter": (*_OF_ANY, *data_checks.EXPORTER, _MANNERS),
+    "link": (*_OF_ANY, *bench_checks.LINK, _MANNERS),
+    "device": (*_OF_ANY, *bench_checks.DEVICE, _MANNERS),
+    "tracker": (*_OF_ANY, *bench_checks.SOURCE, _MANNERS),
+    "joints": (*_OF_ANY, *bench_checks.SOURCE, _MANNERS),
+    "camera": (*_OF_ANY, *bench_checks.CAMERA, _MANNERS),
+    "bench": (*_OF_ANY, *bench_checks.BENCH, _MANNERS),
+    "command": (it_imports, it_is_a_click_command_that_says_what_it_does),
+    "report_section": (it_imports, it_is_a_function_of_a_runs_result),
+}
+"""The checks of each kind, in their order."""
+
+# --- running them ---------------------------------------------------------------------------------------------------
 
 
 def assert_contract(component: type | str, kind: str, *, at_least: int | None = None) -> Sequence[CheckResult]:
@@ -63,7 +182,7 @@ def assert_contract(component: type | str, kind: str, *, at_least: int | None = 
     Args:
         component: its class, or ``module:attribute`` of it.
         kind: what it is registered as: ``model``, ``effect``, ``measurement`` and so on.
-        at_least: so many checks must run; by default as many as on any component of its kind.
+        at_least: so many checks must run; by default all of its kind.
 
     Returns:
         results: of all checks, those that did not run included.
@@ -75,21 +194,21 @@ def assert_contract(component: type | str, kind: str, *, at_least: int | None = 
     if kind not in KINDS:
         raise ValueError(f"found the kind {kind!r}, expected one of {', '.join(KINDS)}")
     name = component if isinstance(component, str) else component.__qualname__
-    results = _checked(kind, name, lambda: _loaded(component))
+
+    def load() -> Any:
+        if isinstance(component, str) and ":" not in component:
+            raise ValueError(f"found {component!r}, expected module:attribute")
+        return resolve_name(component) if isinstance(component, str) else component
+
+    results = _checked(kind, name, load)
     faults = [f"  {result.check}: {result.fault}" for result in results if result.fault]
-    left = [f"  {result.check}" for result in results if result.not_run]
-    ran, expected = len(results) - len(left), KNOWN_CHECKS[kind] if at_least is None else at_least
+    idle = [f"  {result.check}" for result in results if result.not_run]
+    ran, expected = len(results) - len(idle), len(CHECKS[kind]) if at_least is None else at_least
     if faults:
         raise AssertionError("\n".join([f"{kind} {name} breaks the plugin contract:", *faults]))
     if ran < expected:
-        raise AssertionError("\n".join([f"{kind} {name}: {ran} checks ran, expected at least {expected}.", *left]))
+        raise AssertionError("\n".join([f"{kind} {name}: {ran} checks ran, expected at least {expected}.", *idle]))
     return results
-
-
-def _loaded(component: type | str) -> Any:
-    if isinstance(component, str) and ":" not in component:
-        raise ValueError(f"found {component!r}, expected module:attribute")
-    return resolve_name(component) if isinstance(component, str) else component
 
 
 def check_component(component: Component) -> list[CheckResult]:
@@ -99,65 +218,76 @@ def check_component(component: Component) -> list[CheckResult]:
 
 def check_plugin(plugin: PluginInfo, registry: PluginRegistry) -> list[CheckResult]:
     """The plugin's registration, then every component that it announced."""
-    record = Recorder(f"plugin {plugin.name}")
-    with record.check("it loads, with no hook that armcal does not know"):
+
+    def it_loads_with_no_hook_that_armcal_does_not_know(s: Subject) -> None:
         expect(not plugin.fault, plugin.fault)
-    if plugin.fault:
-        return record.results
-    if not plugin.is_file:
-        with record.check("its registration imports nothing heavy"):
+
+    def its_registration_prints_and_imports_nothing_heavy(s: Subject) -> None:
+        if not plugin.is_file:
             _expect_light(plugin.module)
-    own = registry.announced_by(plugin)
-    for component in own:
-        with record.check(f"the {component.kind} {component.name!r} is offered once"):
+
+    def each_component_is_offered_once(s: Subject) -> None:
+        for component in registry.announced_by(plugin):
             registry.find(component.kind, component.name)
-    return record.results + [result for component in own for result in check_component(component)]
+
+    subject, results = Subject(), list[CheckResult]()
+    for check in (
+        it_loads_with_no_hook_that_armcal_does_not_know,
+        its_registration_prints_and_imports_nothing_heavy,
+        each_component_is_offered_once,
+    ):
+        results.append(_tried(check, f"plugin {plugin.name}", subject))
+        if plugin.fault:
+            return results
+    return results + [result for own in registry.announced_by(plugin) for result in check_component(own)]
 
 
 def _checked(kind: str, name: str, load: Callable[[], Any]) -> list[CheckResult]:
-    """Every check of a kind on what ``load`` gives: a component's class."""
-    record, (_, check) = Recorder(f"{kind} {name}"), _CHECKS[kind]
-    with record.group():
-        if check is not None:
-            with watched(record) as begin, record.group():
-                with record.needed("it imports"):
-                    made = load()
-                begin(made)
-                check(record, check_settings(record, kind, made))
-        elif kind == "command":  # it is imported for one call of armcal, and may do to the process what it needs
-            with record.needed("it imports"):
-                command = load()
-            with record.check("it is a click command that says what it does"):
-                expect(isinstance(command, click.Command), f"found {type(command).__name__}, expected a click.Command")
-                expect(bool(command.help), f"found no help of the command {command.name!r}, expected a docstring")
-        else:
-            with record.needed("it imports"):
-                section = load()
-            with record.check("it is a function of a run's result"):
-                expect(callable(section), f"found {type(section).__name__}, expected a function of a RunResult")
-                needed = [p for p in inspect.signature(section).parameters.values() if p.default is p.empty]
-                count = len(needed)
-                expect(count == 1, f"found {count} arguments without a default, expected one: the RunResult")
-    return record.results
+    subject = Subject(kind=kind, load=load, heard=io.StringIO(), process=_process())
+    results, ended = list[CheckResult](), False
+    with redirect_stdout(subject.heard):
+        for check in CHECKS[kind]:
+            if not ended or check is _MANNERS:
+                results.append(_tried(check, f"{kind} {name}", subject))
+                ended = ended or (check in NEEDED and bool(results[-1].fault or results[-1].not_run))
+    return results
+
+
+def _tried(check: Check, component: str, subject: Subject) -> CheckResult:
+    name = check.__name__.replace("_", " ")
+    try:
+        check(subject)
+    except NotRun as reason:
+        return CheckResult(component, f"{name} (not run: {reason})", not_run=str(reason))
+    except PLUGIN_FAULTS as fault:
+        try:
+            text = " ".join(str(fault).split())
+        except PLUGIN_FAULTS:
+            text = "(its message cannot be read)"
+        text = text if isinstance(fault, (ContractError, ArmcalError)) else f"{type(fault).__name__}: {text}"
+        return CheckResult(
+            component, name, text if len(text) <= MOST_CHARACTERS else f"{text[: MOST_CHARACTERS - 3]}..."
+        )
+    return CheckResult(component, name)
 
 
 def _expect_light(target: str) -> None:
     """Import the registration module in a fresh interpreter and see what came with it, and what it said."""
-    module = target.partition(":")[0]
+    module, mark = target.partition(":")[0], "imported:"
     code = (
         f"import sys; sys.path[:] = {sys.path!r}; import armcal.hooks; before = set(sys.modules); import {module}; "
-        f"print({_MARK!r}, *sorted({{name.partition('.')[0] for name in set(sys.modules) - before}}))"
+        f"print({mark!r}, *sorted({{name.partition('.')[0] for name in set(sys.modules) - before}}))"
     )
     ran = subprocess.run(
         [sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=_LONGEST_IMPORT_S, check=False
     )
     if ran.returncode:
         raise ContractError(f"{module} does not import by itself: {ran.stderr.strip().splitlines()[-1:]}")
-    said, _, imported = ran.stdout.rpartition(_MARK)
+    said, _, imported = ran.stdout.rpartition(mark)
     shown = " ".join(said.split())[:60]
     expect(not shown, f"found {shown!r} printed when {module} is imported, expected nothing")
-    own = {module.partition(".")[0], "armcal"}
-    foreign = [name for name in imported.split() if name not in own and name not in sys.stdlib_module_names]
+    known = {module.partition(".")[0], "armcal"}
+    foreign = [name for name in imported.split() if name not in known and name not in sys.stdlib_module_names]
     expect(
         not foreign,
         f"found {', '.join(foreign)} imported by {module}, expected only armcal.hooks: "

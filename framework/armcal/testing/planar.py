@@ -7,7 +7,6 @@ import casadi as ca
 import numpy as np
 
 from armcal.arm.assembly import Arm, ArmState
-from armcal.arm.effects import JointCommand, JointEffect, Spring
 from armcal.arm.environment import Environment
 from armcal.arm.model import Attachment, Chain, Joint
 from armcal.base import se3
@@ -44,7 +43,6 @@ class PlanarArm:
         )
 
     def chain(self, values: Mapping[str, Expression]) -> Chain:
-        """Base, two joints, and the frame ``elbow`` between them."""
         upper, fore = (se3.translation_along("x", values[name]) for name in ("a1", "a2"))
         joints = (
             Joint("q1", se3.identity(), _Y_AXIS, offset=values["theta1"]),
@@ -61,24 +59,6 @@ class SkewedArm(PlanarArm):
         chain = super().chain(values)
         first, second = chain.joints
         return replace(chain, joints=(replace(first, angular=(0.0, 0.0, 1.0)), second))
-
-
-@dataclass(frozen=True)
-class Springs(JointEffect):
-    """A spring on every joint's own axis, and one about x and y at the base; all of one compliance."""
-
-    count: int
-
-    def parameters(self) -> tuple[ParameterBlock, ...]:
-        """The compliance (rad/(N m), or m/N on a sliding joint)."""
-        return (scalar("k", "rad_per_Nm", 1e-3, 1e-3),)
-
-    def springs(self, values: Mapping[str, Expression]) -> tuple[Spring, ...]:
-        def law(load: Expression, command: JointCommand) -> Expression:
-            return values["k"] * load
-
-        base = Spring(0, ((1.0, 0.0, 0.0), _Y_AXIS), law)
-        return (base, *(Spring(site, (), law) for site in range(1, self.count + 1)))
 
 
 class Walls(Contact):
@@ -116,7 +96,6 @@ class Tip:
         return (self.arm,)
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """None."""
         return ()
 
     def channels(self) -> tuple[Channel, ...]:
@@ -135,7 +114,6 @@ class Tip:
         return ca.vertcat(*[measured[axis] - predicted[axis] for axis in _TIP])
 
     def noise(self) -> tuple[float, ...]:
-        """One millimetre a coordinate."""
         return (NOISE_M,) * 3
 
 
@@ -147,7 +125,6 @@ class Body(Tip):
         return (*super().channels(), *(Channel(name, "dimensionless") for name in QUATERNION))
 
     def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> dict[str, Expression]:
-        """In the base frame (m, 1)."""
         turned = quaternion_expression(arms[self.arm].base_T_tool.rotation)
         named = {name: turned[i] for i, name in enumerate(QUATERNION)}
         return {**super().outputs(arms, values), **named}

@@ -19,7 +19,6 @@ from armcal.measure.contact import Contact
 from armcal.measure.measurement import Channel
 from pydantic import ConfigDict
 
-SEEN: dict[str, Any] = {}
 """Sound components leave it alone."""
 DEGREE = math.pi / 180
 
@@ -148,20 +147,6 @@ class DriftsEachCall(Arm):
     def chain(self, values: Any) -> Any:
         self.calls += 1
         return super().chain({**values, "link": values["link"] + 1e-6 * self.calls})
-
-
-class CountsInItsModule(Arm):
-    def chain(self, values: Any) -> Any:
-        SEEN["calls"] = SEEN.get("calls", 0) + 1
-        return super().chain(values)
-
-
-class CountsInItsClass(Arm):
-    built: ClassVar[list[Any]] = []
-
-    def __init__(self, settings: Any) -> None:
-        super().__init__(settings)
-        self.built.append(settings)
 
 
 class LongAxis(Arm):

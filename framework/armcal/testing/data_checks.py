@@ -1,0 +1,514 @@
+"""Checks on readers, simulators, estimators and exporters: known files, small problems whose answer is known."""
+
+import math
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePath
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+from typing_extensions import override
+
+from armcal.base.arrays import Array
+from armcal.base.dataset import Dataset, SetAside
+from armcal.base.domains import Interval
+from armcal.base.parameters import Parameters
+from armcal.calibration.exporter import Exported, ExportRequest
+from armcal.errors import InputError, ProblemError
+from armcal.estimate.estimator import Estimator, Solution
+from armcal.estimate.online import Gaussian, Linearised, Observation, OnlineEstimator, Update
+from armcal.estimate.simulation import SimulationRequest, measured_without_noise
+from armcal.measure.measurement import Measurement
+from armcal.measure.reader import ReadRequest, requested_channels
+from armcal.problem.problem import FactorRecords, Problem
+from armcal.testing.checking import ContractError, NotRun, Subject, expect, needed, raises_only
+from armcal.testing.planar import (
+    ARM,
+    GRAVITY,
+    NOISE_M,
+    QUATERNION,
+    TRACKER,
+    WALLS,
+    Body,
+    Tip,
+    Walls,
+    all_parameters,
+    commands,
+    dataset,
+    planar_arms,
+)
+
+MISSING_FILE = "/no/such/folder/measurements"
+
+
+@needed
+def it_builds(s: Subject) -> None:
+    s.built = s.build()
+
+
+# --- readers --------------------------------------------------------------------------------------------------------
+
+_REFUSALS = (InputError, ValidationError)
+_DAMAGED: Mapping[str, bytes] = {
+    "empty": b"",
+    "NUL bytes": b"\0" * 64,
+    "text that is not UTF-8": b"id,q1_deg\n1,\xff\xfe\xfa\n",
+    "noise": bytes(np.random.default_rng(8).integers(0, 256, 4096, dtype=np.uint8)),
+    "a cut-off line": b'id,q1_deg,q2_deg,x_mm,y_mm,z_mm\n1,10,"20',
+}
+
+
+@dataclass(frozen=True)
+class _Source:
+    """Files by name, which of them ``path`` names (the folder if empty), and what they say to whom."""
+
+    files: Mapping[str, bytes]
+    path: str
+    channels: Mapping[str, Array]  # SI
+    measurements: Mapping[str, Measurement]
+
+    @property
+    def count(self) -> int:
+        return len(next(iter(self.channels.values())))
+
+
+def it_refuses_a_missing_file_a_damaged_one_and_a_folder_in_place_of_one(s: Subject) -> None:
+    """By an armcal error; a folder that holds damaged files, too."""
+    method = getattr(s.built, "read", None)
+    expect(callable(method), f"found read = {method!r}, expected a method")
+    _expect_refused(s, Path(MISSING_FILE), "a file that is not there")
+    for name, content in _DAMAGED.items():
+        with _written({"data": content}) as folder:
+            _expect_refused(s, folder / "data", f"damaged files: {name}", of_records=True)
+    with _written({"data": b"", "inner/data": b""}) as folder:
+        _expect_refused(s, folder / "inner", "a folder in place of a file", of_records=True)
+        _expect_refused(s, folder / "data", "a file in place of a folder", of_records=True)
+
+
+@needed
+def it_reads_a_known_file_in_si_a_record_a_row_the_same_each_time(s: Subject) -> None:
+    refused = []
+    for source in _sources(s.made):
+        try:
+            first = _read_source(s, source)
+        except _REFUSALS as refusal:
+            refused.append(str(refusal))
+            continue
+        s.source, again = source, _read_source(s, source)
+        text = f"found {len(first)} records and {len(first.set_aside)} set aside, expected {source.count}"
+        expect(len(first) == source.count, text)
+        for name, channel in source.channels.items():
+            values = first.column(name)
+            expect(float(np.abs(values - channel).max()) <= 1e-9, f"{name}: found {values}, expected {channel} (SI)")
+        same = first.ids == again.ids and set(first.channels) == set(again.channels)
+        expect(same, "found other records the second time")
+        for name, values in first.channels.items():
+            expect(np.array_equal(values, again.channels[name], equal_nan=True), f"found other numbers in {name}")
+        return
+    if hasattr(s.made, "EXAMPLE_SOURCE"):
+        raise ContractError(f"it refuses its own EXAMPLE_SOURCE: {refused[0]}")
+    raise NotRun("it reads no plain table, and has no EXAMPLE_SOURCE")
+
+
+def a_cell_that_is_wrong_or_empty_is_reported_never_passed_over(s: Subject) -> None:
+    """The last number of the second to last line becomes another text, in each file that has such a line."""
+    source: _Source = s.source
+    for cell in ("not_a_number", ""):
+        files = {name: _with_cell(content, cell) for name, content in source.files.items()}
+        if files == dict(source.files):
+            raise NotRun("its example is not a table of text separated by commas")
+        with suppress(*_REFUSALS):
+            records = _read_source(s, replace(source, files=files))
+            finite = all(np.isfinite(records.column(name)).all() for name in source.channels)
+            expect(
+                (len(records) + len(records.set_aside) == source.count or bool(records.warnings))
+                and (len(records) < source.count or not finite),
+                f"found {len(records)} records and {len(records.set_aside)} set aside of {source.count} rows, "
+                f"one of them with {cell or 'nothing'!r} in a cell; expected it refused, or set aside with a reason",
+            )
+
+
+def _read(s: Subject, path: Path, measurements: Mapping[str, Measurement]) -> Dataset:
+    if "path" not in type(s.settings).model_fields:
+        raise NotRun("its settings have no path")
+    arms = planar_arms([ARM])
+    request = ReadRequest(arms, measurements, requested_channels(arms, measurements, measured=True))
+    with raises_only(*_REFUSALS, expected="armcal.errors.DataError with the file's name"):
+        read = s.made(s.made.Settings.model_validate({**s.example, "path": str(path)})).read(request)
+    if not isinstance(read, Dataset):
+        raise ContractError(f"found {type(read).__name__}, expected a Dataset")
+    texts = (*read.ids, *read.warnings, read.source, read.sha256)
+    expect(all(isinstance(own, str) for own in texts), "found ids, warnings, source or sha256 that are no texts")
+    kinds = all(isinstance(own, SetAside) for own in read.set_aside) and all(isinstance(row, int) for row in read.rows)
+    expect(kinds, "found set_aside that are no SetAside, or rows that are no whole numbers")
+    return read
+
+
+def _expect_refused(s: Subject, path: Path, what: str, *, of_records: bool = False) -> None:
+    with suppress(*_REFUSALS):
+        read = _read(s, path, {TRACKER: Tip()})
+        expect(of_records and len(read) == 0, f"found {len(read)} records made of {what}, expected it refused")
+
+
+@contextmanager
+def _written(files: Mapping[str, bytes]) -> Iterator[Path]:
+    with tempfile.TemporaryDirectory() as name:
+        for file, content in files.items():
+            path = Path(name, file)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+        yield Path(name)
+
+
+def _read_source(s: Subject, source: _Source) -> Dataset:
+    with _written(source.files) as folder:
+        return _read(s, folder / source.path, source.measurements)
+
+
+def _with_cell(content: bytes, cell: str) -> bytes:
+    lines = content.decode("utf-8", "replace").split("\n")
+    filled = [i for i, line in enumerate(lines) if "," in line]
+    if len(filled) < 2:
+        return content
+    lines[filled[-2]] = f"{lines[filled[-2]].rpartition(',')[0]},{cell}"
+    return "\n".join(lines).encode()
+
+
+def _sources(made: Any) -> Iterator[_Source]:
+    """A component's own ``EXAMPLE_SOURCE``, else plain tables of a tip and of a body."""
+    own = getattr(made, "EXAMPLE_SOURCE", None)
+    if own is None:
+        yield _table({TRACKER: Tip()}, ())
+        yield _table({TRACKER: Body()}, QUATERNION)
+        return
+    expect(
+        isinstance(own, Mapping) and set(own) == {"files", "path", "channels"},
+        f"found EXAMPLE_SOURCE = {own!r}, expected a mapping with files, path and channels",
+    )
+    files = {name: text.encode() if isinstance(text, str) else text for name, text in own["files"].items()}
+    channels = {name: np.array(values, dtype=float) for name, values in own["channels"].items()}
+    measures = any(name.startswith(f"{TRACKER}.") for name in channels)
+    yield _Source(files, own["path"], channels, {TRACKER: Tip()} if measures else {WALLS: Walls()})
+
+
+def _table(measurements: Mapping[str, Measurement], more: tuple[str, ...]) -> _Source:
+    """Columns by name with their unit, as ``csv`` reads them; the arm is where its nominal parameters say."""
+    angles = np.array([(10.0, -20.0), (30.0, 45.0), (-60.0, 5.0), (90.0, 120.0)])
+    first, both, (upper, fore) = np.radians(angles[:, 0]), np.radians(angles.sum(axis=1)), (0.3, 0.25)
+    x, z = upper * np.cos(first) + fore * np.cos(both), -upper * np.sin(first) - fore * np.sin(both)
+    turned = np.stack([np.cos(both / 2), 0 * both, np.sin(both / 2), 0 * both], axis=1)
+    turned *= np.where(turned[:, :1] < 0, -1, 1)
+    cells = np.hstack([angles, np.round(1000 * np.stack([x, 0 * x, z], axis=1), 6), turned[:, : len(more)]])
+    header = ",".join(("id", "q1_deg", "q2_deg", "x_mm", "y_mm", "z_mm", *more))
+    rows = [",".join((f"r{i}", *(f"{float(cell)!r}" for cell in row))) for i, row in enumerate(cells)]
+    names = (f"{ARM}.q1", f"{ARM}.q2", *(f"{TRACKER}.{name}" for name in ("x", "y", "z", *more)))
+    factors = (*(math.pi / 180,) * 2, *(1e-3,) * 3, *(1.0,) * len(more))
+    channels = {name: factor * cells[:, i] for i, (name, factor) in enumerate(zip(names, factors, strict=True))}
+    return _Source({"data.csv": "\n".join([header, *rows, ""]).encode()}, "data.csv", channels, measurements)
+
+
+READER = (
+    it_builds,
+    it_refuses_a_missing_file_a_damaged_one_and_a_folder_in_place_of_one,
+    it_reads_a_known_file_in_si_a_record_a_row_the_same_each_time,
+    a_cell_that_is_wrong_or_empty_is_reported_never_passed_over,
+)
+
+# --- simulators and exporters, of a planar arm ----------------------------------------------------------------------
+
+
+def it_simulates_what_every_instrument_reads_the_same_each_time(s: Subject) -> None:
+    arms, refused = planar_arms([ARM]), []
+    choices: tuple[Mapping[str, Measurement], ...] = ({TRACKER: Tip()}, {WALLS: Walls()})
+    for measurements in choices:
+        request = SimulationRequest(arms, measurements, all_parameters(arms), GRAVITY)
+        try:
+            first = s.built.simulate(request)
+            break
+        except InputError as fault:
+            refused.append(str(fault))
+    else:
+        raise NotRun(f"its EXAMPLE does not suit the arm of the check: {'; '.join(refused)}")
+    for requested in requested_channels(request.arms, request.measurements, measured=True):
+        given = first.has(requested.channel) or not requested.required
+        expect(given, f"found no {requested.channel} in the records, expected every required channel")
+    for again in (s.built.simulate(request), s.build().simulate(request)):
+        same = first.ids == again.ids and set(first.channels) == set(again.channels)
+        expect(same, "found other records or channels from the same request the second time")
+        for name, values in first.channels.items():
+            expect(bool(np.isfinite(values).all()), f"found numbers in {name} that are not finite")
+            expect(bool(np.array_equal(values, again.channels[name])), f"found other numbers in {name} another time")
+
+
+SIMULATOR = (it_builds, it_simulates_what_every_instrument_reads_the_same_each_time)
+
+
+def an_arm_is_written_the_same_each_time_or_refused_by_an_armcal_error(s: Subject) -> None:
+    first = _exported(s.built, _request())
+    for other in (s.built, s.build()):
+        expect(_exported(other, _request()) == first, "found other content, or another refusal, the second time")
+    request, values = _request(), _request().values
+    _exported(s.built, request)
+    same = all(np.array_equal(value, values[name]) for name, value in request.values.items())
+    expect(same and set(request.values) == set(values), "it changes the values that it is given")
+
+
+def _request() -> ExportRequest:
+    arm = planar_arms([ARM])[ARM]
+    return ExportRequest(ARM, arm, {block.name: np.array(block.nominal) for block in arm.parameters()})
+
+
+def _exported(exporter: Any, request: ExportRequest) -> Exported | str:
+    """What it writes, or why it refuses."""
+    try:
+        with raises_only(InputError):
+            exported = exporter.export(request)
+    except InputError as refusal:
+        return str(refusal)
+    if not isinstance(exported, Exported):
+        raise ContractError(f"found {type(exported).__name__}, expected armcal.calibration.exporter.Exported")
+    for name, content in {"content": exported.content, **exported.companions}.items():
+        expect(isinstance(content, bytes), f"found {name} of type {type(content).__name__}, expected bytes")
+    for name in exported.companions:
+        plain = name == PurePath(name).name and name not in ("", ".", "..") and "\\" not in name
+        expect(plain, f"found the companion {name!r}, expected the plain name of a file")
+    return exported
+
+
+EXPORTER = (it_builds, an_arm_is_written_the_same_each_time_or_refused_by_an_armcal_error)
+
+# --- estimators: exact tip positions of an arm whose parameters are known -------------------------------------------
+
+_POSES, _TOLERANCE = 12, 1e-6
+_TRUTH = {"a1": 0.31, "a2": 0.243, "theta1": 0.05, "theta2": -0.08, "side": 0.02}
+_UPPER_SIDE_M, _PRIOR_SD_M = 0.015, 4e-4
+_SIDE = f"{ARM}.planar.side"
+
+
+@dataclass(frozen=True)
+class _Case:
+    """A problem, its records, and the values that solve it; ``judged`` are the entries compared, None for all."""
+
+    problem: Problem
+    records: tuple[FactorRecords, ...]
+    answer: Array
+    judged: tuple[str, ...] | None = None
+
+    def solved_by(self, estimator: Estimator) -> Solution:
+        start = self.problem.parameters.nominal()
+        solution = estimator.solve(self.problem, self.records, start)
+        values, verdict = np.asarray(solution.values), solution.verdict
+        expect(values.shape == start.shape, f"found {values.size} values, expected {start.size}")
+        expect(bool(np.isfinite(values).all()), f"found the values {values}")
+        whole = isinstance(verdict.converged, bool) and bool(verdict.name)
+        expect(whole, f"found the verdict {verdict}, expected a name and converged true or false")
+        expect(bool(np.array_equal(start, self.problem.parameters.nominal())), "it changed the start that it was given")
+        return solution
+
+    def expect_near(self, solution: Solution) -> None:
+        names = self.problem.parameters.entry_names
+        judged = [self.judged is None or name in self.judged for name in names]
+        off = np.where(judged, np.abs(solution.values - self.answer), 0.0)
+        worst = int(np.argmax(off))
+        expect(
+            float(off[worst]) <= _TOLERANCE,
+            f"{names[worst]}: found {solution.values[worst]:.9g}, expected {self.answer[worst]:.9g}",
+        )
+
+
+@needed
+def it_gives_a_value_for_every_entry_and_converges(s: Subject) -> None:
+    s.case = _case(Interval(upper=_UPPER_SIDE_M), None, _UPPER_SIDE_M)
+    s.solution = s.case.solved_by(s.built)
+    expect(s.solution.verdict.converged, f"found the verdict {s.solution.verdict.status!r}, expected convergence")
+
+
+def it_keeps_to_the_bounds_and_finds_the_truth(s: Subject) -> None:
+    s.case.problem.parameters.check(s.solution.values)
+    s.case.expect_near(s.solution)
+
+
+def it_weighs_priors(s: Subject) -> None:
+    data, prior = _POSES / NOISE_M**2, 1 / _PRIOR_SD_M**2  # information on ``side``, which the prior puts at zero
+    case = _case(Interval(), _PRIOR_SD_M, _TRUTH["side"] * data / (data + prior))
+    case.expect_near(case.solved_by(s.built))
+
+
+def it_weighs_records_in_any_order(s: Subject) -> None:
+    scattered = _scattered()
+    solution = scattered.solved_by(s.built)
+    scattered.expect_near(solution)
+    order = np.random.default_rng(7).permutation(_POSES)
+    shuffled = replace(scattered, records=scattered.problem.subset(scattered.records, order)).solved_by(s.built)
+    off = float(np.abs(shuffled.values - solution.values).max())
+    expect(off <= _TOLERANCE, f"found values that differ by {off:.1e} for another order of records")
+
+
+def it_does_the_same_twice(s: Subject) -> None:
+    for estimator in (s.built, s.build()):
+        off = float(np.abs(s.case.solved_by(estimator).values - s.solution.values).max())
+        expect(off == 0.0, f"found values that differ by {off:.1e} from the first time")
+
+
+def cut_short_it_reports_that_it_did_not_converge(s: Subject) -> None:
+    if "max_iterations" not in type(s.settings).model_fields:
+        raise NotRun("its settings have no max_iterations")
+    short = s.made(s.made.Settings.model_validate({**s.example, "max_iterations": 1}))
+    expect(not s.case.solved_by(short).verdict.converged, "found converged after one iteration, expected not converged")
+
+
+def _case(side: Interval, prior_sd: float | None, side_answer: float) -> _Case:
+    """Exact tip positions; ``side`` moves y alone, so neither its bound nor its prior disturbs the rest."""
+    arms, measurements = planar_arms([ARM]), {TRACKER: Tip()}
+    parameters: Parameters = all_parameters(arms)
+    true = parameters.with_nominal(np.array([_TRUTH[n.rpartition(".")[2]] for n in parameters.names]))
+    moved = dataset(commands(arms, _POSES, np.random.default_rng(5)))
+    exact = measured_without_noise(SimulationRequest(arms, measurements, true, GRAVITY), moved)
+    records = dataset({**moved.channels, **exact})
+    block = replace(parameters[_SIDE], domain=side, prior_sd=prior_sd)
+    parameters = parameters.replaced({_SIDE: block}).with_free(parameters.names)
+    problem = Problem.build(arms, measurements, parameters, GRAVITY, records, "interpreted")
+    answer = true.nominal()
+    answer[parameters.entries_of(_SIDE)] = side_answer
+    return _Case(problem, problem.records(records), answer)
+
+
+def _scattered() -> _Case:
+    """Noisy tips whose weights differ; ``side`` is then the weighted mean of y, by which nothing else moves."""
+    case, random = _case(Interval(), None, _TRUTH["side"]), np.random.default_rng(6)
+    kernel, records = case.problem.kernels[0], case.records[0]
+    noisy = records.record.copy()
+    noisy[:, :_POSES] += random.normal(0.0, 3 * NOISE_M, (len(noisy), _POSES))
+    weights = random.uniform(0.2, 5.0, _POSES)
+    weighted = case.problem.weighted((replace(records, record=noisy),), (weights,))
+    y, answer = noisy[kernel.factor.channels.index(f"{TRACKER}.y"), :_POSES], case.answer.copy()
+    answer[case.problem.parameters.entries_of(_SIDE)] = weights @ y / weights.sum()
+    return replace(case, records=weighted, answer=answer, judged=(_SIDE,))
+
+
+ESTIMATOR = (
+    it_builds,
+    it_gives_a_value_for_every_entry_and_converges,
+    it_keeps_to_the_bounds_and_finds_the_truth,
+    it_weighs_priors,
+    it_weighs_records_in_any_order,
+    it_does_the_same_twice,
+    cut_short_it_reports_that_it_did_not_converge,
+)
+
+# --- online estimators: a linear problem whose answer is a sum of information ---------------------------------------
+
+_RECORDS, _STATES, _ROWS = 12, 4, 2
+_SHARE = 1e-7
+"""How far a number may be off, in its standard deviation."""
+
+
+@dataclass(frozen=True)
+class _Line(Observation):
+    """A record whose prediction is linear in the state, so that it looks alike from anywhere."""
+
+    measured: Array
+    slope: Array
+    noise: Array
+
+    @override
+    def at(self, point: Array) -> Linearised:
+        return Linearised(self.measured - self.slope @ point, self.slope, self.noise)
+
+
+@needed
+def it_takes_a_record(s: Subject) -> None:
+    window = s.built.window
+    whole = isinstance(window, int) and window >= 1
+    expect(whole, f"found window = {window!r}, expected a number of records from 1")
+    s.prior, s.lines = _linear()
+    s.updates = _taken(s.built, s.prior, s.lines)
+
+
+def it_finds_what_prior_and_records_say_together(s: Subject) -> None:
+    for place, update in enumerate(s.updates, start=1):
+        covariance = update.posterior.covariance
+        expect(bool((covariance == covariance.T).all()), f"found a covariance that is not symmetric after {place}")
+        lowest = float(np.linalg.eigvalsh(covariance)[0])
+        expect(lowest > 0, f"found the eigenvalue {lowest:.2g} after record {place}, expected all above zero")
+        right = _known(s.prior, s.lines[:place])
+        sd = np.sqrt(np.diag(right.covariance))
+        off = float(np.abs((update.posterior.mean - right.mean) / sd).max())
+        expect(off < _SHARE, f"found a mean {off:.1e} standard deviations off after record {place}")
+        wide = float(np.abs((covariance - right.covariance) / np.outer(sd, sd)).max())
+        expect(wide < _SHARE, f"found a covariance {wide:.1e} off after record {place}, in units of variances")
+    update, first = s.updates[0], s.lines[0]  # of the first record: the prior is known, whatever the window
+    innovation = update.innovation - (first.measured - first.slope @ s.prior.mean)
+    covariance = update.covariance - (first.slope @ s.prior.covariance @ first.slope.T + first.noise)
+    off = max(float(np.abs(innovation).max()), float(np.abs(covariance).max()))
+    expect(off < _SHARE, f"found an innovation or its covariance (the NIS) {off:.1e} off for the first record")
+
+
+def it_changes_nothing_that_it_is_given_and_keeps_nothing(s: Subject) -> None:
+    """From one update to the next, too."""
+    mean, covariance = s.prior.mean.copy(), s.prior.covariance.copy()
+    s.built.update(s.prior, s.lines[:1])
+    same = bool(np.array_equal(mean, s.prior.mean) and np.array_equal(covariance, s.prior.covariance))
+    expect(same, "it changed the prior that it was given")
+    for before, update in zip(s.updates, _taken(s.built, *_linear()), strict=True):
+        first, again = before.posterior, update.posterior
+        same = np.array_equal(first.mean, again.mean) and np.array_equal(first.covariance, again.covariance)
+        expect(same, "the same records gave other beliefs the second time")
+
+
+def a_variance_below_zero_is_an_error(s: Subject) -> None:
+    line = s.lines[0]
+    blind = _Line(line.measured, line.slope * [1, 1, 1, 0], line.noise)
+    with suppress(ProblemError, np.linalg.LinAlgError), np.errstate(invalid="ignore"):
+        s.built.update(Gaussian(s.prior.mean, np.diag([1.0, 1.0, 1.0, -0.5])), [blind])
+        raise ContractError("found a belief made of a variance of -0.5, expected armcal.errors.ProblemError")
+
+
+def _linear() -> tuple[Gaussian, tuple[_Line, ...]]:
+    random = np.random.default_rng(3)
+    root = random.normal(size=(_STATES, _STATES))
+    prior = Gaussian(random.normal(size=_STATES), root @ root.T + np.eye(_STATES))
+    noise = np.array([[0.2, 0.05], [0.05, 0.1]])
+    truth = prior.mean + root @ random.normal(size=_STATES)
+    slopes = random.normal(size=(_RECORDS, _ROWS, _STATES))
+    return prior, tuple(_Line(slope @ truth + 0.3 * random.normal(size=_ROWS), slope, noise) for slope in slopes)
+
+
+def _taken(estimator: OnlineEstimator, prior: Gaussian, lines: Sequence[_Line]) -> list[Update]:
+    """Each record in turn: a filter goes on from its posterior, a window from the prior of its first record."""
+    window, updates, before, belief = estimator.window, list[Update](), prior, prior
+    latest: list[_Line] = []
+    for line in lines:
+        latest.append(line)
+        update = estimator.update(belief if window == 1 else before, latest if window > 1 else [line])
+        belief = update.posterior
+        shapes = belief.mean.shape, belief.covariance.shape, update.innovation.shape, update.covariance.shape
+        expected = (_STATES,), (_STATES, _STATES), (_ROWS,), (_ROWS, _ROWS)
+        expect(shapes == expected, f"found arrays of the shapes {shapes}, expected {expected}")
+        updates.append(update)
+        if len(latest) == window > 1:
+            before, latest = _known(before, latest[:1]), latest[1:]
+    return updates
+
+
+def _known(prior: Gaussian, lines: Sequence[_Line]) -> Gaussian:
+    """By information: what prior and records say."""
+    information = np.linalg.inv(prior.covariance)
+    projected = information @ prior.mean
+    for line in lines:
+        weighted = line.slope.T @ np.linalg.inv(line.noise)
+        information, projected = information + weighted @ line.slope, projected + weighted @ line.measured
+    covariance = np.linalg.inv(information)
+    return Gaussian(covariance @ projected, covariance)
+
+
+ONLINE = (
+    it_builds,
+    it_takes_a_record,
+    it_finds_what_prior_and_records_say_together,
+    it_changes_nothing_that_it_is_given_and_keeps_nothing,
+    a_variance_below_zero_is_an_error,
+)
