@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from armcal.devices.framed.frames import Frame, FrameDecoder, encoded
-from armcal_pca9685.firmata_messages import END, I2C_REPLY, SYSEX, FirmataDecoder, pairs
 
 from benchmarks.report import Row
 
@@ -20,13 +19,11 @@ _AT_ONCE = 64
 
 
 def run() -> Iterator[Row]:
-    """Both parsers."""
+    """Frames of the serial link."""
     random = np.random.default_rng(0)
     contents = [random.bytes(int(n)) for n in random.integers(4, 32, _MESSAGES)]
     framed = b"".join(encoded(Frame(0x91, i % 256, content)) for i, content in enumerate(contents))
     yield _row("frames with a CRC", framed, FrameDecoder)
-    replies = (bytes((SYSEX, I2C_REPLY)) + pairs(bytes((0x40, 6)) + content) + bytes((END,)) for content in contents)
-    yield _row("Firmata messages", b"".join(replies), FirmataDecoder)
 
 
 def _row(work: str, stream: bytes, decoder: Callable[[], Any]) -> Row:

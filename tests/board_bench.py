@@ -13,7 +13,6 @@ import numpy as np
 from armcal.config.servo_file import BoardSettings, ServoFile, ServoSettings, servo_file_text
 from armcal.devices.device import DeviceError
 from armcal.devices.link import LinkIdentity
-from armcal_simulation.boards.firmata_board import FirmataBoard
 from armcal_simulation.boards.framed_board import BoardIdentity, FramedBoard
 from armcal_simulation.boards.i2c_bus import I2cBus
 from armcal_simulation.boards.pca9685_model import Pca9685Model
@@ -163,16 +162,13 @@ class Line:
 class PtyBoard:
     """A simulated board at the end of a pty, answering in a thread of its own."""
 
-    def __init__(self, folder: Path, kind: str, oscillators=(25e6,), board_id: str = "") -> None:
+    def __init__(self, folder: Path, oscillators=(25e6,), board_id: str = "") -> None:
         self.clock, self.path, self.lock = Clock(), folder / "board", threading.Lock()
         self.chips = [Pca9685Model(self.clock.now, hz, 0x40 + i) for i, hz in enumerate(oscillators)]
         self.bus = I2cBus(self.clock.now, self.chips)
-        self.line = Line(self.path, 0 if kind == "framed" else 0xF7)
-        if kind == "framed":
-            identity = BoardIdentity(board_id, 25_000_000)
-            self.firmware = FramedBoard(self.clock.now, self.bus, self.line.send, identity)
-        else:
-            self.firmware = FirmataBoard(self.bus, self.line.send)
+        self.line = Line(self.path, 0)
+        identity = BoardIdentity(board_id, 25_000_000)
+        self.firmware = FramedBoard(self.clock.now, self.bus, self.line.send, identity)
         self.deaf = False
         self.clock.passing = self._timers
         self._ends = threading.Event()

@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 from armcal_simulation.bench.serial_line import SerialLine, delimited
-from armcal_simulation.boards.firmata_board import FirmataBoard
 from armcal_simulation.boards.framed_board import FramedBoard
 from armcal_simulation.boards.i2c_bus import I2cBus
 from armcal_simulation.boards.pca9685_model import Pca9685Model
+
+from tests.arduino_sketch import SketchBoard
 
 ADDRESS = 0x40
 TICK = 122 / 25e6
@@ -25,7 +26,7 @@ TICK = 122 / 25e6
 class BoardAtPty:
     """One chip behind a firmware behind a pty, and the host's end of it. Nothing happens but in ``ask``."""
 
-    def __init__(self, path: Path, make: Callable[[BoardAtPty], FirmataBoard | FramedBoard]) -> None:
+    def __init__(self, path: Path, make: Callable[[BoardAtPty], FramedBoard | SketchBoard]) -> None:
         self.now = 0.0
         self.chip = Pca9685Model(self.clock, address=ADDRESS)
         self.bus = I2cBus(self.clock, [self.chip])
@@ -67,7 +68,7 @@ class BoardAtPty:
 
 
 @contextlib.contextmanager
-def board_at_pty(path: Path, make: Callable[[BoardAtPty], FirmataBoard | FramedBoard]) -> Iterator[BoardAtPty]:
+def board_at_pty(path: Path, make: Callable[[BoardAtPty], FramedBoard | SketchBoard]) -> Iterator[BoardAtPty]:
     at = BoardAtPty(path, make)
     try:
         yield at

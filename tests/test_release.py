@@ -291,7 +291,7 @@ def test_an_i2c_board_without_its_extra_is_refused_with_the_mend(empty: Path, tm
     shutil.copytree(LRM, tmp_path / "lrm")
     bench = tmp_path / "lrm" / "bench.yaml"
     content = yaml.safe_load(bench.read_text(encoding="utf-8"))
-    links = [section for section in _mappings(content) if section.get("type") in ("framed", "firmata")]
+    links = [section for section in _mappings(content) if section.get("type") == "framed"]
     assert links, "the shipped bench has a link"
     for link in links:
         link.clear()

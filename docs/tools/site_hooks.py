@@ -20,7 +20,7 @@ _BLOCK = re.compile(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', re.DOT
 _OUTSIDE = re.compile(r"\[([^\]]+)\]\(\.\./([^)#]+)(#[^)]*)?\)")
 _ENTRY = re.compile(r"^- \*\*\[(\w+)\]\*\*", re.MULTILINE)
 _CODE = re.compile(r"(^ *```.*?^ *```|`[^`\n]+`)", re.DOTALL | re.MULTILINE)
-_KEY = re.compile(r"\[([A-Z][A-Za-z]*\d{2,4}|Firmata|URDF|DTrack2|PCA9685)\](?![(\[])")
+_KEY = re.compile(r"\[([A-Z][A-Za-z]*\d{2,4}|URDF|DTrack2|PCA9685)\](?![(\[])")
 _FETCHED = re.compile(r'<script src="https://[^"]*iframe-worker[^"]*"></script>')
 
 

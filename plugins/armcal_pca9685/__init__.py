@@ -1,1 +1,1 @@
-"""PCA9685 servo boards, and the links that reach them: Linux I2C, Firmata, and framed serial lines."""
+"""PCA9685 servo boards, and the links that reach them: Linux I2C, and framed serial lines."""

@@ -6,7 +6,6 @@ from armcal.hooks import Register, hookimpl
 @hookimpl
 def armcal_register_links(register: Register) -> None:
     register("linux_i2c", "armcal_pca9685.linux_i2c:LinuxI2cLink", "an I2C bus of this computer")
-    register("firmata", "armcal_pca9685.firmata_link:FirmataLink", "a board with stock Firmata on a serial port")
     register("framed", "armcal_pca9685.framed_link:FramedLink", "a board that looks after the arm by itself")
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import math
-import os
-import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
@@ -33,7 +31,6 @@ from armcal_bench.acquisition.settings import AcquisitionSettings, ArrivalSettin
 from armcal_bench.acquisition.tracker_monitor import TrackerMonitor
 from armcal_bench.bench import Bench
 from armcal_bench.hazards import FirstMotion
-from armcal_pca9685.firmata_link import FirmataLink
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
@@ -744,48 +741,3 @@ class TestFolders:
 
             assert run.acquire(asked).ending.how == "done"
         assert "another" in refusals[0]
-
-
-def test_firmata_is_greeted_though_the_board_reports_its_pins_all_the_time(tmp_path: Path) -> None:
-    """Another program has switched reports on, and the board was not started anew when the port was opened."""
-    master, slave = os.openpty()
-    import tty
-
-    tty.setraw(slave)
-    stop = threading.Event()
-
-    def board() -> None:
-        os.set_blocking(master, False)
-        greeted = 0
-        while not stop.wait(0.02):
-            try:
-                if b"\xf9" in os.read(master, 4096):
-                    greeted += 1
-                    os.write(master, b"\xf9\x02\x05\xf0\x79\x02\x05S\x00t\x00\xf7")
-            except BlockingIOError:
-                pass
-            os.write(master, b"\xe0\x12\x03\x90\x01\x00")
-
-    class Clock:
-        def __init__(self) -> None:
-            self.time = 0.0
-
-        def now(self) -> float:
-            return self.time
-
-        def sleep(self, seconds: float) -> None:
-            self.time += seconds
-
-    thread = threading.Thread(target=board, daemon=True)
-    thread.start()
-    link = FirmataLink(FirmataLink.Settings(port=os.ttyname(slave)))
-    found: list[Any] = []
-    opening = threading.Thread(target=lambda: found.append(link.open(Clock())), daemon=True)  # type: ignore[arg-type]
-    opening.start()
-    opening.join(5.0)
-    stop.set()
-    thread.join()
-    assert found and "2.5" in found[0].firmware
-    link.close()
-    os.close(master)
-    os.close(slave)

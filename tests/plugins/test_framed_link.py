@@ -18,7 +18,7 @@ from board_bench import JOINTS, PtyBoard, servo_file, written
 
 @pytest.fixture
 def board(tmp_path):
-    with PtyBoard(tmp_path, "framed", board_id="A5069RR4") as made:
+    with PtyBoard(tmp_path, board_id="A5069RR4") as made:
         yield made
 
 

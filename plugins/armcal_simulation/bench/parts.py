@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Literal, Self, TypeVar
+from typing import Annotated, Self, TypeVar
 
 from armcal.arm.assembly import Arm, only_arm
 from armcal.arm.joints import unknown_joint
@@ -73,10 +73,9 @@ class ServoBenchSettings(BenchTruthSettings):
     """The truth of a bench with boards whose pulses drive hobby servos.
 
     ``servos`` is a servo file with the true oscillators and pulse tables. ``joints`` has the kind of servo, by joint or
-    for ``all``. ``board_id`` and ``states_oscillator_hz`` are what a framed board reports of itself (0: nothing).
+    for ``all``. ``board_id`` and ``states_oscillator_hz`` are what a board reports of itself (0: nothing).
     """
 
-    firmware: Literal["firmata", "framed"] = "framed"
     board_id: str = "SIMULATED"
     states_oscillator_hz: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
     servos: InputPath

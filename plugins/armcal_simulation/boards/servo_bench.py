@@ -16,7 +16,6 @@ from armcal_simulation.bench.parts import ServoBenchSettings, bounds_of, tracked
 from armcal_simulation.bench.serial_line import delimited
 from armcal_simulation.bench.servo_model import ServoModel
 from armcal_simulation.bench.world import BenchWorld
-from armcal_simulation.boards.firmata_board import FirmataBoard
 from armcal_simulation.boards.framed_board import BoardIdentity, FramedBoard
 from armcal_simulation.boards.i2c_bus import I2cBus
 from armcal_simulation.boards.pca9685_model import Commit, Pca9685Model
@@ -53,23 +52,18 @@ class PulseBench(BenchWorld):
             chip.on_commit = partial(self._committed, name)
         self._joints = {(servo.board, servo.channel): joint for joint, servo in file.servos.items()}
         self._bus = I2cBus(self.clock, list(self._chips.values()))
-        self._board: FirmataBoard | FramedBoard
-        if settings.firmware == "firmata":
-            self._board = FirmataBoard(self._bus, self.send)
-        else:
-            identity = BoardIdentity(settings.board_id, settings.states_oscillator_hz)
-            try:
-                boots = int(json.loads(self._eeprom.read_text(encoding="utf-8"))["boots"])
-            except (OSError, ValueError, KeyError, TypeError):
-                boots = 0
-            self._board = FramedBoard(self.clock, self._bus, self.send, identity, boots)
+        identity = BoardIdentity(settings.board_id, settings.states_oscillator_hz)
+        try:
+            boots = int(json.loads(self._eeprom.read_text(encoding="utf-8"))["boots"])
+        except (OSError, ValueError, KeyError, TypeError):
+            boots = 0
+        self._board = FramedBoard(self.clock, self._bus, self.send, identity, boots)
         self.split = delimited(self._board.delimiter)
 
     @override
     def boot(self) -> None:
         self._board.boot()
-        if isinstance(self._board, FramedBoard):
-            self._eeprom.write_text(json.dumps({"boots": self._board.boots}) + "\n", encoding="utf-8")
+        self._eeprom.write_text(json.dumps({"boots": self._board.boots}) + "\n", encoding="utf-8")
 
     @override
     def receive(self, data: bytes) -> None:
@@ -97,14 +91,12 @@ class PulseBench(BenchWorld):
 
     @override
     def state(self) -> dict[str, Any]:
-        board = self._board
-        framed = {"boots": board.boots, "took_over": board.guard.took_over} if isinstance(board, FramedBoard) else {}
         broken = [[v.time, name, v.rule] for name, chip in self._chips.items() for v in chip.violations]
         return {
             "pulses_s": {joint: self._chips[b].pulse_s(channel) for (b, channel), joint in self._joints.items()},
             "violations": len(broken),
             "violated": broken[-_SHOWN_VIOLATIONS:],
-            "board": framed,
+            "board": {"boots": self._board.boots, "took_over": self._board.guard.took_over},
         }
 
     def _committed(self, board: str, commit: Commit) -> None:
@@ -124,7 +116,6 @@ class ServoBench(SimulatedBench):
 
     Settings: ClassVar[type[ServoBenchSettings]] = ServoBenchSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {
-        "firmware": "framed",
         "servos": str(EXAMPLE_SERVOS),
         "truth": str(EXAMPLE_TRUTH),
         "joints": {"all": {"backlash_deg": 0.1}, "q2": {"continuous_Nm": 0.8}},
