@@ -14,7 +14,7 @@ from armcal.run.plan_approaches import APPROACH_ROOM, reachable, with_poses_betw
 
 from tests.own_arms import POST, OwnArm, said_by
 
-FEW = ("plan.count=48", "plan.starts=1", "plan.sweeps=1", "plan.bound=none", "plan.candidates=continuous")
+FEW = ("plan.count=48", "plan.starts=1", "plan.sweeps=1", "plan.candidates=continuous")
 FREE = ["arm.mdh.theta[2-3]", "arm.servo.above?", "arm.servo.below?", "arm.lag.lag?"]
 
 

@@ -19,7 +19,7 @@ from click.testing import CliRunner, Result
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 DEMO, PLAN, DATA = (str(CONFIGS / name) for name in ("demo.yaml", "plan.yaml", "demo.csv"))
-QUICK = ("--set", "evaluator=interpreted", "--set", "plan.starts=1", "--set", "plan.bound=interior_point")
+QUICK = ("--set", "evaluator=interpreted", "--set", "plan.starts=1")
 NOSE = "{type: ball, centre: {frame: nose}, radius_mm: 1}"
 NO_PARTS = "{between: [a, b], at_least_mm: 1}"
 
@@ -181,7 +181,7 @@ def test_limits_and_clearance_are_kept(tmp_path: Path, kind: str) -> None:
     assert (np.abs(q) <= np.array([100, 50, 100, 100, 100, 50]) + 1e-9).all()
     experiment = Experiment.load(PLAN)
     check = clearance_check(experiment.settings.plan.clearance, experiment.system.arms, experiment.source)
-    assert check is not None and check(np.deg2rad(q.T)).all()
+    assert check is not None and check(np.deg2rad(q.T)).allowed.all()
     assert told["candidates"]["left_out"]["too little clearance"] > 0
     assert (told["candidates"]["refined"] > 0) == (kind == "continuous")
 
@@ -193,25 +193,6 @@ def test_moving_on_through_joint_space_tells_more(tmp_path: Path) -> None:
     moved = planned(tmp_path / "b.csv", *few, config=PLAN)
     assert moved["log_det"] > held["log_det"] + 1
     assert moved["log_det"] == pytest.approx(log_det(scaled_rows(tmp_path / "b.csv")), rel=1e-9)
-
-
-@pytest.mark.slow
-def test_a_plan_robust_to_priors_is_better_on_average_over_them(tmp_path: Path) -> None:
-    priors = ("--set", 'parameters.priors={"arm.mdh.theta*": 30 deg}', "--poses", "12")
-    robust = planned(tmp_path / "r.csv", *priors, "--set", "plan.robust={draws: 6}", config=PLAN)
-    plain = planned(tmp_path / "p.csv", *priors, config=PLAN)
-    again = planned(
-        tmp_path / "a.csv",
-        *priors,
-        "--set",
-        "plan.robust={draws: 6}",
-        "--candidates",
-        str(tmp_path / "p.csv"),
-        config=PLAN,
-    )
-    assert set(robust["ids"]) != set(plain["ids"])
-    assert robust["value"] > again["value"]  # over the same draws
-    assert plain["log_det"] >= robust["log_det"]  # at the nominal values
 
 
 @pytest.mark.slow
@@ -238,7 +219,6 @@ def test_the_same_command_gives_the_same_file(tmp_path: Path) -> None:
         (["--poses", "50", "--candidates", "nowhere.csv"], "nowhere.csv"),
         (["--poses", "50", "--given", "nowhere.csv"], "nowhere.csv"),
         (["--poses", "50", "--calibration", "nowhere.yaml"], "nowhere.yaml"),
-        (["--poses", "50", "--set", "plan.robust={draws: 2}"], "no prior on a free parameter"),
         (["--poses", "50", "--set", "plan.limits={q1: [9 deg, 1 deg]}"], "not in rising order"),
         (["--poses", "50", "--set", "plan.limits={q9: [1 deg, 9 deg]}"], "'q9'"),
         (["--poses", "50", "--set", "plan.limits={q1: [1 deg, 9 deg]}"], "200 beyond joint limits"),

@@ -26,7 +26,7 @@ LARGEST_MM = 1.0
 """Of the demonstration's held-out error: its noise alone is 0.8 mm."""
 EXTRAS = {
     "online": "armcal recalibrate and mission",
-    "convex": "the estimator cvxpy, certified bounds of a plan for E, cones in armcal recalibrate",
+    "convex": "the estimator cvxpy, cones in armcal recalibrate",
     "figures": "the figures of armcal mission and capability",
     "lerobot": "LeRobot's data sets",
     "camera": "boards found in images, boards to print (armcal board)",

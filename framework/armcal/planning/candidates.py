@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
-from armcal.base.parameters import Parameters
 from armcal.errors import ProblemError
 from armcal.problem.many_points import as_seen
 from armcal.problem.problem import Problem, triangular
@@ -26,15 +24,10 @@ _TAKES_PART = 1e-6
 
 @dataclass(frozen=True)
 class Candidates:
-    """Candidates by coordinates in typical scales, at one value vector or at several draws of it.
+    """Candidates by coordinates in typical scales."""
 
-    Attributes:
-        base: what is known before, as R with R'R the information (draws x rows x n).
-        rows: whitened Jacobians (draws x n_r x N x n); the n_r rows of a candidate enter together.
-    """
-
-    base: Array
-    rows: Array
+    base: Array  # what is known before, as R with R'R the information (rows x n)
+    rows: Array  # whitened Jacobians (n_r x N x n); the n_r rows of a candidate enter together
 
     def __post_init__(self) -> None:
         """Raises ProblemError: not all of it is finite."""
@@ -43,52 +36,46 @@ class Candidates:
             raise ProblemError(text, hint="Check these values: plan about a calibration that converged, or without.")
 
     @property
-    def draws(self) -> int:
-        return len(self.rows)
-
-    @property
     def count(self) -> int:
-        return int(self.rows.shape[2])
+        return int(self.rows.shape[1])
 
     @property
     def size(self) -> int:
-        return int(self.rows.shape[3])
+        return int(self.rows.shape[2])
 
     def subset(self, chosen: Indices) -> Candidates:
-        return Candidates(self.base, np.take(self.rows, chosen, axis=2))
+        return Candidates(self.base, np.take(self.rows, chosen, axis=1))
 
     def known(self) -> Array:
-        return np.asarray(np.swapaxes(self.base, 1, 2) @ self.base)
+        return np.asarray(self.base.T @ self.base)
 
     def ridge(self) -> float:
-        mean = float(np.mean(np.einsum("krij,krij->kr", self.rows, self.rows))) * self.rows.shape[1] / self.size
-        known = float(np.mean(np.einsum("kij,kij->k", self.base, self.base))) / self.size
+        mean = float(np.mean(np.einsum("rij,rij->r", self.rows, self.rows))) * len(self.rows) / self.size
+        known = float(np.sum(self.base**2)) / self.size
         return float(RIDGE * max(mean, known, 1e-300))
 
     def information(self, weights: Array) -> Array:
-        """Of what is known before and the candidates by weight (N), one matrix a draw."""
+        """Of what is known before and the candidates by weight (N)."""
         used = np.flatnonzero(weights)
-        rows = self.rows[:, :, used, :] * np.sqrt(np.maximum(weights[used], 0.0))[:, None]
-        flat = rows.reshape(self.draws, -1, self.size)
-        return np.asarray(self.known() + np.swapaxes(flat, 1, 2) @ flat)
+        flat = (self.rows[:, used, :] * np.sqrt(np.maximum(weights[used], 0.0))[:, None]).reshape(-1, self.size)
+        return np.asarray(self.known() + flat.T @ flat)
 
-    def triangles(self, chosen: Indices) -> list[Array]:
-        """R with R'R the information of what is known and the chosen ones, one a draw: keeps small singular values."""
-        triangles = list(self.base)
+    def triangle(self, chosen: Indices) -> Array:
+        """R with R'R the information of what is known and the chosen ones: keeps small singular values."""
+        triangle = self.base
         for start in range(0, len(chosen), _ROWS_AT_ONCE):
-            few = self.rows[:, :, chosen[start : start + _ROWS_AT_ONCE], :].reshape(self.draws, -1, self.size)
-            triangles = [triangular(np.vstack([above, part])) for above, part in zip(triangles, few, strict=True)]
-        return triangles
+            few = self.rows[:, chosen[start : start + _ROWS_AT_ONCE], :].reshape(-1, self.size)
+            triangle = triangular(np.vstack([triangle, few]))
+        return triangle
 
-    def scores(self, gradients: Array) -> Array:
-        """<gradient, J'J> of every candidate, averaged over draws (N); ``gradients`` (draws x n x n) symmetric."""
+    def scores(self, gradient: Array) -> Array:
+        """<gradient, J'J> of every candidate (N); ``gradient`` (n x n) symmetric."""
         total = np.zeros(self.count)
-        for rows, gradient in zip(self.rows, gradients, strict=True):
-            for part in rows:
-                for start in range(0, self.count, _ROWS_AT_ONCE):
-                    few = part[start : start + _ROWS_AT_ONCE]
-                    total[start : start + _ROWS_AT_ONCE] += np.einsum("ij,ij->i", few @ gradient, few)
-        return total / self.draws
+        for part in self.rows:
+            for start in range(0, self.count, _ROWS_AT_ONCE):
+                few = part[start : start + _ROWS_AT_ONCE]
+                total[start : start + _ROWS_AT_ONCE] += np.einsum("ij,ij->i", few @ gradient, few)
+        return total
 
 
 def deviations(triangle: Array) -> Array:
@@ -115,19 +102,3 @@ def whitened_rows(problem: Problem, values: Array, dataset: Dataset) -> Array:
         return rows
     triangles = np.asarray(np.linalg.qr(rows.transpose(1, 0, 2), mode="r"))
     return np.ascontiguousarray(triangles.transpose(1, 0, 2))
-
-
-def over_draws(problem: Problem, draws: Sequence[Array], dataset: Dataset) -> Array:
-    """The same at several value vectors (draws x n_r x N x n)."""
-    return np.stack([whitened_rows(problem, values, dataset) for values in draws])
-
-
-def parameter_draws(parameters: Parameters, count: int, seed: int) -> Iterator[Array]:
-    """Value vectors from the parameters' priors, within bounds; those without a prior stay nominal."""
-    prior = parameters.prior_information()
-    deviation = np.where(prior > 0, 1 / np.sqrt(np.where(prior > 0, prior, 1.0)), 0.0)
-    lower, upper = parameters.increment_bounds()
-    random = np.random.default_rng(seed)
-    for _ in range(count):
-        moved = parameters.from_coordinates(random.normal(size=len(prior)) * deviation)
-        yield parameters.retract(np.clip(moved, lower, upper))

@@ -18,7 +18,6 @@ GOALS: tuple[Goal, ...] = get_args(Goal)
 FLOOR = 1e-300
 """Eigenvalues are kept above it, so that a singular matrix is very bad and not an error."""
 _SAME = 1e-6
-SMALLEST_DETERMINANT = 1e-13
 
 
 @dataclass(frozen=True)
@@ -39,13 +38,13 @@ class Criterion:
         return self.value(np.maximum(np.linalg.eigvalsh(information), FLOOR))
 
     def efficiency(self, value: float, bound: float, size: int) -> float:
-        """How good a plan of this value is beside the best there could be, between 0 and 1.
+        """How good a plan for D, A or O5 is beside the best there could be, between 0 and 1.
 
         For D by the determinant's n-th root: 0.99 means that 1 % more measurements would make up for it.
         """
         if self.name == "D":
             return float(np.exp((value - bound) / size))
-        return float(value / bound if self.name == "E" else bound / value)
+        return bound / value
 
 
 def _power(p: float) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
@@ -78,44 +77,6 @@ def spread(slope: Callable[[Array], Array], curvature: Callable[[Array], Array],
     near = np.abs(a - b) <= _SAME * np.maximum(a, b)
     difference = (slope(a) - slope(b)) / np.where(near, 1.0, a - b)
     return np.asarray(np.where(near, curvature((a + b) / 2), difference))
-
-
-def packed_log_det(packed: Array, n_rows: int) -> Array:
-    """log det(I + S) of packed symmetric matrices; very small where it is not positive definite."""
-    if n_rows == 1:
-        determinant = 1 + packed[0]
-    elif n_rows == 3:
-        a, b, c, d, e, f = packed
-        a, d, f = a + 1, d + 1, f + 1
-        determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
-    else:
-        signs, logarithms = np.linalg.slogdet(_unpacked(packed, n_rows) + np.eye(n_rows))
-        return np.asarray(np.where(signs > 0, logarithms, np.log(SMALLEST_DETERMINANT)))
-    return np.asarray(np.log(np.maximum(determinant, SMALLEST_DETERMINANT)))
-
-
-def packed_trace(seen: Array, squared: Array, n_rows: int) -> Array:
-    """tr (I + S)^-1 Q of packed symmetric matrices."""
-    if n_rows == 1:
-        return np.asarray(squared[0] / np.maximum(1 + seen[0], SMALLEST_DETERMINANT))
-    if n_rows == 3:
-        a, b, c, d, e, f = seen
-        a, d, f = a + 1, d + 1, f + 1
-        adjugate = (d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b)
-        determinant = a * adjugate[0] + b * adjugate[1] + c * adjugate[2]
-        weights = (1.0, 2.0, 2.0, 1.0, 2.0, 1.0)
-        total = sum(w * x * q for w, x, q in zip(weights, adjugate, squared, strict=True))
-        return np.asarray(total / np.maximum(determinant, SMALLEST_DETERMINANT))
-    whole = _unpacked(seen, n_rows) + np.eye(n_rows)
-    return np.asarray(np.trace(np.linalg.solve(whole, _unpacked(squared, n_rows)), axis1=1, axis2=2))
-
-
-def _unpacked(packed: Array, n_rows: int) -> Array:
-    left, right = np.triu_indices(n_rows)
-    whole = np.empty((packed.shape[1], n_rows, n_rows))
-    whole[:, left, right] = packed.T
-    whole[:, right, left] = packed.T
-    return whole
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,6 @@ from armcal.planning.criterion import Criterion, spread
 
 AT_ONCE = 2000
 """Above so many candidates the relaxation is solved on those that matter, and certified on all."""
-INTERIOR_POINT = "interior point, equivalence theorem"
 _MANY_COORDINATES = 64
 _FEW = 600
 _GAP = 1e-7
@@ -59,30 +58,19 @@ class Task:
 
 @dataclass(frozen=True)
 class Tangent:
-    """An affine function above the criterion: ``constant`` plus <gradients, J'J> (draws x n x n) of the chosen."""
+    """An affine function above the criterion: ``constant`` plus <gradient, J'J> (n x n) of the chosen."""
 
     constant: float
-    gradients: Array
+    gradient: Array
 
 
 @dataclass(frozen=True)
 class Relaxation:
-    """What the relaxation says.
+    """What the relaxation says."""
 
-    Attributes:
-        weights: of the candidates (N).
-        bound: no plan has a larger value.
-        scores: what each candidate adds to the bound at most (N).
-        how: which solver gave the weights.
-    """
-
-    weights: Array
-    bound: float
-    scores: Array
-    how: str
-
-
-Solver = Callable[[Task], tuple[Array, Tangent]]
+    weights: Array  # of the candidates (N)
+    bound: float  # no plan has a larger value
+    scores: Array  # what each candidate adds to the bound at most (N)
 
 
 def tangent(task: Task, weights: Array) -> Tangent:
@@ -93,22 +81,21 @@ def tangent(task: Task, weights: Array) -> Tangent:
     information = candidates.information(weights) + candidates.ridge() * np.eye(candidates.size)
     values, vectors = np.linalg.eigh(information)
     values = np.maximum(values, 1e-300)
-    gradients = (vectors * slope(values)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-    inside = np.einsum("kij,kij->", gradients, known - information) / candidates.draws
-    return Tangent(float(np.mean(task.criterion.value(values)) + inside), gradients)
+    gradient = np.asarray((vectors * slope(values)) @ vectors.T)
+    return Tangent(float(task.criterion.value(values) + np.sum(gradient * (known - information))), gradient)
 
 
-def certified(task: Task, weights: Array, upper: Tangent, how: str) -> Relaxation:
-    scores = task.candidates.scores(upper.gradients)
-    return Relaxation(weights, upper.constant + task.most(scores), scores, how)
+def certified(task: Task, weights: Array, upper: Tangent) -> Relaxation:
+    scores = task.candidates.scores(upper.gradient)
+    return Relaxation(weights, upper.constant + task.most(scores), scores)
 
 
-def relax(task: Task, solver: Solver, how: str, at_once: int | None = None) -> Relaxation:
+def relax(task: Task, at_once: int | None = None) -> Relaxation:
     """Solve the relaxation; above ``at_once`` candidates on those that matter, until the bound holds for all."""
     if at_once is None:
         at_once = max(AT_ONCE if task.candidates.size <= _MANY_COORDINATES else _FEW, 4 * task.count)
     if task.candidates.count <= at_once:
-        return certified(task, *solver(task), how)
+        return certified(task, *interior_point(task))
     # To begin with: those that add most to an even mixture, and a few of all kinds.
     candidates, number, count = task.candidates, task.candidates.count, at_once // 4
     information = candidates.information(np.full(number, task.count / number))
@@ -119,8 +106,8 @@ def relax(task: Task, solver: Solver, how: str, at_once: int | None = None) -> R
     best: Relaxation | None = None
     for _ in range(_ROUNDS):
         weights = np.zeros(number)
-        weights[active], upper = solver(task.subset(active))
-        made = certified(task, weights, upper, how)
+        weights[active], upper = interior_point(task.subset(active))
+        made = certified(task, weights, upper)
         reached = upper.constant + task.subset(active).most(made.scores[active])
         best = made if best is None or made.bound < best.bound else best
         if made.bound - reached <= _GAP * max(1.0, abs(made.bound)):
@@ -193,19 +180,15 @@ def _derivatives(task: Task, weights: Array) -> tuple[Array, Array]:
     information = candidates.information(weights) + candidates.ridge() * np.eye(candidates.size)
     left, right = np.triu_indices(candidates.size)
     double = np.where(left == right, 1.0, np.sqrt(2.0))
-    gradient, parts = np.zeros(candidates.count), []
-    for matrix, rows in zip(information, candidates.rows, strict=True):
-        values, vectors = np.linalg.eigh(matrix)
-        values = np.maximum(values, 1e-300)
-        turned = rows @ vectors
-        gradient += np.einsum("rni,rni,i->n", turned, turned, slope(values), optimize=True) / candidates.draws
-        factor = np.sqrt(np.maximum(-spread(slope, curvature, values), 0.0) / candidates.draws)
-        part = np.zeros((candidates.count, len(left)))
-        for row in turned:
-            part += row[:, left] * row[:, right]
-        part *= factor[left, right] * double
-        parts.append(part)
-    return gradient, parts[0] if len(parts) == 1 else np.hstack(parts)
+    values, vectors = np.linalg.eigh(information)
+    values = np.maximum(values, 1e-300)
+    turned = candidates.rows @ vectors
+    gradient = np.einsum("rni,rni,i->n", turned, turned, slope(values), optimize=True)
+    factor = np.sqrt(np.maximum(-spread(slope, curvature, values), 0.0))
+    half = np.zeros((candidates.count, len(left)))
+    for row in turned:
+        half += row[:, left] * row[:, right]
+    return np.asarray(gradient), half * (factor[left, right] * double)
 
 
 def _newton_step(curved: Array, diagonal: Array, right: Array) -> tuple[Array, float]:

@@ -14,7 +14,7 @@ from armcal.base.units import display_unit, to_unit
 from armcal.estimate.estimator import Estimate
 from armcal.planning.candidates import Candidates, deviations, whitened_rows
 from armcal.planning.criterion import criterion
-from armcal.planning.planning import built_up
+from armcal.planning.exchange import built_up
 from armcal.planning.relaxation import Task
 from armcal.problem.problem import Problem, triangular
 
@@ -75,14 +75,14 @@ def suggest(
     if not (np.isfinite(base).all() and len(usable)):
         return ()
     rows, poses = rows[:, usable], poses.subset(usable)
-    candidates = Candidates(base[None], rows[None])
+    candidates = Candidates(base, rows)
     chosen = built_up(Task(candidates, criterion("D"), min(count, len(poses))))
     before = deviations(base)
     known = np.isfinite(before) & (before > 0)
     units = {channel: display_unit(dimension).name for channel, dimension in joints.items()}
     suggestions = []
     for number in range(1, len(chosen) + 1):
-        after = deviations(candidates.triangles(chosen[:number])[0])
+        after = deviations(candidates.triangle(chosen[:number]))
         commands = {channel: float(poses.column(channel)[chosen[number - 1]]) for channel in joints}
         shrink = float(np.mean(after[known] / before[known])) if known.any() else 1.0
         suggestions.append(Suggestion(commands, _text(commands, units), shrink, beside))

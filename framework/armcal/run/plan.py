@@ -11,11 +11,9 @@ from armcal.base.parameters import Parameters
 from armcal.errors import ProblemError
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.identifiability import Identifiability, analyse, measures_of
-from armcal.planning.bound import bounded
-from armcal.planning.candidates import Candidates, deviations, over_draws
+from armcal.planning.candidates import Candidates, deviations, whitened_rows
 from armcal.planning.criterion import Observability, criterion, observability
-from armcal.planning.planning import Plan, choose, value_of
-from armcal.planning.refinement import Allowed, refine
+from armcal.planning.exchange import Allowed, Plan, choose, refine, value_of
 from armcal.planning.relaxation import Task
 from armcal.run.experiment import Experiment
 from armcal.run.plan_approaches import (
@@ -56,7 +54,6 @@ class Certificate:
 
     bound: float
     efficiency: float
-    how: str
 
 
 @dataclass(frozen=True)
@@ -145,7 +142,7 @@ def make_plan(
 
 def _identifiability(task: Task, chosen: Indices, parameters: Parameters) -> Identifiability:
     names = parameters.coordinate_names
-    return analyse(task.candidates.triangles(chosen)[0], np.ones(len(names)), names, measures_of(parameters))
+    return analyse(task.candidates.triangle(chosen), np.ones(len(names)), names, measures_of(parameters))
 
 
 def _chosen(task: Task, settings: PlanSettings, parameters: Parameters) -> Plan:
@@ -158,8 +155,8 @@ def _chosen(task: Task, settings: PlanSettings, parameters: Parameters) -> Plan:
             f"{'; '.join(str(combination) for combination in most.undetermined)}.",
             hint="Fix one parameter of each, give it a prior, or give other candidates.",
         )
-    before = int(np.linalg.matrix_rank(candidates.base[0])) if candidates.base.size else 0
-    numbers = task.count * candidates.rows.shape[1]
+    before = int(np.linalg.matrix_rank(candidates.base)) if candidates.base.size else 0
+    numbers = task.count * candidates.rows.shape[0]
     if numbers < candidates.size - before:
         raise ProblemError(
             f"{task.count} poses give {numbers} equations, and {candidates.size - before} of {candidates.size} "
@@ -195,7 +192,9 @@ def _refined(
         )
 
     def rows(poses: Array) -> Array:
-        return over_draws(problem, context.draws, as_if_measured(context.experiment, dataset_at(poses)))
+        return whitened_rows(
+            problem, context.parameters.nominal(), as_if_measured(context.experiment, dataset_at(poses))
+        )
 
     known, by = task.candidates.known(), task.criterion
     after = refine(before, limits, known, by, rows, lambda q: allowed(q[:count]), context.settings.sweeps)
@@ -205,7 +204,7 @@ def _refined(
     number = task.candidates.count
     poses = np.concatenate([pool.dataset.stacked(channels), after[:, moved]], axis=1)
     pool = replace(pool, dataset=dataset_at(poses))
-    together = np.concatenate([task.candidates.rows, rows(after[:, moved])], axis=2)
+    together = np.concatenate([task.candidates.rows, rows(after[:, moved])], axis=1)
     task = replace(task, candidates=Candidates(context.base, together))
     begin = plan.chosen.copy()
     begin[moved] = number + np.arange(len(moved))
@@ -224,18 +223,17 @@ def _between(context: PlanContext, task: Task, plan: Plan, pool: Pool) -> Plan:
 
 
 def _result(context: PlanContext, task: Task, plan: Plan, pool: Pool, refined: int) -> PlanResult:
-    """A plan's figures; all but the criterion and its bound at the nominal values."""
+    """A plan's figures; the relaxation bounds criteria that are sums over eigenvalues."""
     parameters, chosen = context.parameters, pool.dataset.subset(plan.chosen)
-    relaxed, certificate = bounded(task, context.settings.bound, plan.relaxation), None
-    if relaxed is not None:
-        efficiency = task.criterion.efficiency(plan.value, relaxed.bound, task.candidates.size)
-        certificate = Certificate(relaxed.bound, efficiency, relaxed.how)
-    nominal = context.about((parameters.nominal(),))
-    measured = Task(Candidates(nominal.base, nominal.rows(chosen)), criterion("D"), task.count)
+    certificate = None
+    if task.criterion.trace is not None:
+        bound = plan.relaxation.bound
+        certificate = Certificate(bound, task.criterion.efficiency(plan.value, bound, task.candidates.size))
+    measured = Task(Candidates(context.base, context.rows(chosen)), criterion("D"), task.count)
     everything = np.arange(task.count)
-    triangle = measured.candidates.triangles(everything)[0]
+    triangle = measured.candidates.triangle(everything)
     given = 0 if context.given is None else len(context.given)
-    equations = (task.count + given) * measured.candidates.rows.shape[1] + len(context.priors)
+    equations = (task.count + given) * measured.candidates.rows.shape[0] + len(context.priors)
     dataset, seconds, hottest = in_order_of_visit(context, chosen, keeps_approaches=pool.kind in PLANNED)
     return PlanResult(
         dataset=dataset,
@@ -247,7 +245,7 @@ def _result(context: PlanContext, task: Task, plan: Plan, pool: Pool, refined: i
         certificate=certificate,
         observability=observability(np.linalg.svd(triangle, compute_uv=False).astype(float), equations),
         names=parameters.coordinate_names,
-        deviations=np.array([deviations(part) for part in (nominal.base[0], triangle)]) * parameters.scales(),
+        deviations=np.array([deviations(part) for part in (context.base, triangle)]) * parameters.scales(),
         identifiability=_identifiability(measured, everything, parameters),
         travel_s=seconds,
         peak=hottest,

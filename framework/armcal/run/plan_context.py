@@ -1,9 +1,9 @@
-"""What a pose plan stands on: parameter values or draws of them, and the information there is before; its order."""
+"""What a pose plan stands on: parameter values, and the information there is before; its order."""
 
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from armcal.calibration.calibration import Calibration
 from armcal.errors import ConfigError, ProblemError
 from armcal.estimate.simulation import with_channels
 from armcal.measure.groups import grouped_instances
-from armcal.planning.candidates import over_draws, parameter_draws
+from armcal.planning.candidates import whitened_rows
 from armcal.planning.visit import cool_order, heat, path_time, peak, quick_order, travel_times
 from armcal.problem.problem import Problem, triangular
 from armcal.run.experiment import Experiment
@@ -27,36 +27,28 @@ _SPEEDS = {"angle": np.deg2rad(60.0), "length": 0.05}
 
 @dataclass(frozen=True)
 class PlanContext:
-    """What all steps of one plan stand on.
-
-    Attributes:
-        priors: as rows of information by coordinates in typical scales.
-        draws: the value vectors at which information is taken.
-        base: priors and given records at each draw, as R with R'R their information.
-    """
+    """What all steps of one plan stand on."""
 
     experiment: Experiment
     settings: PlanSettings
     space: JointSpace
     parameters: Parameters
     given: Dataset | None
-    priors: Array
-    draws: tuple[Array, ...] = ()
-    base: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    priors: Array  # as rows of information by coordinates in typical scales
 
-    def about(self, draws: tuple[Array, ...]) -> Self:
-        here = replace(self, draws=draws)
+    @cached_property
+    def base(self) -> Array:
+        """Priors and given records, as R with R'R their information."""
         if self.given is None:
-            return replace(here, base=np.array([self.priors] * len(draws)))
-        seen = [
-            triangular(np.vstack([self.priors, part.reshape(-1, part.shape[-1])])) for part in here.rows(self.given)
-        ]
-        return replace(here, base=np.array(seen))
+            return self.priors
+        rows = self.rows(self.given)
+        return triangular(np.vstack([self.priors, rows.reshape(-1, rows.shape[-1])]))
 
     def rows(self, dataset: Dataset) -> Array:
-        """Whitened Jacobians at every draw (draws x n_r x N x n)."""
+        """Whitened Jacobians (n_r x N x n)."""
         records = as_if_measured(self.experiment, dataset)
-        return over_draws(problem_of(self.experiment, self.parameters, records), self.draws, records)
+        problem = problem_of(self.experiment, self.parameters, records)
+        return whitened_rows(problem, self.parameters.nominal(), records)
 
 
 def parameters_of(experiment: Experiment, calibration: Path | None) -> Parameters:
@@ -112,23 +104,10 @@ def as_if_measured(experiment: Experiment, dataset: Dataset) -> Dataset:
 def plan_context(
     experiment: Experiment, settings: PlanSettings, space: JointSpace, parameters: Parameters, given: Dataset | None
 ) -> PlanContext:
-    """Priors and given records as information, at the nominal values, or at draws from the priors if so configured.
-
-    Raises:
-        ConfigError: draws are configured, and no prior to draw from.
-    """
-    scales, prior, robust = parameters.scales(), parameters.prior_information(), settings.robust
+    """Priors and given records as information, at the nominal values."""
+    scales, prior = parameters.scales(), parameters.prior_information()
     priors = np.diag(scales * np.sqrt(prior))[prior > 0]
-    context = PlanContext(experiment, settings, space, parameters, given, priors)
-    if robust is None:
-        return context.about((parameters.nominal(),))
-    if not prior.any():
-        raise ConfigError(
-            "found plan.robust and no prior on a free parameter: there is nothing to be robust against.",
-            where=experiment.source.where(("plan", "robust")),
-            hint="Give parameters.priors, or leave plan.robust out.",
-        )
-    return context.about(tuple(parameter_draws(parameters, robust.draws, robust.seed)))
+    return PlanContext(experiment, settings, space, parameters, given, priors)
 
 
 def in_order_of_visit(

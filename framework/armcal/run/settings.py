@@ -9,7 +9,6 @@ from armcal.config.selection import ParameterSettings
 from armcal.config.system import StaticsSettings
 from armcal.estimate.bootstrap import BootstrapSettings
 from armcal.estimate.weighing import NoiseSettings
-from armcal.planning.bound import BoundSolver
 from armcal.planning.criterion import Goal
 from armcal.run.plan_clearance import ClearanceSettings
 
@@ -61,13 +60,6 @@ class UncertaintySettings(BootstrapSettings):
     profile: tuple[str, ...] = ()
 
 
-class RobustSettings(Settings):
-    """The criterion is averaged over so many draws of the parameters from their priors."""
-
-    draws: Annotated[int, Field(ge=1, le=100)] = 8
-    seed: Annotated[int, Field(ge=0)] = 0
-
-
 class PlanSettings(Settings):
     """How poses are planned.
 
@@ -88,8 +80,6 @@ class PlanSettings(Settings):
     starts: Annotated[int, Field(ge=0)] | None = None
     seed: Annotated[int, Field(ge=0)] = 0
     sweeps: Annotated[int, Field(ge=0, le=100)] = 8
-    bound: BoundSolver = "auto"
-    robust: RobustSettings | None = None
     clearance: ClearanceSettings | None = None
     order: Literal["travel", "torque", "none"] = "travel"
     speeds_deg_per_s: dict[str, Speed] = Field(default_factory=dict)

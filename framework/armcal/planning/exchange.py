@@ -1,0 +1,573 @@
+"""Choosing poses by exchange: several starts, each led to where no single swap of poses helps.
+
+DETMAX [Mitchell1974] lets poses in and takes them out again, in excursions that grow while they fail; Fedorov's
+exchange [Fedorov1972] then tries every swap. Of many candidates, the starts see those that the relaxation finds most
+promising; the best plan is then led to where no swap with any candidate helps.
+
+A pose brings n_r rows H that enter together. With C the inverse of the information, adding it changes
+
+    C by -C H' (I + H C H')^-1 H C,    log det by log det(I + H C H')    [Fedorov1972]
+
+and H C H' of every other candidate likewise, so that nothing is ever decomposed anew for a candidate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from armcal.base.arrays import Array, Indices, Mask
+from armcal.planning.candidates import Candidates
+from armcal.planning.criterion import Criterion, Goal, criterion
+from armcal.planning.relaxation import AT_ONCE, Relaxation, Task, relax
+
+Rows = Callable[[Array], Array]
+"""Poses (joints x N) to whitened Jacobians (n_r x N x n)."""
+Allowed = Callable[[Array], Mask]
+"""Poses (joints x N) to whether each may be visited (N, bool)."""
+STARTS = 10
+KICKS_A_START = 4
+DECOMPOSED_STARTS = 1
+"""Goals whose every change takes a decomposition get fewer random starts, and start from the plans for D and A."""
+SHORTLIST = 512
+_LONGEST_EXCURSION = 3
+_MOST_SWEEPS = 200
+_MOST_EXCURSIONS = 50
+_LEAST_WEIGHT = 1e-6
+_KICKED = 0.12
+_QUICK: tuple[Goal, ...] = ("D", "A")
+_REFRESH = 64
+_TOLERANCE = 1e-9
+_DOUBTFUL = -12.0
+"""A removal that takes so much of the log determinant would carry rounding into the inverse."""
+_SMALLEST = 1e-13  # determinant
+_FIRST_STEP, _SHRINK, _GAIN = 0.125, 0.5, 1e-9  # of a pose that is moved through joint space
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A chosen set of poses.
+
+    Attributes:
+        chosen: candidates in the order in which each adds most to those before it (repeated where that was allowed).
+        value: of the criterion, with what is known before.
+        starts: how many were made.
+        swaps: how many poses came in for others, over all starts.
+        relaxation: that the starts began from; of the log determinant where the criterion is no sum over eigenvalues.
+    """
+
+    chosen: Indices
+    value: float
+    starts: int
+    swaps: int
+    relaxation: Relaxation
+
+
+def value_of(candidates: Candidates, by: Criterion, chosen: Indices) -> float:
+    singular = np.linalg.svd(candidates.triangle(chosen), compute_uv=False)
+    padded = np.pad(singular, (0, candidates.size - len(singular)))
+    return float(by.value(np.maximum(np.sort(padded**2), 1e-300)))
+
+
+def choose(task: Task, starts: int | None = None, seed: int = 0, begin: Indices | None = None) -> Plan:
+    """The best plan of several starts.
+
+    Args:
+        task: candidates, criterion and number of poses.
+        starts: drawn by the relaxation's weights, beside its rounding and one built up pose by pose; each brings a few
+            kicks of the best plan. None: as many as pay.
+        seed: of what is random.
+        begin: a plan to start from as well.
+
+    Raises:
+        ValueError: fewer candidates than poses.
+    """
+    if task.count > task.candidates.count * task.limit:
+        raise ValueError(f"{task.count} poses of {task.candidates.count} candidates")
+    quick = task.criterion.name in _QUICK
+    smooth = task if task.criterion.trace else replace(task, criterion=criterion("D"))
+    relaxed = relax(smooth)
+    few = _promising(task, relaxed, begin)
+    smaller = task.subset(few)
+    given = [np.searchsorted(few, start) for start in (_rounded(task, relaxed), begin) if start is not None]
+    if not quick:
+        given += [choose(replace(smaller, criterion=criterion(goal)), starts=0).chosen for goal in _QUICK]
+    if starts is None:
+        starts = STARTS if quick else DECOMPOSED_STARTS
+    random = np.random.default_rng(seed)
+    given += [_drawn(smaller, relaxed.weights[few], random) for _ in range(starts)]
+    kicks = starts * (KICKS_A_START if quick else 1)
+    chosen, swaps = _best(smaller, given, kicks, random)
+    chosen = few[chosen]
+    if len(few) < task.candidates.count:
+        chosen, more = detmax(task, chosen, longest=0)
+        swaps += more
+    chosen = in_order(task, chosen)
+    return Plan(chosen, value_of(task.candidates, task.criterion, chosen), len(given) + 1 + kicks, swaps, relaxed)
+
+
+def built_up(task: Task) -> Indices:
+    """A plan without a relaxation: pose by pose, then led to where no swap helps; in the order of ``in_order``."""
+    held = tally(task.candidates, task.criterion)
+    return in_order(task, detmax(task, _built_up(task, held), held)[0])
+
+
+def in_order(task: Task, chosen: Indices) -> Indices:
+    """A plan's poses, each adding most to those before it: to stop early loses least."""
+    part = replace(task.subset(chosen), count=len(chosen), limit=1)
+    return chosen[_built_up(part, tally(part.candidates, part.criterion))]
+
+
+def _best(task: Task, starts: list[Indices], kicks: int, random: np.random.Generator) -> tuple[Indices, int]:
+    """The best plan of these starts, of one built up pose by pose, and of kicks; and how many poses came in over all.
+
+    A kick exchanges a few poses of the best plan for any others and climbs again: better plans lie near good ones.
+    """
+    held = tally(task.candidates, task.criterion)
+    starts = [*starts, _built_up(task, held)]
+    best, best_value, swaps = starts[0], -np.inf, 0
+    for number in range(len(starts) + kicks):
+        if number < len(starts):
+            start = starts[number]
+        else:
+            times = np.bincount(best, minlength=task.candidates.count)
+            others = np.repeat(np.arange(task.candidates.count), task.limit - times)
+            size = min(max(1, round(_KICKED * task.count)), len(others))
+            kept = random.permutation(best)[: task.count - size]
+            start = np.concatenate([kept, random.choice(others, size, replace=False)]).astype(np.intp)
+        chosen, moves = detmax(task, start, held)
+        value, swaps = value_of(task.candidates, task.criterion, chosen), swaps + moves
+        if value > best_value:
+            best, best_value = chosen, value
+    return best, swaps
+
+
+def _drawn(task: Task, weights: Array, random: np.random.Generator) -> Indices:
+    pool = np.repeat(np.arange(task.candidates.count), task.limit)
+    waits = random.exponential(size=len(pool)) / np.maximum(weights[pool], _LEAST_WEIGHT)
+    return np.sort(pool[np.argsort(waits)[: task.count]])
+
+
+def _rounded(task: Task, relaxed: Relaxation) -> Indices:
+    remaining = relaxed.weights[:, None] - np.arange(task.limit)
+    heaviest = np.argsort(-remaining.ravel(), kind="stable")[: task.count]
+    return np.sort(heaviest // task.limit).astype(np.intp)
+
+
+def _promising(task: Task, relaxed: Relaxation, begin: Indices | None) -> Indices:
+    number = task.candidates.count
+    if number <= AT_ONCE:
+        return np.arange(number)
+    best = np.argpartition(-relaxed.scores, AT_ONCE)[:AT_ONCE]
+    also = _rounded(task, relaxed) if begin is None else np.concatenate([_rounded(task, relaxed), begin])
+    return np.union1d(best, also).astype(np.intp)
+
+
+def _built_up(task: Task, held: Tally) -> Indices:
+    held.restart(np.zeros(0, dtype=np.intp))
+    times = np.zeros(task.candidates.count, dtype=int)
+    chosen = []
+    for _ in range(task.count):
+        best = _best_addition(held.if_added(), times, task.limit)
+        held.add(best)
+        times[best] += 1
+        chosen.append(best)
+    return np.array(chosen, dtype=np.intp)
+
+
+def _best_addition(change: Array, times: NDArray[np.int_], limit: int) -> int:
+    free = times < limit
+    best = int(np.argmax(np.where(free, change, -np.inf)))
+    return best if free[best] else int(np.flatnonzero(free)[0])
+
+
+class _Climb:
+    """A plan under exchange: its poses, how often each is in it, its value beside the start's."""
+
+    def __init__(self, task: Task, held: Tally, start: Indices) -> None:
+        self.task, self.held, self.moves = task, held, 0
+        self.begin(np.asarray(start, dtype=np.intp))
+
+    def begin(self, chosen: Indices) -> None:
+        self.chosen: list[int] = [int(i) for i in chosen]
+        self.times = np.bincount(chosen, minlength=self.task.candidates.count)
+        self.held.restart(chosen)
+
+    def let_in(self) -> float:
+        change = self.held.if_added()
+        best = _best_addition(change, self.times, self.task.limit)
+        self._enter(best)
+        return float(change[best])
+
+    def take_out(self) -> float:
+        change = self.held.if_removed(np.array(self.chosen, dtype=np.intp))
+        place = int(np.argmax(change))
+        self._leave(place)
+        return float(change[place])
+
+    def swap(self, place: int) -> float:
+        """Exchange one pose for the best other, if that helps; the gain."""
+        change = self.held.if_swapped(self.chosen[place])
+        self.times[self.chosen[place]] -= 1
+        best = _best_addition(change, self.times, self.task.limit)
+        self.times[self.chosen[place]] += 1
+        if not change[best] > self.held.tolerance() or best == self.chosen[place]:
+            return 0.0
+        self._leave(place)
+        self._enter(best)
+        return float(change[best])
+
+    def _enter(self, candidate: int) -> None:
+        self.held.add(candidate)
+        self.chosen.append(candidate)
+        self.times[candidate] += 1
+        self.moves += 1
+
+    def _leave(self, place: int) -> None:
+        candidate = self.chosen.pop(place)
+        self.held.remove(candidate)
+        self.times[candidate] -= 1
+
+
+def detmax(
+    task: Task, start: Indices, held: Tally | None = None, longest: int = _LONGEST_EXCURSION
+) -> tuple[Indices, int]:
+    """DETMAX from a start, then exchanges until none helps: the plan, and how many poses came in."""
+    climb = _Climb(task, held or tally(task.candidates, task.criterion), start)
+    reachable = min(longest, task.count - 1, task.candidates.count * task.limit - task.count)
+    length = 1
+    for _ in range(_MOST_EXCURSIONS + 10 * task.count):
+        if length > reachable:
+            break
+        length = 1 if _excursion(climb, length) else length + 1
+    for _ in range(_MOST_SWEEPS):
+        plan = list(climb.chosen)
+        gains = [climb.swap(climb.chosen.index(candidate)) for candidate in plan if candidate in climb.chosen]
+        if not any(gain > 0 for gain in gains):
+            break
+    return np.sort(np.array(climb.chosen, dtype=np.intp)), climb.moves
+
+
+def _excursion(climb: _Climb, length: int) -> bool:
+    """Up and back, or down and back, if either gains; the plan as before if not."""
+    for up_first in (True, False):
+        before = np.array(climb.chosen, dtype=np.intp)
+        steps = [climb.let_in, climb.take_out] if up_first else [climb.take_out, climb.let_in]
+        gained = sum(step() for step in steps for _ in range(length))
+        if gained > climb.held.tolerance() and not np.array_equal(np.sort(climb.chosen), np.sort(before)):
+            return True
+        if not np.array_equal(np.sort(climb.chosen), np.sort(before)):
+            climb.begin(before)
+    return False
+
+
+class Tally(Protocol):
+    """A plan in the making. Values are the criterion's."""
+
+    def restart(self, chosen: Indices) -> None:
+        """Begin anew with these."""
+
+    def add(self, candidate: int) -> None:
+        """Let one in."""
+
+    def remove(self, candidate: int) -> None:
+        """Take one out."""
+
+    def if_added(self) -> Array:
+        """The change of value with each candidate let in (N)."""
+
+    def if_removed(self, chosen: Indices) -> Array:
+        """The change of value without each of these."""
+
+    def if_swapped(self, candidate: int) -> Array:
+        """The change of value with each candidate instead of this one (N)."""
+
+    def tolerance(self) -> float:
+        """Changes below it may be rounding."""
+
+
+def tally(candidates: Candidates, criterion: Criterion) -> Tally:
+    if criterion.name in ("D", "A"):
+        return DeterminantTally(candidates) if criterion.name == "D" else TraceTally(candidates)
+    return SpectralTally(candidates, criterion)
+
+
+class DeterminantTally(Tally):
+    """Log determinant. Symmetric n_r x n_r matrices of all candidates are kept packed (pairs x N)."""
+
+    def __init__(self, candidates: Candidates) -> None:
+        self._candidates = candidates
+        self._n_rows, self._count, self._size = candidates.rows.shape
+        self._flat = np.ascontiguousarray(candidates.rows.reshape(-1, self._size))
+        self._left, self._right = np.triu_indices(self._n_rows)
+        self._known = candidates.known() + candidates.ridge() * np.eye(self._size)
+        self.restart(np.zeros(0, dtype=np.intp))
+
+    @override
+    def restart(self, chosen: Indices) -> None:
+        rows = self._candidates.rows[:, chosen, :].reshape(-1, self._size)
+        self._settle(self._known + rows.T @ rows)
+
+    @override
+    def add(self, candidate: int) -> None:
+        self._change(candidate, 1.0)
+
+    @override
+    def remove(self, candidate: int) -> None:
+        self._change(candidate, -1.0)
+
+    @override
+    def if_added(self) -> Array:
+        return _packed_log_det(self._seen, self._n_rows)  # log det(I + H C H')
+
+    @override
+    def if_removed(self, chosen: Indices) -> Array:
+        return _packed_log_det(-self._seen[:, chosen], self._n_rows)  # log det(I - H C H')
+
+    @override
+    def if_swapped(self, candidate: int) -> Array:
+        loss = self.if_removed(np.array([candidate]))[0]
+        half, _ = self._half(candidate, -1.0)
+        return _packed_log_det(self._seen + self._outer(half, half), self._n_rows) + float(loss)
+
+    @override
+    def tolerance(self) -> float:
+        return _TOLERANCE
+
+    def _settle(self, information: Array) -> None:
+        self._information, self._changes = information, 0
+        self._inverse = np.linalg.inv(information)
+        self._inverse = (self._inverse + self._inverse.T) / 2
+        reached = (self._flat @ self._inverse).reshape(self._n_rows, self._count, -1)
+        rows = self._candidates.rows
+        pairs = zip(self._left, self._right, strict=True)
+        self._seen = np.array([np.einsum("ij,ij->i", reached[a], rows[b]) for a, b in pairs])
+
+    def _change(self, candidate: int, sign: float) -> None:
+        rows = self._rows_of(candidate)
+        information = self._information + sign * (rows.T @ rows)
+        doubtful = sign < 0 and float(_packed_log_det(-self._seen[:, [candidate]], self._n_rows)[0]) < _DOUBTFUL
+        if doubtful or self._changes >= _REFRESH:
+            self._settle(information)
+            return
+        half, factor = self._half(candidate, sign)
+        self._advance(half, factor, sign)
+        self._information, self._changes = information, self._changes + 1
+
+    def _advance(self, half: Array, factor: Array, sign: float) -> None:
+        self._seen = self._seen - sign * self._outer(half, half)
+        self._inverse = self._inverse - sign * (factor @ factor.T)
+
+    def _rows_of(self, candidate: int) -> Array:
+        return self._flat[candidate :: self._count]
+
+    def _half(self, candidate: int, sign: float) -> tuple[Array, Array]:
+        """W (n_r x n_r x N) and Y (n x n_r) with which H C H' changes by -sign W'W and C by -sign Y Y'."""
+        rows = self._rows_of(candidate)
+        reached = self._inverse @ rows.T
+        middle = np.eye(self._n_rows) + sign * (rows @ reached)
+        values, vectors = np.linalg.eigh((middle + middle.T) / 2)
+        factor = reached @ (vectors / np.sqrt(np.maximum(values, _SMALLEST)))
+        return self._across(factor), factor
+
+    def _across(self, factor: Array) -> Array:
+        """factor' H' of every candidate (columns x n_r x N)."""
+        return np.asarray((factor.T @ self._flat.T).reshape(-1, self._n_rows, self._count))
+
+    def _outer(self, first: Array, second: Array) -> Array:
+        total = first[0][self._left] * second[0][self._right]
+        for a, b in zip(first[1:], second[1:], strict=True):
+            total += a[self._left] * b[self._right]
+        return np.asarray(total)
+
+
+class TraceTally(DeterminantTally):
+    """Minus the trace of the covariance; H C^2 H' is kept beside H C H'."""
+
+    @override
+    def if_added(self) -> Array:
+        return _packed_trace(self._seen, self._squared, self._n_rows)  # tr (I + H C H')^-1 H C^2 H'
+
+    @override
+    def if_removed(self, chosen: Indices) -> Array:
+        return -_packed_trace(-self._seen[:, chosen], self._squared[:, chosen], self._n_rows)
+
+    @override
+    def if_swapped(self, candidate: int) -> Array:
+        loss = self.if_removed(np.array([candidate]))[0]
+        half, factor = self._half(candidate, -1.0)
+        seen = self._seen + self._outer(half, half)
+        squared = self._squared_after(half, factor, -1.0)
+        return _packed_trace(seen, squared, self._n_rows) + float(loss)
+
+    @override
+    def tolerance(self) -> float:
+        return _TOLERANCE * float(np.trace(self._inverse))
+
+    def _settle(self, information: Array) -> None:
+        super()._settle(information)
+        reached = (self._flat @ self._inverse).reshape(self._n_rows, self._count, -1)
+        pairs = zip(self._left, self._right, strict=True)
+        self._squared = np.array([np.einsum("ij,ij->i", reached[a], reached[b]) for a, b in pairs])
+
+    def _advance(self, half: Array, factor: Array, sign: float) -> None:
+        self._squared = self._squared_after(half, factor, sign)
+        super()._advance(half, factor, sign)
+
+    def _squared_after(self, half: Array, factor: Array, sign: float) -> Array:
+        """H (C - sign Y Y')^2 H' from H C^2 H'."""
+        twice = self._across(self._inverse @ factor)
+        mixed = np.tensordot(factor.T @ factor, half, axes=1)
+        cross = self._outer(twice, half) + self._outer(half, twice)
+        return np.asarray(self._squared - sign * cross + self._outer(mixed, half))
+
+
+class SpectralTally(Tally):
+    """Any function of eigenvalues, by decomposition; beyond ``SHORTLIST`` candidates, of those that promise most."""
+
+    def __init__(self, candidates: Candidates, criterion: Criterion) -> None:
+        self._candidates, self._criterion = candidates, criterion
+        self._known = candidates.known() + candidates.ridge() * np.eye(candidates.size)
+        self.restart(np.zeros(0, dtype=np.intp))
+
+    @override
+    def restart(self, chosen: Indices) -> None:
+        rows = self._candidates.rows[:, chosen, :].reshape(-1, self._candidates.size)
+        self._settle(self._known + rows.T @ rows)
+
+    @override
+    def add(self, candidate: int) -> None:
+        self._settle(self._information + self._of(np.array([candidate]))[0])
+
+    @override
+    def remove(self, candidate: int) -> None:
+        self._settle(self._information - self._of(np.array([candidate]))[0])
+
+    @override
+    def if_added(self) -> Array:
+        return self._tried(self._information)
+
+    @override
+    def if_removed(self, chosen: Indices) -> Array:
+        return self._values(self._information - self._of(chosen)) - self._value
+
+    @override
+    def if_swapped(self, candidate: int) -> Array:
+        return self._tried(self._information - self._of(np.array([candidate]))[0])
+
+    @override
+    def tolerance(self) -> float:
+        return _TOLERANCE * abs(self._value)
+
+    def _settle(self, information: Array) -> None:
+        self._information = (information + information.T) / 2
+        self._value = float(self._values(self._information))
+
+    def _values(self, information: Array) -> Array:
+        return np.asarray(self._criterion.of(information))
+
+    def _of(self, chosen: Indices) -> Array:
+        rows = self._candidates.rows[:, chosen, :]
+        return np.asarray(np.einsum("rci,rcj->cij", rows, rows, optimize=True))
+
+    def _tried(self, information: Array) -> Array:
+        count = self._candidates.count
+        change = np.full(count, -np.inf)
+        few = np.arange(count)
+        if count > SHORTLIST:  # those that add most along the directions that are least determined
+            values, vectors = np.linalg.eigh(information)
+            weight = np.maximum(values, 1e-12 * values[-1]) ** -2.0
+            scores = self._candidates.scores((vectors * weight) @ vectors.T)
+            few = np.argpartition(-scores, SHORTLIST)[:SHORTLIST].astype(np.intp)
+        change[few] = self._values(information + self._of(few)) - self._value
+        return change
+
+
+def _packed_log_det(packed: Array, n_rows: int) -> Array:
+    """log det(I + S) of packed symmetric matrices; very small where it is not positive definite."""
+    if n_rows == 1:
+        determinant = 1 + packed[0]
+    elif n_rows == 3:
+        a, b, c, d, e, f = packed
+        a, d, f = a + 1, d + 1, f + 1
+        determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    else:
+        signs, logarithms = np.linalg.slogdet(_unpacked(packed, n_rows) + np.eye(n_rows))
+        return np.asarray(np.where(signs > 0, logarithms, np.log(_SMALLEST)))
+    return np.asarray(np.log(np.maximum(determinant, _SMALLEST)))
+
+
+def _packed_trace(seen: Array, squared: Array, n_rows: int) -> Array:
+    """tr (I + S)^-1 Q of packed symmetric matrices."""
+    if n_rows == 1:
+        return np.asarray(squared[0] / np.maximum(1 + seen[0], _SMALLEST))
+    if n_rows == 3:
+        a, b, c, d, e, f = seen
+        a, d, f = a + 1, d + 1, f + 1
+        adjugate = (d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b)
+        determinant = a * adjugate[0] + b * adjugate[1] + c * adjugate[2]
+        weights = (1.0, 2.0, 2.0, 1.0, 2.0, 1.0)
+        total = sum(w * x * q for w, x, q in zip(weights, adjugate, squared, strict=True))
+        return np.asarray(total / np.maximum(determinant, _SMALLEST))
+    whole = _unpacked(seen, n_rows) + np.eye(n_rows)
+    return np.asarray(np.trace(np.linalg.solve(whole, _unpacked(squared, n_rows)), axis1=1, axis2=2))
+
+
+def _unpacked(packed: Array, n_rows: int) -> Array:
+    left, right = np.triu_indices(n_rows)
+    whole = np.empty((packed.shape[1], n_rows, n_rows))
+    whole[:, left, right] = packed.T
+    whole[:, right, left] = packed.T
+    return whole
+
+
+def refine(
+    poses: Array, limits: Array, known: Array, by: Criterion, rows: Rows, allowed: Allowed, sweeps: int
+) -> Array:
+    """Poses moved coordinate by coordinate while that helps, with steps that shrink sweep by sweep.
+
+    Args:
+        poses: the plan (joints x N; rad or m).
+        limits: of each joint (joints x 2).
+        known: information before the plan, by coordinates in typical scales (n x n).
+        by: what is to grow.
+        rows: Jacobians of poses.
+        allowed: clearance.
+        sweeps: how often each pose is tried.
+
+    Returns:
+        the poses (joints x N), within limits and allowed where they were moved.
+    """
+    poses = np.array(poses)
+    held = rows(poses)
+    information = known + np.einsum("rni,rnj->ij", held, held, optimize=True)
+    step = _FIRST_STEP * (limits[:, 1] - limits[:, 0])
+    for _ in range(sweeps):
+        for index in range(poses.shape[1]):
+            # One joint moved by a step either way, or to one of its limits (joints x trials).
+            pose = poses[:, index, None]
+            moves = [np.diag(step), -np.diag(step), *(np.diag(limits[:, end] - poses[:, index]) for end in (0, 1))]
+            trials = np.clip(pose + np.concatenate(moves, axis=1), limits[:, :1], limits[:, 1:])
+            trials = trials[:, np.any(trials != pose, axis=0)]
+            trials = trials[:, allowed(trials)]
+            if not trials.shape[1]:
+                continue
+            tried = rows(trials)
+            without = information - _square(held[:, index])
+            values = by.of(without + np.einsum("rni,rnj->nij", tried, tried))
+            now = float(by.of(information))
+            best = int(np.argmax(values))
+            if values[best] > now + _GAIN * abs(now):
+                poses[:, index], held[:, index] = trials[:, best], tried[:, best]
+                information = without + _square(tried[:, best])
+        step = step * _SHRINK
+    return np.asarray(poses)
+
+
+def _square(rows: Array) -> Array:
+    return np.asarray(rows.T @ rows)
