@@ -10,7 +10,7 @@ from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.config.system import System
-from armcal.problem.grouped_kernel import BLOCK_RECORDS
+from armcal.problem.kernel import BLOCK_RECORDS
 from armcal.problem.problem import Problem
 
 from benchmarks import lrm, lrm_numpy, rigid_arm

@@ -17,7 +17,7 @@ import yaml
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.estimate.estimator import Estimate, estimate
-from armcal.estimate.nuisance import started
+from armcal.estimate.polish import started
 from armcal.problem.problem import Problem
 from armcal.problem.readings import with_joint_noise
 from armcal.run.experiment import Experiment

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 from armcal.arm.assembly import Arm, prefixed
-from armcal.arm.environment import Environment
+from armcal.arm.statics import Environment
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.measure.groups import group_blocks, groups_of
 from armcal.problem.problem import Problem
-from armcal_contact.ball import BallInSocket
+from armcal_contact.contacts import BallInSocket
 from armcal_mdh.model import MdhModel
 from chain_oracle import ChainSpec, Row, elementary
 

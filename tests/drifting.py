@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from armcal.estimate.weighing import fit
+from armcal.estimate.robust import fit
 from armcal.problem.drift import with_drift
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from armcal.arm.assembly import Arm, prefixed
 from armcal.arm.effects import JointEffect
-from armcal.arm.environment import Environment
+from armcal.arm.statics import Environment
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters, scalar
 from armcal.problem.problem import Problem

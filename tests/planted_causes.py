@@ -10,8 +10,8 @@ import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.diagnose.residual_structure import ResidualStructure, structure
 from armcal.estimate.estimator import Estimate
+from armcal.estimate.robust import fit
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
-from armcal.estimate.weighing import fit
 from armcal.problem.motion import Motion, recorded_position
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment

@@ -16,9 +16,9 @@ from armcal.base.dataset import Dataset
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.estimate.estimator import estimate
-from armcal.estimate.nuisance import started
+from armcal.estimate.identifiability import require_solvable
+from armcal.estimate.polish import started
 from armcal.estimate.simulation import SimulationRequest
-from armcal.estimate.structure import require_solvable
 from armcal.problem.problem import Problem
 from armcal.problem.readings import with_joint_noise
 from armcal.run.experiment import Experiment

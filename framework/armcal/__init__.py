@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from armcal.errors import NotConvergedError as NotConvergedError
     from armcal.estimate.estimator import Estimate as Estimate
     from armcal.hooks import hookimpl as hookimpl
-    from armcal.measure.contact import Contact as Contact
+    from armcal.measure.instrument import Contact as Contact
     from armcal.measure.instrument import Instrument as Instrument
     from armcal.measure.instrument import InstrumentSettings as InstrumentSettings
     from armcal.measure.measurement import Channel as Channel
@@ -84,8 +84,7 @@ _FOR_PLUGINS = {
     "armcal.base.domains": "Interval",
     "armcal.base.parameters": "scalar",
     "armcal.base.settings": "Angle Compliance Force Length Length3 Mass Temperature Torque",
-    "armcal.measure.contact": "Contact",
-    "armcal.measure.instrument": "Instrument InstrumentSettings",
+    "armcal.measure.instrument": "Contact Instrument InstrumentSettings",
     "armcal.measure.measurement": "Channel",
     "armcal.plugins": "use_plugins",
     "armcal.report.sections": "ReportSection",

@@ -214,7 +214,7 @@ COMPONENTS: Mapping[str, ComponentKind] = MappingProxyType(
                 f"{_MEASURE}:DimensionedResidual",
                 f"{_MEASURE}:GroupedMeasurement",
                 f"{_MEASURE}:NamesGroups",
-                "armcal.measure.partners:PairedMeasurement",
+                "armcal.measure.groups:PairedMeasurement",
             ),
         ),
         "reader": ComponentKind("armcal_register_readers", "Reader(settings)", "armcal.measure.reader:Reader"),

@@ -1,26 +1,167 @@
 """The section ``bench`` of a configuration, and what it names, built: clock, device, tracker."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, Self
+from typing import Annotated, Any, Literal, Protocol, Self
 
+import numpy as np
 from armcal.arm.assembly import Arm, only_arm
+from armcal.base.arrays import Array
+from armcal.base.poses import PoseSettings
 from armcal.base.settings import InputPath, Settings
 from armcal.config.system import build_component
 from armcal.config.validate import validate
 from armcal.devices.clock import Clock, RealClock, SimulatedClock
 from armcal.devices.device import JointDevice
-from armcal.devices.live import JointStream, LiveCamera, Tracker
+from armcal.devices.live import JointStream, LiveCamera, Tracker, TrackerFrame
 from armcal.devices.simulated import SimulatedBench
 from armcal.errors import ConfigError
+from armcal.measure.rests import far_off, mean_rotation
 from armcal.plugins import refuse
 from armcal.run.experiment import Experiment
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from armcal_bench.acquisition.settings import AcquisitionSettings
-from armcal_bench.bodies import BodySettings
 from armcal_bench.recording.window import RecordingSettings
+
+_LEAST_OUTLIER_M = 2e-4
+_NAMES_SHOWN = 8
+
+
+NONE = "none"
+"""In the place of the base body's name: the tracker's world itself stands still with the arm's base."""
+
+Name = Annotated[str, Field(min_length=1, max_length=100)]
+
+
+class BodySettings(Settings):
+    """The bodies by the tracker's own names, and what is known about where they sit.
+
+    Attributes:
+        tool: the body on the tool.
+        base: the body that stands still with the arm's base; ``none`` where the tracker's world does.
+        base_motion: ``moving``: each frame is taken in the base body's own pose of that frame. ``still``: the base body's
+            poses of all frames of a capture are averaged first.
+        base_T_reference: where the base body (or the tracker's world, without one) is in the arm's base frame.
+        tool_body_T_target: where the measured target is on the tool body.
+    """  # noqa: E501
+
+    tool: Name = "tool"
+    base: Name = NONE
+    base_motion: Literal["moving", "still"] = "moving"
+    base_T_reference: PoseSettings = Field(default_factory=PoseSettings)
+    tool_body_T_target: PoseSettings = Field(default_factory=PoseSettings)
+
+    @model_validator(mode="after")
+    def _two_bodies(self) -> Self:
+        if self.tool == self.base:
+            raise ValueError(
+                f"found {self.tool!r} for both tool and base, expected two bodies (base: none for no base)"
+            )
+        return self
+
+    @property
+    def has_base(self) -> bool:
+        return self.base != NONE
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Some frames, in the arm's base frame.
+
+    Attributes:
+        poses: ``base_T_target`` (N x 4 x 4, m), NaN where a frame does not show it; the rotation alone is NaN where
+            the tracker gives only positions.
+        faults: why a frame does not show it, a sentence; empty where it does (N).
+    """
+
+    poses: Array
+    faults: tuple[str, ...]
+
+
+def in_base(frames: Sequence[TrackerFrame], settings: BodySettings) -> Capture:
+    """The target's pose in each frame: base_T_reference reference_T_world world_T_body body_T_target.
+
+    The reference is the base body, in each frame or on the average of these frames, or the tracker's world.
+    """
+    tool = _stacked(frames, settings.tool)
+    faults = [tool_fault(frame, settings) for frame in frames]
+    reference = _reference(frames, settings)
+    for i in np.flatnonzero(np.isnan(reference).any(axis=(1, 2))).tolist():
+        faults[i] = faults[i] or base_fault(frames[i], settings)
+    base_T_reference, body_T_target = settings.base_T_reference.matrix, settings.tool_body_T_target.matrix
+    seen_at = tool[:, :3, 3]
+    if body_T_target[:3, 3].any():  # a target at the body's origin needs no rotation
+        seen_at = seen_at + tool[:, :3, :3] @ body_T_target[:3, 3]
+    back = np.swapaxes(reference[:, :3, :3], 1, 2)
+    from_reference = np.einsum("nij,nj->ni", back, seen_at - reference[:, :3, 3])
+    poses = np.full((len(frames), 4, 4), np.nan)
+    poses[:, 3] = [0.0, 0.0, 0.0, 1.0]
+    poses[:, :3, 3] = from_reference @ base_T_reference[:3, :3].T + base_T_reference[:3, 3]
+    poses[:, :3, :3] = base_T_reference[:3, :3] @ back @ tool[:, :3, :3] @ body_T_target[:3, :3]
+    poses[[bool(fault) for fault in faults], :3] = np.nan
+    return Capture(poses, tuple(faults))
+
+
+def tool_fault(frame: TrackerFrame, settings: BodySettings) -> str:
+    """Why a frame does not show where the target is in the tracker's world; empty if it does."""
+    pose = frame.bodies.get(settings.tool)
+    if pose is None:
+        return _unseen(frame, settings.tool, "tool")
+    if np.isnan(pose[0, 0]) and any(settings.tool_body_T_target.position):
+        return f"the tool body {settings.tool!r} has no orientation, and the target is not at its origin"
+    return ""
+
+
+def base_fault(frame: TrackerFrame, settings: BodySettings) -> str:
+    """Why a frame does not show where the base is; empty if it does, or nobody asks."""
+    if not settings.has_base:
+        return ""
+    pose = frame.bodies.get(settings.base)
+    if pose is None:
+        return _unseen(frame, settings.base, "base")
+    return f"the base body {settings.base!r} has no orientation" if np.isnan(pose[0, 0]) else ""
+
+
+def repeats(frame: TrackerFrame, before: TrackerFrame | None, settings: BodySettings) -> bool:
+    """Whether a frame shows just what the one before showed, to the last digit: no live tracker does."""
+    if before is None:
+        return False
+    if frame.counter == before.counter:
+        return True
+    names = (settings.tool, settings.base) if settings.has_base else (settings.tool,)
+    pairs = [(frame.bodies.get(name), before.bodies.get(name)) for name in names]
+    seen = [(a, b) for a, b in pairs if a is not None and b is not None]
+    return len(seen) == len(pairs) and all(a.tobytes() == b.tobytes() for a, b in seen)
+
+
+def _unseen(frame: TrackerFrame, name: str, role: str) -> str:
+    others = [other for other, pose in frame.bodies.items() if pose is not None][:_NAMES_SHOWN]
+    seen = f"it sees {', '.join(others)}" if others else "it sees none"
+    return f"the tracker does not see the {role} body {name!r} ({seen})"
+
+
+def _stacked(frames: Sequence[TrackerFrame], name: str) -> Array:
+    """``world_T_body`` of each frame, NaN where it is not seen (N x 4 x 4)."""
+    nothing = np.full((4, 4), np.nan)
+    poses = [frame.bodies.get(name) for frame in frames]
+    return np.array([nothing if pose is None else pose for pose in poses]).reshape(-1, 4, 4)
+
+
+def _reference(frames: Sequence[TrackerFrame], settings: BodySettings) -> Array:
+    """``world_T_reference`` of each frame (N x 4 x 4)."""
+    if not settings.has_base:
+        return np.tile(np.eye(4), (len(frames), 1, 1))
+    stacked = _stacked(frames, settings.base)
+    seen = stacked[~np.isnan(stacked).any(axis=(1, 2))]
+    if settings.base_motion == "moving" or not len(seen):
+        return stacked
+    kept = seen[~far_off(seen[:, None, :3, 3], _LEAST_OUTLIER_M)]
+    mean = np.eye(4)
+    mean[:3, :3], mean[:3, 3] = mean_rotation(kept[:, :3, :3]), kept[:, :3, 3].mean(axis=0)
+    return np.tile(mean, (len(frames), 1, 1))
+
 
 SECTION = "bench"
 

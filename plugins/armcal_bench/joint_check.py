@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from armcal.arm.horn import TOOTH_DEG, teeth_text
+from armcal.arm.servo import TOOTH_DEG, teeth_text
 from armcal.base.arrays import Array
 from armcal.devices.device import MeasuringDevice, measured_angles, open_device
 from armcal.devices.wiring import WiringRecord

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.devices.live import TrackerFrame
-from armcal.measure.stillness import deviations_of_mean, judged, mean_pose, turns_from
+from armcal.measure.rests import deviations_of_mean, judged, mean_pose, turns_from
 from scipy.spatial.transform import Rotation
 
 from armcal_bench.acquisition.settings import SettleSettings
-from armcal_bench.bodies import BodySettings, in_base, repeats
+from armcal_bench.bench import BodySettings, in_base, repeats
 
 FROZEN = "the tracker is frozen: it gives the same frame again"
 _MOST_FRAMES = 20_000

@@ -16,8 +16,7 @@ from armcal.errors import InputError
 from armcal.io.file_set import write_new, write_over
 from pydantic import ValidationError
 
-from armcal_camera.board import Aprilgrid, Board, BoardFile, Charuco, Chessboard, Tag
-from armcal_camera.pattern import dark_rectangles, outline
+from armcal_camera.board import Aprilgrid, Board, BoardFile, Charuco, Chessboard, Tag, dark_rectangles, outline
 
 PAPERS = MappingProxyType(
     {

@@ -1,33 +1,160 @@
-"""Records from images: a folder of them, and a file that says where the arm stood for each."""
+"""Records from images: a folder of them, and a file that says where the arm stood for each.
+
+Corners as CSV in long form, for those who detect them with other programs: ``image,board,point,u_px,v_px``.
+
+``board`` counts from 0, and may be left out where there is one; ``point`` counts each board's points from 0. The
+centre of an image's first pixel is at 0, 0.
+"""
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
+import json
+import math
+import os
 import re
+import tempfile
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 from armcal.base.arrays import Array
+from armcal.base.config_text import as_json
 from armcal.base.dataset import Dataset
 from armcal.base.settings import Angle, InputPath, Settings
 from armcal.base.units import from_unit
 from armcal.errors import DataError, Location
+from armcal.functions.compiler import cache_directory
+from armcal.io.cells import CellFault, read_cell
 from armcal.io.file_set import write_over
 from armcal.io.parallel import Automatic, Report
-from armcal.io.plain_files import input_bytes, refuse
+from armcal.io.plain_files import input_bytes, refuse, text_of
 from armcal.measure.reader import ReadRequest
 from pydantic import Field, model_validator
 
 from armcal_camera.board import Board
-from armcal_camera.corners_csv import corners_text, read_corners
-from armcal_camera.detection import Detection, detect
-from armcal_camera.detection_cache import detection_key, forget_old, keep_detection, kept_detection
-from armcal_camera.images import MOST_BYTES, grey_image, is_image
+from armcal_camera.detection import VERSION, Detection, detect
+from armcal_camera.images import MOST_BYTES, grey_image, is_image, opencv
 from armcal_camera.pose_table import read_poses
+
+COLUMNS = ("image", "board", "point", "u_px", "v_px")
+_MAX_BYTES = 512 * 1024**2
+_LAYOUT = f"Give a header {','.join(COLUMNS)} and a line a corner."
+
+
+def read_corners(path: Path, boards: Sequence[Board]) -> tuple[dict[str, Array], bytes]:
+    """The corners of each image (K x 2 over all boards, px), in the order in which images appear; and the file.
+
+    Raises:
+        DataError: with line and column.
+    """
+    content = input_bytes(path, _MAX_BYTES, "a CSV file of corners")
+    rows = csv.reader(io.StringIO(text_of(content, path, "Save it as CSV text in UTF-8.")))
+    header = [cell.strip() for cell in next(rows, [])]
+    missing = [name for name in COLUMNS if name not in header and (name != "board" or len(boards) > 1)]
+    if missing:
+        text = f"found the columns {', '.join(header) or 'none'}, expected {', '.join(missing)} as well."
+        refuse(path, text, _LAYOUT, 1)
+    at = {name: header.index(name) for name in COLUMNS if name in header}
+    starts = np.cumsum([0, *(len(board.points) for board in boards)])
+    corners: dict[str, Array] = {}
+    for cells in rows:
+        if not any(cell.strip() for cell in cells):
+            continue
+        line = rows.line_num
+        if len(cells) != len(header):
+            refuse(path, f"found {len(cells)} cells, expected {len(header)} as in the header.", _LAYOUT, line)
+        board = _count(path, line, "board", cells[at["board"]], len(boards)) if "board" in at else 0
+        point = _count(path, line, "point", cells[at["point"]], len(boards[board].points))
+        own = corners.setdefault(cells[at["image"]].strip(), np.full((starts[-1], 2), np.nan))
+        place = own[starts[board] + point]
+        if not np.isnan(place).all():
+            refuse(path, f"found the point {point} of this image again.", "Remove one of the lines.", line, "point")
+        place[:] = [_pixel(path, line, name, cells[at[name]]) for name in ("u_px", "v_px")]
+    if not corners:
+        refuse(path, "found a header and no corners.", _LAYOUT)
+    return corners, content
+
+
+def corners_text(corners: Mapping[str, Array], boards: Sequence[Board]) -> str:
+    """The file that says the same; corners that were not seen are left out."""
+    places = [(number, point) for number, board in enumerate(boards) for point in range(len(board.points))]
+    lines = [",".join(COLUMNS)]
+    for image, pixels in corners.items():
+        shown = f'"{image}"' if "," in image else image
+        lines += [
+            f"{shown},{board},{point},{u:.5f},{v:.5f}"
+            for (board, point), (u, v) in zip(places, pixels, strict=True)
+            if math.isfinite(u) and math.isfinite(v)
+        ]
+    return "\n".join([*lines, ""])
+
+
+def _count(path: Path, line: int, column: str, cell: str, number: int) -> int:
+    text = cell.strip()
+    if not (text.isascii() and text.isdecimal() and int(text) < number):
+        message = f"found {text[:40]!r}, expected a whole number from 0 to {number - 1}."
+        refuse(path, message, "Check which board of the measurement it is, and count from 0.", line, column)
+    return int(text)
+
+
+def _pixel(path: Path, line: int, column: str, cell: str) -> float:
+    value = read_cell(cell)
+    if isinstance(value, CellFault):
+        refuse(path, value.text, value.hint, line, column)
+    if math.isinf(value):
+        refuse(path, "found an infinite number, expected pixels.", "Leave the line out.", line, column)
+    return value
+
+
+_KEPT = 20_000
+
+
+def detection_key(content: bytes, board: Board) -> str:
+    rest = json.dumps([board.to_config(), VERSION, opencv().__version__])
+    return hashlib.sha256(content + rest.encode()).hexdigest()[:40]
+
+
+def kept_detection(key: str, board: Board) -> Detection | None:
+    """A detection that was kept; None if there is none that is whole."""
+    path = _place(key)
+    with suppress(OSError, ValueError, TypeError, KeyError):
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        corners = np.array(stored.pop("corners"), dtype=float).reshape(-1, 2)
+        size = stored.pop("found_size")
+        numbers: dict[str, Any] = {name: np.nan if value is None else value for name, value in stored.items()}
+        if corners.shape == (len(board.points), 2):
+            os.utime(path)
+            return Detection(corners, found_size=None if size is None else tuple(size), **numbers)
+    return None
+
+
+def keep_detection(key: str, detection: Detection) -> None:
+    """Keep it, whole or not at all; a disk that is full or read-only costs nothing but time."""
+    path = _place(key)
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".tmp", delete=False, encoding="utf-8") as file:
+            file.write(as_json({**asdict(detection), "corners": detection.corners.tolist()}, indent=None))
+        Path(file.name).replace(path)
+
+
+def forget_old() -> None:
+    with suppress(OSError):
+        files = sorted(_place("").parent.glob("*"), key=lambda path: path.stat().st_mtime, reverse=True)
+        for path in files[_KEPT:]:
+            path.unlink()
+
+
+def _place(key: str) -> Path:
+    return cache_directory() / "corners" / f"{key}.json"
+
 
 _FEWEST = 3
 _BLURRED = 3.0

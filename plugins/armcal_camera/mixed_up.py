@@ -11,8 +11,7 @@ from armcal.base.arrays import Array, Indices, Mask
 from armcal.errors import ProblemError
 from scipy.spatial.transform import Rotation
 
-from armcal_camera.hand_eye import hand_eye
-from armcal_camera.views import homography
+from armcal_camera.hand_eye import hand_eye, homography
 
 _BENT, _STRAIGHT = 0.05, 0.01
 """Of the size of a board's image: corners of another board, and of this one through an ordinary lens."""

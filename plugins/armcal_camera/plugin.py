@@ -15,7 +15,7 @@ def armcal_register_commands(register: Register) -> None:
 
 @hookimpl
 def armcal_register_models(register: Register) -> None:
-    register("flange_pose", "armcal_camera.flange_pose:FlangePose", "an arm of which only flange poses are recorded")
+    register("flange_pose", "armcal_camera.pose_table:FlangePose", "an arm of which only flange poses are recorded")
 
 
 @hookimpl

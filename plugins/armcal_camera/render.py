@@ -11,10 +11,9 @@ from armcal.errors import ConfigError
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from armcal_camera.board import Board
+from armcal_camera.board import Board, dark_rectangles, outline
 from armcal_camera.images import Grey, opencv
 from armcal_camera.intrinsics import DISTORTION
-from armcal_camera.pattern import dark_rectangles, outline
 
 _SAMPLES = 4  # along each side of a pixel
 _COARSE_PX = 4

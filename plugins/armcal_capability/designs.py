@@ -17,8 +17,8 @@ from armcal.calibration.tool_expression import ToolExpression, arm_expression
 from armcal.config.selection import with_values
 from armcal.config.system import System, build_system
 from armcal.config.validate import validate
+from armcal.config.yaml_nodes import entries_of, override, set_at, steps_of
 from armcal.config.yaml_source import ConfigSource, Reader, as_source, load_config, root_of
-from armcal.config.yaml_tree import entries_of, override, set_at, steps_of
 from armcal.errors import ConfigError, Location
 from armcal.plugins import PluginRegistry
 from armcal.run.plan_clearance import clearance_check

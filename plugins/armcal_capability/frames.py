@@ -8,11 +8,9 @@ from armcal.base.arrays import Array
 from armcal.base.quaternions import nearest_turn, rotation_matrix
 from armcal.diagnose.readings import check_reach
 from armcal.errors import DataError, Location, NotConvergedError
-from armcal.estimate.placing import placings
-from armcal.estimate.start import BETTER, FAR, pose_words
+from armcal.estimate.start import BETTER, FAR, placings, pose_words
 from armcal.problem.problem import Problem
-from armcal.problem.rigid_alignment import FEWEST, Tools, alignments, undetermined
-from armcal.problem.sighting import Sighting, sighting_of, tools_of
+from armcal.problem.rigid_alignment import FEWEST, Sighting, Tools, alignments, sighting_of, tools_of, undetermined
 from armcal.report.numbers import plural
 from scipy.spatial.transform import Rotation
 

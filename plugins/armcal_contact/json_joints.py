@@ -1,10 +1,22 @@
-"""The joint stream ``json_lines``: a JSON object a line, in datagrams, a pipe or a file that grows."""
+"""The joint stream ``json_lines``: a JSON object a line, in datagrams, a pipe or a file that grows.
 
-from collections.abc import Mapping
+One JSON object as joint readings.
+
+Three forms are read. Names: ``{"j1_deg": 12.5, "j2_deg": ..., "time_s": 3.2, "socket": "hole_0"}``. Names and positions
+in two lists, as ROS has them: ``{"name": ["j1", ...], "position": [0.2, ...]}`` (rad; m of sliding joints), with the
+time under ``header``. And one list of all joints in order: ``{"q": [0.2, ...]}``. Other texts are labels; other numbers
+mean nothing.
+"""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
+from armcal.arm.joints import unknown_joint
 from armcal.base.settings import Settings
-from armcal.base.units import split_suffix
+from armcal.base.units import from_unit, split_suffix, units_of
 from armcal.devices.clock import Clock
 from armcal.devices.line_source import Begin, LineJointStream, SourceName, open_lines
 from armcal.devices.live import JointSample
@@ -12,7 +24,176 @@ from armcal.errors import ConfigError
 from pydantic import Field, field_validator
 from typing_extensions import override
 
-from armcal_contact.json_joint_message import JointMessages, RefusedLine
+_DIGITS = "0123456789"
+_MOST_LABELS = 50
+_LONGEST_LABEL = 200
+_UNITS = tuple(unit.name for dimension in ("angle", "length") for unit in units_of(dimension))
+
+
+class RefusedLine(ValueError):  # noqa: N818 (it is no error of a program's)
+    """A line that is passed over; its text gives the reason, in few ways, so that reasons can be counted."""
+
+
+@dataclass(frozen=True)
+class JointMessage:
+    """A line as it was read: the source's own time (s), angles by channel (rad or m), texts."""
+
+    stamp: float | None
+    angles: Mapping[str, float]
+    labels: Mapping[str, str]
+
+
+class JointMessages:
+    """Reads lines for some channels.
+
+    Args:
+        channels: ``arm.j1`` and so on, in order.
+        names: the source's own names, by channel or joint.
+        values: the key of a list of all joints in order; None where they have names.
+        unit: of numbers whose names have none.
+        time: the key of the time, with its unit.
+
+    Raises:
+        ValueError: a name is of no joint, or of several.
+    """
+
+    def __init__(
+        self, channels: Sequence[str], names: Mapping[str, str], values: str | None, unit: str | None, time: str
+    ) -> None:
+        self._channels, self._values, self._unit, self._time = tuple(channels), values, unit, time
+        split = split_suffix(time, "time")
+        self._time_unit = split[1].name if split else "s"
+        joints = [channel.partition(".")[2] for channel in channels]
+        short = {j: c for j, c in zip(joints, channels, strict=True) if joints.count(j) == 1}
+        own: dict[str, str] = {}
+        for joint, name in names.items():
+            channel = joint if joint in self._channels else short.get(joint)
+            if channel is None:
+                raise ValueError(unknown_joint([joint], short or channels))
+            if channel in own:
+                raise ValueError(f"{channel} is named twice")
+            own[channel] = name
+        doubled = [name for name in own.values() if list(own.values()).count(name) > 1]
+        if doubled:
+            raise ValueError(f"two joints are called {doubled[0]!r}")
+        back = {channel: joint for joint, channel in short.items()}
+        self._names = {c: (own[c],) if c in own else tuple(n for n in (c, back.get(c)) if n) for c in channels}
+        self._numbered = {name.rstrip(_DIGITS) for own in self._names.values() for name in own} - {""}
+        self._plans: dict[tuple[str, ...], dict[str, tuple[str, str]]] = {}
+
+    def read(self, line: bytes | None) -> JointMessage:
+        """One line; None for one that was too long.
+
+        Raises:
+            RefusedLine: it holds no reading of the joints.
+        """
+        if line is None:
+            raise RefusedLine("it is too long")
+        try:
+            content = json.loads(line)
+        except (ValueError, RecursionError) as fault:
+            raise RefusedLine("it is not JSON") from fault
+        if not isinstance(content, dict):
+            raise RefusedLine("it is no JSON object")
+        if self._values is not None:
+            listed = content.get(self._values)
+            if not isinstance(listed, list):
+                raise RefusedLine(f"it has no list {self._values}")
+            if len(listed) != len(self._channels):
+                raise RefusedLine(f"it has {len(listed)} joints, expected {len(self._channels)}")
+            pairs, unit = zip(self._channels, listed, strict=True), self._unit or "rad"
+            angles, used = {c: from_unit(_number(value, c), unit) for c, value in pairs}, {self._values}
+        elif isinstance(content.get("name"), list) and "position" in content:
+            angles, used = self._named(content["name"], content["position"]), {"name"}
+        else:
+            angles, used = self._flat(content)
+        texts = [(key, value.strip()) for key, value in content.items() if isinstance(value, str) and key not in used]
+        fit = [(key, value) for key, value in texts if value and len(value) <= _LONGEST_LABEL]
+        labels = {_clean(key): _clean(value) for key, value in fit[:_MOST_LABELS]}
+        return JointMessage(self._stamp(content), angles, labels)
+
+    def _named(self, names: list[Any], positions: Any) -> dict[str, float]:
+        if not isinstance(positions, list) or len(positions) != len(names):
+            raise RefusedLine("it has not as many positions as names")
+        given = {str(name): position for name, position in zip(names, positions, strict=True)}
+        angles = {}
+        for channel, own in self._names.items():
+            name = next((n for n in own if n in given), None)
+            if name is None:
+                raise RefusedLine(f"it has {len(names)} joints and none called {own[-1]}, expected {len(self._names)}")
+            angles[channel] = from_unit(_number(given[name], channel), self._unit or "rad")
+        return angles
+
+    def _flat(self, content: Mapping[str, Any]) -> tuple[dict[str, float], set[str]]:
+        keys = tuple(content)
+        plan = self._plans.get(keys)
+        if plan is None:
+            plan = self._planned(keys)
+            if len(self._plans) > 16:
+                self._plans.clear()
+            self._plans[keys] = plan
+        angles = {c: from_unit(_number(content[key], c), unit) for c, (key, unit) in plan.items()}
+        return angles, {key for key, _ in plan.values()}
+
+    def _planned(self, keys: Sequence[str]) -> dict[str, tuple[str, str]]:
+        """The key of each channel and its unit."""
+        plan: dict[str, tuple[str, str]] = {}
+        for channel, own in self._names.items():
+            spelt = [(key, unit) for name in own for key, unit in self._spelt(name) if key in keys]
+            if len(spelt) > 1:
+                raise RefusedLine(f"it has both {spelt[0][0]} and {spelt[1][0]}")
+            if spelt and not spelt[0][1]:
+                raise RefusedLine(f"{spelt[0][0]} has no unit: call it {spelt[0][0]}_rad, or give unit: rad")
+            if spelt:
+                plan[channel] = spelt[0]
+        lacking = [own[-1] for channel, own in self._names.items() if channel not in plan]
+        used = {key for key, _ in plan.values()}
+        beyond = [key for key in keys if key not in used and self._is_joint(key)]
+        if lacking or beyond:
+            which = f"no {lacking[0]}" if lacking else f"{beyond[0]}, which is none of the arm's"
+            count = len(plan) + len(beyond)
+            raise RefusedLine(f"it has {count} joints, expected {len(self._names)}: found {which}")
+        return plan
+
+    def _spelt(self, name: str) -> list[tuple[str, str]]:
+        split = split_suffix(name)
+        whole = split[1].name if split and split[1].name in _UNITS else self._unit or ""
+        return [(name, whole), *[(f"{name}_{unit}", unit) for unit in _UNITS]]
+
+    def _is_joint(self, key: str) -> bool:
+        split = split_suffix(key)
+        stem = split[0] if split and split[1].name in _UNITS else key if self._unit else ""
+        return stem[-1:].isdigit() and stem.rstrip(_DIGITS) in self._numbered
+
+    def _stamp(self, content: Mapping[str, Any]) -> float | None:
+        if self._time in content:
+            return from_unit(_number(content[self._time], self._time), self._time_unit)
+        header = content.get("header")
+        stamp = header.get("stamp") if isinstance(header, dict) else None
+        if not isinstance(stamp, dict):
+            return None
+        seconds, nanoseconds = (next((stamp[k] for k in keys if k in stamp), 0) for keys in _STAMP)
+        return _number(seconds, "its time") + 1e-9 * _number(nanoseconds, "its time")
+
+
+_STAMP = (("sec", "secs"), ("nanosec", "nsecs"))
+
+
+def _number(value: Any, name: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise RefusedLine(f"{name} is no number")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise RefusedLine(f"{name} is not finite")
+    return number
+
+
+def _clean(text: str) -> str:
+    """Text that can be written as UTF-8: JSON may hold half a surrogate pair."""
+    return text.encode("utf-8", "replace").decode("utf-8")
 
 
 class JsonLinesJointSettings(Settings):

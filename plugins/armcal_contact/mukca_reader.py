@@ -22,7 +22,7 @@ from armcal.io.cells import is_missing, is_number
 from armcal.io.cut_file import may_be_cut, whole_rows
 from armcal.io.plain_files import input_bytes, refuse, text_of
 from armcal.measure.checks import check_dataset, layout_of
-from armcal.measure.contact import named_arm
+from armcal.measure.instrument import named_arm
 from armcal.measure.measurement import GroupedMeasurement, noise_channels
 from armcal.measure.missing import with_absent
 from armcal.measure.reader import ReadRequest, RequestedChannel

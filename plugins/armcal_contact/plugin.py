@@ -5,10 +5,10 @@ from armcal.hooks import Register, hookimpl
 
 @hookimpl
 def armcal_register_measurements(register: Register) -> None:
-    register("ball_in_socket", "armcal_contact.ball:BallInSocket", "a ball on the tool, seated in sockets")
-    register("clamped_tool", "armcal_contact.clamp:ClampedTool", "the tool clamped at points that do not move")
-    register("plane_contact", "armcal_contact.plane:PlaneContact", "a tip that touches planes")
-    register("tip_distance", "armcal_contact.distance:TipDistance", "the distance between the tips of two records")
+    register("ball_in_socket", "armcal_contact.contacts:BallInSocket", "a ball on the tool, seated in sockets")
+    register("clamped_tool", "armcal_contact.contacts:ClampedTool", "the tool clamped at points that do not move")
+    register("plane_contact", "armcal_contact.contacts:PlaneContact", "a tip that touches planes")
+    register("tip_distance", "armcal_contact.contacts:TipDistance", "the distance between the tips of two records")
 
 
 @hookimpl

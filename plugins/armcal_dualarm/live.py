@@ -15,8 +15,16 @@ from armcal.errors import ConfigError, DataError
 from armcal.measure.rests import LiveRests, Rows
 from typing_extensions import override
 
-from armcal_dualarm.log_columns import LogColumns
-from armcal_dualarm.log_table import Column, cells_of, delimiter_of, is_header, number_of, place_of, text_of
+from armcal_dualarm.log_reader import (
+    Column,
+    LogColumns,
+    cells_of,
+    delimiter_of,
+    is_header,
+    number_of,
+    place_of,
+    text_of,
+)
 
 
 class TwoArmStreamSettings(LogColumns):

@@ -6,9 +6,8 @@ import casadi as ca
 import numpy as np
 from armcal.arm.assembly import scoped
 from armcal.arm.effects import MOUNT, JointCommand, Spring
-from armcal.arm.environment import STATICS, tilted
 from armcal.arm.model import Chain, forward
-from armcal.arm.statics import MOUNT_FRAME, TOOL_FRAME, Load, frame_names
+from armcal.arm.statics import MOUNT_FRAME, STATICS, TOOL_FRAME, Load, frame_names, tilted
 from armcal.base.arrays import Array
 from armcal.calibration.exporter import ExportRequest, random_commands, rigid_tools
 from armcal.calibration.rigid_chain import RigidJoint, rigid_chain

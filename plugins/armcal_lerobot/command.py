@@ -10,8 +10,7 @@ import click
 from armcal.cli.common import FILE, Console, command_line, speaking
 from armcal.errors import InputError
 
-from armcal_lerobot.calibration_file import read_motors
-from armcal_lerobot.motors import Units
+from armcal_lerobot.motor_file import Units, read_motors
 
 _JOINT_HELP = "Which joint a motor turns, where names differ; =-JOINT where it turns the other way."
 
@@ -49,7 +48,7 @@ def check(console: Console, calibration: Path, other: Path | None, folder: Path 
 
     With OTHER (yesterday's file and today's) also how far the same command moves each joint, and the gripper.
     """
-    from armcal_lerobot.check import check_content, show_check
+    from armcal_lerobot.comparison import check_content, show_check
 
     if folder is not None and given["config"] is None:
         raise InputError("found --data without --arm.", hint="Give --arm CONFIG: poses matter for mm at its gripper.")
@@ -72,7 +71,7 @@ def joints(console: Console, calibration: Path, model: str, **given: Any) -> Non
 
     The joints of a servo bus, limits of a plan, zeros and priors of a servo map.
     """
-    from armcal_lerobot.check import sections
+    from armcal_lerobot.comparison import sections
 
     file = read_motors(calibration)
     gripper = _gripper(console, list(file.motors), **given)
@@ -97,7 +96,7 @@ def zeros(console: Console, calibrated: Path, calibration: Path, arm_name: str |
     """
     from armcal.calibration.joint_zeros import zeros_of
 
-    from armcal_lerobot.check import require_not_written, rezeroed, show_zeros, wired_zeros
+    from armcal_lerobot.comparison import require_not_written, rezeroed, show_zeros, wired_zeros
 
     file = read_motors(calibration)
     known, left = zeros_of(calibrated, arm_name, console.registry())
@@ -139,9 +138,9 @@ def compare(console: Console, dataset: Path, second: Path | None, out: Path | No
 
     Offset, gain, backlash and delay from recorded data, with intervals; of two data sets also what differs.
     """
-    from armcal_lerobot.motion import read_motion
+    from armcal_lerobot.comparison import compare_content, page, show_compare
     from armcal_lerobot.recordings import open_recording
-    from armcal_lerobot.tracking_report import compare_content, page, show_compare
+    from armcal_lerobot.tracking import read_motion
 
     units, calibration = given["units"], given.pop("calibration")
     file = read_motors(calibration) if calibration else None
@@ -184,9 +183,8 @@ def rests(console: Console, dataset: Path, out: Path, calibration: Path | None, 
 
     A CSV to calibrate from, and a camera's images of these moments.
     """
-    from armcal_lerobot.gripper import wiring_of
     from armcal_lerobot.recordings import open_recording
-    from armcal_lerobot.rest_records import records_of, write_images, write_records
+    from armcal_lerobot.rest_records import records_of, wiring_of, write_images, write_records
 
     if (given["camera"] is None) != (given["images"] is None):
         raise InputError("found one of --camera and --images, expected both.", hint="Give both, or none.")
@@ -205,7 +203,7 @@ def _gripper(console: Console, motors: list[str], **given: Any) -> Any:
         if given["joints"] or given["arm_name"]:
             raise InputError("found --joint or --arm-name without --arm.", hint="Give --arm CONFIG.")
         return None
-    from armcal_lerobot.gripper import Gripper, wiring_of
+    from armcal_lerobot.rest_records import Gripper, wiring_of
 
     gripper = Gripper(given["config"], given["arm_name"], wiring_of(given["joints"]), console.registry())
     gripper.require(motors)

@@ -17,7 +17,7 @@ from armcal.io.plain_files import input_bytes, text_of
 from armcal.plugins import library
 from numpy.typing import NDArray
 
-from armcal_lerobot.calibration_file import read_json
+from armcal_lerobot.motor_file import read_json
 
 STATE, ACTION = "observation.state", "action"
 _NUMBERS = ("timestamp", "episode_index", "frame_index")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 import numpy as np
-from armcal.calibration.convert_poe_urdf import urdf_text
+from armcal.calibration.convert import urdf_text
 from armcal.calibration.exporter import POSES
 from armcal.calibration.rigid_chain import RigidChain, RigidJoint, turn_between
 from armcal.cli.common import FILE, Console, spare_inputs, speaking

@@ -8,8 +8,7 @@ from typing import NoReturn
 
 import numpy as np
 from armcal.base.arrays import Array
-from armcal.config.yaml_nodes import Node, Origin, read_nodes
-from armcal.config.yaml_tree import entries_of
+from armcal.config.yaml_nodes import Node, Origin, entries_of, read_nodes
 from armcal.errors import DataError, Location
 from armcal.io.plain_files import refuse
 

@@ -1,18 +1,171 @@
 """A recording: a folder of files, or one file."""
 
 import re
+import sqlite3
+from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
+from urllib.parse import quote
 
+import numpy as np
 import yaml
-from armcal.io.plain_files import input_bytes, refuse
+from armcal.base.settings import Settings
+from armcal.io.plain_files import input_bytes, input_file, refuse
 
 from armcal_ros2.mcap import McapFile
-from armcal_ros2.message import RawMessage, Topic, decompressed, message_types
-from armcal_ros2.sqlite import SqliteFile
+from armcal_ros2.message import MAX_BYTES, RawMessage, Topic, decompressed, message_types
+
+_MOST_DELAYS = 4096
+_FAR_S, _FEW = 10.0, 10
+"""A stamp that is so far from the others, by the time of receipt, is wrong; after so many at the begin, the others."""
+_ZERO, _SAME, _FAR = "the stamp zero", "the stamp of the one before", "a stamp far from those of others"
+_EARLIER = "a stamp before that of an earlier one"
+_MOST: Mapping[str, float] = MappingProxyType({_ZERO: 0.5, _SAME: 0.5, _FAR: 0.5, _EARLIER: 0.01})
+"""A larger part of the messages, and times are not to be trusted."""
+Clock = Literal["header", "receive"]
+
+
+class TopicSettings(Settings):
+    """A topic, and what its times are: stamps of its headers, or when the recorder received its messages."""
+
+    topic: str | None = None
+    stamps: Clock = "header"
+
+
+class Stamps:
+    """Times of one topic's messages, in order; those that cannot be are counted.
+
+    Attributes:
+        count: of messages.
+        latest: the last time (s since 1970), None before the first.
+    """
+
+    def __init__(self, topic: str, clock: Clock) -> None:
+        self.topic, self.count = topic, 0
+        self.latest: float | None = None
+        self._clock = clock
+        self._left = Counter[str]()
+        self._usual: float | None = None
+        self._delays = array("d")
+
+    def time(self, stamp: int, received: int) -> float | None:
+        """Seconds since 1970 (arguments in ns); None where it is missing, repeated or before an earlier one."""
+        self.count += 1
+        chosen = stamp if self._clock == "header" else received
+        time, delay = chosen / 1e9, (received - chosen) / 1e9
+        fault = ""
+        if not chosen:
+            fault = _ZERO
+        elif time == self.latest:
+            fault = _SAME
+        elif self._usual is not None and abs(delay - self._usual) > _FAR_S:
+            if self._left[_FAR] < _FEW or self.count > 2 * _FEW:
+                fault = _FAR
+            else:
+                self.latest = None  # the first were wrong, and these are right
+        if not fault and self.latest is not None and time < self.latest:
+            fault = _EARLIER
+        if fault:
+            self._left[fault] += 1
+            return None
+        self.latest, self._usual = time, delay
+        if len(self._delays) < _MOST_DELAYS:
+            self._delays.append(delay)
+        return time
+
+    @property
+    def delay(self) -> float:
+        """The median time from measurement to receipt, by both clocks (s); NaN before the first message."""
+        return float(np.median(self._delays)) if self._delays else float("nan")
+
+    def check(self, place: str) -> list[str]:
+        """What was left out, sentences; times that are useless altogether are refused.
+
+        Raises:
+            DataError: stamps are zero, constant or backwards in too many messages.
+        """
+        for cause, count in self._left.items():
+            if count > max(_MOST[cause] * self.count, 1):
+                text = f"{count} of {self.count} messages of {self.topic} have {cause}, expected times of measurement."
+                hint = f"Set stamps: receive for {self.topic}, or give each program that publishes a topic of its own."
+                refuse(place, text, hint)
+        listed = ", ".join(f"{count} with {cause}" for cause, count in self._left.items())
+        return [f"of {self.count} messages of {self.topic} some were left out: {listed}."] if listed else []
+
+
+def nanoseconds(stamp: Any) -> int:
+    """The time of a header (ns since 1970)."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+MAGIC = b"SQLite format 3\0"
+_ROWS = "SELECT topic_id, timestamp, CASE WHEN topic_id IN ({0}) THEN data END FROM messages ORDER BY id"
+_HINT = "Give a recording of ROS 2: a folder with metadata.yaml, or a file .mcap or .db3."
+
+
+class SqliteFile:
+    """One file.
+
+    Attributes:
+        path: of the file.
+        faults: what of it could not be read, known once all messages were asked for.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.faults: list[str] = []
+
+    def messages(self, is_read: Callable[[Topic], bool]) -> Iterator[RawMessage]:
+        """All messages in the order of the file; those that are not chosen have no data.
+
+        Raises:
+            DataError: it is no SQLite file of rosbag2.
+        """
+        self.faults = []
+        with input_file(self.path, MAX_BYTES, "a recording") as file:
+            if file.read(len(MAGIC)) != MAGIC:
+                refuse(self.path, "found other content than that of an SQLite file.", _HINT)
+        try:
+            connection, topics = self._opened()
+        except sqlite3.Error as fault:
+            refuse(self.path, f"found no topics of a recording in it ({fault}).", _HINT)
+        with closing(connection):
+            chosen = ", ".join(str(int(key)) for key, topic in topics.items() if is_read(topic))
+            count = 0
+            try:
+                for key, received, data in connection.execute(_ROWS.format(chosen)):
+                    count += 1
+                    if key in topics and isinstance(received, int) and isinstance(data, bytes | None):
+                        yield RawMessage(topics[key], received, data)
+            except (sqlite3.Error, MemoryError) as fault:  # memory: a length that is damaged
+                self.faults.append(f"it is cut off or damaged after {count} messages ({fault}); these were read")
+
+    def _opened(self) -> tuple[sqlite3.Connection, dict[int, Topic]]:
+        """The file and its topics; where its journal cannot be used it is left aside.
+
+        Raises:
+            sqlite3.Error: it has no topics.
+        """
+        for more in ("", "&immutable=1"):
+            connection = sqlite3.connect(f"file:{quote(str(self.path.absolute()))}?mode=ro{more}", uri=True)
+            try:
+                connection.execute("PRAGMA writable_schema = ON")  # or a file that is cut off is not even opened
+                rows = connection.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
+                connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
+            except sqlite3.Error:
+                connection.close()
+                if more:
+                    raise
+                continue
+            if more:
+                self.faults.append("its journal could not be used: the last messages may be missing")
+            return connection, {key: Topic(*map(str, rest)) for key, *rest in rows}
+        raise AssertionError("both ways are tried")
+
 
 _METADATA = "metadata.yaml"
 _KINDS: Mapping[str, type[McapFile | SqliteFile]] = MappingProxyType({".mcap": McapFile, ".db3": SqliteFile})

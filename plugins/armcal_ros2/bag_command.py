@@ -56,7 +56,7 @@ def images(
     console: Console, path: Path, out: Path, topic: str | None, joints: str | None, clock_offset_ms: float
 ) -> None:
     """Take one image of each rest out of the recording PATH, for the reader images."""
-    from armcal_ros2.images import extract
+    from armcal_ros2.survey import extract
 
     extracted = extract(Bag(path), out, topic, joints, clock_offset_ms / 1000)
     data: dict[str, Any] = {"type": "images", "folder": str(out), "poses": str(out / "joints.csv")}

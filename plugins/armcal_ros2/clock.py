@@ -14,7 +14,7 @@ from armcal.base.arrays import Array
 from scipy.interpolate import CubicSpline
 from scipy.special import stdtrit
 
-from armcal_ros2.joints import JointRest
+from armcal_ros2.samples import JointRest
 
 _BESIDE_S = 0.3
 """So much of the rests before and after a motion belongs to it."""

@@ -1,17 +1,23 @@
 """What a recording holds: topics, frames, joints and their rests, and the data section that would read it."""
 
+from bisect import bisect_right
 from collections import Counter, deque
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+import yaml
 from armcal.errors import DataError, Location
+from armcal.io.file_set import require_new, write_new
+from armcal.io.plain_files import refuse
+from numpy.typing import NDArray
 
-from armcal_ros2.bag import Bag
-from armcal_ros2.joints import JointLog, JointsSettings, RestSettings
-from armcal_ros2.message import JOINT_STATE
-from armcal_ros2.samples import MEASURED, TRANSFORMS
-from armcal_ros2.stamps import nanoseconds
+from armcal_ros2.bag import Bag, Stamps, nanoseconds
+from armcal_ros2.message import CAMERA_INFO, IMAGES, JOINT_STATE
+from armcal_ros2.samples import GUARD_S, MEASURED, TRANSFORMS, JointLog, JointRest, JointsSettings, RestSettings
 
 _MOST_FRAMES = 200
 _LATEST = 20
@@ -116,3 +122,156 @@ def survey(bag: Bag) -> Survey:
         if sum(topic_summary.computed.values()) and not topic_summary.measured:
             remarks.append(f"all frames in {name} are computed from the joints: they measure nothing.")
     return Survey(topics, joints, [*bag.remarks, *remarks])
+
+
+_LUMA = np.array([0.299, 0.587, 0.114])
+_MAGIC: Mapping[bytes, str] = MappingProxyType({b"\xff\xd8": ".jpg", b"\x89PNG": ".png"})
+_STEPS: Mapping[str, tuple[int, tuple[int, ...]]] = MappingProxyType(
+    {
+        "mono8": (1, (0,)),
+        "8uc1": (1, (0,)),
+        "rgb8": (3, (0, 1, 2)),
+        "bgr8": (3, (2, 1, 0)),
+        "8uc3": (3, (2, 1, 0)),
+        "rgba8": (4, (0, 1, 2)),
+        "bgra8": (4, (2, 1, 0)),
+        "yuv422_yuy2": (2, (0,)),
+        "yuyv": (2, (0,)),
+        "yuv422": (2, (1,)),
+        "uyvy": (2, (1,)),
+    }
+)
+"""Bytes of a pixel by encoding, and which of them are red, green and blue, or the brightness."""
+
+
+@dataclass(frozen=True)
+class Extracted:
+    """What was written: images, the joints and files beside them, and what was left out, sentences."""
+
+    images: tuple[str, ...]
+    joints: tuple[str, ...]
+    files: tuple[Path, ...]
+    remarks: tuple[str, ...]
+
+
+def extract(bag: Bag, out: Path, topic: str | None, joints: str | None, offset: float) -> Extracted:
+    """Write the image nearest to the middle of each rest, ``joints.csv`` and ``camera_info.yaml``.
+
+    Args:
+        bag: the recording.
+        out: the folder, which must be empty or not there.
+        topic: of the images, joints: of the joint states; needed where there are several.
+        offset: how far the camera's clock is ahead of that of the joints (s).
+
+    Raises:
+        DataError: no such topics, or no rest with an image.
+        InputError: files are there already.
+    """
+    content = survey(bag)
+    topics = [name for name, own in content.topics.items() if own.type in IMAGES]
+    images = _only(bag, topics, topic, "images", "--topic")
+    log = content.joints[_only(bag, list(content.joints), joints, "joint states", "--joints")]
+    rests = [rest for rest in log.rests if rest.end - rest.begin >= RestSettings().window]
+    table, information = out / "joints.csv", out / "camera_info.yaml"
+    require_new([table, information])
+    out.mkdir(parents=True, exist_ok=True)
+    stamps, written, infos = Stamps(images, "header"), dict[int, str](), list[Any]()
+    for place, message in _nearest(bag, images, rests, stamps, offset, infos):
+        suffix, picture = picture_of(message, images)
+        written[place] = f"rest{place + 1:04d}{suffix}"
+        write_new({out / written[place]: picture})
+    remarks = [*content.remarks, *stamps.check(str(bag.path))]
+    if not written:
+        refuse(bag.path, f"found no image of {images} in {len(rests)} rests.", " ".join(remarks) or "Record again.")
+    if len(written) < len(rests):
+        remarks.append(f"{len(rests) - len(written)} of {len(rests)} rests have no image.")
+    lines = [",".join(["image", "time_s", *(f"{name}_rad" for name in log.names)])]
+    for place, name in written.items():
+        middle = (rests[place].begin + rests[place].end) / 2
+        lines.append(",".join([name, *map(repr, [middle, *rests[place].means.tolist()])]))
+    files = {table: ("\n".join(lines) + "\n").encode()}
+    if infos:
+        files[information] = _camera_info(infos[0]).encode()
+    write_new(files)
+    return Extracted(tuple(written.values()), log.names, tuple(files), tuple(remarks))
+
+
+def _only(bag: Bag, names: Sequence[str], stated: str | None, what: str, option: str) -> str:
+    chosen = names[0] if stated is None and len(names) == 1 else stated
+    if chosen is not None and chosen in names:
+        return chosen
+    text = f"found topics with {what}: {', '.join(names) or 'none'}, expected {stated or 'one'}."
+    raise DataError(text, where=Location(str(bag.path)), hint=f"Give {option} NAME." if names else "Record them too.")
+
+
+def _nearest(
+    bag: Bag, topic: str, rests: Sequence[JointRest], stamps: Stamps, offset: float, infos: list[Any]
+) -> Iterator[tuple[int, Any]]:
+    """The place of each rest with an image, and the image nearest to its middle; only one is held at a time."""
+    begins, settle = [rest.begin for rest in rests], RestSettings().settle
+    above = topic.removesuffix("/compressed").rpartition("/")[0]
+    held: tuple[int, float, Any] | None = None
+    for (own, received, _), message in bag.decoded(
+        lambda read: read.name == topic or (read.name == f"{above}/camera_info" and not infos)
+    ):
+        if message is None:
+            continue
+        if own.type == CAMERA_INFO:
+            infos.append(message)
+            continue
+        time = stamps.time(nanoseconds(message.header.stamp), received)
+        place = -1 if time is None else bisect_right(begins, time - offset) - 1
+        if time is None or place < 0 or not begins[place] + settle <= time - offset <= rests[place].end - GUARD_S:
+            continue
+        away = abs(time - offset - (rests[place].begin + rests[place].end) / 2)
+        if held is not None and held[0] != place:
+            yield held[0], held[2]
+            held = None
+        if held is None or away < held[1]:
+            held = (place, away, message)
+    if held is not None:
+        yield held[0], held[2]
+
+
+def picture_of(message: Any, topic: str) -> tuple[str, bytes]:
+    """The ending of a file's name and its content: as compressed, or grey values as PGM.
+
+    Raises:
+        DataError: of an encoding that is not read.
+    """
+    data = np.asarray(message.data, dtype=np.uint8)
+    if not hasattr(message, "encoding"):
+        content = data.tobytes()
+        suffix = next((ending for magic, ending in _MAGIC.items() if content.startswith(magic)), None)
+        if suffix is None:
+            refuse(topic, f"found images compressed as {message.format!r}, expected JPEG or PNG.", "Record others.")
+        return suffix, content
+    rows = data.reshape(message.height, message.step)
+    encoding = message.encoding.lower()
+    if encoding in ("mono16", "16uc1"):
+        pixels = rows[:, : 2 * message.width].reshape(message.height, message.width, 2)
+        return ".pgm", _pgm(pixels[:, :, 0 if message.is_bigendian else 1])
+    if encoding not in _STEPS:
+        known = ", ".join(_STEPS)
+        refuse(topic, f"found images encoded as {message.encoding!r}, expected {known} or mono16.", "Record others.")
+    step, places = _STEPS[encoding]
+    pixels = rows[:, : step * message.width].reshape(message.height, message.width, step)[:, :, list(places)]
+    grey = pixels[:, :, 0] if len(places) == 1 else np.round(pixels @ _LUMA)
+    return ".pgm", _pgm(grey.astype(np.uint8))
+
+
+def _pgm(grey: NDArray[np.uint8]) -> bytes:
+    height, width = grey.shape
+    return f"P5\n{width} {height}\n255\n".encode() + np.ascontiguousarray(grey).tobytes()
+
+
+def _camera_info(message: Any) -> str:
+    distortion = [float(x) for x in message.d]
+    content = {
+        "image_width": int(message.width),
+        "image_height": int(message.height),
+        "camera_matrix": {"rows": 3, "cols": 3, "data": [float(x) for x in message.k]},
+        "distortion_model": message.distortion_model,
+        "distortion_coefficients": {"rows": 1, "cols": len(distortion), "data": distortion},
+    }
+    return yaml.safe_dump(content, sort_keys=False)

@@ -10,12 +10,11 @@ import click
 from armcal.cli.common import Console
 from armcal.errors import EXIT_BAD_INPUT, InputError
 
-from armcal_servobus.checks import examined
 from armcal_servobus.configured import on_config, opened
-from armcal_servobus.find_command import find_command
-from armcal_servobus.home_command import home_command
-from armcal_servobus.homing import turned
-from armcal_servobus.servos import Servos
+from armcal_servobus.device import examined
+from armcal_servobus.finding import find_command
+from armcal_servobus.homing import home_command, turned
+from armcal_servobus.joints import Servos
 
 
 @click.group()

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Literal
 
-from armcal_servobus.packets import ProtocolName
+from armcal_servobus.bus import ProtocolName
 
 ANY = -1
 _RPM = 2 * math.pi / 60

@@ -12,9 +12,8 @@ from pydantic import Field
 from typing_extensions import override
 
 from armcal_servobus.bus import Bus
-from armcal_servobus.checks import checked
-from armcal_servobus.joints import ServoJoint, ServoJointsSettings, named
-from armcal_servobus.servos import Servos
+from armcal_servobus.device import checked
+from armcal_servobus.joints import ServoJoint, ServoJointsSettings, Servos, named
 
 _AGAIN_S = 0.5
 

@@ -7,7 +7,7 @@ from armcal.arm.assembly import Arm
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.estimate.simulation import SimulationRequest, measured_with_noise
-from armcal.measure.points import LimitedView
+from armcal.measure.instrument import LimitedView
 from armcal.problem.many_points import as_seen
 from armcal.problem.problem import Problem
 

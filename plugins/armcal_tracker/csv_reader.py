@@ -7,26 +7,31 @@ neither a long file nor a broken one takes much memory. A single bad cell is loo
 import csv
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, Literal, Self
+from typing import Annotated, Any, BinaryIO, ClassVar, Literal, NoReturn, Self
 
 import numpy as np
+from armcal.arm.assembly import Arm
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.settings import InputPath, Settings
-from armcal.base.units import from_unit
+from armcal.base.units import DIMENSIONLESS, from_unit
+from armcal.calibration.rigid_chain import nominal_tools
 from armcal.errors import DataError, Location
 from armcal.io.cells import DECIMAL_COMMA, CellFault, plain_numbers, read_cell, with_point
 from armcal.io.cut_file import may_be_cut, whole_rows
 from armcal.io.plain_files import input_file, refuse
-from armcal.measure.checks import check_dataset, layout_of
+from armcal.measure.checks import Layout, check_dataset, layout_of, require_records
 from armcal.measure.column_match import Column, Header, Plan, header_of, match_columns, renamed
-from armcal.measure.reader import ReadRequest
+from armcal.measure.layout import set_aside, warned
+from armcal.measure.reader import ReadRequest, RequestedChannel
 from pydantic import Field, model_validator
+from scipy.spatial.transform import Rotation
+from typing_extensions import override
 
 MAX_BYTES = 2 * 1024**3
 MAX_LINE_BYTES = 1024**2
@@ -210,3 +215,398 @@ def _number(cell: str, line: int, column: Column, header: Header, has_commas: bo
         other = ' Or set decimal: "," in the data section, if all numbers of the file have one.' if is_comma else ""
         raise DataError(number.text, where=where, hint=number.hint + other)
     return number
+
+
+QUATERNION = ("qw", "qx", "qy", "qz")
+TURNS = ("turn1", "turn2", "turn3")
+MATRIX = tuple(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))
+_OTHER = {"xyzw": "wxyz", "wxyz": "xyzw"}
+_Nine = tuple[str, str, str, str, str, str, str, str, str]
+
+
+class Orientation(Settings):
+    """How a file gives base_T_body's rotation.
+
+    Values are numbers of all records, one row each, in the order of ``mapped``.
+    """
+
+    kind: ClassVar[str]
+    """What one of them is called."""
+
+    @property
+    def declared(self) -> str:
+        raise NotImplementedError
+
+    def mapped(self) -> Mapping[str, str]:
+        raise NotImplementedError
+
+    def size(self, values: Array) -> Array:
+        """How large each is (N); zero for none at all."""
+        return np.ones(len(values))
+
+    def fault(self, values: Array) -> Array:
+        """How far each is from a rotation or a reflection (N)."""
+        return np.zeros(len(values))
+
+    def rotations(self, values: Array) -> Rotation:
+        """Of each record.
+
+        Raises:
+            ValueError: a value is none.
+        """
+        raise NotImplementedError
+
+    def others(self, values: Array) -> Mapping[str, Rotation]:
+        raise NotImplementedError
+
+
+class QuaternionColumns(Orientation):
+    """The four columns of a quaternion, as they stand in the file, and in which order its parts stand in them."""
+
+    kind = "quaternion"
+    columns: tuple[str, str, str, str]
+    order: Literal["xyzw", "wxyz"]
+
+    @property
+    @override
+    def declared(self) -> str:
+        return f"order: {self.order}"
+
+    @override
+    def mapped(self) -> dict[str, str]:
+        own = dict(zip(self.order, self.columns, strict=True))
+        return {name: own[name[1]] for name in QUATERNION}
+
+    @override
+    def size(self, values: Array) -> Array:
+        return np.asarray(np.linalg.norm(values, axis=1))
+
+    @override
+    def fault(self, values: Array) -> Array:
+        return np.abs(self.size(values) - 1)
+
+    @override
+    def rotations(self, values: Array) -> Rotation:
+        return Rotation.from_quat(values[:, [1, 2, 3, 0]])
+
+    @override
+    def others(self, values: Array) -> dict[str, Rotation]:
+        """The other order; it is the inverse between two fixed rotations, so that no turn of records shows it."""
+        other = _OTHER[self.order]
+        in_file = values[:, ["wxyz".index(part) for part in self.order]]
+        exchanged = Rotation.from_quat(in_file[:, [other.index(part) for part in "xyzw"]])
+        return {f"order: {other}, or as body_T_base,": exchanged}
+
+
+class RotationColumns(Orientation):
+    """The nine columns of a rotation matrix, row by row."""
+
+    kind = "rotation matrix"
+    columns: _Nine
+
+    @property
+    @override
+    def declared(self) -> str:
+        return "the matrix row by row"
+
+    @override
+    def mapped(self) -> dict[str, str]:
+        return dict(zip(MATRIX, self.columns, strict=True))
+
+    @override
+    def size(self, values: Array) -> Array:
+        return np.asarray(np.abs(values).max(axis=1))
+
+    @override
+    def fault(self, values: Array) -> Array:
+        matrices = values.reshape(-1, 3, 3)
+        squares = np.swapaxes(matrices, 1, 2) @ matrices
+        return np.asarray(np.abs(squares - np.eye(3)).max(axis=(1, 2)))
+
+    @override
+    def rotations(self, values: Array) -> Rotation:
+        return Rotation.from_matrix(values.reshape(-1, 3, 3))
+
+    @override
+    def others(self, values: Array) -> dict[str, Rotation]:
+        return {"it column by column, that is as body_T_base,": self.rotations(values).inv()}
+
+
+class AnglesColumns(Orientation):
+    """The three columns of roll, pitch and yaw: R = Rz(yaw) Ry(pitch) Rx(roll), turns about fixed axes.
+
+    Any three angles are a rotation, three zeros too.
+    """
+
+    kind = "triple of roll, pitch and yaw"
+    columns: tuple[str, str, str]
+    unit: Literal["deg", "rad"]
+
+    @property
+    @override
+    def declared(self) -> str:
+        return f"R = Rz(yaw) Ry(pitch) Rx(roll) in {self.unit}"
+
+    @override
+    def mapped(self) -> dict[str, str]:
+        return dict(zip(TURNS, self.columns, strict=True))
+
+    @override
+    def rotations(self, values: Array) -> Rotation:
+        return Rotation.from_euler("xyz", values, degrees=self.unit == "deg")
+
+    @override
+    def others(self, values: Array) -> dict[str, Rotation]:
+        degrees = self.unit == "deg"
+        return {
+            "it as rotation_vector": Rotation.from_rotvec(values, degrees=degrees),
+            "R = Rx(roll) Ry(pitch) Rz(yaw)": Rotation.from_euler("XYZ", values, degrees=degrees),
+            f"unit: {'rad' if degrees else 'deg'}": Rotation.from_euler("xyz", values, degrees=not degrees),
+        }
+
+
+class EulerColumns(AnglesColumns):
+    """The three columns of Euler angles, and their convention, as SciPy has it.
+
+    ``order`` names the axes in the order of the columns: small letters are turns about fixed axes (``xyz``: R = Rz Ry
+    Rx, as ``rpy``), capitals about the axes that turned before (``XYZ``: R = Rx Ry Rz).
+    """
+
+    kind = "triple of Euler angles"
+    order: Annotated[str, Field(pattern="^([xyz]{3}|[XYZ]{3})$")]
+
+    @model_validator(mode="after")
+    def _three_turns(self) -> Self:
+        if self.order[0] == self.order[1] or self.order[1] == self.order[2]:
+            raise ValueError(f"found the order {self.order!r}, expected neighbours to differ: XYZ, ZYX, ZYZ, xyz, ...")
+        return self
+
+    @property
+    @override
+    def declared(self) -> str:
+        return f"order: {self.order} in {self.unit}"
+
+    @override
+    def rotations(self, values: Array) -> Rotation:
+        return Rotation.from_euler(self.order, values, degrees=self.unit == "deg")
+
+    @override
+    def others(self, values: Array) -> dict[str, Rotation]:
+        degrees, other = self.unit == "deg", self.order.swapcase()
+        return {
+            f"order: {other}": Rotation.from_euler(other, values, degrees=degrees),
+            "it as that of body_T_base": self.rotations(values).inv(),
+            f"unit: {'rad' if degrees else 'deg'}": Rotation.from_euler(self.order, values, degrees=not degrees),
+        }
+
+
+class VectorColumns(AnglesColumns):
+    """The three columns of a rotation vector: its direction is the axis, its length the angle."""
+
+    kind = "rotation vector"
+
+    @property
+    @override
+    def declared(self) -> str:
+        return f"the rotation vector of base_T_body in {self.unit}"
+
+    @override
+    def rotations(self, values: Array) -> Rotation:
+        return Rotation.from_rotvec(values, degrees=self.unit == "deg")
+
+    @override
+    def others(self, values: Array) -> dict[str, Rotation]:
+        degrees = self.unit == "deg"
+        return {
+            "it as rpy": Rotation.from_euler("xyz", values, degrees=degrees),
+            "it as that of body_T_base": self.rotations(values).inv(),
+            f"unit: {'rad' if degrees else 'deg'}": Rotation.from_rotvec(values, degrees=not degrees),
+        }
+
+
+def reflections(values: Array) -> Array:
+    """Places of matrices (N x 9) that mirror; none among quaternions (N x 4)."""
+    if values.shape[1] != len(MATRIX):
+        return np.zeros(0, dtype=np.intp)
+    return np.flatnonzero(np.linalg.det(values.reshape(-1, 3, 3)) < 0)
+
+
+TOLERANCE = 1e-3
+"""How far a quaternion's length may be from one, or an entry of R^T R from the identity's."""
+MOST_FAULTY = 0.05
+WORST = ((5.0, 3.0), (0.5, 10.0))
+"""The declared meaning of the columns is refused if it fits the arm worse than this (deg), and so many times worse than
+another; the second where the body hardly turned, as where a probe must face its tracker."""
+_ZERO = 1e-6
+FEWEST = 6
+_STRIDES = (1, 2, 3, 5, 7, 11, 17)
+_MOST_PAIRS = 4000
+_LARGEST_TURN_RAD = 2.6
+"""Beyond it a rotation vector may jump to the other end of its axis."""
+
+
+class PoseCsvSettings(CsvSettings):
+    """As ``csv``, and base_T_body's orientation.
+
+    One of ``quaternion``, ``rotation``, ``rpy``, ``euler`` and ``rotation_vector``.
+
+    ``measurement`` names the measurement that reads orientations; by default the only one.
+    """
+
+    quaternion: QuaternionColumns | None = None
+    rotation: RotationColumns | None = None
+    rpy: AnglesColumns | None = None
+    euler: EulerColumns | None = None
+    rotation_vector: VectorColumns | None = None
+    measurement: str | None = None
+
+    @model_validator(mode="after")
+    def _one_orientation(self) -> Self:
+        if sum(given is not None for given in self._given()) != 1:
+            raise ValueError(
+                "expected one of quaternion: {columns: [...], order: xyzw}, rotation: {columns: [...]}, "
+                "rpy: {columns: [...], unit: deg}, euler: {columns: [...], order: XYZ, unit: deg} "
+                "and rotation_vector: {columns: [...], unit: rad}"
+            )
+        return self
+
+    def _given(self) -> tuple[Orientation | None, ...]:
+        return self.quaternion, self.rotation, self.rpy, self.euler, self.rotation_vector
+
+    @property
+    def orientation(self) -> Orientation:
+        return next(orientation for orientation in self._given() if orientation is not None)
+
+
+class PoseCsvReader:
+    """The reader ``pose_csv``: orientations become unit quaternions, ``INSTANCE.qw`` (never below 0) to ``INSTANCE.qz``."""  # noqa: E501
+
+    Settings: ClassVar[type[PoseCsvSettings]] = PoseCsvSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {
+        "path": "/no/such/folder/measurements",
+        "quaternion": {"columns": ["qx", "qy", "qz", "qw"], "order": "xyzw"},
+    }
+
+    def __init__(self, settings: PoseCsvSettings) -> None:
+        self._settings = settings
+        self._orientation = settings.orientation
+
+    def read(self, request: ReadRequest) -> Dataset:
+        """The records of the file, in SI; ``rows`` are lines, the header's being 1.
+
+        Raises:
+            DataError: with file, line and column; or the orientations are not those of this arm.
+        """
+        s, instance = self._settings, self._instance(request)
+        mapped = {f"{instance}.{name}": own for name, own in self._orientation.mapped().items()}
+        columns = {**s.columns, **mapped}
+        reader = CsvReader(CsvSettings(path=s.path, columns=columns, delimiter=s.delimiter, decimal=s.decimal))
+        # the file's numbers in place of the quaternion; they cannot be absent
+        quaternion = {f"{instance}.{name}" for name in QUATERNION}
+        rest = [channel for channel in request.channels if channel.channel not in quaternion]
+        own = [RequestedChannel(name, (name,), DIMENSIONLESS, True, parts=(instance,)) for name in mapped]
+        dataset = reader.read(replace(request, channels=(*rest, *own)))
+        dataset = self._without_faulty(dataset, tuple(mapped))
+        values = dataset.stacked(tuple(mapped)).T
+        made = np.flatnonzero(~np.isnan(values).any(axis=1))
+        mirrored = reflections(values[made])
+        if mirrored.size:
+            text = f"found {mirrored.size} of {len(made)} rotation matrices that are reflections (determinant -1)."
+            hint = "Check the order and signs of the columns, and that the frames are right-handed."
+            self._refuse(text, hint, dataset.rows[made[mirrored[0]]])
+        self._refuse_other_meaning(dataset.subset(made), request, instance, values[made])
+        return self._with_quaternions(dataset, instance, values, made)
+
+    def _instance(self, request: ReadRequest) -> str:
+        reading = [name for name, m in request.measurements.items() if {c.name for c in m.channels()} >= {*QUATERNION}]
+        named = self._settings.measurement
+        if named in reading or (named is None and len(reading) == 1):
+            return named or reading[0]
+        self._refuse(
+            f"found {', '.join(reading) or 'no measurement'} to read orientations, expected {named or 'one'}.",
+            "Add a measurement tip_pose, or set measurement: NAME in the data section.",
+        )
+
+    def _without_faulty(self, dataset: Dataset, channels: tuple[str, ...]) -> Dataset:
+        """Set aside what is no rotation; refuse the file if that is more than a few."""
+        values, kind = dataset.stacked(channels).T, self._orientation.kind
+        made = ~np.isnan(values).any(axis=1)
+        off, size = self._orientation.fault(values), self._orientation.size(values)
+        zero, wrong = made & (size < _ZERO), made & (size >= _ZERO) & (off > TOLERANCE)
+        if wrong.sum() > MOST_FAULTY * made.sum():
+            first = int(np.flatnonzero(wrong)[0])
+            text = f"found {wrong.sum()} of {made.sum()} orientations that are no {kind}, the first off by"
+            hint = "Check that the columns are those of the orientation, and in this order."
+            self._refuse(f"{text} {off[first]:.3g} (more than {TOLERANCE:g}).", hint, dataset.rows[first])
+        faulty = {int(i): f"its {kind} is zero" for i in np.flatnonzero(zero)}
+        faulty |= {int(i): f"its {kind} is off by {off[i]:.3g}" for i in np.flatnonzero(wrong)}
+        return require_records(
+            set_aside(dataset, Layout(by_line=True), faulty, f"the {kind} is none", "Measure these again.")
+        )
+
+    def _refuse_other_meaning(self, dataset: Dataset, request: ReadRequest, instance: str, values: Array) -> None:
+        """Refuse orientations that turn unlike the nominal arm, where another reading of the columns turns like it."""
+        arm = request.arms.get(request.measurements[instance].arms[0])
+        if arm is None or not len(dataset):
+            return
+        nominal = nominal_rotations(arm, dataset)
+        declared = np.degrees(misfit(self._orientation.rotations(values), nominal))
+        others = {name: np.degrees(misfit(r, nominal)) for name, r in self._orientation.others(values).items()}
+        best = min(others, key=lambda name: others[name])
+        if any(declared > worst and declared > times * others[best] for worst, times in WORST):
+            self._refuse(
+                f"orientations turn unlike the nominal arm: with {self._orientation.declared} the turns between "
+                f"records are off by {declared:.2f} deg (median), with {best} by {others[best]:.2f} deg.",
+                "Correct the order of the columns, or give base_T_body's orientation.",
+            )
+
+    def _with_quaternions(self, dataset: Dataset, instance: str, values: Array, made: Array) -> Dataset:
+        """Unit quaternions, of a sign that does not jump back and forth for nothing."""
+        quaternions = np.full((len(dataset), 4), np.nan)
+        quaternions[made] = self._orientation.rotations(values[made]).as_quat()[:, [3, 0, 1, 2]]
+        negative = quaternions[:, 0] < 0
+        quaternions[negative] *= -1
+        given = {f"{instance}.{name}" for name in self._orientation.mapped()}
+        channels = {name: numbers for name, numbers in dataset.channels.items() if name not in given}
+        channels |= {f"{instance}.{name}": quaternions[:, i] for i, name in enumerate(QUATERNION)}
+        dataset = replace(dataset, channels=channels)
+        if self._settings.quaternion is None or not negative.any():
+            return dataset
+        text = (
+            f"{negative.sum()} of {len(made)} quaternions had qw below 0 and were negated, which is the same rotation."
+        )
+        return warned(dataset, text)
+
+    def _refuse(self, message: str, hint: str, line: int | None = None) -> NoReturn:
+        raise DataError(message, where=Location(str(self._settings.path), line=line), hint=hint)
+
+
+def nominal_rotations(arm: Arm, dataset: Dataset) -> Rotation:
+    """base_T_tool's rotation of the nominal arm in each record, without its effects."""
+    commands = dataset.stacked([*arm.command_channels])
+    return Rotation.from_matrix(nominal_tools(arm, commands.T)[:, :3, :3])
+
+
+def misfit(measured: Rotation, nominal: Rotation) -> float:
+    """How far measured turns between records are from the nominal ones (rad, the median of pairs of records).
+
+    Turns from record to record, seen from the body, are the nominal ones seen from the tool: both sets of rotation
+    vectors differ by one rotation, which is found first. [Park1994] Angles alone would not do: they stay the same
+    when a quaternion's components are exchanged, and when all rotations are inverted.
+    """
+    index = np.arange(len(nominal))
+    pairs = [(index[:-stride], index[stride:]) for stride in _STRIDES if stride < len(nominal)]
+    if not pairs:
+        return 0.0
+    first, second = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
+    step = max(1, len(first) // _MOST_PAIRS)
+    first, second = first[::step], second[::step]
+    turned = (nominal[first].inv() * nominal[second]).as_rotvec()
+    seen = (measured[first].inv() * measured[second]).as_rotvec()
+    usable = np.linalg.norm(turned, axis=1) < _LARGEST_TURN_RAD
+    turned, seen = turned[usable], seen[usable]
+    if len(turned) < FEWEST:
+        return 0.0
+    left, _, right = np.linalg.svd(turned.T @ seen)
+    tool_T_body = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return float(np.median(np.linalg.norm(turned @ tool_T_body - seen, axis=1)))

@@ -6,13 +6,13 @@ from armcal.hooks import Register, hookimpl
 @hookimpl
 def armcal_register_measurements(register: Register) -> None:
     register("tip_position", "armcal_tracker.position:TipPosition", "position of a target on the tool")
-    register("tip_pose", "armcal_tracker.pose:TipPose", "position and orientation of a body on the tool")
+    register("tip_pose", "armcal_tracker.position:TipPose", "position and orientation of a body on the tool")
 
 
 @hookimpl
 def armcal_register_readers(register: Register) -> None:
     register("csv", "armcal_tracker.csv_reader:CsvReader", "columns by name with their unit as suffix")
-    register("pose_csv", "armcal_tracker.pose_csv_reader:PoseCsvReader", "as csv, with orientations in it")
+    register("pose_csv", "armcal_tracker.csv_reader:PoseCsvReader", "as csv, with orientations in it")
 
 
 @hookimpl

@@ -1,14 +1,313 @@
-"""A URDF, checked: links with their masses, and joints that make one tree of them. [URDF]"""
+"""A URDF, checked: links with their masses, and joints that make one tree of them. [URDF]
 
+Strict XML: elements with their lines, places and numbers; nothing in a file can name another file or grow.
+
+Document types are refused, and with them every entity but the five of XML itself. Processing instructions and
+comments are passed over.
+"""
+
+from __future__ import annotations
+
+import codecs
 import difflib
+import math
+import re
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
+from typing import Literal, NoReturn, get_args
+from xml.parsers import expat
 
 from armcal.arm.model import Mimic
+from armcal.errors import ConfigError, Location
+from armcal.io.plain_files import input_bytes
 
-from armcal_urdf.elements import Element, Three, number, read_elements, three, unit_axis
+Encoding = Literal["utf-8", "utf-16-le", "utf-16-be", "iso-8859-1", "us-ascii"]
+
+MAX_BYTES = 256 * 1024
+"""Of a URDF: a calibration holds it whole, and may have four times as many itself."""
+_MOST = 1 << 26
+"""Read at all, so that what is too large is refused with the reason."""
+_MARKS: tuple[tuple[bytes, Encoding], ...] = (
+    (codecs.BOM_UTF8, "utf-8"),
+    (codecs.BOM_UTF16_LE, "utf-16-le"),
+    (codecs.BOM_UTF16_BE, "utf-16-be"),
+    (b"<\0", "utf-16-le"),
+    (b"\0<", "utf-16-be"),
+)
+_DECLARED = re.compile(r"""\ufeff?<\?xml\s[^>]*?encoding\s*=\s*["']([^"'>]*)["']""")
+_OTHER_NAMES: dict[str, Encoding] = {
+    "utf8": "utf-8",
+    "ascii": "us-ascii",
+    "latin-1": "iso-8859-1",
+    "latin1": "iso-8859-1",
+}
+
+
+def read_text(path: Path) -> tuple[str, Encoding]:
+    """The text of a file and its encoding.
+
+    Raises:
+        ConfigError: it cannot be read, is too large, or is not in the encoding that it declares.
+    """
+    return decode(input_bytes(path, _MOST, "a URDF file", ConfigError), str(path))
+
+
+def decode(data: bytes, label: str) -> tuple[str, Encoding]:
+    """Text and encoding; ``encode`` gives the same bytes back.
+
+    Raises:
+        ConfigError: too large, of an encoding that is not known, or not in the one it declares.
+    """
+    if len(data) > MAX_BYTES:
+        raise ConfigError(
+            f"the file is larger than {MAX_BYTES // 1024} KiB, which a calibration could not hold.",
+            where=Location(label),
+            hint="Keep meshes in files of their own, and leave out what is not the arm.",
+        )
+    encoding = next((name for mark, name in _MARKS if data.startswith(mark)), None)
+    encoding = encoding or declared(data[:200].decode("iso-8859-1"), label) or "utf-8"
+    try:
+        return data.decode(encoding), encoding
+    except UnicodeDecodeError as fault:
+        line = data.count(b"\n", 0, fault.start) + 1
+        raise ConfigError(
+            f"the bytes at offset {fault.start} are not {encoding}.",
+            where=Location(label, line),
+            hint="Save the file as UTF-8, or declare its encoding in the first line.",
+        ) from fault
+
+
+def declared(text: str, label: str) -> Encoding | None:
+    """The encoding that the text's first line declares, None if it declares none.
+
+    UTF-16 cannot be recognised by the declaration alone, and a declaration of it in another encoding is wrong.
+
+    Raises:
+        ConfigError: it is not one of those known.
+    """
+    match = _DECLARED.match(text)
+    if match is None:
+        return None
+    name = match[1].lower()
+    name = _OTHER_NAMES.get(name, name)
+    known = {encoding: encoding for encoding in get_args(Encoding)}
+    if name not in known or name.startswith("utf-16"):
+        raise ConfigError(
+            f"found the encoding {match[1]!r}, expected UTF-8, UTF-16, ISO-8859-1 or US-ASCII and a text in it.",
+            where=Location(label, 1),
+            hint="Save the file as UTF-8.",
+        )
+    result: Encoding = known[name]
+    return result
+
+
+def encode(text: str, encoding: Encoding) -> bytes:
+    """The bytes of a text.
+
+    Raises:
+        ValueError: it holds a character that the encoding has not.
+    """
+    try:
+        return text.encode(encoding)
+    except UnicodeEncodeError as fault:
+        line = text.count("\n", 0, fault.start) + 1
+        raise ValueError(f"line {line} of the URDF holds {text[fault.start]!r}, which {encoding} has not") from fault
+
+
+MAX_DEPTH = 50
+UTF8 = "utf-8"
+Three = tuple[float, float, float]
+
+LARGEST = 1e6
+"""m, rad or kg: no arm is that far off, and sums with larger numbers lose the micrometres."""
+SHORTEST_AXIS = 1e-9
+_WHITE = re.compile(r"[ \t\r\n]+")
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+
+
+@dataclass(frozen=True)
+class Element:
+    """One element.
+
+    Attributes:
+        tag: its name.
+        attributes: values by name, references expanded.
+        line: of its start tag, from 1.
+        start: offset of its start tag in the text as UTF-8.
+        label: the file's name for people.
+        children: elements in it.
+    """
+
+    tag: str
+    attributes: Mapping[str, str]
+    line: int
+    start: int
+    label: str
+    children: list[Element] = field(default_factory=list)
+
+    def all(self, tag: str) -> Iterator[Element]:
+        return (child for child in self.children if child.tag == tag)
+
+    def one(self, tag: str) -> Element | None:
+        """The child of a name; None if there is none.
+
+        Raises:
+            ConfigError: it stands twice.
+        """
+        elements = list(self.all(tag))
+        if len(elements) > 1:
+            elements[1].refuse(f"found <{tag}> twice in one <{self.tag}>.", f"The first is at line {elements[0].line}.")
+        return elements[0] if elements else None
+
+    def text(self, name: str) -> str:
+        """An attribute that has to be there and hold something.
+
+        Raises:
+            ConfigError: it is missing or empty.
+        """
+        value = self.attributes.get(name, "")
+        if not value.strip():
+            which = "an empty" if name in self.attributes else "no"
+            self.refuse(f"found {which} attribute {name!r} in <{self.tag}>.", f'Write <{self.tag} {name}="..."/>.')
+        return value
+
+    def refuse(self, message: str, hint: str) -> NoReturn:
+        raise ConfigError(message, where=Location(self.label or None, self.line), hint=hint)
+
+
+def read_elements(text: str, label: str) -> Element:
+    """The root element of a text.
+
+    Raises:
+        ConfigError: not well-formed, a document type, or nested too deeply; with file and line.
+    """
+    try:
+        data = text.encode(UTF8)
+    except UnicodeEncodeError as fault:
+        line = text.count("\n", 0, fault.start) + 1
+        hint = "Delete it."
+        raise ConfigError("found half a surrogate pair.", where=Location(label or None, line), hint=hint) from fault
+    parser = expat.ParserCreate(UTF8)
+    builder = _Builder(parser, label)
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as fault:
+        raise ConfigError(
+            f"this is not well-formed XML: {expat.ErrorString(fault.code)}.",
+            where=Location(label or None, fault.lineno),
+            hint="Check tags, quotes and < > & on this line and the ones before it.",
+        ) from fault
+    return builder.root[0]
+
+
+class _Builder:
+    """Builds elements out of the parser's events."""
+
+    def __init__(self, parser: expat.XMLParserType, label: str) -> None:
+        self.root: list[Element] = []
+        self._parser, self._label = parser, label
+        self._open: list[Element] = []
+        parser.StartElementHandler = self._start
+        parser.EndElementHandler = self._end
+        parser.StartDoctypeDeclHandler = self._doctype
+
+    def _start(self, tag: str, attributes: dict[str, str]) -> None:
+        line, start = self._parser.CurrentLineNumber, self._parser.CurrentByteIndex
+        element = Element(tag, attributes, line, start, self._label)
+        if tag.startswith("xacro:"):
+            element.refuse(f"found <{tag}>: this is xacro, not yet a URDF.", "Run it through xacro first.")
+        if len(self._open) >= MAX_DEPTH:
+            element.refuse(f"elements are nested deeper than {MAX_DEPTH} levels.", "A URDF needs five.")
+        (self._open[-1].children if self._open else self.root).append(element)
+        self._open.append(element)
+
+    def _end(self, tag: str) -> None:
+        self._open.pop()
+
+    def _doctype(self, name: str, *_: object) -> None:
+        raise ConfigError(
+            f"found a document type (<!DOCTYPE {name}>), which could name files and entities.",
+            where=Location(self._label or None, self._parser.CurrentLineNumber),
+            hint="Delete it: a URDF has none.",
+        )
+
+
+def words_of(value: str) -> list[str]:
+    return [word for word in _WHITE.split(value) if word]
+
+
+def number(element: Element, name: str, default: float, largest: float = LARGEST) -> float:
+    """One number; the default where there is no such attribute.
+
+    Raises:
+        ConfigError: not one number.
+    """
+    return numbers(element, name, (default,), largest)[0]
+
+
+def three(element: Element | None, name: str, default: Three = (0.0, 0.0, 0.0)) -> Three:
+    """Three numbers; the default where there is no such element or attribute.
+
+    Raises:
+        ConfigError: not three numbers.
+    """
+    if element is None:
+        return default
+    x, y, z = numbers(element, name, default, LARGEST)
+    return x, y, z
+
+
+def numbers(element: Element, name: str, default: tuple[float, ...], largest: float) -> tuple[float, ...]:
+    """As many numbers as the default has.
+
+    Raises:
+        ConfigError: another count, or what is no finite decimal number of typical size.
+    """
+    if name not in element.attributes:
+        return default
+    words = words_of(element.attributes[name])
+    if len(words) != len(default):
+        count = f"{len(default)} number" + ("s" if len(default) > 1 else "")
+        element.refuse(
+            f"found {len(words)} in {_shown(element, name)}, expected {count}.", "Separate them by single spaces."
+        )
+    for word in words:
+        if not (word.isascii() and _NUMBER.fullmatch(word)):
+            xacro = "${" in element.attributes[name]
+            hint = "Run the file through xacro first." if xacro else "Write a decimal number with a point: 0.25."
+            element.refuse(f"found {word[:40]!r} in {_shown(element, name)}, expected a number.", hint)
+        if not abs(float(word)) <= largest:
+            element.refuse(
+                f"found {word[:40]} in {_shown(element, name)}, expected a number of size {largest:g} at most.",
+                "Lengths are in m, angles in rad, masses in kg.",
+            )
+    return tuple(map(float, words))
+
+
+def unit_axis(element: Element | None) -> Three:
+    """The direction of an <axis>, of length one; x where there is none, by the format.
+
+    Raises:
+        ConfigError: there are none in it, not three, or all zero.
+    """
+    if element is not None:
+        element.text("xyz")
+    x, y, z = three(element, "xyz", (1.0, 0.0, 0.0))
+    length = math.hypot(x, y, z)
+    if element is not None and length < SHORTEST_AXIS:
+        element.refuse(
+            f"found an axis of length {length:g} in {_shown(element, 'xyz')}.", 'Give a direction, xyz="0 0 1".'
+        )
+    return x / length, y / length, z / length
+
+
+def _shown(element: Element, name: str) -> str:
+    value = element.attributes[name]
+    return f'<{element.tag} {name}="{value if len(value) <= 40 else value[:37] + "..."}">'
+
 
 MOVING = ("revolute", "continuous", "prismatic")
 FREE = ("floating", "planar")

@@ -8,12 +8,11 @@ from functools import partial
 import numpy as np
 import pytest
 from armcal.devices.device import DeviceError, DeviceLostError, DeviceUnwellError
-from armcal_bench.acquisition.acquisition_run import AcquisitionRun
-from armcal_bench.acquisition.drive import Drive
+from armcal_bench.acquisition.drive import Drive, PathPlanner
 from armcal_bench.acquisition.heat import HeatModel
-from armcal_bench.acquisition.path_planner import PathPlanner
 from armcal_bench.acquisition.run_log import Progress
 from armcal_bench.acquisition.schedule import Scheduler
+from armcal_bench.acquisition.session import AcquisitionRun
 from armcal_bench.acquisition.settings import AcquisitionSettings, ServoHeatSettings
 from armcal_bench.acquisition.tracker_monitor import MotionGate
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from armcal.devices.live import TrackerFrame
-from armcal.measure.stillness import mean_rotation, turns_from
-from armcal_bench.bodies import BodySettings, in_base, repeats
+from armcal.measure.rests import mean_rotation, turns_from
+from armcal_bench.bench import BodySettings, in_base, repeats
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError

@@ -21,7 +21,7 @@ from armcal.cli.main import cli
 from armcal.config.yaml_source import load_config
 from armcal.errors import ArmcalError, CalibrationWarning, ConfigError
 from armcal.plugins import PluginRegistry, discover
-from armcal_joints.springs import TorsionalSprings
+from armcal_joints.effects import TorsionalSprings
 from click.testing import CliRunner, Result
 from soak import shares
 

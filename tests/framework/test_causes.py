@@ -11,16 +11,15 @@ import numpy as np
 import oracle
 import pytest
 from armcal.cli.main import cli
+from armcal.diagnose.dependences import predicted_positions
 from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.evidence_findings import neighbour_findings, structure_findings
-from armcal.diagnose.fit_rows import FitRows
-from armcal.diagnose.noise_findings import Finding
-from armcal.diagnose.odds import UNLISTED
-from armcal.diagnose.outside import predicted_positions
-from armcal.diagnose.residual_structure import LEVEL, structure
+from armcal.diagnose.large_errors import Finding
+from armcal.diagnose.residual_structure import LEVEL, UNLISTED, structure
+from armcal.diagnose.score_tests import FitRows
 from armcal.diagnose.unseen import scale_deviation
 from armcal.diagnose.verdict import _in_short
-from armcal.estimate.weighing import fit
+from armcal.estimate.robust import fit
 from armcal.problem.motion import Motion, recorded_position
 from armcal_ipopt.estimator import IpoptEstimator
 from click.testing import CliRunner

@@ -11,9 +11,7 @@ import pytest
 import yaml
 from armcal.arm.model import forward
 from armcal.base.quaternions import rpy_of
-from armcal.calibration.convert_check import Difference, difference, load_source, reload
-from armcal.calibration.convert_mdh import mdh_section
-from armcal.calibration.convert_poe_urdf import poe_section, urdf_text
+from armcal.calibration.convert import Difference, difference, load_source, mdh_section, poe_section, reload, urdf_text
 from armcal.calibration.rigid_chain import largest_difference, random_commands, rigid_chain, tool_poses
 from armcal.cli.main import cli
 from armcal.errors import ConfigError, ProblemError

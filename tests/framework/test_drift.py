@@ -16,8 +16,8 @@ from armcal.diagnose.verdict import LEVEL, _good_for, _size
 from armcal.errors import DataError
 from armcal.estimate.estimator import estimate
 from armcal.estimate.prediction import KnownDrift, Predictor
+from armcal.estimate.robust import NoiseSettings, Weighing
 from armcal.estimate.validation import cross_validate, folds, record_errors
-from armcal.estimate.weighing import NoiseSettings, Weighing
 from armcal.problem.drift import residuals, with_drift
 from armcal_cvxpy.estimator import CvxpyEstimator
 from armcal_ipopt.estimator import IpoptEstimator

@@ -5,9 +5,8 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from armcal.arm.assembly import Arm, ArmInputs
+from armcal.arm.assembly import Arm, ArmInputs, deflections, elastic_sites, split_deflection
 from armcal.arm.effects import MOUNT, JointCommand, JointEffect, Spring
-from armcal.arm.elastic import deflections, elastic_sites, split_deflection
 from armcal.arm.model import Attachment, Chain, Joint, forward
 from armcal.arm.statics import Load, MassSpec, SiteWrench
 from armcal.base import se3

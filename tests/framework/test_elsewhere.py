@@ -10,11 +10,11 @@ import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.diagnose.evidence import elsewhere
 from armcal.diagnose.unseen import Elsewhere, elsewhere_findings
-from armcal.estimate.nuisance import started
-from armcal.estimate.weighing import fit
+from armcal.estimate.polish import started
+from armcal.estimate.robust import fit
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
-from armcal_contact.ball import BallInSocket
+from armcal_contact.contacts import BallInSocket
 from armcal_ipopt.estimator import IpoptEstimator
 
 IPOPT = IpoptEstimator(IpoptEstimator.Settings())

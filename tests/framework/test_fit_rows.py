@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import contact_oracle as co
 import numpy as np
-from armcal.diagnose.fit_rows import FitRows
-from armcal.estimate.nuisance import started
-from armcal_contact.ball import BallInSocket
+from armcal.diagnose.score_tests import FitRows
+from armcal.estimate.polish import started
+from armcal_contact.contacts import BallInSocket
 from armcal_ipopt.estimator import IpoptEstimator
 
 PLACES = {"hole_0": (0.35, 0.1, 0.25), "hole_1": (0.38, 0.12, 0.27)}

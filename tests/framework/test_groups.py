@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from armcal.errors import DataError, InputError, ProblemError
 from armcal.estimate.estimator import Solution, SolverVerdict, estimate
-from armcal.estimate.nuisance import restricted, started
-from armcal.estimate.structure import require_solvable
+from armcal.estimate.identifiability import require_solvable
+from armcal.estimate.polish import restricted, started
 from armcal.functions import compiler
 from armcal_tracker.position import TipPosition, TipPositionSettings
 from contact_oracle import (

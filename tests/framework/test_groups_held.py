@@ -8,7 +8,7 @@ import contact_oracle as co
 import numpy as np
 import pytest
 from armcal.errors import InputError
-from armcal.estimate.nuisance import restricted, settled, started, untrained
+from armcal.estimate.polish import restricted, settled, started, untrained
 from armcal.estimate.validation import record_errors
 from armcal.problem.readings import with_joint_noise
 from armcal_ipopt.estimator import IpoptEstimator

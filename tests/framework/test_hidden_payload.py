@@ -9,7 +9,7 @@ import numpy as np
 import oracle
 import pytest
 from armcal.diagnose.unseen import hidden_payload, hidden_payload_findings
-from armcal.estimate.weighing import fit
+from armcal.estimate.robust import fit
 from armcal.problem.motion import Motion
 from armcal_ipopt.estimator import IpoptEstimator
 from noise_cases import NOISE_M, posed

@@ -14,9 +14,9 @@ from armcal.base.arrays import Array
 from armcal.cli.main import cli
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Estimate, estimate
+from armcal.estimate.robust import NoiseSettings, WeighedFit, fit, weighed
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.estimate.validation import cross_validate, folds
-from armcal.estimate.weighing import NoiseSettings, WeighedFit, fit, weighed
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from click.testing import CliRunner, Result

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from armcal.estimate.structure import explain, identify
+from armcal.estimate.identifiability import explain, identify
 from planted_arms import PLANTED, SOUND, as_rows, full, oracle_null, same_span
 
 

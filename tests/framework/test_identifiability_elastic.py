@@ -10,13 +10,12 @@ import numpy as np
 import oracle
 import pytest
 from armcal.arm.assembly import Arm, prefixed
-from armcal.arm.environment import Environment
-from armcal.arm.statics import MassSpec
+from armcal.arm.statics import Environment, MassSpec
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
-from armcal.estimate.structure import explain, identify
+from armcal.estimate.identifiability import explain, identify
 from armcal.problem.problem import Problem
-from armcal_joints.springs import TorsionalSprings
+from armcal_joints.effects import TorsionalSprings
 from armcal_mdh.model import MdhModel
 from armcal_tracker.position import TipPosition, TipPositionSettings
 from chain_oracle import jacobian

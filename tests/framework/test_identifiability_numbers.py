@@ -7,8 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from armcal.base.parameters import Parameters
-from armcal.estimate.identifiability import analyse, correlated_pairs, expected_covariance
-from armcal.estimate.structure import explain, held_by_nothing, identify
+from armcal.estimate.identifiability import (
+    analyse,
+    correlated_pairs,
+    expected_covariance,
+    explain,
+    held_by_nothing,
+    identify,
+)
 from planted_arms import PLANTED, POSES, SOUND, full
 
 

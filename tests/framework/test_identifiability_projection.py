@@ -12,8 +12,7 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters, scalar
 from armcal.estimate.estimator import Solution, SolverVerdict, estimate
-from armcal.estimate.identifiability import analyse
-from armcal.estimate.structure import explain, identify, require_solvable
+from armcal.estimate.identifiability import analyse, explain, identify, require_solvable
 from armcal.measure.measurement import Channel
 from armcal.problem.problem import Problem
 from armcal.problem.projection import projected

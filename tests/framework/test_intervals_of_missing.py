@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from armcal.diagnose.coverage import Scores, coverage, missed, predictor, score, stretch
+from armcal.estimate.robust import fit
 from armcal.estimate.simulation import with_channels
-from armcal.estimate.weighing import fit
 from armcal.run.experiment import Experiment
 from drifting import DEMO, FREE, problem_of
 

@@ -12,9 +12,9 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.calibration.intervals import PredictionRecord, Uncertainty
 from armcal.estimate.estimator import estimate
-from armcal.estimate.nuisance import started
+from armcal.estimate.polish import started
 from armcal.problem.readings import with_joint_noise
-from armcal_contact.distance import TipDistance
+from armcal_contact.contacts import TipDistance
 from armcal_ipopt.estimator import IpoptEstimator
 from armcal_tracker.position import TipPosition, TipPositionSettings
 from chain_oracle import ChainSpec, Row

@@ -19,10 +19,8 @@ import pytest
 from armcal.errors import NotConvergedError
 from armcal.functions import c_source, compiler
 from armcal.problem import kernel
-from armcal.problem.backend import Interpreter
 from armcal.problem.factor import Factor
-from armcal.problem.grouped_kernel import BLOCK_RECORDS
-from armcal.problem.kernel import build_kernel, kernel_source
+from armcal.problem.kernel import BLOCK_RECORDS, Interpreter, build_kernel, kernel_source
 from forked import run_code
 
 AGREEMENT = 1e-12

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.run.experiment import Experiment
+from armcal_bench.acquisition.drive import travel
 from armcal_bench.acquisition.heat import HeatModel
-from armcal_bench.acquisition.path_planner import travel
 from armcal_bench.acquisition.preparation import prepare
 from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, ScheduleForecast, Scheduler, forecast_schedule
 from armcal_bench.acquisition.settings import ServoHeatSettings

@@ -10,7 +10,7 @@ import oracle
 import pytest
 from armcal.base.domains import Pose, Semidefinite
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
-from armcal.estimate.minimal import MinimalSet, minimal_set
+from armcal.estimate.identifiability import MinimalSet, minimal_set
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -17,7 +17,7 @@ from armcal.measure.environment import warn_beyond_limits
 from armcal.measure.missing import set_aside_not_finite, with_absent
 from armcal.measure.reader import ReadRequest, RequestedChannel, evidence_channels, requested_channels
 from armcal.testing.planar import Tip, planar_arms
-from armcal_contact.ball import BallInSocket, BallInSocketSettings
+from armcal_contact.contacts import BallInSocket, BallInSocketSettings
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
 from armcal_tracker.position import TipPosition, TipPositionSettings
 

@@ -8,8 +8,8 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.diagnose.evidence_findings import worse_than_nominal
 from armcal.diagnose.majority import FEWEST, moved_findings, moved_groups
-from armcal.estimate.nuisance import mislabelled, settled, started, untrained
-from armcal_contact.ball import BallInSocket, BallInSocketSettings
+from armcal.estimate.polish import mislabelled, settled, started, untrained
+from armcal_contact.contacts import BallInSocket, BallInSocketSettings
 
 NOISE = 2e-4
 PLACES = {"hole_0": (0.35, 0.1, 0.25), "hole_1": (0.38, 0.12, 0.27)}

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from armcal.calibration.convert_check import load_source
+from armcal.calibration.convert import load_source
 from armcal.calibration.rigid_chain import tool_poses
 from armcal.cli.main import cli
 from armcal.plugins import discover

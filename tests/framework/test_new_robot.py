@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from armcal.calibration.calibration import Calibration
-from armcal.calibration.convert_check import difference, load_source
+from armcal.calibration.convert import difference, load_source
 from armcal.cli.main import cli
 from armcal.cli.new_robot import direction, place
 from armcal.errors import InputError

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from armcal.estimate.combination import Combination, Measure, named
-from armcal.estimate.null_space import null_rows, sparse_basis
+from armcal.estimate.identifiability import Combination, Measure, named, null_rows, sparse_basis
 
 MM, DEG = Measure("m", 0.01), Measure("rad", 0.05)
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.errors import ConfigError
-from armcal.estimate.loss import tuned
 from armcal.estimate.online import Gaussian
+from armcal.estimate.robust import tuned
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.refit import NetRecord, NetState, Prior, Refit, Refitter

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from armcal.errors import NotConvergedError
-from armcal.estimate.loss import median_norm, tuned
+from armcal.estimate.robust import median_norm, tuned
 from armcal_online.tracking.observer import Reading
 from armcal_online.tracking.start import FilterSetup
 from online_arm import AXES, JOINTS, NOISE_M, PROBES, STATES, World, begun, predicted

@@ -18,7 +18,7 @@ from armcal.errors import DataError, NotConvergedError
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from armcal.run.prepare import Prepared, Stopwatch, assemble
-from armcal_contact.ball import BallInSocket
+from armcal_contact.contacts import BallInSocket
 from click.testing import CliRunner
 from scipy.optimize import minimize
 
@@ -291,7 +291,7 @@ def test_a_lost_fit_whose_residuals_cannot_be_taken_says_what_to_look_at(monkeyp
     def nowhere(*parts: object) -> None:
         raise NotConvergedError("the elastic equilibrium of a record did not settle.")
 
-    monkeypatch.setattr("armcal.estimate.weighing.estimate", nowhere)
+    monkeypatch.setattr("armcal.estimate.robust.estimate", nowhere)
     with pytest.raises(NotConvergedError, match=r"ipopt did not converge \(Maximum.*axes, units and frame"):
         calibrate(Experiment.load(DEMO, ["estimator.max_iterations=2"]))
     with pytest.raises(NotConvergedError, match="did not settle"):

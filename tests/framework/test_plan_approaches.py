@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from armcal.run.experiment import Experiment
-from armcal.run.plan import make_plan
-from armcal.run.plan_approaches import APPROACH_ROOM, reachable, with_poses_between
+from armcal.run.plan import APPROACH_ROOM, make_plan, reachable, with_poses_between
 
 from tests.own_arms import POST, OwnArm, said_by
 

@@ -12,12 +12,11 @@ import pytest
 from armcal.cli.main import cli
 from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.evidence_findings import percent, structure_findings
-from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.predictable import FEWEST_POSES, predictable
 from armcal.diagnose.residual_structure import structure
-from armcal.diagnose.score_tests import linear_fit
+from armcal.diagnose.score_tests import FitRows, linear_fit
 from armcal.diagnose.verdict import _left
-from armcal.estimate.weighing import fit
+from armcal.estimate.robust import fit
 from armcal.problem.motion import Motion, recorded_position
 from armcal_ipopt.estimator import IpoptEstimator
 from click.testing import CliRunner

@@ -13,7 +13,6 @@ import yaml
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import sealed
 from armcal.cli.main import cli
-from armcal.diagnose.clustered import widened
 from armcal.diagnose.coverage import (
     FEWEST,
     Coverage,
@@ -27,11 +26,12 @@ from armcal.diagnose.coverage import (
     stretch,
     whitened_like,
 )
+from armcal.diagnose.score_tests import widened
 from armcal.errors import DataError
 from armcal.estimate.prediction import LEVELS, Spread
+from armcal.estimate.robust import fit
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.estimate.validation import folds
-from armcal.estimate.weighing import fit
 from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.problem.drift import with_drift
 from armcal.problem.motion import recorded_position

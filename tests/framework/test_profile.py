@@ -13,8 +13,8 @@ from armcal.errors import ConfigError, NotConvergedError
 from armcal.estimate.estimator import Solution, SolverVerdict
 from armcal.estimate.polish import bounded_step, polish
 from armcal.estimate.profile import profiled, profiles
+from armcal.estimate.robust import NoiseSettings, Weighing, fit
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
-from armcal.estimate.weighing import NoiseSettings, Weighing, fit
 from armcal.problem.posed import PosedProblem
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment

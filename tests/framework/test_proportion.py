@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from armcal.diagnose.gross import Figure, Proportion, proportion
 from armcal.diagnose.gross_findings import size_findings
-from armcal.estimate.nuisance import started
-from armcal.estimate.weighing import fit
-from armcal_contact.ball import BallInSocket
+from armcal.estimate.polish import started
+from armcal.estimate.robust import fit
+from armcal_contact.contacts import BallInSocket
 from armcal_ipopt.estimator import IpoptEstimator
 
 IPOPT = IpoptEstimator(IpoptEstimator.Settings())

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from armcal.run.experiment import Experiment
-from armcal_bench.recording.agreement import AgreementJudge
-from armcal_bench.recording.quick_fit import QuickFitter
+from armcal_bench.recording.agreement import AgreementJudge, QuickFitter
 from recordings import DEMO, command, postures, recorded, still_lines
 
 

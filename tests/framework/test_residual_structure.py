@@ -17,7 +17,7 @@ from armcal.diagnose.evidence_findings import determined_finding
 from armcal.diagnose.large_errors import Judged, large_errors
 from armcal.diagnose.residual_structure import LEVEL, MOST_RECORDS, structure
 from armcal.diagnose.score_tests import DRAWS, family_test, linear_fit, own_basis
-from armcal.estimate.weighing import fit
+from armcal.estimate.robust import fit
 from armcal.problem.motion import Motion, recorded_position
 from armcal_ipopt.estimator import IpoptEstimator
 from noise_cases import FEW, NOISE_M, posed

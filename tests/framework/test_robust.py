@@ -10,9 +10,7 @@ import pytest
 from armcal.errors import DataError
 from armcal.estimate import robust
 from armcal.estimate.estimator import SolverVerdict
-from armcal.estimate.loss import median_norm, tuned
-from armcal.estimate.redundancy import studentised_distances
-from armcal.estimate.weighing import NoiseSettings, Weighing, fit, weighed
+from armcal.estimate.robust import NoiseSettings, Weighing, fit, median_norm, studentised_distances, tuned, weighed
 from armcal_cvxpy.estimator import CvxpyEstimator
 from armcal_ipopt.estimator import IpoptEstimator
 from noise_cases import FEW, NOISE_M, deviations_off, measured, posed

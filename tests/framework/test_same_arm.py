@@ -13,12 +13,10 @@ import yaml
 from armcal.arm.model import Chain
 from armcal.base.dataset import Dataset
 from armcal.base.domains import ScrewAxis
-from armcal.calibration.convert_check import load_source, nominal_values, reload
-from armcal.calibration.convert_mdh import mdh_section
-from armcal.calibration.convert_poe_urdf import poe_section, urdf_text
+from armcal.calibration.convert import load_source, mdh_section, nominal_values, poe_section, reload, urdf_text
 from armcal.calibration.rigid_chain import numeric_chain, random_commands, rigid_chain, tool_poses
 from armcal.estimate.estimator import estimate
-from armcal.estimate.structure import identify
+from armcal.estimate.identifiability import identify
 from armcal.plugins import discover
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment

@@ -21,10 +21,10 @@ from armcal.calibration.compensation.request import Commands
 from armcal.calibration.recorded_range import beyond_records
 from armcal.errors import ConfigError, DataError
 from armcal_serve.answering import Answerer, command_rows
-from armcal_serve.calibration_watch import CalibrationWatch
 from armcal_serve.loaded import Order, loaded
 from armcal_serve.protocol import Acting, CompensateAnswer, ForwardAnswer, Refusal
 from armcal_serve.served_arm import ServedArm
+from armcal_serve.server import CalibrationWatch
 from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 from serving import ROOT, ask, foreign, made, sha256, told, variant

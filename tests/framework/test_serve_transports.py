@@ -22,7 +22,7 @@ from armcal_serve.protocol import MAX_LINE_BYTES
 from armcal_serve.transports.datagrams import Datagrams
 from armcal_serve.transports.stream import StandardStreams
 from armcal_serve.transports.unix import MOST_CLIENTS, UnixSocket
-from armcal_serve.worker import Message, Unpacker
+from armcal_serve.worker_process import Message, Unpacker
 
 
 class Worker:

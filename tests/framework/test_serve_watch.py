@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from armcal.config.yaml_source import MAX_BYTES
 from armcal.errors import ConfigError
-from armcal_serve.calibration_watch import AGAIN_S, QUIET_S, CalibrationWatch
+from armcal_serve.server import AGAIN_S, QUIET_S, CalibrationWatch
 from serving import put
 
 END = f"# sha256 of the lines above: {'0' * 64}\n"

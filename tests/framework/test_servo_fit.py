@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from armcal.arm.servo import PulseClock, PulseTable
-from armcal_bench.servo.fit import fit_servos
-from armcal_bench.servo.problem import FitTask, KnownBoard, KnownServo, MeasuredPulse, Observation
+from armcal_bench.servo.problem import FitTask, KnownBoard, KnownServo, MeasuredPulse, Observation, fit_servos
 
 US = 1e-6
 KNOTS = tuple(math.radians(a) for a in (-100, 0, 100))

@@ -18,10 +18,10 @@ from armcal_bench.acquisition.heat import HeatModel, ThermalState
 from armcal_bench.acquisition.recovery import DeviceLost
 from armcal_bench.acquisition.settings import LostSettings
 from armcal_bench.acquisition.tracker_monitor import MotionGate, StopRequested
-from armcal_bench.servo.mover import Mover
 from armcal_bench.servo.outputs import improved, write_servo_file
 from armcal_bench.servo.record import NAME, Record
 from armcal_bench.servo.session import Conversation, evaluated, measure
+from armcal_bench.servo.setup import Mover
 
 from tests.bench_fakes import FakeClock
 from tests.framework.test_acquire_faults import faults

@@ -11,12 +11,11 @@ from armcal.arm.servo import PulseClock, PulseTable
 from armcal.config.servo_file import load_servo_file
 from armcal.config.yaml_source import load_config
 from armcal.run.experiment import Experiment
-from armcal_bench.servo.findings import findings
 from armcal_bench.servo.nominal import NominalArm
 from armcal_bench.servo.outcome import outcome_of
-from armcal_bench.servo.outputs import improved, results, write_servo_file
+from armcal_bench.servo.outputs import findings, improved, results, write_servo_file
 from armcal_bench.servo.problem import KnownBoard, KnownServo, MeasuredPulse
-from armcal_bench.servo.settings import ServoCalibrationSettings
+from armcal_bench.servo.setup import ServoCalibrationSettings
 from scipy.spatial.transform import Rotation
 
 from tests.servo_fakes import CONFIGS

@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 from armcal.run.experiment import Experiment
-from armcal_bench.servo.nominal import NominalArm
+from armcal_bench.servo.nominal import NominalArm, NoTurnError, turning_of_positions, turning_of_rotations
 from armcal_bench.servo.trial import Move, judged, swapped, wrapped
-from armcal_bench.servo.turning import NoTurnError, turning_of_positions, turning_of_rotations
 from scipy.spatial.transform import Rotation
 
 from tests.servo_fakes import CONFIGS

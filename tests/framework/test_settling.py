@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import pytest
 from armcal.devices.live import REPEATED, TrackerFrame
-from armcal.measure.stillness import deviations_of_mean, mean_pose
+from armcal.measure.rests import deviations_of_mean, mean_pose
 from armcal_bench.acquisition.settings import SettleSettings
 from armcal_bench.acquisition.tracker_monitor import TrackerHealth
-from armcal_bench.bodies import BodySettings
+from armcal_bench.bench import BodySettings
 from armcal_bench.settling import Settled, Settling, drift_of
 from hypothesis import given, settings
 from hypothesis import strategies as st

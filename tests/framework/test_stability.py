@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armcal.arm.equilibrium import MOST_DEFLECTION, lowest, settle
+from armcal.arm.evaluator import MOST_DEFLECTION, lowest, settle
 from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.errors import NotConvergedError

@@ -14,10 +14,8 @@ from armcal.base.dataset import Dataset
 from armcal.cli.check import gravity_lines
 from armcal.cli.main import cli
 from armcal.diagnose.permuted_axes import find_permuted_axes
-from armcal.estimate.placing import placings
-from armcal.estimate.start import Start, aligned_start
-from armcal.problem.rigid_alignment import Alignment, Tools, alignments, hand_eye, undetermined
-from armcal.problem.sighting import sighting_of, tools_of
+from armcal.estimate.start import Start, aligned_start, placings
+from armcal.problem.rigid_alignment import Alignment, Tools, alignments, hand_eye, sighting_of, tools_of, undetermined
 from armcal.run.experiment import Experiment
 from armcal.run.prepare import Prepared, Stopwatch, assemble
 from click.testing import CliRunner

@@ -10,12 +10,11 @@ import oracle
 import pytest
 from armcal.arm.assembly import Arm
 from armcal.arm.effects import JointEffect, Spring
-from armcal.arm.environment import Environment
 from armcal.arm.model import forward
-from armcal.arm.statics import Load, MassSpec, wrenches
+from armcal.arm.statics import Environment, Load, MassSpec, wrenches
 from armcal.base.parameters import Parameters, scalar
 from armcal.problem.problem import Problem
-from armcal_joints.springs import TorsionalSprings, TorsionalSpringSettings
+from armcal_joints.effects import TorsionalSprings, TorsionalSpringSettings
 from armcal_mdh.model import MdhModel, MdhSettings
 from armcal_tracker.position import TipPosition, TipPositionSettings
 from scipy.spatial.transform import Rotation

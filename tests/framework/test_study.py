@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.cli.main import cli
-from armcal.config.variants import load_variants
+from armcal.config.yaml_source import load_variants
 from armcal.errors import ConfigError, NotConvergedError, ProblemError
 from armcal.estimate.validation import FitTask, fit_and_judge, folds
 from armcal.io.parallel import Sequential, Workers

@@ -8,11 +8,10 @@ import numpy as np
 import oracle
 import pytest
 from armcal.diagnose.evidence_findings import worse_than_declared
-from armcal.diagnose.noise_findings import component_findings
+from armcal.diagnose.large_errors import component_findings
 from armcal.errors import ProblemError
-from armcal.estimate.likelihood import Term, _evaluate, maximise
-from armcal.estimate.variance import apply_components, estimate_components
-from armcal.estimate.weighing import NoiseSettings, fit, weighed
+from armcal.estimate.robust import NoiseSettings, fit, weighed
+from armcal.estimate.variance import Term, _evaluate, apply_components, estimate_components, maximise
 from armcal.problem.factor_records import by_covariance, transformed
 from armcal.run.experiment import Experiment
 from armcal.run.prepare import Stopwatch, prepare

@@ -10,13 +10,12 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.errors import ConfigError
 from armcal.estimate.estimator import estimate
-from armcal.estimate.nuisance import started
+from armcal.estimate.polish import started
 from armcal.estimate.simulation import SimulationRequest
 from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.problem.readings import with_joint_noise
-from armcal_contact.clamp import ClampedTool
-from armcal_contact.plane import PlaneContact
+from armcal_contact.contacts import ClampedTool, PlaneContact
 from armcal_dualarm.closure import ClosedChain
 from armcal_ipopt.estimator import IpoptEstimator
 from armcal_simulation.contacts import ContactsSettings, ContactsSimulator

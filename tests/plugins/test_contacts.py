@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 from armcal.base import se3
 from armcal.errors import InputError
-from armcal.estimate.nuisance import restricted, settled, started, untrained
-from armcal.estimate.structure import require_solvable
+from armcal.estimate.identifiability import require_solvable
+from armcal.estimate.polish import restricted, settled, started, untrained
 from armcal.problem.readings import with_joint_noise
-from armcal_contact.ball import BallInSocket
-from armcal_contact.clamp import ClampedTool
-from armcal_contact.plane import PlaneContact
+from armcal_contact.contacts import BallInSocket, ClampedTool, PlaneContact
 from armcal_dualarm.closure import ClosedChain
 from armcal_ipopt.estimator import IpoptEstimator
 from contact_oracle import LEFT

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from armcal.devices.live import REPEATED
-from armcal_tracker.dtrack_message import messages
+from armcal_tracker.dtrack import messages
 from armcal_tracker.frames import LATE, FrameCounter, UnreadableError
 from scipy.spatial.transform import Rotation
 

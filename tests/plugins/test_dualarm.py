@@ -10,7 +10,7 @@ import pytest
 import two_arms
 import yaml
 from armcal.cli.main import cli
-from armcal.estimate.structure import identify
+from armcal.estimate.identifiability import identify
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 from two_arms import CONFIGS, JOINTS, Case, NumpyArm, offsets_of, placements

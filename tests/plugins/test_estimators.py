@@ -10,8 +10,7 @@ import pytest
 from armcal.base.domains import Interval
 from armcal.errors import ProblemError
 from armcal.estimate.estimator import estimate
-from armcal.estimate.identifiability import analyse
-from armcal.estimate.structure import require_solvable
+from armcal.estimate.identifiability import analyse, require_solvable
 from armcal.problem.posed import PosedProblem
 from armcal.problem.problem import Problem
 from armcal_cvxpy.estimator import CvxpyEstimator

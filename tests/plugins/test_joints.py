@@ -14,17 +14,23 @@ import oracle
 import pytest
 import yaml
 from armcal.arm.assembly import Arm, ArmInputs, prefixed
-from armcal.arm.environment import Environment
-from armcal.arm.statics import Load, MassSpec
+from armcal.arm.statics import Environment, Load, MassSpec
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.cli.main import cli
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal_joints.backlash import ApproachBacklash, BearingPlay, TorqueBacklash
-from armcal_joints.servo_map import GearError, ServoMap
-from armcal_joints.springs import Compliances, CubicSprings, TorsionalSprings
-from armcal_joints.thermal import ThermalLength
+from armcal_joints.effects import (
+    ApproachBacklash,
+    BearingPlay,
+    Compliances,
+    CubicSprings,
+    GearError,
+    ServoMap,
+    ThermalLength,
+    TorqueBacklash,
+    TorsionalSprings,
+)
 from armcal_tracker.position import TipPosition, TipPositionSettings
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation

@@ -12,10 +12,16 @@ import pytest
 from armcal.devices.clock import RealClock
 from armcal.devices.device import DeviceRefusedError
 from armcal.errors import DataError
-from armcal_tracker.frame_table import frame_table, row_of
 from armcal_tracker.frames import UnreadableError
-from armcal_tracker.json_message import json_frame
-from armcal_tracker.line_trackers import GrowingCsvSettings, GrowingCsvTracker, JsonLinesSettings, JsonLinesTracker
+from armcal_tracker.line_trackers import (
+    GrowingCsvSettings,
+    GrowingCsvTracker,
+    JsonLinesSettings,
+    JsonLinesTracker,
+    frame_table,
+    json_frame,
+    row_of,
+)
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 

@@ -11,8 +11,14 @@ from armcal.errors import ProblemError
 from armcal.estimate.online import Gaussian, Linearised, OnlineEstimator, Update, checked, kalman_update
 from armcal.plugins import Component, discover
 from armcal.testing.contract import check_component, check_plugin
-from armcal_kalman.filters import ExtendedFilter, ExtendedSettings, UnscentedFilter, UnscentedSettings
-from armcal_kalman.window import WindowEstimator, WindowSettings
+from armcal_kalman.filters import (
+    ExtendedFilter,
+    ExtendedSettings,
+    UnscentedFilter,
+    UnscentedSettings,
+    WindowEstimator,
+    WindowSettings,
+)
 
 MADE: dict[str, Callable[[], OnlineEstimator]] = {
     "extended": lambda: ExtendedFilter(ExtendedSettings()),

@@ -11,7 +11,7 @@ import pytest
 from armcal.arm.assembly import Arm
 from armcal.errors import ArmcalError, DataError
 from armcal.measure.reader import ReadRequest, requested_channels
-from armcal_contact.ball import BallInSocket, BallInSocketSettings
+from armcal_contact.contacts import BallInSocket, BallInSocketSettings
 from armcal_contact.mukca_reader import MukcaReader, MukcaSettings
 from armcal_mdh.model import MdhModel, MdhSettings
 

@@ -16,8 +16,7 @@ from armcal.arm.statics import Load, MassSpec, effort, wrenches
 from armcal.base import se3
 from armcal.base.domains import Direction
 from armcal.base.parameters import Parameters
-from armcal_poe.model import PoeModel
-from armcal_poe.settings import PoeSettings
+from armcal_poe.model import PoeModel, PoeSettings
 from pydantic import ValidationError
 
 EXACT_M = 1e-12

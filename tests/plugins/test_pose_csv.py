@@ -8,8 +8,8 @@ from armcal.arm.assembly import Arm
 from armcal.errors import DataError
 from armcal.measure.reader import ReadRequest, requested_channels
 from armcal_mdh.model import MdhModel, MdhSettings
-from armcal_tracker.pose import TipPose, TipPoseSettings
-from armcal_tracker.pose_csv_reader import PoseCsvReader, PoseCsvSettings, misfit, nominal_rotations
+from armcal_tracker.csv_reader import PoseCsvReader, PoseCsvSettings, misfit, nominal_rotations
+from armcal_tracker.position import TipPose, TipPoseSettings
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
@@ -320,7 +320,7 @@ def test_matrices_that_are_none(tmp_path):
 
 def test_rows_of_another_measurement_have_no_orientation(tmp_path):
     """A second instrument keeps the record; where the quaternion is missing the pose was not measured."""
-    from armcal_contact.ball import BallInSocket, BallInSocketSettings
+    from armcal_contact.contacts import BallInSocket, BallInSocketSettings
 
     ball = BallInSocket(BallInSocketSettings.si(noise=1e-3), ("arm",))
     angles = joints(30)

@@ -13,7 +13,7 @@ from armcal.arm.servo import PulseClock, PulseTable, quantised
 from armcal.base.config_text import ConfigText
 from armcal.config.servo_file import digest
 from armcal.run.experiment import Experiment
-from armcal_joints.quantisation import Quantisation
+from armcal_joints.effects import Quantisation
 from board_bench import JOINTS, LRM_PULSES_US, servo_file, written
 from pydantic import ValidationError
 

@@ -18,8 +18,7 @@ from armcal.problem.posed import PosedProblem
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal_cvxpy.estimator import CvxpyEstimator
-from armcal_ipopt.convex_steps import QuadraticModel
-from armcal_ipopt.estimator import IpoptEstimator
+from armcal_ipopt.estimator import IpoptEstimator, QuadraticModel
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 CONE = CvxpyEstimator(CvxpyEstimator.Settings())

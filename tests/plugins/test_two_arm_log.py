@@ -10,7 +10,7 @@ from armcal.arm.assembly import Arm
 from armcal.errors import ArmcalError, DataError
 from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.measure.rests import Rest, StillSettings, rests
-from armcal_contact.ball import BallInSocket, BallInSocketSettings
+from armcal_contact.contacts import BallInSocket, BallInSocketSettings
 from armcal_dualarm.closure import ClosedChain, ClosedChainSettings
 from armcal_dualarm.log_reader import TwoArmLogReader, TwoArmLogSettings
 from armcal_mdh.model import MdhModel, MdhSettings

@@ -25,9 +25,9 @@ from armcal.measure.reader import requested_channels
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 from armcal.run.plan_poses import stated_beyond
-from armcal_joints.servo_map import ServoMap
-from armcal_urdf.encoding import MAX_BYTES, decode, encode
+from armcal_joints.effects import ServoMap
 from armcal_urdf.model import UrdfModel, UrdfSettings
+from armcal_urdf.robot import MAX_BYTES, decode, encode
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from armcal.arm.assembly import Arm
 from armcal.calibration.calibration import Calibration
-from armcal.calibration.convert_check import reload
+from armcal.calibration.convert import reload
 from armcal.calibration.exporter import ExportRequest, effects_reach, random_commands, request_of, rigid_tools
 from armcal.calibration.rigid_chain import tool_poses
 from armcal.cli.main import cli
@@ -22,9 +22,9 @@ from armcal.errors import ConfigError, ProblemError
 from armcal.plugins import discover
 from armcal.testing.planar import planar_arms
 from armcal_urdf import edit, export
-from armcal_urdf.encoding import decode
 from armcal_urdf.export import UrdfExporter, UrdfExportSettings
 from armcal_urdf.model import UrdfModel, UrdfSettings
+from armcal_urdf.robot import decode
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 

@@ -13,9 +13,8 @@ from armcal.config.system import build_system
 from armcal.config.yaml_source import load_config
 from armcal.errors import EXIT_BAD_INPUT, EXIT_DONE, ArmcalError, ConfigError
 from armcal.plugins import discover
-from armcal_urdf.chain import chain_of
-from armcal_urdf.elements import MAX_DEPTH
-from armcal_urdf.robot import read_robot
+from armcal_urdf.model import chain_of
+from armcal_urdf.robot import MAX_DEPTH, read_robot
 from click.testing import CliRunner
 
 MUTANTS = 700

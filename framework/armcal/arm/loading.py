@@ -7,9 +7,8 @@ import casadi as ca
 import numpy as np
 
 from armcal.arm.assembly import Arm
-from armcal.arm.environment import Environment
 from armcal.arm.model import Chain, Frames, Vector3, forward
-from armcal.arm.statics import LOAD_CHANNELS, Load, SiteWrench, joint_efforts, wrenches
+from armcal.arm.statics import LOAD_CHANNELS, Environment, Load, SiteWrench, joint_efforts, wrenches
 from armcal.base.arrays import Array
 from armcal.base.se3 import Expression
 

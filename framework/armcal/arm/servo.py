@@ -13,6 +13,16 @@ import casadi as ca
 from armcal.arm.effects import JointEffect
 from armcal.base.se3 import Expression
 
+SPLINE_TEETH = 25
+"""Of the usual spline."""
+TOOTH_DEG = 360 / SPLINE_TEETH
+
+
+def teeth_text(number: int, tooth_deg: float = TOOTH_DEG) -> str:
+    """So many teeth, either way, in words: "2 teeth of its horn (14.4 deg each)"."""
+    return f"{abs(number)} {'tooth' if abs(number) == 1 else 'teeth'} of its horn ({tooth_deg:.1f} deg each)"
+
+
 COUNTS = 4096
 """In one period."""
 PRESCALES = (3, 255)

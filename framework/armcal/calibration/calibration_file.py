@@ -14,7 +14,7 @@ from armcal.base.config_text import finite, plain
 from armcal.base.settings import Settings
 from armcal.calibration.intervals import PredictionRecord
 from armcal.calibration.physics import CheckRecord, ComponentRecord
-from armcal.config.yaml_scalars import needs_quotes
+from armcal.config.yaml_nodes import needs_quotes
 from armcal.config.yaml_source import ConfigSource, load_config
 from armcal.errors import ConfigError, Location
 from armcal.estimate.estimator import Estimate

@@ -11,8 +11,8 @@ import casadi as ca
 import numpy as np
 
 from armcal.arm.assembly import Arm
-from armcal.arm.environment import STATICS, Environment
 from armcal.arm.joints import joint_limits
+from armcal.arm.statics import STATICS, Environment
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock, Parameters

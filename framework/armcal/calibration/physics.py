@@ -15,8 +15,7 @@ import numpy as np
 from armcal import plugins
 from armcal.arm import assembly
 from armcal.arm.assembly import command_channels
-from armcal.arm.environment import Environment
-from armcal.arm.statics import LOAD_CHANNELS
+from armcal.arm.statics import LOAD_CHANNELS, Environment
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
@@ -25,9 +24,9 @@ from armcal.calibration.intervals import PlusMinus
 from armcal.calibration.tool_expression import poses_of
 from armcal.config.system import System
 from armcal.errors import Location, PluginError
-from armcal.measure.contact import ArmsAlone
+from armcal.measure.groups import PairedMeasurement
+from armcal.measure.instrument import ArmsAlone
 from armcal.measure.measurement import Measurement
-from armcal.measure.partners import PairedMeasurement
 from armcal.measure.reader import requested_channels
 from armcal.plugins import PluginRegistry
 from armcal.problem.problem import Problem

@@ -14,10 +14,9 @@ import numpy as np
 from typing_extensions import override
 
 from armcal.arm.assembly import Arm, ArmInputs, scoped
-from armcal.arm.environment import STATICS, Environment, tilted
 from armcal.arm.evaluator import ElasticPass, Evaluator
 from armcal.arm.servo import PulseClock, PulseTable, SteppedEffect
-from armcal.arm.statics import LOAD_CHANNELS, Load
+from armcal.arm.statics import LOAD_CHANNELS, STATICS, Environment, Load, tilted
 from armcal.base import se3
 from armcal.base.arrays import Array, Mask
 from armcal.base.parameters import Parameters

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from armcal.calibration.acceptance import accept as accepted
+from armcal.calibration.calibration import accept as accepted
 from armcal.calibration.calibration_file import sealed
 from armcal.cli.common import FILE, Console, speaking
 from armcal.io.file_set import write_over

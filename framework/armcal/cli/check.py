@@ -15,9 +15,8 @@ from armcal.cli.common import FILE, Console, data, overrides, speaking
 from armcal.cli.console import say
 from armcal.config.system import System
 from armcal.errors import ProblemError
-from armcal.estimate.identifiability import Identifiability
+from armcal.estimate.identifiability import Identifiability, identify, require_solvable
 from armcal.estimate.start import Start, pose_words
-from armcal.estimate.structure import identify, require_solvable
 from armcal.run.experiment import Experiment
 from armcal.run.prepare import Prepared, Stopwatch, assemble, gravity_findings
 

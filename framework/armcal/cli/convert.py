@@ -7,9 +7,17 @@ from typing import Any
 import click
 import yaml
 
-from armcal.calibration.convert_check import ConvertSource, Difference, difference, load_source, reload
-from armcal.calibration.convert_mdh import Convention, mdh_section
-from armcal.calibration.convert_poe_urdf import poe_section, urdf_text
+from armcal.calibration.convert import (
+    Convention,
+    ConvertSource,
+    Difference,
+    difference,
+    load_source,
+    mdh_section,
+    poe_section,
+    reload,
+    urdf_text,
+)
 from armcal.calibration.rigid_chain import rigid_chain
 from armcal.cli.common import FILE, Console, arm, spare_inputs, speaking
 from armcal.errors import ArmcalError, PluginError

@@ -23,9 +23,8 @@ from armcal.calibration.exporter import (
 from armcal.cli.common import FILE, Console, accept, arm, spare_inputs, speaking, unwritten
 from armcal.cli.completion import component_names
 from armcal.config.validate import validate
-from armcal.config.yaml_nodes import Node, Origin
+from armcal.config.yaml_nodes import Node, Origin, assignment, set_at
 from armcal.config.yaml_source import Reader, as_source
-from armcal.config.yaml_tree import assignment, set_at
 from armcal.errors import ConfigError, InputError, Location, PluginError
 from armcal.io.file_set import require_new, write_new, write_over
 from armcal.io.plain_files import check_output, writing

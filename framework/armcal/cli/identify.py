@@ -13,10 +13,20 @@ from armcal.base.config_text import finite
 from armcal.base.parameters import Parameters
 from armcal.cli.common import FILE, Console, data, overrides, speaking
 from armcal.errors import ConfigError, Location
-from armcal.estimate.combination import Combination, Measure
-from armcal.estimate.identifiability import CORRELATED, Identifiability, correlated_pairs, expected_covariance
-from armcal.estimate.minimal import Dropped, minimal_set
-from armcal.estimate.structure import CAUSES, explain, held_by_nothing, identify_from
+from armcal.estimate.identifiability import (
+    CAUSES,
+    CORRELATED,
+    Combination,
+    Dropped,
+    Identifiability,
+    Measure,
+    correlated_pairs,
+    expected_covariance,
+    explain,
+    held_by_nothing,
+    identify_from,
+    minimal_set,
+)
 from armcal.estimate.validation import error_unit
 from armcal.planning.criterion import observability
 from armcal.problem.projection import factor_at_zero

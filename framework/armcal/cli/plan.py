@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from armcal.cli.common import FILE, Console, overrides, speaking
 from armcal.errors import ConfigError, InputError, Location
-from armcal.estimate.combination import Measure
+from armcal.estimate.identifiability import Measure
 from armcal.measure.csv_writer import write_csv
 from armcal.planning.criterion import GOALS
 from armcal.run.experiment import Experiment

@@ -15,11 +15,10 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from armcal.arm.servo import PulseClock, PulseTable
-from armcal.base.quantities import UnitOf
-from armcal.base.settings import Settings
+from armcal.base.settings import Settings, UnitOf
 from armcal.base.units import from_unit
 from armcal.config.validate import validate
-from armcal.config.yaml_scalars import read_plain
+from armcal.config.yaml_nodes import read_plain
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
 

@@ -10,10 +10,9 @@ from pydantic import Field, field_validator
 from typing_extensions import get_protocol_members, is_protocol
 
 from armcal.arm.assembly import PLACEMENT, Arm, MassiveModel, prefixed
-from armcal.arm.environment import STATICS, Environment, gravity_tilt
 from armcal.arm.joints import require_couplings
 from armcal.arm.servo import SteppedEffect
-from armcal.arm.statics import MassSpec, frame_names
+from armcal.arm.statics import STATICS, Environment, MassSpec, frame_names, gravity_tilt
 from armcal.base.parameters import FIT_NAME, ParameterBlock, Parameters, declared
 from armcal.base.poses import PoseSettings
 from armcal.base.settings import Acceleration3, Angle, Force3, Length3, Mass, Settings, Torque3

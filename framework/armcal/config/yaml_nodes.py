@@ -6,6 +6,7 @@ anything is built and no tag can construct an object.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -14,8 +15,92 @@ from typing import Any, NoReturn
 
 import yaml
 
-from armcal.config.yaml_scalars import Scalar, ScalarError, read_plain
 from armcal.errors import ConfigError, Location
+
+Scalar = bool | int | float | str | None
+
+_LONGEST_INTEGER = 300
+
+_NULL = frozenset(("", "~", "null", "Null", "NULL"))
+_TRUE = frozenset(w for base in ("yes", "true", "on") for w in (base, base.capitalize(), base.upper()))
+_FALSE = frozenset(w for base in ("no", "false", "off") for w in (base, base.capitalize(), base.upper()))
+
+_INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)")
+_HEX = re.compile(r"[-+]?0x[0-9a-fA-F]+")
+_FLOAT = re.compile(r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+)([eE][-+][0-9]+)?")
+_LOOSE_EXPONENT = re.compile(r"([-+]?)([0-9]+\.?[0-9]*|\.[0-9]+)[eE]([-+]?)([0-9]+)")
+_NOT_FINITE = re.compile(r"[-+]?\.(inf|Inf|INF|nan|NaN|NAN)")
+_CLOCK = re.compile(r"[-+]?[0-9][0-9_]*(:[0-5]?[0-9])+(\.[0-9_]*)?")
+_OCTAL = re.compile(r"[-+]?(0[0-9_]+|0o[0-7_]+|0b[01_]+|0x[0-9a-fA-F_]*_[0-9a-fA-F_]*)")
+_UNDERSCORE = re.compile(r"[-+]?[0-9][0-9_]*\.?[0-9_]*([eE][-+]?[0-9_]+)?")
+
+
+class ScalarError(ValueError):
+    """A bare word that YAML would read as something surprising; ``hint`` is what to write instead."""
+
+    def __init__(self, message: str, hint: str) -> None:
+        super().__init__(message)
+        self.hint = hint
+
+
+def read_plain(text: str) -> Scalar:
+    """The value of an unquoted scalar.
+
+    Null, booleans (yes, no, on and off too), decimal and 0x integers and decimal fractions are read as YAML
+    1.1 does; everything else is text, dates included.
+
+    Raises:
+        ScalarError: a number in a spelling that YAML reads otherwise than it looks, or one not finite.
+    """
+    if text in _NULL:
+        return None
+    if text in _TRUE or text in _FALSE:
+        return text in _TRUE
+    if _INTEGER.fullmatch(text):
+        if len(text) > _LONGEST_INTEGER:
+            raise ScalarError(f"found a number of {len(text)} digits", "Quote it if it is text.")
+        return int(text)
+    if _HEX.fullmatch(text) and len(text) <= _LONGEST_INTEGER:
+        return int(text, 16)
+    if _FLOAT.fullmatch(text):
+        if not math.isfinite(float(text)):
+            raise ScalarError(f"{text} is too large to be a number", "Write a finite number.")
+        return float(text)
+    _refuse_surprises(text)
+    return text
+
+
+def needs_quotes(text: str) -> bool:
+    """Whether a text is refused where it stands bare, as ``1e5`` is, which YAML itself takes for text and writes so."""
+    try:
+        read_plain(text)
+    except ScalarError:
+        return True
+    return False
+
+
+def _refuse_surprises(text: str) -> None:
+    quoted = f'or "{text}" if it is text'
+    if _NOT_FINITE.fullmatch(text):
+        raise ScalarError(f"{text} is not a finite number", f"Write a finite number, leave the key out, {quoted}.")
+    if match := _LOOSE_EXPONENT.fullmatch(text):
+        sign, digits, exponent_sign, exponent = match.groups()
+        digits = digits if "." in digits else f"{digits}.0"
+        digits = f"0{digits}" if digits.startswith(".") else digits
+        clear = f"{sign}{digits}e{exponent_sign or '+'}{exponent}"
+        raise ScalarError(f"{text} is text to YAML, not a number", f"Write {clear}, {quoted}.")
+    if _CLOCK.fullmatch(text):
+        mend = f"Write a number with its unit, for example 90 s, {quoted}."
+        raise ScalarError(f"YAML reads {text} in base 60", mend)
+    if _OCTAL.fullmatch(text):
+        digits = text.lstrip("+-0").replace("_", "")
+        sign = "-" if text.startswith("-") else ""
+        decimal = f"{sign}{digits}" if digits.isdecimal() else "a decimal number"
+        mend = f"Write {decimal}, {quoted}."
+        raise ScalarError(f"YAML reads {text} as an octal, binary or hexadecimal number", mend)
+    if "_" in text and _UNDERSCORE.fullmatch(text):
+        raise ScalarError(f"{text} is a number with underscores", f"Write {text.replace('_', '')}, {quoted}.")
+
 
 MAX_DEPTH = 50
 MAX_NODES = 1_000_000
@@ -257,3 +342,98 @@ class _Builder:
         shown = tag.replace("tag:yaml.org,2002:", "!!")
         hint = "Remove it: a config holds plain values only."
         self.refuse(f"found the tag {shown}, expected no tag.", hint, line)
+
+
+_STEPS = re.compile(r'(?:"([^"]+)"|([^."\s]+))(?:\.|$)')
+
+
+def entries_of(node: Node) -> dict[str, Node]:
+    return node.value if isinstance(node.value, dict) else {}
+
+
+def merge(parent: Node, child: Node) -> Node:
+    """The child over the parent: mappings merge, null removes the parent's key, anything else replaces."""
+    if not (isinstance(parent.value, dict) and isinstance(child.value, dict)):
+        return child
+    entries = dict(parent.value)
+    for key, node in child.value.items():
+        if key not in entries:
+            entries[key] = node
+        elif node.value is None:
+            del entries[key]
+        else:
+            entries[key] = merge(entries[key], node)
+    return replace(child, value=entries)
+
+
+def steps_of(name: str) -> tuple[str, ...] | None:
+    """The keys of a dotted name, of which one that holds a dot stands in double quotes; None if it is not one."""
+    matches = list(_STEPS.finditer(name))
+    steps = tuple(match[1] or match[2] for match in matches)
+    whole = "".join(match[0] for match in matches) == name and not name.endswith(".")
+    return steps if whole and steps and len(steps) <= MAX_DEPTH else None
+
+
+def override(tree: Node, text: str) -> Node:
+    """The tree after one ``a.b=value``.
+
+    Raises:
+        ConfigError: the text is not of that form, or does not fit the tree.
+    """
+    assigned = assignment(text, "--set")
+    if assigned is None:
+        hint = "Write for example --set parameters.bounds=none; null as the value removes a key."
+        where = Location(f"command line (--set {text})")
+        raise ConfigError(f"found {text!r}, expected a dotted name, '=' and a value.", where=where, hint=hint)
+    steps, value = assigned
+    if steps[0] == "extends":
+        hint = "Write it in the config."
+        raise ConfigError("'extends' is read from files only.", where=value.origin.at(None), hint=hint)
+    return set_at(tree, steps, value)
+
+
+def assignment(text: str, option: str) -> tuple[tuple[str, ...], Node] | None:
+    """The keys and the value of ``a.b=value`` from the command line; None if it is not of that form.
+
+    Raises:
+        ConfigError: the value is not YAML.
+    """
+    name, equals, written = text.partition("=")
+    steps = steps_of(name.strip())
+    if not equals or steps is None or not written.strip():
+        return None
+    origin = Origin(f"command line ({option} {name.strip()})", Path.cwd(), numbered=False, prefix=steps)
+    return steps, read_nodes(written, origin) or Node(origin, 1, None)
+
+
+def set_at(node: Node, steps: tuple[str, ...], value: Node) -> Node:
+    """The tree with another value at a path; null removes.
+
+    Raises:
+        ConfigError: the path leads into a number or text, or to an index that a list has not.
+    """
+    if not steps:
+        return value
+    step, rest = steps[0], steps[1:]
+    if isinstance(node.value, tuple):
+        items = list(node.value)
+        if not (step.isascii() and step.isdecimal() and len(step) < 10 and int(step) < len(items)):
+            raise ConfigError(
+                f"found the index {step!r} into a list of {len(items)} values.",
+                where=value.origin.at(None),
+                hint=f"Write an index from 0 to {len(items) - 1}." if items else "Override the whole list.",
+            )
+        items[int(step)] = set_at(items[int(step)], rest, value)
+        return replace(node, value=tuple(items))
+    if node.value is not None and not isinstance(node.value, dict):
+        raise ConfigError(
+            f"the key above {step!r} holds {str(node.value)[:60]!r}, expected a mapping or a list.",
+            where=value.origin.at(None),
+            hint="Override that key itself, or correct the name.",
+        )
+    entries = dict(entries_of(node))
+    if not rest and value.value is None and step in entries:
+        del entries[step]
+    else:
+        entries[step] = set_at(entries.get(step, Node(value.origin, 1, None)), rest, value)
+    return replace(node, value=entries)

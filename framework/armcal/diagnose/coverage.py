@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from armcal.base.arrays import Array, Indices
-from armcal.diagnose.noise_findings import Finding
+from armcal.diagnose.large_errors import Finding
 from armcal.errors import NotConvergedError
 from armcal.estimate.bootstrap import automatic_block_length, standard_error_of_mean
 from armcal.estimate.estimator import Estimator
@@ -32,9 +32,9 @@ from armcal.estimate.prediction import (
     is_position,
     quantile,
 )
+from armcal.estimate.robust import WeighedFit, Weighing, fit
 from armcal.estimate.validation import FitTask, JudgedFit, Recording, Split, failed_fit, fit_and_judge, judged_fit
 from armcal.estimate.variance import apply_components
-from armcal.estimate.weighing import WeighedFit, Weighing, fit
 from armcal.problem.problem import FactorRecords, Problem
 
 Residuals = tuple[Array, ...]

@@ -2,24 +2,33 @@
 
 Each dependence is a set of columns: how residuals would move with it, to first order, along the motion of one joint,
 along the residual's own entries (base axes for a position), or along the turning of one site.
+
+Whether the scatter of residuals depends on something: time, place, a joint's angle, a torque.
+
+Squares of residuals, leverage counted, are regressed on one thing after another [Koenker1981]; all of them at once keep
+their level (Bonferroni). What does as well as the best, within 20 to 1, is named beside it.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
+from scipy.special import chdtrc, fdtrc
 
 from armcal.arm.assembly import Arm, shown_joint
 from armcal.arm.effects import joint_rate
 from armcal.arm.loading import SiteLoads
-from armcal.base.arrays import Array
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.units import display_unit, to_unit
 from armcal.diagnose.held import Moves
+from armcal.diagnose.predictable import CLEAR, Kernels, smooth
+from armcal.diagnose.score_tests import FitRows
 from armcal.estimate.freeing import candidates
+from armcal.measure.measurement import NamesMistakes
 from armcal.problem.motion import Motion, recorded_order
-from armcal.problem.problem import Problem
+from armcal.problem.problem import FactorRecords, Problem
 
 MOST_LEVELS = 12
 """Levels of a joint are separated one by one up to so many; beyond, by a cubic."""
@@ -303,3 +312,266 @@ def _centred(features: Array, command: Array) -> Array:
     centred = np.zeros_like(features)
     centred[known] = features[known] - features[known].mean(axis=0)
     return centred
+
+
+LEVEL = 0.05
+LACK = 0.01
+TIMES_REPEATS = 3.0
+"""How many times what repeats scatter residuals are, for the rest to be worth a word: no model is perfect."""
+_FEWEST_REPEATS = 5
+_MM = 1000.0
+
+
+@dataclass(frozen=True)
+class NoiseTrend:
+    """What the scatter depends on.
+
+    Attributes:
+        words: as the end of a sentence.
+        p_value: that it does not, over all things looked at.
+        low, high: scatter in units of the declared noise, in the third of the records with the least and most of it.
+        alternatives: what else may be meant, the most likely first.
+    """
+
+    words: str
+    p_value: float
+    low: float
+    high: float
+    alternatives: tuple[str, ...]
+
+
+def noise_trend(residual: Array, basis: Array, by_record: Indices, here: Records, place: Array) -> NoiseTrend | None:
+    """What the scatter of a residual (rows, whitened) depends on; None where nothing shows.
+
+    ``basis`` is what the fit takes up (rows x n), ``place`` what instruments read (3 x N; m), or nothing (0 x N).
+    """
+    leverage = np.sum(basis[by_record] ** 2, axis=2)
+    squares = np.mean(residual[by_record] ** 2 / np.maximum(1 - leverage, 0.05), axis=1)
+    tried = [(words, f) for words, f in _features(here, place) if np.ptp(f) > 1e-9 * max(1.0, float(np.abs(f).max()))]
+    spread = float(squares.std())
+    if not tried or not spread:
+        return None
+    explained = np.array([np.corrcoef(squares, f)[0, 1] ** 2 for _, f in tried])
+    best, count = int(np.argmax(explained)), len(squares)
+    p = min(1.0, len(tried) * float(chdtrc(1, count * explained[best])))
+    if p > LEVEL:
+        return None
+    gains = -0.5 * count * np.log1p(-np.minimum(explained, 1 - 1e-12))
+    close = [i for i in np.argsort(-gains) if i != best and gains[i] > gains[best] - CLEAR]
+    thirds = np.array_split(np.argsort(tried[best][1], kind="stable"), 3)
+    low, high = (float(np.sqrt(np.mean(squares[part]))) for part in (thirds[0], thirds[-1]))
+    return NoiseTrend(tried[best][0], p, low, high, tuple(tried[i][0] for i in close))
+
+
+def _features(here: Records, place: Array) -> Iterator[tuple[str, Array]]:
+    yield "the recorded order", recorded_order(here.dataset)
+    for axis, coordinate in zip("xyz", place, strict=False):
+        yield f"the coordinate {axis}", coordinate
+    if len(place):
+        yield "the distance from the instrument", np.linalg.norm(place, axis=0)
+    for channel in here.motion.channels:
+        joint = channel.rpartition(".")[2]
+        command = np.nan_to_num(here.dataset.column(channel))
+        yield f"the command of {joint}", command
+        yield (
+            f"how far {joint} is from the middle of its commands",
+            np.abs(command - (command.min() + command.max()) / 2),
+        )
+    for loads in here.motion.loads.values():
+        for number, effort in enumerate(loads.efforts, start=1):
+            yield f"the load on joint {number}", np.abs(np.nan_to_num(effort))
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """What records of one pose say of noise.
+
+    Attributes:
+        scatter_mm: of a record about the mean of its pose (root mean square).
+        left_mm: of all residuals (root mean square).
+        records, poses: how many repeats there are, and of how many poses.
+        p_value: that residuals are as repeats have them.
+        shared: whether the means of poses nearby miss alike.
+    """
+
+    scatter_mm: float
+    left_mm: float
+    records: int
+    poses: int
+    p_value: float
+    shared: bool
+
+    @property
+    def exceeded(self) -> bool:
+        return self.p_value < LACK and self.left_mm > TIMES_REPEATS * self.scatter_mm
+
+
+def repeats_of(residual: Array, basis: Array, rows: FitRows, pose: Indices, kernels: Kernels) -> Repeats | None:
+    """Of a fit's residual (rows), which took up a basis (rows x n); None where hardly a ``pose`` (N) was repeated."""
+    by_record, size = rows.by_record, np.bincount(pose)
+    again = int(np.sum(size - 1))
+    if again < _FEWEST_REPEATS:
+        return None
+    means = np.zeros((len(size), len(pose)))
+    means[pose, np.arange(len(pose))] = 1 / size[pose]
+    own, off = means @ residual[by_record], np.zeros_like(residual)
+    off[by_record] = residual[by_record] - own[pose]
+    acting = int(np.sum(np.any(residual[by_record] != 0, axis=0)))
+    spare, pure = again * acting, float(off @ off)
+    lacking = len(pose) * acting - basis.shape[1] - spare
+    lack = max(float(np.sum(residual[by_record] ** 2)) - pure, 0.0)
+    ratio = lack / max(lacking, 1) / max(pure / spare, 1e-300)
+    return Repeats(
+        float(np.sqrt(np.sum(rows.errors(off) ** 2) / again)) * _MM,
+        float(np.sqrt(np.mean(rows.errors(residual) ** 2))) * _MM,
+        again + int(np.sum(size > 1)),
+        int(np.sum(size > 1)),
+        float(fdtrc(lacking, spare, ratio)) if lacking > 0 else 1.0,
+        _shared(own, np.einsum("gn,nrc->grc", means, basis[by_record]), pose, kernels),
+    )
+
+
+def _shared(own: Array, taken_up: Array, pose: Indices, kernels: Kernels) -> bool:
+    within, first = np.linalg.qr(taken_up.reshape(own.size, -1))[0], np.unique(pose, return_index=True)[1]
+    if within.shape[1] >= own.size:
+        return False
+    left, places = own.ravel() - within @ (within.T @ own.ravel()), np.arange(own.size).reshape(own.shape)
+    of_poses = Kernels(tuple(kernel[np.ix_(first, first)] for kernel in kernels.kernels))
+    return bool(smooth(left, within, places, of_poses).evidence > CLEAR)
+
+
+_MOST_STEPS, _MOST_SLIPS = 40, 12
+"""Places at which something may have jumped are looked at: of all that is measured, and of each joint."""
+_FEWEST_APART = 4
+_LOAD_PARTS = (slice(0, 3), slice(3, 4), slice(4, 8))
+"""Of the loads that motion knows slopes by: turns of gravity, its size, mass and place of a payload."""
+_STEP_MEASURE = "repeat some of the first poses now, and look at what was touched at that time"
+
+
+def outside(
+    problem: Problem,
+    motion: Motion,
+    dataset: Dataset,
+    positions: Sequence[Array],
+    moves: Moves,
+) -> Iterator[Dependence]:
+    """Everything that these records could show; ``positions`` are what instruments should read."""
+    here = Records(dataset, motion)
+    yield from _of_mistakes(here, problem, moves)
+    if motion.by_load:
+        by_load = [slope.transpose(0, 2, 1) for slope in motion.by_load]  # n_r x N x (gravity's turn, size, load)
+        level = "level the base, or measure its tilt with a spirit level; gravity is stated in the instrument's frame"
+        weigh = "weigh what hangs on the tool"
+        turns = tuple(f"turned about {axis}" for axis in _AXES)
+        gravity, size, load = (tuple(slope[:, :, part] for slope in by_load) for part in _LOAD_PARTS)
+        words, effect = "the direction of gravity in the base frame", "statics.gravity_r?, freed"
+        yield Dependence("gravity", "", "", words, effect, level, gravity, turns, "rad")
+        words = "the size of gravity, or of all masses together"
+        yield Dependence("gravity", "size", "", words, "statics.gravity_m_s2", weigh, size, ("share",), "1")
+        words = "a load at the tool that is not stated"
+        yield Dependence("load", "", "", words, "statics.payload_g", weigh, load)
+    yield from _of_instrument(here, positions)
+    yield from _of_steps(here, problem, positions)
+
+
+def _of_instrument(here: Records, read: Sequence[Array]) -> Iterator[Dependence]:
+    """Scale and axes of instruments that measure positions; all of them alike."""
+    if not any(np.any(position) for position in read):
+        return
+    zeros = [np.zeros((size, len(here.dataset), 1)) for size in here.sizes]
+
+    def columns(*entries: tuple[int, int]) -> tuple[Array, ...]:
+        """What is read along one axis grows with the coordinate on another: one column for each such pair."""
+        parts = []
+        for own, zero in zip(read, zeros, strict=True):
+            part = np.repeat(zero, len(entries), axis=2)
+            for k, (row, other) in enumerate(entries if len(own) else ()):
+                part[row, :, k] = -own[other]
+            parts.append(part)
+        return tuple(parts)
+
+    known = "measure a known length along each axis with the instrument"
+    together = tuple(np.sum(part, axis=2, keepdims=True) for part in columns((0, 0), (1, 1), (2, 2)))
+    words = "the instrument's scale, along all axes alike"
+    yield Dependence("scale", "", "", words, "", known, together, ("share",), "1")
+    for i, axis in enumerate(_AXES):
+        words = f"the instrument's scale along {axis}"
+        yield Dependence("scale", axis, "", words, "", known, columns((i, i)), ("share",), "1")
+    words = "the instrument's axes, which are not at right angles"
+    labels = tuple(f"between {_AXES[i]} and {_AXES[j]}" for i, j in ((0, 1), (0, 2), (1, 2)))
+    yield Dependence("scale", "axes", "", words, "", known, columns((0, 1), (0, 2), (1, 2)), labels, "rad")
+
+
+def predicted_positions(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset
+) -> tuple[Array, ...]:
+    """What each factor should read of a position (3 x N; m), 0 where it reads none; nothing (0 x N) of other factors.
+
+    Not what it does read: the noise of that would be taken for a scale.
+    """
+    positions = []
+    for kernel, off in zip(problem.kernels, problem.residuals(values, records), strict=True):
+        channels = kernel.factor.position_channels
+        read = bool(channels) and all(map(dataset.has, channels))
+        positions.append(np.nan_to_num(dataset.stacked(channels) - off[:3]) if read else np.zeros((0, len(dataset))))
+    return tuple(positions)
+
+
+def _of_steps(here: Records, problem: Problem, read: Sequence[Array]) -> Iterator[Dependence]:
+    """Something that moved once, between two records."""
+    order = recorded_order(here.dataset)
+    if np.ptp(order) <= 0:
+        return
+    ids = [here.dataset.ids[i] for i in np.argsort(order, kind="stable")]
+    rank = np.argsort(np.argsort(order, kind="stable"), kind="stable")
+    turns = [np.zeros((size, len(rank), 3)) for size in here.sizes]
+    for part, own in zip(turns, read, strict=True):
+        part[: len(own)] = np.stack([np.cross(axis, own, axisc=0, axisb=0) for axis in np.eye(3)], 2) if len(own) else 0
+    for place in _places(len(rank), _MOST_STEPS):
+        after = (rank >= place).astype(float)[:, None]
+        words = f"whether a record was measured before or after {ids[place]}: what is measured jumps there as a whole"
+        effect, shifts = "the records before and after as groups of their own", here.axes(after)
+        yield Dependence("step", "", "", words, effect, _STEP_MEASURE, shifts, jumps=True)
+        if any(map(np.any, turns)):
+            both = tuple(np.concatenate(p, axis=2) for p in zip(shifts, (t * after for t in turns), strict=True))
+            yield Dependence("step", "", "", f"{words}, and turns", effect, _STEP_MEASURE, both, jumps=True)
+    for channel in here.motion.channels:
+        arm, _, joint = channel.partition(".")
+        shown = shown_joint(channel, problem.blueprint.arms)
+        si = "rad" if problem.blueprint.arms[arm].commanded[joint] == "angle" else "m"
+        for place in _places(len(rank), _MOST_SLIPS):
+            along = here.along(channel, (rank >= place).astype(float)[:, None])
+            words = f"whether a record was measured before or after {ids[place]}: {shown} slips there"
+            yield Dependence("slip", shown, arm, words, "", _STEP_MEASURE, along, ("slip",), si, jumps=True)
+
+
+def _of_mistakes(here: Records, problem: Problem, moves: Moves) -> Iterator[Dependence]:
+    """What instruments say may have gone wrong with them meanwhile."""
+    order, many = recorded_order(here.dataset), len(problem.blueprint.measurements) > 1
+    ranked = np.argsort(order, kind="stable")
+    rank = np.argsort(ranked, kind="stable")
+    for name, measurement in problem.blueprint.measurements.items():
+        for one in measurement.mistakes() if isinstance(measurement, NamesMistakes) else ():
+            if one.course == "always":
+                continue
+            blocks = [problem.parameters[f"{name}.{p}"] for p in one.parameters]
+            shares = [float(block.nominal[0]) if one.together else 1.0 for block in blocks]
+            own = [[share * part for part in moves[b.name]] for share, b in zip(shares, blocks, strict=True)]
+            columns = [np.concatenate(parts, axis=2) for parts in zip(*own, strict=True)]
+            moved = [part.sum(axis=2, keepdims=True) for part in columns] if one.together else columns
+            subject, words = (name if many else ""), f"{name}: {one.words}" if many else one.words
+            labels, unit = (("change",), "1") if one.together and one.course != "once" else ((), "")
+            if np.ptp(order) > 0 and one.course == "slowly":
+                course = tuple(move * (rank / max(len(rank) - 1, 1) - 0.5)[:, None] for move in moved)
+                yield Dependence(one.kind, subject, "", words, "", one.measure, course, labels, unit)
+            elif np.ptp(order) > 0:
+                for place in _places(len(rank), _MOST_SLIPS):
+                    jump = tuple(move * (rank >= place)[:, None] for move in moved)
+                    at = f"whether a record was measured before or after {here.dataset.ids[ranked[place]]}: {words}"
+                    yield Dependence(one.kind, subject, "", at, "", one.measure, jump, jumps=True)
+
+
+def _places(count: int, most: int) -> list[int]:
+    inner = np.arange(_FEWEST_APART, count - _FEWEST_APART + 1)
+    step = max(_FEWEST_APART, -(-len(inner) // most))
+    return [int(i) for i in inner[step // 2 :: step]]

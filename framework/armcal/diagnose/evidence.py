@@ -11,13 +11,12 @@ from armcal.base.dataset import Dataset
 from armcal.diagnose.held import Contradiction
 from armcal.diagnose.large_errors import LargeErrors
 from armcal.diagnose.residual_structure import ResidualStructure
-from armcal.diagnose.rounded import Rounding
-from armcal.diagnose.unseen import Elsewhere, HiddenPayload
+from armcal.diagnose.unseen import Elsewhere, HiddenPayload, Rounding
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.prediction import NewRecording
 from armcal.planning.candidates import whitened_rows
 from armcal.problem.problem import Problem
-from armcal.problem.tool_motion import along, apart_from, tools, unseen_motions
+from armcal.problem.rigid_alignment import along, apart_from, tools, unseen_motions
 
 UNSEEN = 400
 UP_TO_FRAMES = "where the base stands and which point of the tool is meant"

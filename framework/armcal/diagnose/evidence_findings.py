@@ -9,14 +9,12 @@ from armcal.base.arrays import Array
 from armcal.base.domains import Semidefinite, symmetric
 from armcal.base.parameters import ParameterBlock
 from armcal.base.units import digits, readable
+from armcal.diagnose.dependences import TIMES_REPEATS
 from armcal.diagnose.evidence import PriorsAlone
-from armcal.diagnose.large_errors import BY_CHANCE, LargeErrors
-from armcal.diagnose.noise_findings import Finding, Grade, first_few
-from armcal.diagnose.noise_trend import TIMES_REPEATS
-from armcal.diagnose.predictable import FEWEST_POSES, MOST_OF_MEDIAN, Predictable
+from armcal.diagnose.large_errors import BY_CHANCE, Finding, Grade, LargeErrors, first_few
+from armcal.diagnose.predictable import FEWEST_POSES, IMITATED, MOST_OF_MEDIAN, Predictable
 from armcal.diagnose.predictable import LEVEL as PREDICTED_LEVEL
 from armcal.diagnose.residual_structure import FEWEST_RECORDS, WORTHWHILE, ResidualStructure, Structure
-from armcal.diagnose.smooth import IMITATED
 from armcal.estimate.estimator import AT_BOUND, Estimate
 from armcal.estimate.validation import Halves
 

@@ -12,11 +12,10 @@ from armcal.base.arrays import Array, Indices
 from armcal.base.domains import Pose, ScrewAxis
 from armcal.base.poses import NO_TURN
 from armcal.errors import NotConvergedError
-from armcal.estimate.combination import Measure
 from armcal.estimate.estimator import Estimate
-from armcal.estimate.structure import random_records
+from armcal.estimate.identifiability import Measure, random_records
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.tool_motion import along, apart_from, rigid_fit, spread_of, tools, unseen_motions
+from armcal.problem.rigid_alignment import along, apart_from, rigid_fit, spread_of, tools, unseen_motions
 
 BEYOND, FAR_BEYOND = 4.0, 20.0
 """Standard deviations of a prior, or typical corrections where there is none: what is worth a look, what is gross."""

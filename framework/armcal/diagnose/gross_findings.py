@@ -11,13 +11,12 @@ from armcal.base.domains import Rotation
 from armcal.base.units import digits
 from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.gross import AS_MUCH, BEYOND, BY_SHARES, FAR_BEYOND, MOST_RECORDS, Displaced, Figure
+from armcal.diagnose.large_errors import Finding, Grade, first_few
 from armcal.diagnose.majority import FAR, Minority
-from armcal.diagnose.noise_findings import Finding, Grade, first_few
 from armcal.diagnose.residual_structure import ResidualStructure, Structure
 from armcal.estimate.start import BETTER
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.rigid_alignment import FEWEST, hand_eye
-from armcal.problem.sighting import sighting_of, tools_of
+from armcal.problem.rigid_alignment import FEWEST, hand_eye, sighting_of, tools_of
 
 OF_REACH = 0.03
 """An error beyond this share of the arm's reach, or of a radian, is gross, whatever the arm and its instrument."""

@@ -12,11 +12,10 @@ import numpy as np
 from scipy.special import stdtr
 
 from armcal.base.arrays import Array
-from armcal.diagnose.clustered import unbiased_roots
-from armcal.diagnose.fit_rows import FitRows
-from armcal.diagnose.noise_findings import Finding
-from armcal.estimate.combination import Measure
+from armcal.diagnose.large_errors import Finding
+from armcal.diagnose.score_tests import FitRows, unbiased_roots
 from armcal.estimate.estimator import Estimate
+from armcal.estimate.identifiability import Measure
 from armcal.measure.measurement import HasScale, Mistake, NamesMistakes
 from armcal.problem.problem import FactorRecords, Problem
 

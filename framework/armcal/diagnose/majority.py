@@ -11,8 +11,8 @@ from scipy.special import chdtri
 
 from armcal.base.arrays import Array, Indices
 from armcal.base.units import digits
-from armcal.diagnose.fit_rows import FitRows
-from armcal.diagnose.noise_findings import Finding
+from armcal.diagnose.large_errors import Finding
+from armcal.diagnose.score_tests import FitRows
 from armcal.measure.groups import group_key
 from armcal.problem.problem import FactorRecords, Problem
 

@@ -33,14 +33,22 @@ from armcal.diagnose.readings import (
     two_frames,
 )
 from armcal.errors import NotConvergedError
-from armcal.estimate.placing import Placing, placings
 from armcal.estimate.polish import descended
+from armcal.estimate.start import Placing, placings
 from armcal.problem.factor_records import subset
 from armcal.problem.posed import PosedProblem
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.rigid_alignment import Tools, nearest
-from armcal.problem.sighting import Sighting, shown_instead, sighting_of, tools_of
-from armcal.problem.tool_motion import rigid_fit, spread_of, tools
+from armcal.problem.rigid_alignment import (
+    Sighting,
+    Tools,
+    nearest,
+    rigid_fit,
+    shown_instead,
+    sighting_of,
+    spread_of,
+    tools,
+    tools_of,
+)
 
 MUCH_BETTER = 3.0
 """A permutation leaves so many times less than the data as they stand."""

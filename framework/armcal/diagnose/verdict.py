@@ -21,7 +21,7 @@ from armcal.diagnose.evidence_findings import (
     structure_findings,
 )
 from armcal.diagnose.held import contradiction_findings
-from armcal.diagnose.noise_findings import (
+from armcal.diagnose.large_errors import (
     Finding,
     component_findings,
     first_few,
@@ -29,13 +29,12 @@ from armcal.diagnose.noise_findings import (
     suspicious_in_short,
     suspicious_records,
 )
-from armcal.diagnose.rounded import rounding_findings
-from armcal.diagnose.unseen import Elsewhere
+from armcal.diagnose.unseen import Elsewhere, rounding_findings
 from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
 from armcal.estimate.identifiability import POOR_CONDITION, bound_together, correlated_pairs
 from armcal.estimate.prediction import NewRecording
+from armcal.estimate.robust import WeighedFit
 from armcal.estimate.validation import summarise
-from armcal.estimate.weighing import WeighedFit
 from armcal.planning.suggestion import CANDIDATES, Suggestion, in_words, is_worth_measuring
 
 LEVEL = 0.05

@@ -14,8 +14,7 @@ from scipy.special import stdtrit
 from armcal.base.arrays import Array
 from armcal.base.parameters import Parameters
 from armcal.errors import NotConvergedError
-from armcal.estimate.identifiability import Identifiability, InverseInformation
-from armcal.estimate.structure import identify_from
+from armcal.estimate.identifiability import Identifiability, InverseInformation, identify_from
 from armcal.io.parallel import Executor
 from armcal.problem.problem import FactorRecords, Problem, triangular
 from armcal.problem.projection import factor_at_zero

@@ -3,21 +3,217 @@
 Rank is judged on the whitened Jacobian with each column scaled by the typical scale of its parameter, by singular
 values and by QR with pivoting [Golub2013]; undetermined combinations are reduced to as few parameters each as
 possible.
+
+A minimal set of parameters: which to keep free, and what absorbs each of the others.
+
+QR with column pivoting on the scaled Jacobian [Golub2013], block by block, preferred blocks first; the way in which
+base parameters are found numerically [Khalil2002].
+
+Why a combination is undetermined: no poses determine it, these poses do not, or only not at these values.
+
+A model is analytic, so its rank is the same almost everywhere; random poses at a point near the values at hand show
+it with probability one, and what is undetermined there is a gauge.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
+from math import comb
+from typing import Literal
 
 import numpy as np
 from scipy.linalg import qr
 
-from armcal.base.arrays import Array
+from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.parameters import Parameters
-from armcal.estimate.combination import Combination, Measure, named
-from armcal.estimate.null_space import sparse_basis
+from armcal.base.units import shown_unit
+from armcal.errors import NotConvergedError, ProblemError
+from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.projection import approach_channels, factor_at_zero, fits, joint_channels, projected
+from armcal.problem.rigid_alignment import along, apart_from, tools, unseen_motions
+
+MOST_NAMES = 6
+"""A longer combination is cut when it is shown; ``terms`` has all of it."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """How one parameter is shown: its SI unit, and its typical scale in it."""
+
+    unit: str
+    scale: float
+
+    def shown(self, coefficient: float) -> tuple[float, str]:
+        factor, unit = shown_unit(self.unit)
+        return coefficient * self.scale * factor, unit
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A direction in parameter space.
+
+    Attributes:
+        terms: (name, coefficient in typical scales of the parameter), the largest first.
+        measures: one a term; empty to show coefficients in typical scales.
+    """
+
+    terms: tuple[tuple[str, float], ...]
+    measures: tuple[Measure, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(name for name, _ in self.terms)
+
+    @property
+    def amounts(self) -> tuple[str, ...]:
+        """What each term moves by when the first moves by one unit: ``+1 mm``, ``-0.5 deg``."""
+        if not self.measures:
+            return tuple(f"{weight / self.terms[0][1]:+.3g}" for _, weight in self.terms)
+        shown = [m.shown(weight) for m, (_, weight) in zip(self.measures, self.terms, strict=True)]
+        return tuple(f"{amount / shown[0][0]:+.3g} {unit}".rstrip() for amount, unit in shown)
+
+    def __str__(self) -> str:
+        if not self.terms:
+            return "nothing"
+        if len(self.terms) == 1:
+            return f"{self.terms[0][0]} alone"
+        more = len(self.terms) - MOST_NAMES
+        others, amounts = self.names[1:MOST_NAMES], self.amounts[:MOST_NAMES]
+        tail = f" and {more} more" if more > 0 else ""
+        listed = f"{', '.join(others)}{tail}" if tail else _listed(others)
+        return f"{self.names[0]} trades with {listed} ({amounts[0]} with {_listed(amounts[1:])})"
+
+
+def named(vector: Array, names: Sequence[str], measures: Sequence[Measure], at_least: float) -> Combination:
+    """A vector in typical scales (n) as a combination, entries below ``at_least`` times the largest left out.
+
+    The first term is positive: the vector's own sign means nothing.
+    """
+    largest = float(np.abs(vector).max(initial=0.0)) or 1.0
+    # Rounded, so that equal shares stay in the order of the parameters whatever their last digits.
+    order = np.argsort(-np.round(np.abs(vector) / largest, 6), kind="stable")
+    kept = [int(i) for i in order if abs(vector[i]) > at_least * largest]
+    size = float(np.copysign(largest, vector[kept[0]])) if kept else largest
+    terms = tuple((names[i], float(vector[i] / size)) for i in kept)
+    return Combination(terms, tuple(measures[i] for i in kept) if measures else ())
+
+
+def _listed(words: Sequence[str]) -> str:
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+EXACT = 1e-6
+"""Sine of the angle within which a vector belongs to a space."""
+_LEAST_SHARE = 3e-3
+_MOST_SUBSETS = 60_000
+_LARGEST_SUBSET = 3
+_MOST_BY_SEARCH = 100
+_MOST_WIDE = 300
+
+
+def sparse_basis(space: Array, nested: tuple[Array, ...] = (), within: float = EXACT) -> Array:
+    """A basis (m x n) of the same space whose vectors have few entries.
+
+    Vectors of up to three entries are all tried; beyond them those of the least sum of magnitudes are searched for.
+
+    Args:
+        space: orthonormal rows (m x n).
+        nested: orthonormal rows of subspaces of it, each in the next, known to ``within``; the basis begins with a
+            basis of the first, goes on to one of the second, and so on.
+        within: sine of the angle.
+
+    Returns:
+        rows with a largest entry of 1.
+    """
+    chosen = np.zeros((0, space.shape[1]))
+    for part in (*nested, space):
+        sine = within if part is not space else EXACT
+        for vector in _candidates(part, space, sine):
+            if len(chosen) == len(part):
+                break
+            basis = np.linalg.qr(chosen.T)[0]
+            left = vector - basis @ (basis.T @ vector)
+            if not len(chosen) or np.linalg.norm(left) > 10 * sine * np.linalg.norm(vector):
+                chosen = np.vstack([chosen, vector])
+    return np.array([row / np.abs(row).max() for row in chosen]).reshape(-1, space.shape[1])
+
+
+def null_rows(matrix: Array, tolerance: float) -> Array:
+    """Orthonormal rows that a matrix (m x n) maps to no more than ``tolerance``."""
+    _, values, directions = np.linalg.svd(matrix)
+    return np.asarray(directions[int(np.sum(values > tolerance)) :])
+
+
+def _candidates(part: Array, space: Array, sine: float) -> Iterator[Array]:
+    """Sparse vectors of a subspace, the sparsest first; then enough to span it."""
+    if len(part) == 1:
+        snapped = _snapped(part[0], space, _support(part[0], 3 * sine))
+        yield part[0] if snapped is None else snapped
+        return
+    taking_part = np.flatnonzero(np.linalg.norm(part, axis=0) > sine).astype(np.intp)
+    for size in range(1, _LARGEST_SUBSET + 1):
+        if comb(len(taking_part), size) <= _MOST_SUBSETS:
+            yield from _on_few(part, space, taking_part, size, sine)
+    if 1 < len(part) <= _MOST_BY_SEARCH and len(taking_part) <= _MOST_WIDE:
+        least = [v for i in taking_part if (v := _least(part, space, int(i))) is not None]
+        yield from sorted(
+            least, key=lambda v: (int(_support(v, EXACT).sum()), float(np.abs(v).sum() / np.abs(v).max()))
+        )
+    if len(part):  # reduced row echelon form
+        pivots = qr(part, pivoting=True, mode="economic")[2]
+        yield from np.linalg.solve(part[:, pivots[: len(part)]], part)
+    yield from part
+
+
+def _on_few(part: Array, space: Array, taking_part: Indices, size: int, sine: float) -> Iterator[Array]:
+    """All vectors of a subspace with exactly ``size`` entries, the surest first."""
+    subsets = np.array(list(combinations(taking_part, size)), dtype=np.intp).reshape(-1, size)
+    columns = part.T[subsets]
+    cosines, vectors = np.linalg.eigh(columns @ columns.transpose(0, 2, 1))
+    entries = vectors[:, :, -1]
+    full = np.abs(entries).min(axis=1) > 3 * sine
+    off = 1 - cosines[:, -1]
+    belonging = np.flatnonzero(full & (off < max(sine**2, 1e-12)))
+    for index in belonging[np.argsort(np.round(off[belonging], 9), kind="stable")]:
+        vector = np.zeros(part.shape[1])
+        vector[subsets[index]] = entries[index]
+        snapped = _snapped(vector, space, np.isin(np.arange(len(vector)), subsets[index]))
+        if snapped is not None:
+            yield snapped
+
+
+def _least(part: Array, space: Array, entry: int) -> Array | None:
+    """The vector of the least sum of magnitudes whose ``entry`` is 1."""
+    from scipy.optimize import linprog
+
+    count, width = part.shape
+    cost = np.concatenate([np.zeros(count), np.ones(width)])
+    above = np.block([[part.T, -np.eye(width)], [-part.T, -np.eye(width)]])
+    through = np.concatenate([part[:, entry], np.zeros(width)])[None, :]
+    bounds = [(None, None)] * count + [(0, None)] * width
+    done = linprog(cost, above, np.zeros(2 * width), through, [1.0], bounds, method="highs")
+    if done.status != 0 or done.x is None:
+        return None
+    vector = np.asarray(done.x[:count] @ part)
+    snapped = _snapped(vector, space, _support(vector, _LEAST_SHARE))
+    return vector if snapped is None else snapped
+
+
+def _snapped(vector: Array, space: Array, present: Mask) -> Array | None:
+    """The nearest vector of a space that has no other entries than those present; None if there is none."""
+    inside = null_rows(space[:, ~present].T, EXACT) @ space if not present.all() else space
+    if not len(inside):
+        return None
+    return np.asarray(np.where(present, (inside @ vector) @ inside, 0.0))
+
+
+def _support(vector: Array, share: float) -> Mask:
+    return np.asarray(np.abs(vector) > share * np.abs(vector).max())
+
 
 RANK_TOLERANCE = 1e-9
 """Relative to the largest singular value: far above rounding, far below anything a real experiment determines."""
@@ -200,3 +396,353 @@ def numerical_rank(scaled: Array) -> int:
 def _count_above(values: Array) -> int:
     largest = float(values.max(initial=0.0))
     return int(np.sum(values > RANK_TOLERANCE * largest)) if largest > 0 else 0
+
+
+_NEW = 1e-6
+"""Of a column's own length: less than this beyond what is kept adds nothing."""
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """A coordinate that need not be free.
+
+    Attributes:
+        name: of the coordinate.
+        absorbed_by: it first, then what the kept ones do instead: the combination that changes no measurement.
+        left: the part of its effect that the kept ones cannot imitate, 0 to 1.
+    """
+
+    name: str
+    absorbed_by: Combination
+    left: float
+
+
+@dataclass(frozen=True)
+class MinimalSet:
+    """Which blocks to free.
+
+    Attributes:
+        kept: block names, in the order of the parameters.
+        redundant: coordinates that the kept ones absorb entirely.
+        left_out: coordinates that would add something, but were not wanted (too many, or too uncertain).
+        deviations: of the kept coordinates, in typical scales, by the declared noise; infinite where a kept block
+            has an undetermined combination within it.
+    """
+
+    kept: tuple[str, ...]
+    redundant: tuple[Dropped, ...]
+    left_out: tuple[Dropped, ...]
+    deviations: dict[str, float]
+
+
+def minimal_set(
+    triangle: Array,
+    parameters: Parameters,
+    preferred: Sequence[Sequence[str]] = (),
+    most: int | None = None,
+    most_uncertain: float = np.inf,
+) -> MinimalSet:
+    """Choose blocks that determine all that the data determines, and no more.
+
+    Free parameters of groups, sockets and clamps, are tried first: a configuration has them free without naming them.
+
+    Args:
+        triangle: R (m x n) with R'R = J'J of the whitened residuals by the coordinates of the free blocks.
+        parameters: whose free blocks are chosen from.
+        preferred: block names; those of the first group are tried first, then those of the second, and so on.
+        most: no more blocks than this.
+        most_uncertain: leave out, the most uncertain first, what stays uncertain by more than so many typical scales.
+    """
+    columns = triangle * parameters.scales()
+    places = parameters.coordinates_of
+    tolerance = RANK_TOLERANCE * float(np.linalg.norm(columns, 2)) if columns.size else 0.0
+    of_groups = [block.name for block in parameters.free if block.nuisance]
+    ranked = [[name for name in group if name in places] for group in (of_groups, *preferred)]
+    ranked.append([name for name in places if not any(name in group for group in ranked)])
+    order = _chosen(columns, places, ranked, tolerance)
+    kept = order[:most]
+    while kept:
+        deviation = {name: _deviations(columns, places, kept)[places[name]].max() for name in kept}
+        # Between equals the one preferred least goes first.
+        worst = max(reversed(kept), key=lambda name: deviation[name])
+        if deviation[worst] <= most_uncertain:
+            break
+        kept = [name for name in kept if name != worst]
+    return _described(columns, parameters, places, kept, tolerance)
+
+
+def _chosen(
+    columns: Array, places: Mapping[str, slice], groups: Sequence[Sequence[str]], tolerance: float
+) -> list[str]:
+    """Blocks in the order in which they are taken: within a group, the one with most that is new."""
+    basis = np.zeros((len(columns), 0))
+    chosen: list[str] = []
+    for group in groups:
+        waiting = list(dict.fromkeys(group))
+        while waiting:
+            new = {name: columns[:, places[name]] for name in waiting}
+            for _ in range(2):  # twice, against rounding
+                new = {name: own - basis @ (basis.T @ own) for name, own in new.items()}
+            # Rounded, so that equals stay in the order of the parameters whatever their last digits.
+            best = max(waiting, key=lambda name: float(f"{np.linalg.norm(new[name]):.9e}"))
+            left, values, _ = np.linalg.svd(new[best], full_matrices=False)
+            fresh = left[:, values > max(tolerance, _NEW * float(np.linalg.norm(columns[:, places[best]])))]
+            if not fresh.shape[1]:
+                break
+            basis = np.hstack([basis, fresh])
+            chosen.append(best)
+            waiting.remove(best)
+    return chosen
+
+
+def _described(
+    columns: Array, parameters: Parameters, places: Mapping[str, slice], kept: Sequence[str], tolerance: float
+) -> MinimalSet:
+    names, measures = parameters.coordinate_names, measures_of(parameters)
+    inside = np.zeros(len(names), dtype=bool)
+    for name in kept:
+        inside[places[name]] = True
+    redundant: list[Dropped] = []
+    left_out: list[Dropped] = []
+    imitation = np.linalg.pinv(columns[:, inside], rcond=RANK_TOLERANCE) @ columns
+    for i in np.flatnonzero(~inside):
+        vector = np.zeros(len(names))
+        vector[i], vector[inside] = 1.0, -imitation[:, i]
+        left, length = float(np.linalg.norm(columns @ vector)), float(np.linalg.norm(columns[:, i]))
+        share = left / length if length > tolerance else 0.0
+        combination = named(np.where(np.arange(len(names)) == i, 0.0, vector), names, measures, _NAMED)
+        own = named(np.eye(len(names))[i], names, measures, _NAMED)
+        whole = Combination(
+            own.terms + tuple((n, float(vector[names.index(n)])) for n in combination.names if length > tolerance),
+            own.measures + tuple(m for m in combination.measures if length > tolerance),
+        )
+        dropped = Dropped(names[i], whole, share)
+        (left_out if left > max(tolerance, _NEW * length) else redundant).append(dropped)
+    deviation = _deviations(columns, places, kept)
+    return MinimalSet(
+        kept=tuple(name for name in places if name in set(kept)),
+        redundant=tuple(redundant),
+        left_out=tuple(left_out),
+        deviations={names[i]: float(deviation[i]) for i in np.flatnonzero(inside)},
+    )
+
+
+def _deviations(columns: Array, places: Mapping[str, slice], kept: Sequence[str]) -> Array:
+    """Standard deviations in typical scales (n) if these blocks are free; infinite where undetermined, or not kept."""
+    inside = np.concatenate([np.arange(columns.shape[1])[places[name]] for name in kept]) if kept else np.zeros(0, int)
+    deviation = np.full(columns.shape[1], np.inf)
+    if not len(inside):
+        return deviation
+    _, values, directions = np.linalg.svd(columns[:, inside], full_matrices=True)
+    values = np.concatenate([values, np.zeros(len(inside) - len(values))])
+    seen = values > RANK_TOLERANCE * values[0]
+    known = np.sqrt(np.sum((directions[seen] / values[seen][:, None]) ** 2, axis=0))
+    blurred = np.linalg.norm(directions[~seen], axis=0) > 1e-6
+    deviation[inside] = np.where(blurred, np.inf, known)
+    return deviation
+
+
+Cause = Literal["gauge", "values", "poses", "unknown"]
+CAUSES: dict[Cause, str] = {
+    "gauge": "a gauge: no poses determine it",
+    "values": "not seen at these values, only away from them",
+    "poses": "these poses do not determine it, others would",
+    "unknown": "it could not be found out whether other poses would determine it",
+}
+_AWAY = 0.1
+"""How far from the values at hand a point lies where the rank is taken, in typical scales."""
+_HARDLY_AWAY = 1e-3
+"""And one where undetermined directions are taken: they turn along with the values."""
+_BEYOND = 0.7
+"""rad, or m: how far random poses go beyond the recorded ones."""
+_WITHIN = 1e-2
+"""Sine of the angle within which a direction is the one that is undetermined there."""
+
+UNSEEN_SCALE = "scale is not observable: the same arm, larger or smaller with all it touches, fits as well"
+GIVE_A_LENGTH = "give one length: a known distance, a tracker's record, or a dimension of the arm that is held"
+_GROWTH_LEFT = 1e-4
+"""Of the size of the workspace: what may be left of a growth of all tool positions in proportion."""
+_POSES = 60
+MOST_LISTED = 5
+"""So many undetermined combinations are listed in one message."""
+FEW_HELD = 2
+"""Combinations under priors that are listed in full: they do no harm, and more of them bury the rest."""
+
+
+@dataclass(frozen=True)
+class Undetermined:
+    """A combination that the records do not determine, why, and the priors that take part in it."""
+
+    combination: Combination
+    cause: Cause
+    priors: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.combination}: {CAUSES[self.cause]}"
+
+
+def identify(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Identifiability:
+    return identify_from(factor_at_zero(problem, values, records), problem.parameters)
+
+
+def identify_from(triangle: Array, parameters: Parameters) -> Identifiability:
+    return analyse(triangle, parameters.scales(), parameters.coordinate_names, measures_of(parameters))
+
+
+def explain(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], known: Identifiability
+) -> tuple[Undetermined, ...]:
+    """Every undetermined combination with its cause: gauges first, as few parameters in each as possible."""
+    null = known.null
+    if not len(null):
+        return ()
+    held = problem.parameters.prior_information() > 0
+    priors = {name for name, has in zip(known.names, held, strict=True) if has}
+    causes: list[Cause] = ["unknown"] * len(null)
+    nested: tuple[Array, ...] = ()
+    with suppress(NotConvergedError):
+        if all(record.count for record in records):
+            poses, parameters = random_records(problem, records), problem.parameters
+            at = _scaled(problem, values, poses)
+            here = null_rows(at @ null.T, 1e3 * RANK_TOLERANCE * _largest(at)) @ null  # no poses show these here
+            away = _scaled(problem, nearby(parameters, values), poses)
+            count = len(null_rows(away, RANK_TOLERANCE * _largest(away)))
+            near = _scaled(problem, nearby(parameters, values, _HARDLY_AWAY), poses)
+            anywhere = np.linalg.svd(near)[2][len(near.T) - count :]
+            turn, cosines, _ = np.linalg.svd(here @ anywhere.T)
+            gauge = turn.T[: int(np.sum(cosines > np.sqrt(1 - _WITHIN**2)))] @ here
+            nested, causes = (gauge, here), ["gauge"] * len(gauge)
+            causes += ["values"] * (len(here) - len(gauge))
+            causes += ["poses"] * (len(null) - len(here))
+    vectors = sparse_basis(null, nested, _WITHIN)
+    combinations = [named(vector, known.names, known.measures, _NAMED) for vector in vectors]
+    return tuple(
+        Undetermined(combination, cause, tuple(name for name in combination.names if name in priors))
+        for combination, cause in zip(combinations, causes, strict=True)
+    )
+
+
+def held_by_nothing(parameters: Parameters, known: Identifiability) -> tuple[Combination, ...]:
+    """Undetermined combinations that priors do not hold either."""
+    null = known.null
+    if not len(null):
+        return ()
+    strength = np.sqrt(parameters.prior_information()) * parameters.scales()
+    free = null_rows((null * strength).T, RANK_TOLERANCE * max(float(strength.max()), 1e-300)) @ null
+    return tuple(named(vector, known.names, known.measures, _NAMED) for vector in sparse_basis(free))
+
+
+def nearby(parameters: Parameters, values: Array, away: float = _AWAY, seed: int = 0) -> Array:
+    random = np.random.default_rng(seed)
+    at, scale = parameters.local(values), parameters.increment_scales()
+    lower, upper = parameters.increment_bounds()
+    step = away * scale * random.uniform(0.5, 1.0, len(scale)) * random.choice([-1.0, 1.0], len(scale))
+    step = np.where((at + step < lower) | (at + step > upper), -step, step)
+    return parameters.retract(np.clip(at + step, lower, upper))
+
+
+def random_records(problem: Problem, records: Sequence[FactorRecords], seed: int = 0) -> tuple[FactorRecords, ...]:
+    """Random poses about the recorded ones and beyond them, under the recorded loads, from either side."""
+    count = int(np.clip(3 * problem.increments, 60, 600))
+    result = []
+    for kernel, factor_records in zip(problem.kernels, records, strict=True):
+        random = np.random.default_rng(seed)
+        rows = np.flatnonzero(factor_records.weight[: factor_records.count])
+        chosen = random.choice(rows if len(rows) else np.arange(factor_records.count), count)
+        (drawn,) = Problem.subset([factor_records], chosen.astype(np.intp))
+        record, joints = drawn.record.copy(), list(joint_channels(kernel.factor))
+        seen, approaches = factor_records.record[joints, : factor_records.count], list(approach_channels(kernel.factor))
+        lowest, highest = seen.min(axis=1) - _BEYOND, seen.max(axis=1) + _BEYOND
+        record[joints] = random.uniform(lowest[:, None], highest[:, None], (len(joints), record.shape[1]))
+        record[approaches] = random.choice([-1.0, 1.0], (len(approaches), record.shape[1]))
+        weight = (np.arange(record.shape[1]) < count).astype(float)
+        result.append(replace(drawn, record=record, weight=weight, state=np.zeros_like(drawn.state)))
+    return tuple(result)
+
+
+def _scaled(problem: Problem, values: Array, poses: Sequence[FactorRecords]) -> Array:
+    fitting = projected(problem, values, poses)
+    can = fits(problem, values, fitting)
+    weighed = []
+    for factor_records, mask in zip(fitting, can, strict=True):
+        weight = factor_records.weight.copy()
+        weight[: factor_records.count] *= mask
+        weighed.append(replace(factor_records, weight=weight))
+    return problem.triangular_factor(values, weighed) * problem.parameters.scales()
+
+
+def _largest(matrix: Array) -> float:
+    return float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0
+
+
+def scale_is_unseen(problem: Problem, values: Array, records: Sequence[FactorRecords], known: Identifiability) -> bool:
+    """Whether some undetermined combination makes all tools' positions grow in proportion.
+
+    Contacts fit a smaller arm in a smaller world just as well. The tools decide, not the parameters: which numbers
+    take part in a growth differs from model to model. A growth may go along with a motion of everything, and with
+    another point of a tool being the one that is meant.
+    """
+    if not len(known.null):
+        return False
+    poses = problem.subset(random_records(problem, records), np.arange(_POSES, dtype=np.intp))
+    at, axes = tools(problem, values, poses)
+    moves = [along(problem, values, poses, direction) for direction in known.null]
+    growth = (at - at.mean(axis=(0, 2), keepdims=True)).ravel()
+    left = apart_from(np.array([move.ravel() for move in moves] + unseen_motions(at, axes)).T, growth[:, None])
+    return bool(np.linalg.norm(left) < _GROWTH_LEFT * np.linalg.norm(growth))
+
+
+def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: Array) -> tuple[str, ...]:
+    """Refuse a problem whose answer would be invented.
+
+    Returns:
+        warnings: what priors alone hold, and a poor condition.
+
+    Raises:
+        ProblemError: fewer equations than parameters, or undetermined combinations, without priors on them.
+    """
+    parameters = problem.parameters
+    count = problem.equations(records)
+    unknown = problem.increments
+    has_prior = parameters.prior_information() > 0
+    warnings = []
+    if count < unknown:
+        poses = max((record.count for record in records), default=0)
+        text = f"{count} equations ({poses} records) for {unknown} free parameters"
+        if not has_prior.all():
+            raise ProblemError(f"{text}.", hint="Measure more poses, fix parameters, or give every one a prior.")
+        warnings.append(f"{text}: what the data does not determine comes from the priors.")
+    known = identify(problem, start, records)
+    if known.undetermined:
+        explained = explain(problem, start, records, known)
+        listed = "; ".join(str(undetermined) for undetermined in explained[:MOST_LISTED])
+        more = len(explained) - MOST_LISTED
+        listed += f"; and {more} more, which armcal identify lists" if more > 0 else ""
+        text = f"the data does not determine {len(explained)} combinations"
+        unseen_scale = scale_is_unseen(problem, start, records, known)
+        if held_by_nothing(parameters, known):
+            first, mend = (f"{UNSEEN_SCALE}; ", f"{GIVE_A_LENGTH}. ") if unseen_scale else ("", "")
+            raise ProblemError(f"{first}{text}: {listed}.", hint=_sentence(f"{mend}{_mend(explained)}"))
+        if unseen_scale:
+            warnings.append(f"{UNSEEN_SCALE}; its priors hold it. To know it, {GIVE_A_LENGTH}.")
+        listed = listed if len(explained) <= FEW_HELD else "armcal identify lists them"
+        warnings.append(
+            f"at the nominal values {text}; their priors hold them: {listed}. The verdict counts at the answer."
+        )
+    if known.condition > POOR_CONDITION and not has_prior.all():
+        warnings.append(f"the scaled condition is {known.condition:.1e}: {known.weakest} is hardly determined.")
+    return tuple(warnings)
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _mend(undetermined: Sequence[Undetermined]) -> str:
+    causes = {combination.cause for combination in undetermined}
+    advice = ["fix one parameter of each", "give it a prior"]
+    if "values" in causes:
+        advice.append("start from other values")
+    if causes & {"poses", "unknown"}:
+        advice.append("measure poses that separate them")
+    return _sentence(f"{', '.join(advice[:-1])}, or {advice[-1]}.")

@@ -19,7 +19,7 @@ from armcal.base.arrays import Array
 from armcal.base.domains import Interval
 from armcal.errors import ConfigError, NotConvergedError
 from armcal.estimate.estimator import CONFIDENCE, Estimate, Estimator, Progress, no_progress
-from armcal.estimate.weighing import WeighedFit, Weighing
+from armcal.estimate.robust import WeighedFit, Weighing
 from armcal.io.parallel import Executor, Sequential
 from armcal.problem.posed import PosedProblem
 from armcal.problem.problem import FactorRecords, Problem

@@ -3,22 +3,198 @@
 Both solve weighted least squares again and again, each time from the last answer, and so work with every solver,
 its bounds and its priors. The loss of record i is s^2 rho(u_i / s): u_i is the norm of its whitened residual, s
 its instrument's scale. Small residuals cost what they cost in least squares, and priors weigh as they were stated.
+
+How far each record lies from a fit, in units of what its own residual should scatter by.
+
+A record that pulls the fit towards itself has a small residual even if it is wrong. With H = J C J' (C the inverse
+of the information of records and priors, J whitened) and w the record's weight in the fit, the covariance of its
+residual is s^2 (I - (2 w - 1) H): I - H for one that took part, I + H for one that was set aside [Rousseeuw1987].
+
+Robust losses of a record's residual as a whole, so that no choice of axes matters.
+
+With t the norm of a record's m whitened residuals in units of their scale, the loss is rho(t) and its weight
+rho'(t)/t [Huber1981]. A tuning constant is the one with which, if all noise were Gaussian after all, the estimate
+of a location in m dimensions would keep 95 % of the efficiency of least squares; for m = 1 these are the
+customary 1.345 (Huber) and 2.385 (Cauchy) [Holland1977].
 """
+
+from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import lru_cache
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
+from scipy.special import chdtri, fdtri, gammaln
 
 from armcal.base.arrays import Array
+from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError
-from armcal.estimate.estimator import Estimator, Influence, Progress, Solution, degrees_of_freedom, no_progress
-from armcal.estimate.loss import Loss, LossName, median_norm, tuned
+from armcal.estimate.estimator import (
+    Estimate,
+    Estimator,
+    Influence,
+    Progress,
+    Solution,
+    degrees_of_freedom,
+    estimate,
+    gave_up,
+    no_progress,
+    spread,
+)
+from armcal.estimate.identifiability import InverseInformation
 from armcal.estimate.polish import bounded_step
-from armcal.estimate.redundancy import SMALLEST_SCALE, remaining, studentised_distances
+from armcal.estimate.variance import Axes, VarianceComponents, apply_components, estimate_components
+from armcal.io.parallel import Executor
+from armcal.problem.factor_records import correlation_of
 from armcal.problem.posed import PosedProblem
 from armcal.problem.problem import FactorRecords, Problem
+
+LossName = Literal["huber", "cauchy"]
+
+EFFICIENCY = 0.95
+_LARGEST_NORM, _STEPS = 12.0, 20000
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A loss with its tuning constant, for residuals of one dimension.
+
+    Attributes:
+        name: which one.
+        constant: beyond this many scales a record weighs less (Huber), or half or less (Cauchy).
+        dimension: m, how many residual numbers a record has.
+    """
+
+    name: LossName
+    constant: float
+    dimension: int
+
+    def rho(self, norms: Array) -> Array:
+        """The loss; t^2/2 for small norms t."""
+        c = self.constant
+        if self.name == "huber":
+            return np.where(norms <= c, norms**2 / 2, c * norms - c**2 / 2)
+        return np.asarray(c**2 / 2 * np.log1p((norms / c) ** 2))
+
+    def weight(self, norms: Array) -> Array:
+        """rho'(t)/t, from 1 down."""
+        if self.name == "huber":
+            return np.minimum(1.0, self.constant / np.maximum(norms, self.constant))
+        return np.asarray(1 / (1 + (norms / self.constant) ** 2))
+
+    def stiffness(self, norms: Array) -> tuple[Array, Array]:
+        weight = self.weight(norms)
+        if self.name == "huber":
+            return np.where(norms <= self.constant, 1.0, 0.0), weight
+        return weight**2 * (1 - (norms / self.constant) ** 2), weight
+
+    def gaussian_mean(self, of: Array) -> float:
+        """Mean over Gaussian residuals of a function of the norm, given on ``norm_grid``."""
+        from scipy.integrate import trapezoid  # here, for it takes 0.2 s that only robust fits need
+
+        grid, m = np.maximum(norm_grid(), 1e-300), self.dimension
+        # The density of the chi distribution.
+        logarithm = (m - 1) * np.log(grid) - grid**2 / 2 - gammaln(m / 2) - (m / 2 - 1) * np.log(2)
+        return float(trapezoid(of * np.exp(logarithm), dx=_LARGEST_NORM / _STEPS))
+
+
+@lru_cache(maxsize=32)
+def tuned(name: LossName, dimension: int) -> Loss:
+    """A loss that keeps 95 % efficiency in so many dimensions."""
+    low, high, grid = 1e-2, 100.0, norm_grid()
+    for _ in range(60):
+        middle = np.sqrt(low * high)
+        loss = Loss(name, middle, dimension)
+        spread = loss.gaussian_mean((loss.weight(grid) * grid) ** 2) / dimension
+        along, across = loss.stiffness(grid)
+        slope = loss.gaussian_mean(along + (dimension - 1) * across) / dimension
+        low, high = (middle, high) if slope**2 / spread < EFFICIENCY else (low, middle)
+    return Loss(name, float(np.sqrt(low * high)), dimension)
+
+
+def norm_grid() -> Array:
+    return np.linspace(0.0, _LARGEST_NORM, _STEPS + 1)
+
+
+def median_norm(dimension: int) -> float:
+    return float(np.sqrt(chdtri(dimension, 0.5)))
+
+
+LEVEL = 0.01
+"""Of calling any record an outlier though all noise is Gaussian."""
+SMALLEST_SCALE = 1e-3
+"""In units of the declared noise: residuals smaller than this are none, and no measure of what is large."""
+UNCONTROLLED = 1e-3
+"""Of a residual's variance: below this it would hardly show an error of its own record."""
+
+
+@dataclass(frozen=True)
+class Distances:
+    """Of all records, factor by factor.
+
+    Attributes:
+        studentised: length of each residual in its own standard deviations (N each); 0 where nothing controls it.
+        limits: the length that the largest of all stays below in 99 % of experiments without outliers.
+        scales: residuals in units of their noise, by their median, so that a minority of outliers hardly matters.
+    """
+
+    studentised: tuple[Array, ...]
+    limits: tuple[float, ...]
+    scales: tuple[float, ...]
+
+    def beyond(self) -> tuple[Array, ...]:
+        """How many limits away each record lies (N each)."""
+        return tuple(length / limit for length, limit in zip(self.studentised, self.limits, strict=True))
+
+
+def studentised_distances(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], weights: Sequence[Array]
+) -> Distances:
+    """Distances of all records from a fit that gave them these weights (N each, 0 to 1).
+
+    The limit is Fisher's quantile at 1 % over the number of records (Bonferroni).
+    """
+    counted = problem.weighted(records, weights)
+    inverse = InverseInformation.of(problem.triangular_factor(values, counted), problem.parameters)
+    residuals = remaining(problem, values, records, weights)
+    directions = problem.parameters.entries_jacobian(values) @ inverse.root
+    lengths = []
+    for residual, jacobian, weight in zip(residuals, problem.jacobians(values, records), weights, strict=True):
+        reached = np.einsum("avn,vk->akn", jacobian, directions)
+        hat = np.einsum("avn,bvn->nab", reached, reached)
+        sizes, axes = np.linalg.eigh(np.eye(len(reached)) - (2 * weight[:, None, None] - 1) * hat)
+        # sqrt(r' S^-1 r) of each record; directions that nothing controls are left out.
+        along, controlled = np.einsum("nab,an->nb", axes, residual), sizes > UNCONTROLLED
+        squares = np.where(controlled, along**2 / np.where(controlled, sizes, 1.0), 0.0)
+        lengths.append(np.sqrt(np.sum(squares, axis=1)))
+    freedom = max(1.0, problem.equations(counted) - inverse.spent)
+    tests = sum(len(length) for length in lengths)
+    rows = [len(residual) for residual in residuals]
+    typical = [float(np.median(length)) / median_norm(m) for length, m in zip(lengths, rows, strict=True)]
+    scales = [max(scale, SMALLEST_SCALE) for scale in typical]
+    limits = [float(np.sqrt(m * fdtri(m, freedom, 1 - LEVEL / max(1, tests)))) for m in rows]
+    studentised = [length / scale for length, scale in zip(lengths, scales, strict=True)]
+    return Distances(tuple(studentised), tuple(limits), tuple(scales))
+
+
+def remaining(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], weights: Sequence[Array]
+) -> tuple[Array, ...]:
+    """Whitened residuals (n_r x N) times the roots of the records' own weights.
+
+    Of drifting records less the drift that they determine with these further weights (N each).
+    """
+    residuals, shared = problem.weighted_residuals(values, records), correlation_of(records)
+    weighed = problem.weighted(records, weights) if shared is not None else records
+    correlation = correlation_of(weighed)
+    if shared is None or correlation is None:
+        return residuals
+    states = correlation.states([r[:, :, None] for r in problem.weighted_residuals(values, weighed)])
+    return tuple(r - shared.taken_up(i, states)[:, : r.shape[1], 0] for i, r in enumerate(residuals))
+
 
 MOST_ROUNDS = 200
 MOST_SCALE_ROUNDS = 40
@@ -255,3 +431,228 @@ def _with_status(solution: Solution, text: str, converged: bool | None = None) -
     past = solution.verdict
     done = past.converged if converged is None else past.converged and converged
     return Solution(solution.values, replace(past, status=f"{past.status}; {text}", converged=done))
+
+
+MOST_ESTIMATES = 10
+
+
+class NoiseSettings(Settings):
+    """What is assumed of the noise.
+
+    ``loss``: ``none`` is least squares; ``huber`` and ``cauchy`` weigh large residuals less; ``reject`` sets records
+    aside and fits the rest, at most the fraction ``most_rejected``. ``estimate`` finds variance components, of each
+    instrument as a whole or of its axes apart, and of each joint, and fits with them; ``instruments`` those of
+    instruments alone, where their noise is not known: what the model lacks then counts as noise.
+    """
+
+    loss: Literal["none", "huber", "cauchy", "reject"] = "none"
+    estimate: bool | Literal["instruments"] = False
+    axes: Axes = "together"
+    most_rejected: Annotated[float, Field(gt=0, lt=0.5)] = 0.1
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A record farther from the fit than noise alone takes any record in 99 % of experiments.
+
+    Attributes:
+        record: its place among the records of the fit.
+        measurement: whose residual it is.
+        distance: length of its residual in its own standard deviations, robustly scaled.
+        limit: what was allowed.
+        weight: in the fit: 0 if it was set aside.
+    """
+
+    record: int
+    measurement: str
+    distance: float
+    limit: float
+    weight: float
+
+
+@dataclass(frozen=True)
+class WeighedFit:
+    """A fit, and how its records weighed.
+
+    Attributes:
+        solution: the solver's.
+        estimate: values and how sure they are.
+        records: those of the fit, with the whitening used; set-aside ones have weight zero.
+        weights: of each record, factor by factor (N each).
+        suspects: the farthest first; empty without a loss.
+        components: estimated variances, or None.
+        loss: which one; ``none`` for least squares.
+        rounds: of reweighting and selecting.
+        warnings: what a user should know.
+        as_declared: values of the fit by the declared noise, which came before variances were estimated; else None.
+    """
+
+    solution: Solution
+    estimate: Estimate
+    records: tuple[FactorRecords, ...]
+    weights: tuple[Array, ...]
+    suspects: tuple[Suspect, ...] = ()
+    components: VarianceComponents | None = None
+    loss: str = "none"
+    rounds: tuple[Round, ...] = ()
+    warnings: tuple[str, ...] = ()
+    as_declared: Array | None = None
+
+    @property
+    def set_aside(self) -> tuple[Suspect, ...]:
+        return tuple(s for s in self.suspects if s.weight == 0)
+
+    @property
+    def kept(self) -> Array:
+        """Whether each record took part with some measurement (N)."""
+        return np.asarray(np.any(np.array(self.weights) > 0, axis=0))
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """An estimator that weighs records as the settings say; it is an estimator itself, for folds and studies."""
+
+    inner: Estimator
+    settings: NoiseSettings
+
+    def spread(self, executor: Executor) -> Weighing:
+        return Weighing(spread(self.inner, executor), self.settings)
+
+    def solve(
+        self,
+        problem: Problem,
+        records: Sequence[FactorRecords],
+        start: Array,
+        progress: Progress = no_progress,
+    ) -> Solution:
+        return self._weighed(problem, self._declared(problem, records, start, progress), records, progress)[0].solution
+
+    def fit(
+        self, problem: Problem, records: Sequence[FactorRecords], start: Array, progress: Progress = no_progress
+    ) -> WeighedFit:
+        """Values, and everything that is known of how records weighed."""
+        declared = self._declared(problem, records, start, progress)
+        robust, whitened, components = self._weighed(problem, declared, records, progress)
+        loss, acting, suspects = self.settings.loss, None, list[Suspect]()
+        if loss != "none":
+            distances = studentised_distances(problem, robust.solution.values, whitened, robust.weights)
+            rows = zip(problem.kernels, distances.studentised, distances.limits, robust.weights, strict=True)
+            for kernel, lengths, limit, weights in rows:
+                for i in np.flatnonzero((lengths > limit) | (weights == 0)):
+                    weight = float(weights[i])
+                    suspects.append(Suspect(int(i), kernel.factor.name, float(lengths[i]), limit, weight))
+        if loss == "huber" or loss == "cauchy":
+            acting = influence(problem, whitened, robust, loss, self._trusted(problem, whitened, robust))
+        elif loss == "reject":
+            whitened = problem.weighted(whitened, robust.weights)
+        return WeighedFit(
+            robust.solution,
+            _estimate(problem, whitened, robust.solution, acting),
+            whitened,
+            robust.weights,
+            tuple(sorted(suspects, key=lambda suspect: -suspect.distance)),
+            components,
+            loss,
+            robust.rounds,
+            robust.warnings,
+            None if components is None else declared.solution.values,
+        )
+
+    def _declared(
+        self, problem: Problem, records: Sequence[FactorRecords], start: Array, progress: Progress
+    ) -> RobustFit:
+        return self._robust(problem, tuple(records), self.inner.solve(problem, records, start, progress), progress)
+
+    def _weighed(
+        self, problem: Problem, robust: RobustFit, records: Sequence[FactorRecords], progress: Progress
+    ) -> tuple[RobustFit, tuple[FactorRecords, ...], VarianceComponents | None]:
+        """The fit, its records whitened, and components: these and values in turn, until the components rest.
+
+        Begins with a fit by the declared noise. Suspects are no evidence of the variances.
+        """
+        axes, whitened, before = self.settings.axes, tuple(records), None
+        for number in range(MOST_ESTIMATES if self.settings.estimate else 0):
+            if not robust.solution.verdict.converged:
+                break
+            progress("variance components", number / MOST_ESTIMATES)
+            counted = problem.weighted(records, self._trusted(problem, whitened, robust))
+            of_joints = self.settings.estimate is True
+            components = estimate_components(problem, robust.solution.values, counted, axes, of_joints)
+            components = replace(components, rounds=number + 1)
+            if before is not None and components.close_to(before):
+                return robust, whitened, components
+            before = components
+            whitened = apply_components(problem, robust.solution.values, records, components, axes)
+            again = self.inner.solve(problem, whitened, robust.solution.values)
+            robust = self._robust(problem, whitened, again, progress)
+        return robust, whitened, before
+
+    def _robust(
+        self, problem: Problem, records: tuple[FactorRecords, ...], first: Solution, progress: Progress
+    ) -> RobustFit:
+        loss = self.settings.loss
+        if loss == "none" or not first.verdict.converged or not problem.increments:
+            return RobustFit(first, ones(records), (1.0,) * len(records), ())
+        huber = reweighted(problem, records, self.inner, first, "huber", progress)
+        if loss == "huber" or not huber.solution.verdict.converged:
+            return huber
+        if loss == "cauchy":
+            return reweighted(problem, records, self.inner, huber.solution, "cauchy", progress)
+        return selected(problem, records, self.inner, huber, self.settings.most_rejected, progress)
+
+    def _trusted(self, problem: Problem, records: tuple[FactorRecords, ...], robust: RobustFit) -> tuple[Array, ...]:
+        """1 for records that are evidence of the variances, 0 for suspects of a robust fit."""
+        if self.settings.loss == "none":
+            return robust.weights
+        distances = studentised_distances(problem, robust.solution.values, records, robust.weights)
+        return tuple(np.where(beyond > 1, 0.0, 1.0) for beyond in distances.beyond())
+
+
+def weighed(estimator: Estimator, settings: NoiseSettings) -> Estimator:
+    return estimator if settings.loss == "none" and not settings.estimate else Weighing(estimator, settings)
+
+
+def fit(
+    problem: Problem,
+    records: Sequence[FactorRecords],
+    estimator: Estimator,
+    start: Array,
+    progress: Progress = no_progress,
+) -> WeighedFit:
+    if isinstance(estimator, Weighing):
+        return estimator.fit(problem, records, start, progress)
+    return plain_fit(problem, records, estimator.solve(problem, records, start, progress))
+
+
+@dataclass(frozen=True)
+class _Held:
+    """An estimator that stays where a solution is."""
+
+    solution: Solution
+
+    def solve(
+        self, problem: Problem, records: Sequence[FactorRecords], start: Array, progress: Progress = no_progress
+    ) -> Solution:
+        return self.solution
+
+
+def held_fit(
+    problem: Problem, records: Sequence[FactorRecords], estimator: Estimator, solution: Solution
+) -> WeighedFit:
+    at = _Held(solution)
+    own = replace(estimator, inner=at) if isinstance(estimator, Weighing) else at
+    return fit(problem, records, own, solution.values)
+
+
+def plain_fit(problem: Problem, records: Sequence[FactorRecords], solution: Solution) -> WeighedFit:
+    return WeighedFit(solution, _estimate(problem, records, solution), tuple(records), ones(records))
+
+
+def _estimate(
+    problem: Problem, records: Sequence[FactorRecords], solution: Solution, acting: Influence | None = None
+) -> Estimate:
+    """The estimate at a solution; where a solver gave up on the edge of what springs hold, there may be none."""
+    try:
+        return estimate(problem, records, solution, acting)
+    except NotConvergedError as fault:
+        raise fault if solution.verdict.converged else gave_up(solution.verdict) from fault

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from armcal.arm.assembly import Arm
-from armcal.arm.environment import Environment
+from armcal.arm.statics import Environment
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters

@@ -14,7 +14,7 @@ from armcal.base.arrays import Array, Indices
 from armcal.base.units import ERROR_NAMES, ERROR_UNITS
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.estimator import Estimator, Progress, Solution, no_progress
-from armcal.estimate.nuisance import restricted, settled
+from armcal.estimate.polish import restricted, settled
 from armcal.io.parallel import Executor, Sequential
 from armcal.measure.measurement import Placed
 from armcal.problem.drift import residuals

@@ -13,8 +13,8 @@ from armcal.base.dataset import Dataset
 from armcal.base.units import DIMENSIONLESS, units_of
 from armcal.io.parallel import Report, unreported
 from armcal.io.plain_files import input_bytes, refuse, text_of
+from armcal.measure.instrument import PointMeasurement
 from armcal.measure.measurement import Measurement, noise_channels
-from armcal.measure.points import PointMeasurement
 
 
 @dataclass(frozen=True)

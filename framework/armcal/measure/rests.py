@@ -5,14 +5,152 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby, pairwise
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field, model_validator
+from scipy.spatial.transform import Rotation
 
 from armcal.base.arrays import Array, Indices, Mask
+from armcal.base.quaternions import nearest_turn
 from armcal.base.settings import Angle, Duration, Settings
+
+LEVER_M = 0.1
+"""A turn counts as much as it moves points this far from the target."""
+MOST_OUTLYING = 0.1
+"""A larger part of the frames that lies far off is no accident."""
+_LONGEST_OUTLYING = 2
+"""So many frames in a row may be wrong; more have seen the arm elsewhere."""
+_SURE = 5.5
+"""Standard deviations that the length of a normal vector of three exceeds once in a million times."""
+_MOST_CORRELATED = 0.95
+
+
+_FAR = 6.0
+"""So many times the median distance is far: 9 standard deviations of noise alike in three directions, 4 of one."""
+_MEDIAN_STEPS = 8
+_TINY_M = 1e-9
+
+
+@dataclass(frozen=True)
+class Stillness:
+    """Whether some poses are those of an arm that stands.
+
+    Attributes:
+        why_not: why they are not those of an arm that stands, a sentence; empty if they are.
+        kept: which poses count (N); the others lie far off.
+    """
+
+    why_not: str
+    kept: Mask
+
+
+def judged(poses: Array, spread: float) -> Stillness:
+    """Whether poses (N x 4 x 4, m, in order; N at least 4) are those of an arm that stands.
+
+    The target, and points ``LEVER_M`` from it along its axes, must have the same mean before and after any moment,
+    within ``spread`` (m): before and after the middle strictly, at other moments if noise cannot be the reason. A few
+    outliers are left out: single or in pairs, and never the last frame, which may be the first of a motion.
+    """
+    points = poses[:, None, :3, 3]  # N x P x 3: the target alone where a rotation is not known
+    if not np.isnan(poses[:, 0, 0]).any():
+        points = np.concatenate([points, points + LEVER_M * np.swapaxes(poses[:, :3, :3], 1, 2)], axis=1)
+    kept = ~far_off(points, spread)
+    longest_outlying = max((len(list(run)) for is_kept, run in groupby(kept.tolist()) if not is_kept), default=0)
+    if longest_outlying > _LONGEST_OUTLYING or not kept[-1]:
+        off = 1000 * _longest(points[-1] - _spatial_median(points))
+        return Stillness(f"still moving: it stands elsewhere than before, now {off:.2f} mm off", kept)
+    if (~kept).mean() > MOST_OUTLYING:
+        return Stillness(f"positions jump about: {(~kept).sum()} of {len(kept)} frames lie far from the others", kept)
+    usable = points[kept]
+    half = len(usable) // 2
+    apart = _longest(usable[half:].mean(axis=0) - usable[:half].mean(axis=0))
+    step = apart if apart >= spread else _largest_step(usable, spread)
+    why = f"still moving by {1000 * step:.2f} mm (allowed: {1000 * spread:g} mm)" if step > 0 else ""
+    return Stillness(why, kept)
+
+
+def far_off(points: Array, least: float) -> Mask:
+    """Which frames (points: N x P x 3, m) have a point far from its median: by ``_FAR``, and by ``least`` at any rate.
+
+    Distances do not hang on the directions of the axes, nor does the spatial median. [Huber1981]
+    """
+    away = np.linalg.norm(points - _spatial_median(points), axis=2)
+    limit = np.maximum(_FAR * np.median(away, axis=0), least)
+    return np.asarray((away > limit).any(axis=1))
+
+
+def _spatial_median(points: Array) -> Array:
+    """The place of each point (P x 3) with the least sum of distances to its N places. [Weiszfeld1937]"""
+    median = points.mean(axis=0)
+    for _ in range(_MEDIAN_STEPS):
+        weights = 1 / np.maximum(np.linalg.norm(points - median, axis=2), _TINY_M)
+        median = (weights[..., None] * points).sum(axis=0) / weights.sum(axis=0)[:, None]
+    return np.asarray(median)
+
+
+def mean_rotation(rotations: Array) -> Array:
+    """The rotation (3 x 3) whose matrix is nearest to all (N x 3 x 3, N > 0) in the sum of squares. [Moakher2002]"""
+    return nearest_turn(rotations.mean(axis=0))
+
+
+def turns_from(mean: Array, rotations: Array) -> Array:
+    """The rotation vectors (N x 3, rad) from one rotation to others, in the axes of the one."""
+    return np.asarray(Rotation.from_matrix(mean.T @ rotations).as_rotvec())
+
+
+def mean_pose(poses: Array) -> Array:
+    """The mean (4 x 4) of poses (N x 4 x 4); rotations that are NaN do not count, and all NaN give NaN."""
+    mean = np.eye(4)
+    mean[:3, 3] = poses[:, :3, 3].mean(axis=0)
+    rotations = poses[~np.isnan(poses[:, 0, 0]), :3, :3]
+    mean[:3, :3] = mean_rotation(rotations) if len(rotations) else np.nan
+    return mean
+
+
+def deviations_of_mean(poses: Array, mean: Array) -> Array:
+    """Standard deviations (6) of the mean: x, y, z (m), and the turn about each axis of the target (rad).
+
+    Noise of frames that follow each other may be alike: as many count as an autoregression of first order with the
+    estimated correlation leaves independent. [Box2015] NaN where fewer than two poses have one.
+    """
+    deviations = np.full(6, np.nan)
+    if len(poses) >= 2:
+        deviations[:3] = _of_mean(poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0))
+    rotations = poses[~np.isnan(poses[:, 0, 0]), :3, :3]
+    if len(rotations) >= 2:
+        deviations[3:] = _of_mean(turns_from(mean[:3, :3], rotations))
+    return deviations
+
+
+def _longest(differences: Array) -> float:
+    return float(np.linalg.norm(differences, axis=-1).max())
+
+
+def _largest_step(points: Array, spread: float) -> float:
+    """The largest change of the mean (m) at any moment that exceeds both the spread and what noise would do; or 0."""
+    count = len(points)
+    sums = np.cumsum(points, axis=0)[:-1]
+    before = np.arange(1, count)[:, None, None]
+    steps = np.linalg.norm((sums[-1] + points[-1] - sums) / (count - before) - sums / before, axis=2)
+    # Deviations by differences of neighbours, which a step or a drift hardly enlarges.
+    noise = 1.4826 * np.median(np.abs(np.diff(points, axis=0)), axis=0) / np.sqrt(2)
+    doubt = _SURE * noise.max(axis=1) * np.sqrt(1 / before[..., 0] + 1 / (count - before[..., 0]))
+    sure = (steps > spread) & (steps > doubt)
+    return float(steps[sure].max()) if sure.any() else 0.0
+
+
+def _of_mean(residuals: Array) -> Array:
+    """The deviation of the mean of each column (N x k), whose residuals may be correlated in time."""
+    count = len(residuals)
+    squares = (residuals**2).sum(axis=0)
+    lagged = (residuals[1:] * residuals[:-1]).sum(axis=0)
+    correlation = np.divide(lagged, squares, out=np.zeros_like(squares), where=squares > 0)
+    correlation += (1 + 3 * correlation) / count  # the bias of the estimate
+    correlation = np.clip(correlation, 0.0, _MOST_CORRELATED)
+    return np.asarray(np.sqrt(squares / (count - 1) / count * (1 + correlation) / (1 - correlation)))
+
 
 _SPREAD_RAD = math.radians(0.01)
 

@@ -21,15 +21,16 @@ import casadi as ca
 from typing_extensions import override
 
 from armcal.arm.assembly import Arm, ArmInputs, ArmState, LocalValues, scoped
-from armcal.arm.environment import STATICS, Environment, tilted
 from armcal.arm.evaluator import ElasticPass
 from armcal.arm.pose_residual import SURROUNDINGS, correction_names
-from armcal.arm.statics import LOAD_CHANNELS, Load
+from armcal.arm.statics import LOAD_CHANNELS, STATICS, Environment, Load, tilted
 from armcal.base.arrays import Array
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.se3 import Expression, column
 from armcal.base.units import ERROR_UNITS
 from armcal.errors import ProblemError
+from armcal.measure.groups import OTHER
+from armcal.measure.instrument import LimitedView, PointMeasurement
 from armcal.measure.measurement import (
     GroupedMeasurement,
     Measurement,
@@ -37,8 +38,6 @@ from armcal.measure.measurement import (
     noise_channels,
     residual_dimensions,
 )
-from armcal.measure.partners import OTHER
-from armcal.measure.points import LimitedView, PointMeasurement
 from armcal.plugins import expecting, refuse
 
 _POINT = "point."

@@ -8,7 +8,7 @@ import numpy as np
 from armcal.arm.evaluator import Evaluator
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
-from armcal.measure.points import LimitedView, spread_points
+from armcal.measure.instrument import LimitedView, spread_points
 from armcal.problem.factor import Factor
 from armcal.problem.factor_records import FactorRecords, by_covariance
 from armcal.problem.problem import Problem

@@ -13,7 +13,7 @@ import numpy as np
 from armcal.arm.pose_residual import CORRECTION
 from armcal.base.arrays import Array, Mask
 from armcal.problem.factor import Factor
-from armcal.problem.grouped_kernel import GroupedKernel
+from armcal.problem.kernel import GroupedKernel
 from armcal.problem.problem import FactorRecords, Problem
 
 _MOST_STEPS = 12

@@ -12,7 +12,7 @@ import numpy as np
 
 from armcal.base.arrays import Array
 from armcal.errors import ProblemError
-from armcal.measure.partners import OTHER
+from armcal.measure.groups import OTHER
 from armcal.problem.factor import Factor
 from armcal.problem.factor_records import by_covariance, transformed, whitening_of
 from armcal.problem.problem import FactorRecords, Problem

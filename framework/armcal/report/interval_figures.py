@@ -11,7 +11,7 @@ from armcal.report import svg
 from armcal.report.error_figures import roles
 from armcal.report.numbers import NONE, count, fixed, plural, significant
 from armcal.report.svg import DIAMOND, Axis, Box, Figure
-from armcal.run.intervals import IntervalResult
+from armcal.run.judging import IntervalResult
 from armcal.run.result import RunResult
 
 _RECORDINGS = {"same": "calibrated recording", "new": "new recording"}

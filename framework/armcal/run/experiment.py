@@ -22,8 +22,8 @@ from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource, load_config
 from armcal.errors import ConfigError
 from armcal.estimate.estimator import Estimator, Progress, no_progress
+from armcal.estimate.robust import weighed
 from armcal.estimate.simulation import SimulationRequest, Simulator
-from armcal.estimate.weighing import weighed
 from armcal.measure.checks import records_of
 from armcal.measure.environment import noticed, require_conditions, warn_beyond_limits
 from armcal.measure.groups import grouped_instances, groups_of, pose_numbers, unmatched

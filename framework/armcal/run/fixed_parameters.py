@@ -7,8 +7,8 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.freeing import Candidate, candidates, freeing
+from armcal.estimate.robust import fit
 from armcal.estimate.validation import cross_validate, folds
-from armcal.estimate.weighing import fit
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal.run.prepare import Prepared, acting

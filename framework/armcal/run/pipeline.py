@@ -8,25 +8,23 @@ import numpy as np
 from armcal.base.dataset import SetAside
 from armcal.calibration.intervals import PredictionRecord, covariance_rows, recording_record, stretch_records
 from armcal.calibration.recorded_range import UNKNOWN, recorded_ranges
-from armcal.diagnose.clustered import widened
 from armcal.diagnose.coverage import fit_and_predict
+from armcal.diagnose.score_tests import widened
 from armcal.errors import noted
 from armcal.estimate.bootstrap import Bootstrap, bootstrap
 from armcal.estimate.estimator import Progress, no_progress, spread
 from armcal.estimate.polish import hopeless, typical_off
 from armcal.estimate.profile import Profile, profiles
+from armcal.estimate.robust import WeighedFit, fit, held_fit, plain_fit
 from armcal.estimate.start import FAR
 from armcal.estimate.validation import CrossValidation, Split, cross_validate
-from armcal.estimate.weighing import WeighedFit, fit, held_fit, plain_fit
 from armcal.io.parallel import Executor
 from armcal.plugins import PluginRegistry
 from armcal.problem.corrected import moved_by
 from armcal.problem.motion import recorded_position
-from armcal.run.errors import ErrorTable, RecordErrors, errors_of
+from armcal.run.errors import ErrorTable, FittedRecords, RecordErrors, errors_of
 from armcal.run.experiment import Experiment
-from armcal.run.intervals import IntervalResult, interval_result
-from armcal.run.judging import verdict_of
-from armcal.run.placed import FittedRecords
+from armcal.run.judging import IntervalResult, interval_result, verdict_of
 from armcal.run.pose_residual import ResidualOutcome, layer_of, learned_residual
 from armcal.run.prepare import Prepared, Stopwatch, acting, folds_of, prepare
 from armcal.run.result import RunResult, SuspiciousRecord, noise_result, run_groups

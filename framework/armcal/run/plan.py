@@ -1,38 +1,38 @@
-"""A pose plan: which poses to measure, how good they are, how good any could be, and in which order to visit them."""
+"""A pose plan: which poses to measure, how good they are, how good any could be, and in which order to visit them.
 
+What planned poses need beside information: joints that come from either side, and angles between the usual ones.
+
+Come to from one side only, or from below at each upper end and from above at each lower one, a joint's play, gain and
+zero trade: each level therefore is a candidate from either side. A joint at an end of its range comes from inside.
+And the most informative poses of an arm of servos put each joint at few angles: its ends, and where its gains change.
+There a servo's table is right by construction; between them it is not, and no residual says so.
+"""
+
+import math
+from collections import Counter
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
+from armcal.arm.loading import holding_efforts
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
-from armcal.errors import ProblemError
+from armcal.calibration.calibration import Calibration
+from armcal.errors import ConfigError, ProblemError
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.identifiability import Identifiability, analyse, measures_of
+from armcal.estimate.simulation import with_channels
+from armcal.measure.groups import grouped_instances
 from armcal.planning.candidates import Candidates, deviations, whitened_rows
 from armcal.planning.criterion import Observability, criterion, observability
 from armcal.planning.exchange import Allowed, Plan, choose, refine, value_of
 from armcal.planning.relaxation import Task
+from armcal.planning.visit import cool_order, heat, path_time, peak, quick_order, travel_times
+from armcal.problem.problem import Problem, triangular
 from armcal.run.experiment import Experiment
-from armcal.run.plan_approaches import (
-    PLANNED,
-    approach_channels,
-    come_from_both_sides,
-    depends_on_approach,
-    reachable,
-    with_approaches,
-    with_poses_between,
-)
-from armcal.run.plan_context import (
-    PlanContext,
-    as_if_measured,
-    in_order_of_visit,
-    parameters_of,
-    plan_context,
-    problem_of,
-)
 from armcal.run.plan_poses import (
     JointSpace,
     Pool,
@@ -44,6 +44,216 @@ from armcal.run.plan_poses import (
     same_poses,
 )
 from armcal.run.settings import PlanSettings
+
+_SPEEDS = {"angle": np.deg2rad(60.0), "length": 0.05}
+
+
+@dataclass(frozen=True)
+class PlanContext:
+    """What all steps of one plan stand on."""
+
+    experiment: Experiment
+    settings: PlanSettings
+    space: JointSpace
+    parameters: Parameters
+    given: Dataset | None
+    priors: Array  # as rows of information by coordinates in typical scales
+
+    @cached_property
+    def base(self) -> Array:
+        """Priors and given records, as R with R'R their information."""
+        if self.given is None:
+            return self.priors
+        rows = self.rows(self.given)
+        return triangular(np.vstack([self.priors, rows.reshape(-1, rows.shape[-1])]))
+
+    def rows(self, dataset: Dataset) -> Array:
+        """Whitened Jacobians (n_r x N x n)."""
+        records = as_if_measured(self.experiment, dataset)
+        problem = problem_of(self.experiment, self.parameters, records)
+        return whitened_rows(problem, self.parameters.nominal(), records)
+
+
+def parameters_of(experiment: Experiment, calibration: Path | None) -> Parameters:
+    """Those of the experiment, about the values of a calibration if one is given.
+
+    Raises:
+        ProblemError: nothing is free, or what is measured is a contact, which only few postures can be in.
+        ConfigError: the calibration is of another arm.
+    """
+    parameters = experiment.parameters
+    if touching := grouped_instances(experiment.system.measurements):
+        raise ProblemError(
+            f"{touching[0]} is a contact: poses that touch cannot be chosen from free space.",
+            hint="Take postures up by hand, varied as docs/ball_and_sockets.md says; armcal identify names what they "
+            "determine, and what is missing.",
+        )
+    if not parameters.free:
+        raise ProblemError("no parameter is free: there is nothing to plan for.", hint="Set parameters.free.")
+    return values_about(experiment, calibration)
+
+
+def values_about(experiment: Experiment, calibration: Path | None) -> Parameters:
+    """An experiment's parameters, at the values of a calibration if one is given.
+
+    Raises:
+        ConfigError: the calibration is of another arm.
+    """
+    parameters = experiment.parameters
+    if calibration is None:
+        return parameters
+    calibrated = Calibration.load(calibration, experiment.registry).parameters
+    if calibrated.entry_names != parameters.entry_names:
+        differing = sorted(set(calibrated.entry_names) ^ set(parameters.entry_names))
+        raise ConfigError(
+            f"the calibration has other parameters: {', '.join(differing[:3]) or 'their order differs'}.",
+            hint="Give a calibration of the same arm.",
+        )
+    return parameters.with_nominal(calibrated.nominal())
+
+
+def problem_of(experiment: Experiment, parameters: Parameters, dataset: Dataset) -> Problem:
+    system, evaluator = experiment.system, experiment.settings.evaluator
+    return Problem.build(system.arms, system.measurements, parameters, system.environment, dataset, evaluator)
+
+
+def as_if_measured(experiment: Experiment, dataset: Dataset) -> Dataset:
+    """Poses with the channels of all that would be measured there; which numbers they hold does not matter."""
+    measured = [f"{name}.{c.name}" for name, m in experiment.system.measurements.items() for c in m.channels()]
+    missing = [channel for channel in measured if channel not in dataset.channels]
+    return with_channels(dataset, {channel: np.zeros(len(dataset)) for channel in missing})
+
+
+def plan_context(
+    experiment: Experiment, settings: PlanSettings, space: JointSpace, parameters: Parameters, given: Dataset | None
+) -> PlanContext:
+    """Priors and given records as information, at the nominal values."""
+    scales, prior = parameters.scales(), parameters.prior_information()
+    priors = np.diag(scales * np.sqrt(prior))[prior > 0]
+    return PlanContext(experiment, settings, space, parameters, given, priors)
+
+
+def in_order_of_visit(
+    context: PlanContext, chosen: Dataset, *, keeps_approaches: bool = False
+) -> tuple[Dataset, float, float | None]:
+    """The poses in the order of visit, the time that takes (s), and the peak of the torque's moving average.
+
+    Ids are unique where a pose is repeated; approaches are what this order makes them, unless planned ones are kept.
+    """
+    settings, space, environment = context.settings, context.space, context.experiment.system.environment
+    angles = chosen.stacked(space.channels)
+    given = space.by_joint(
+        {n: [np.deg2rad(v)] for n, v in settings.speeds_deg_per_s.items()},
+        {n: [v / 1000] for n, v in settings.speeds_mm_per_s.items()},
+        ("speeds_deg_per_s", "speeds_mm_per_s"),
+    )
+    speeds = [given.get(n, np.array([_SPEEDS[d]])) for n, d in zip(space.names, space.dimensions, strict=True)]
+    load = environment.gravity, environment.payload_mass, environment.payload_com
+    efforts = [
+        holding_efforts(arm, chosen.stacked([*arm.command_channels]), *load)
+        for arm in context.experiment.system.arms.values()
+    ]
+    times, heats = travel_times(angles, np.concatenate(speeds)), heat(np.concatenate(efforts))
+    if settings.order == "travel":
+        order = quick_order(times)
+    else:
+        order = cool_order(heats, times) if settings.order == "torque" else np.arange(len(chosen))
+    visited = chosen.subset(order)
+    copies: Counter[str] = Counter()
+    ids: list[str] = []
+    for record in visited.ids:
+        copies[record] += 1
+        ids.append(record if copies[record] == 1 else f"{record}_{copies[record]}")
+    numbers = tuple(str(i) for i in range(1, len(ids) + 1))
+    by_order = _approaches(visited, space)
+    channels = by_order | dict(visited.channels) if keeps_approaches else dict(visited.channels) | by_order
+    visited = replace(visited, ids=tuple(ids), channels=channels, extra={"order": numbers})
+    return visited, path_time(times, order), peak(heats, order) if heats.any() else None
+
+
+def _approaches(visited: Dataset, space: JointSpace) -> dict[str, Array]:
+    """The sign of each joint's last motion before each pose (N), 0 before its first."""
+    approaches = {}
+    for channel in space.channels:
+        command, (arm, _, joint) = visited.column(channel), channel.partition(".")
+        signs = np.sign(np.diff(command, prepend=command[:1]))
+        moved = np.maximum.accumulate(np.where(signs != 0, np.arange(len(signs)), 0))
+        approaches[f"{arm}.approach.{joint}"] = signs[moved]
+    return approaches
+
+
+APPROACH_ROOM = np.deg2rad(3.0)
+"""A joint that is come to from a side comes from as far: more than servos have play."""
+PLANNED = ("continuous", "grid")
+"""Kinds of candidates whose approaches can be chosen."""
+SHARE = 0.2
+"""Of the poses, those between the angles that the others repeat."""
+_SAME_LEVEL = 0.02
+"""Of a joint's range."""
+
+
+def depends_on_approach(problem: Problem) -> bool:
+    return any(".approach." in channel for kernel in problem.kernels for channel in kernel.factor.channels)
+
+
+def approach_channels(space: JointSpace) -> tuple[str, ...]:
+    parts = (channel.partition(".") for channel in space.channels)
+    return tuple(f"{arm}.approach.{joint}" for arm, _, joint in parts)
+
+
+def with_approaches(dataset: Dataset, space: JointSpace, signs: Array) -> Dataset:
+    """Poses with the side from which each joint comes (joints x N: 1 from below, -1 from above)."""
+    rows = zip(approach_channels(space), np.where(signs >= 0, 1.0, -1.0), strict=True)
+    return replace(dataset, channels={**dataset.channels, **dict(rows)})
+
+
+def come_from_both_sides(pool: Pool, space: JointSpace, limits: Array, seed: int) -> Pool:
+    """Each candidate twice, each of its joints from one side and from the other, as far as limits (joints x 2) allow.
+
+    Recorded and listed poses have the approaches that were recorded, or none.
+    """
+    if pool.kind not in PLANNED:
+        return pool
+    count, poses = len(pool.dataset), pool.dataset.stacked(space.channels)
+    signs = np.random.default_rng([seed, 2]).choice([-1.0, 1.0], size=poses.shape)
+    twice = pool.dataset.subset(np.tile(np.arange(count), 2))
+    ids = (*pool.dataset.ids, *(f"{name}b" for name in pool.dataset.ids))
+    both = reachable(np.tile(poses, 2), np.hstack([signs, -signs]), limits)
+    return replace(pool, dataset=with_approaches(replace(twice, ids=ids), space, both))
+
+
+def reachable(poses: Array, signs: Array, limits: Array) -> Array:
+    """Approaches (joints x N), those at an end of the range (joints x 2) turned round to come from inside."""
+    begin = poses - signs * APPROACH_ROOM
+    outside = (begin < limits[:, :1]) | (begin > limits[:, 1:])
+    turned = poses + signs * APPROACH_ROOM
+    fits = (turned >= limits[:, :1]) & (turned <= limits[:, 1:])
+    return np.asarray(np.where(outside & fits, -signs, signs))
+
+
+def with_poses_between(poses: Array, limits: Array, chosen: Indices) -> Indices:
+    """A plan whose least informative poses are exchanged for ones between the angles that the others repeat.
+
+    Args:
+        poses: candidates (joints x N, rad or m).
+        limits: of each joint (joints x 2).
+        chosen: the plan, the most informative first.
+    """
+    count = math.ceil(SHARE * len(chosen))
+    kept, scaled = chosen[: len(chosen) - count], (poses - limits[:, :1]) / np.ptp(limits, axis=1)[:, None]
+    others = np.setdiff1d(np.arange(poses.shape[1]), chosen)
+    if len(others) < count or not len(kept):
+        return chosen
+    taken, added = scaled[:, kept], []
+    for _ in range(count):
+        apart = np.min(np.abs(scaled[:, others, None] - taken[:, None, :]), axis=2)
+        best = int(others[int(np.argmax(np.mean(np.minimum(apart, 0.25), axis=0)))])
+        if not np.any(np.min(np.abs(scaled[:, best, None] - taken), axis=1) > _SAME_LEVEL):
+            return chosen
+        added.append(best)
+        taken, others = np.hstack([taken, scaled[:, [best]]]), others[others != best]
+    return np.concatenate([kept, np.array(added, dtype=np.intp)])
+
 
 _MORE = "Plan more poses, give the records that are there already (--given), or give priors."
 

@@ -13,9 +13,10 @@ from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.config.system import System
 from armcal.diagnose.coverage import missed, predictor, whitened_like
-from armcal.diagnose.noise_findings import Finding
+from armcal.diagnose.large_errors import Finding
 from armcal.errors import ConfigError, NotConvergedError
 from armcal.estimate.estimator import Progress
+from armcal.estimate.robust import WeighedFit, fit, held_fit
 from armcal.estimate.validation import (
     CrossValidation,
     FitTask,
@@ -28,10 +29,9 @@ from armcal.estimate.validation import (
     folds,
     judged_fit,
 )
-from armcal.estimate.weighing import WeighedFit, fit, held_fit
 from armcal.io.parallel import Executor
-from armcal.measure.contact import Contact
-from armcal.measure.partners import PairedMeasurement
+from armcal.measure.groups import PairedMeasurement
+from armcal.measure.instrument import Contact
 from armcal.problem.corrected import Moved, corrected_records, sizes_of, unexplained
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.run.experiment import Experiment

@@ -13,15 +13,15 @@ from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.dataset import Dataset
 from armcal.base.units import digits, to_unit
 from armcal.config.system import System
-from armcal.diagnose.noise_findings import Finding, first_few
+from armcal.diagnose.large_errors import Finding, first_few
 from armcal.diagnose.permuted_axes import MUCH_BETTER, find_permuted_axes
 from armcal.diagnose.readings import check_reach
 from armcal.errors import ConfigError, DataError, Location, ProblemError, noted
 from armcal.estimate.estimator import Progress, no_progress
-from armcal.estimate.nuisance import mislabelled, restricted, started
+from armcal.estimate.identifiability import require_solvable
+from armcal.estimate.polish import mislabelled, restricted, started
 from armcal.estimate.profile import profiled
 from armcal.estimate.start import Start, aligned_start, with_proposals
-from armcal.estimate.structure import require_solvable
 from armcal.estimate.validation import Split, error_unit, folds, hold_out, split_by_id, split_by_label
 from armcal.measure.groups import first_of_pose
 from armcal.measure.measurement import GroupedMeasurement

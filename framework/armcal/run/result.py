@@ -15,18 +15,17 @@ from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.verdict import Verdict
 from armcal.estimate.bootstrap import Bootstrap
 from armcal.estimate.estimator import Estimate
-from armcal.estimate.nuisance import settled, untrained
+from armcal.estimate.polish import settled, untrained
 from armcal.estimate.profile import Profile
 from armcal.estimate.residual_spread import ResidualSpread, residual_spread
+from armcal.estimate.robust import WeighedFit
 from armcal.estimate.validation import Split
 from armcal.estimate.variance import VarianceComponents
-from armcal.estimate.weighing import WeighedFit
 from armcal.measure.groups import Groups
 from armcal.problem.problem import Problem
-from armcal.run.errors import ErrorTable, RecordErrors
+from armcal.run.errors import ErrorTable, FittedRecords, RecordErrors
 from armcal.run.experiment import Experiment
-from armcal.run.intervals import IntervalResult
-from armcal.run.placed import FittedRecords
+from armcal.run.judging import IntervalResult
 from armcal.run.pose_residual import ResidualOutcome
 from armcal.run.prepare import PAYLOAD, group_texts, label_of
 

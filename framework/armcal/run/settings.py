@@ -8,7 +8,7 @@ from armcal.base.settings import Angle, InputPath, Length, Settings
 from armcal.config.selection import ParameterSettings
 from armcal.config.system import StaticsSettings
 from armcal.estimate.bootstrap import BootstrapSettings
-from armcal.estimate.weighing import NoiseSettings
+from armcal.estimate.robust import NoiseSettings
 from armcal.planning.criterion import Goal
 from armcal.run.plan_clearance import ClearanceSettings
 

@@ -12,8 +12,8 @@ from armcal.estimate.simulation import TruthfulSimulator
 from armcal.estimate.start import carriers_of
 from armcal.io.file_set import write_over
 from armcal.io.folder import check_folder
+from armcal.measure.instrument import Rendering
 from armcal.measure.measurement import borrowed_names
-from armcal.measure.points import Rendering
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal.run.plan_poses import read_poses

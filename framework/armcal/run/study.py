@@ -17,13 +17,12 @@ from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.settings import Settings
 from armcal.config.validate import validate
-from armcal.config.variants import load_variants
-from armcal.config.yaml_source import ConfigSource
+from armcal.config.yaml_source import ConfigSource, load_variants
 from armcal.errors import ConfigError, DataError, InputError, Location, NotConvergedError, ProblemError
 from armcal.estimate.bootstrap import BlockLength, automatic_block_length, standard_error_of_mean
 from armcal.estimate.estimator import Progress, no_progress
-from armcal.estimate.nuisance import restricted, untrained
-from armcal.estimate.structure import require_solvable
+from armcal.estimate.identifiability import require_solvable
+from armcal.estimate.polish import restricted, untrained
 from armcal.estimate.validation import (
     ErrorSummary,
     FitTask,

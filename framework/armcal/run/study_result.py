@@ -8,8 +8,7 @@ from armcal.base.arrays import Array
 from armcal.base.config_text import as_json
 from armcal.base.dataset import Dataset
 from armcal.calibration.calibration_file import dump
-from armcal.config.variants import SECTION
-from armcal.config.yaml_source import ConfigSource
+from armcal.config.yaml_source import SECTION, ConfigSource
 from armcal.estimate.validation import ErrorSummary, in_unit
 from armcal.io.cells import csv_text
 

@@ -15,7 +15,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.units import display_unit, to_unit
 from armcal.errors import InputError
 from armcal.estimate.estimator import Progress, no_progress
-from armcal.estimate.minimal import MinimalSet, minimal_set
+from armcal.estimate.identifiability import MinimalSet, minimal_set
 from armcal.estimate.simulation import measured_without_noise
 from armcal.measure.csv_writer import write_csv
 from armcal.plugins import PluginRegistry

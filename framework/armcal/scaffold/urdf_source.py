@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from armcal.arm.assembly import PLACEMENT, MassiveModel
 from armcal.arm.model import Joint
-from armcal.calibration.convert_check import nominal_values
+from armcal.calibration.convert import nominal_values
 from armcal.calibration.rigid_chain import numeric_chain
 from armcal.errors import ConfigError, DataError, Location
 from armcal.plugins import PluginRegistry

@@ -19,8 +19,8 @@ from armcal.base.domains import Interval
 from armcal.base.parameters import ParameterBlock, Parameters, declared
 from armcal.base.se3 import Expression, Transform
 from armcal.base.units import ERROR_UNITS, display_unit, si_unit, units_of
+from armcal.measure.groups import OTHER
 from armcal.measure.measurement import Channel, GroupedMeasurement, Measurement
-from armcal.measure.partners import OTHER
 from armcal.measure.reader import surroundings
 from armcal.problem.factor import Factor, build_factor
 from armcal.problem.readings import readings_by_residual

@@ -7,15 +7,15 @@ import casadi as ca
 import numpy as np
 
 from armcal.arm.assembly import Arm, ArmState
-from armcal.arm.environment import Environment
 from armcal.arm.model import Attachment, Chain, Joint
+from armcal.arm.statics import Environment
 from armcal.base import se3
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
 from armcal.base.poses import quaternion_expression
 from armcal.base.se3 import Expression
-from armcal.measure.contact import Contact
+from armcal.measure.instrument import Contact
 from armcal.measure.measurement import Channel
 
 ARM, TRACKER, WALLS = "arm", "tracker", "walls"

@@ -6,9 +6,9 @@ from typing import Self
 
 import numpy as np
 from armcal.arm.assembly import Arm
-from armcal.arm.environment import Environment
 from armcal.arm.joints import unknown_joint
 from armcal.arm.loading import holding_function
+from armcal.arm.statics import Environment
 from armcal.base.arrays import Array
 from armcal.devices.clock import Clock
 

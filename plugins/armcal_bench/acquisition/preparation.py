@@ -14,14 +14,13 @@ from armcal.calibration.rigid_chain import nominal_tools
 from armcal.devices.device import DeviceRefusedError, JointDevice, MeasuringDevice, standing_at
 from armcal.errors import ConfigError, DataError, Location
 from armcal.run.experiment import Experiment
-from armcal.run.plan_approaches import approach_channels
+from armcal.run.plan import approach_channels
 from armcal.run.plan_clearance import clearance_check
 from armcal.run.plan_poses import JointSpace, commands_of, read_poses, stated_beyond
 
-from armcal_bench.acquisition.arrival import Arrival
+from armcal_bench.acquisition.drive import PathPlanner
 from armcal_bench.acquisition.heat import HeatModel, holding_torques
-from armcal_bench.acquisition.path_planner import PathPlanner
-from armcal_bench.acquisition.sag import SagJudge
+from armcal_bench.acquisition.sag import Arrival, SagJudge
 from armcal_bench.acquisition.schedule import Scheduler
 from armcal_bench.acquisition.settings import AcquisitionSettings
 from armcal_bench.bench import Bench

@@ -8,8 +8,8 @@ from typing import TypeGuard
 import numpy as np
 from armcal.base.arrays import Array
 
+from armcal_bench.acquisition.drive import JointPath, PathPlanner, travel
 from armcal_bench.acquisition.heat import COOLED_TO, NEVER, HeatModel
-from armcal_bench.acquisition.path_planner import JointPath, PathPlanner, travel
 
 _SAMPLES = 8
 _CONSIDERED = 12

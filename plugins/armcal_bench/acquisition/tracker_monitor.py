@@ -8,8 +8,7 @@ from armcal.devices.device import DeviceRefusedError
 from armcal.devices.live import REPEATED, TrackerFrame, frames_of
 
 from armcal_bench.acquisition.settings import LostSettings
-from armcal_bench.bench import Bench
-from armcal_bench.bodies import BodySettings, base_fault, repeats, tool_fault
+from armcal_bench.bench import Bench, BodySettings, base_fault, repeats, tool_fault
 from armcal_bench.settling import Settled, Settling, Stand
 
 _WELL_S = 0.1

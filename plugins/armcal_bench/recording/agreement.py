@@ -3,24 +3,407 @@
 A posture is compared with what a fit without it expects there; it disagrees where chance would make it lie so far off
 once in ten thousand postures (F, the noise being estimated). In a group where more postures disagree than agree the
 majority is right. What disagrees takes no part in the fits that judge the others.
+
+A quick fit of the postures so far, whatever they determine, and what it predicts of a posture that it did not see.
+
+Weak priors about the nominal values stand in for what the postures do not determine: an unknown that is not determined
+yet makes the expected error large, not the answer impossible.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Self
 
 import numpy as np
+from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.units import to_unit
 from armcal.devices.live import LiveCamera
-from armcal.errors import ArmcalError, ConfigError
+from armcal.diagnose.score_tests import widened
+from armcal.errors import ArmcalError, ConfigError, ProblemError
+from armcal.estimate.estimator import Solution, SolverVerdict, estimate
+from armcal.estimate.identifiability import (
+    GIVE_A_LENGTH,
+    UNSEEN_SCALE,
+    InverseInformation,
+    explain,
+    identify_from,
+    numerical_rank,
+    scale_is_unseen,
+)
+from armcal.estimate.polish import descended, restricted, started
+from armcal.estimate.start import Start, with_proposals
+from armcal.estimate.validation import hold_out
+from armcal.measure.instrument import Proposing
 from armcal.measure.measurement import Measurement
+from armcal.planning.suggestion import suggest
+from armcal.problem.factor_records import declared
+from armcal.problem.many_points import as_seen
+from armcal.problem.posed import PosedProblem
+from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.projection import factor_at_zero, projected
+from armcal.problem.readings import with_joint_noise
 from armcal.run.experiment import Experiment
+from armcal.run.judging import known_accuracies, own_deviations
+from armcal.run.prepare import labels_of
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.special import fdtri
 
-from armcal_bench.recording.knowledge import Advice, Knowledge, advice, explained, knowledge
-from armcal_bench.recording.quick_fit import Fitted, PredictedResidual, QuickFitter
 from armcal_bench.recording.recording_log import Posture, dataset_of
 from armcal_bench.recording.window import JointKinds
+
+_FAR = 100.0
+"""Ordinary sizes within which a group (a socket) is looked for."""
+_MOST_STEPS = 30
+_DAMPING = 1e-9
+_AT_REST = 1e-5
+"""A step that lowers half the sum of squares by less than this part of it is the last."""
+_LEAST_LEFT = 1e-6
+_POSE_NUMBERS = 6
+"""Points of an image err alike, by an arm's error or a lens: they say no more of noise than the pose of the board."""
+_DECLARED_COUNTS = 2.0
+"""The declared noise counts as so many numbers when the real one is estimated."""
+_LEAST_SCALE = 0.05
+
+
+@dataclass(frozen=True)
+class PredictedResidual:
+    """What a fit predicts of one posture that it did not see.
+
+    Attributes:
+        residual: raw (n; SI).
+        covariance: of it, parameters and noise together (n x n).
+        distance: squared, in units of it, of so many ``numbers``: the entries, or fewer where these err alike.
+        dimensions: of each entry (n): ``length``, ``angle``, ``image``.
+    """
+
+    residual: Array
+    covariance: Array
+    distance: float
+    numbers: int
+    dimensions: NDArray[np.str_]
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Values, how sure their coordinates are, and the noise found in units of the declared one.
+
+    Attributes:
+        half: a root of the covariance by coordinates (n x k).
+        freedom: how many numbers the noise was estimated from.
+        used: which postures were fitted (N).
+    """
+
+    values: Array
+    half: Array
+    scale: float
+    freedom: float
+    used: Mask
+
+
+class QuickFitter:
+    """A problem of some postures, compiled; fits of any of them are solved one after the other.
+
+    Args:
+        experiment: with the parameters that the groups of the postures bring.
+        contacts: the measurements that joints alone make.
+        dataset: the postures.
+        known: values of an earlier fit, by parameter, where it begins; those that are not named begin where they are.
+
+    Raises:
+        NotConvergedError: a posture has no elastic equilibrium.
+        ProblemError: the postures leave open what an instrument finds by itself.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        contacts: dict[str, Measurement],
+        dataset: Dataset,
+        known: Mapping[str, tuple[float, ...]] = MappingProxyType({}),
+    ) -> None:
+        system = experiment.system
+        parameters = experiment.parameters
+        problem = Problem.build(system.arms, contacts, parameters, system.environment, dataset, "interpreted")
+        records = problem.records(dataset)
+        problem, proposed = _placed(problem, records, dataset, known)
+        self.problem = started(problem, records)
+        nominal = self.problem.parameters.nominal()
+        self.records = with_joint_noise(self.problem, records, nominal)
+        weak_priors = {
+            block.name: replace(block, prior_sd=block.scale * (_FAR if block.nuisance or block.name in proposed else 1))
+            for block in self.problem.parameters.free
+            if block.prior_sd is None
+        }
+        self._weak = replace(self.problem, parameters=self.problem.parameters.replaced(weak_priors))
+        parameters, start = self._weak.parameters, self._weak.parameters.nominal()
+        for block in parameters.free:
+            if len(known.get(block.name, ())) == block.size:
+                start[parameters.entries_of(block.name)] = known[block.name]
+        self._x = parameters.local(start) / parameters.increment_scales()
+
+    def free_values(self, fitted: Fitted) -> dict[str, tuple[float, ...]]:
+        parameters = self._weak.parameters
+        return {b.name: tuple(fitted.values[parameters.entries_of(b.name)].tolist()) for b in parameters.free}
+
+    def fit(self, used: Mask) -> Fitted:
+        """Fit some of the postures (N), from where the last fit ended."""
+        parameters = self._weak.parameters
+        records = self._weak.weighted(self.records, [used.astype(float)] * len(self.records))
+        posed = PosedProblem(self._weak, records)
+        self._x = descended(posed, self._x, _MOST_STEPS, _DAMPING, _AT_REST)
+        values = posed.values(self._x)
+        triangle = self._weak.triangular_factor(values, records)
+        spent, equations = InverseInformation.of(triangle, parameters).spent, self._weak.equations(records)
+        freedom = max(equations - spent, 0.0) + _DECLARED_COUNTS
+        squares = 2 * self._weak.cost(values, records)
+        scale = max(float(np.sqrt((squares + _DECLARED_COUNTS) / freedom)), _LEAST_SCALE)
+        independent = sum(self._numbers(one) for one in np.flatnonzero(used).tolist()) / max(equations, 1)
+        root = InverseInformation.of(triangle / scale, parameters).root
+        return Fitted(values, root, scale, freedom * min(independent, 1.0), used)
+
+    def predicted(self, fitted: Fitted, one: int) -> PredictedResidual:
+        """Of a posture that was not fitted."""
+        records = self._weak.subset(self.records, np.array([one], dtype=np.intp))
+        to_half = self._weak.parameters.entries_jacobian(fitted.values) @ fitted.half
+        factors = zip(
+            [kernel.factor for kernel in self._weak.kernels],
+            records,
+            self._weak.whitened_residuals(fitted.values, records),
+            self._weak.jacobians(fitted.values, records),
+            strict=True,
+        )
+        residuals, reaches, whitenings = [], [], []
+        dimensions: list[str] = []
+        for factor, record, residual, jacobian in factors:
+            if record.weight[0] > 0:
+                there = np.ones(len(residual), dtype=bool) if record.present is None else record.present[:, 0]
+                own = declared(factor.noise) if record.whitening is None else record.whitening[:, :, 0]
+                residuals.append(residual[there, 0])
+                reaches.append(jacobian[there, :, 0] @ to_half)
+                whitenings.append(own[np.ix_(there, there)])
+                dimensions += list(np.array(factor.dimensions)[there])
+        whitened, reach = np.concatenate(residuals), np.concatenate(reaches)
+        covariance = fitted.scale**2 * np.eye(len(whitened)) + reach @ reach.T
+        distance, numbers = float(whitened @ np.linalg.solve(covariance, whitened)), self._numbers(one)
+        back = np.linalg.inv(block_diag(*whitenings))
+        distance *= numbers / len(whitened)
+        return PredictedResidual(back @ whitened, back @ covariance @ back.T, distance, numbers, np.array(dimensions))
+
+    def _numbers(self, one: int) -> int:
+        count = 0
+        for kernel, record in zip(self._weak.kernels, self.records, strict=True):
+            if record.weight[one] > 0:
+                rows = kernel.factor.rows if record.present is None else int(record.present[:, one].sum())
+                count += rows if kernel.points is None else min(rows, _POSE_NUMBERS)
+        return count
+
+    def left_out(self, fitted: Fitted) -> dict[int, tuple[float, int]]:
+        """Of each fitted posture how far it lies from a fit without it, to first order: the square in units of what is
+        expected, and how many numbers that are."""
+        to_half = self._weak.parameters.entries_jacobian(fitted.values) @ fitted.half / fitted.scale
+        residuals = self._weak.whitened_residuals(fitted.values, self.records)
+        jacobians = self._weak.jacobians(fitted.values, self.records)
+        rows: dict[int, list[tuple[Array, Array]]] = {}
+        for record, residual, jacobian in zip(self.records, residuals, jacobians, strict=True):
+            reach = np.einsum("rvb,vc->brc", jacobian, to_half)
+            for one in np.flatnonzero(fitted.used & (record.weight[: record.count] > 0)).tolist():
+                rows.setdefault(one, []).append((residual[:, one], reach[one]))
+        distances = {}
+        for one, parts in rows.items():
+            whitened, taken_up = (np.concatenate(part) for part in zip(*parts, strict=True))
+            remaining, directions = np.linalg.eigh(np.eye(len(whitened)) - taken_up @ taken_up.T)
+            squares = (directions.T @ whitened) ** 2 / np.maximum(remaining, _LEAST_LEFT)
+            numbers, there = self._numbers(one), max(int(np.sum(np.any(taken_up != 0, axis=1))), 1)
+            distances[one] = float(squares.sum()) / fitted.scale**2 * numbers / there, numbers
+        return distances
+
+
+def _placed(
+    problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, known: Mapping[str, tuple[float, ...]]
+) -> tuple[Problem, frozenset[str]]:
+    """The problem about what instruments find by themselves of their free parameters, and the names of these."""
+    finders = [name for name, m in problem.blueprint.measurements.items() if isinstance(m, Proposing)]
+    own = [b for b in problem.parameters.free if b.prior_sd is None and b.name.partition(".")[0] in finders]
+    if not own:
+        return problem, frozenset()
+    if all(len(known.get(block.name, ())) == block.size for block in own):
+        parameters, nominal = problem.parameters, problem.parameters.nominal()
+        for block in own:
+            nominal[parameters.entries_of(block.name)] = known[block.name]
+        problem = replace(problem, parameters=parameters.with_nominal(nominal))
+    else:
+        start = with_proposals(Start(problem), records, dataset)
+        if not start.taken:
+            raise ProblemError(
+                "the images are too few to find the camera by.", hint="Take more, each turned otherwise."
+            )
+        problem = start.problem
+    return problem, frozenset(block.name for block in own)
+
+
+FEW = 6
+"""So many undetermined combinations are named at most."""
+_TURN = np.radians(25.0)
+_SLIDE = 0.05
+_ABOUT = 6
+"""So many of the newest postures are varied, joint by joint."""
+_RIDGE = 1e-6
+_WORTH = 0.7
+"""Joints that add nearly as much as the best one are named too."""
+_MOST_NAMED = 3
+_QUICK = SolverVerdict("quick fit", "ended", True, 0, 0.0)
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What is known, counted as ``armcal identify`` counts.
+
+    Attributes:
+        rank, free: determined combinations, of so many numbers.
+        records: how many postures train.
+        missing: the undetermined combinations, once they are few: to name many takes long, and helps little.
+        vary: joints that would add most if they were moved more, the best first.
+    """
+
+    rank: int
+    free: int
+    records: int
+    missing: tuple[str, ...]
+    vary: tuple[str, ...]
+
+
+def knowledge(
+    experiment: Experiment, problem: Problem, records: Sequence[FactorRecords], dataset: Dataset
+) -> Knowledge:
+    """Judge a dataset's postures, those that would train a run.
+
+    Raises:
+        ArmcalError: it cannot be judged.
+    """
+    train = _training(experiment, dataset)
+    problem, training = _restricted(problem, records, train)
+    if not problem.parameters.free:
+        return Knowledge(0, 0, len(train), (), ())
+    triangle = factor_at_zero(problem, problem.parameters.nominal(), training)
+    scaled = triangle * problem.parameters.scales()
+    rank, free = numerical_rank(scaled), scaled.shape[1]
+    missing: tuple[str, ...] = ()
+    if free - rank <= FEW:
+        missing = tuple(map(str, identify_from(triangle, problem.parameters).undetermined))
+    return Knowledge(rank, free, len(train), missing, _joints_to_vary(problem, dataset.subset(train), scaled, rank))
+
+
+def explained(
+    experiment: Experiment, problem: Problem, records: Sequence[FactorRecords], dataset: Dataset
+) -> tuple[str, ...]:
+    """Everything that is not determined, or hardly, with why: gauges too, which no posture would determine.
+
+    Raises:
+        ArmcalError: it cannot be judged.
+    """
+    problem, training = _restricted(problem, records, _training(experiment, dataset))
+    if not problem.parameters.free:
+        return ()
+    values = problem.parameters.nominal()
+    known = identify_from(factor_at_zero(problem, values, training), problem.parameters)
+    lines = [str(undetermined) for undetermined in explain(problem, values, training, known)]
+    if scale_is_unseen(problem, values, training, known):
+        lines.insert(0, f"{UNSEEN_SCALE}; {GIVE_A_LENGTH}")
+    hardly = [f"{combination}: hardly determined (sd {sd:.2g} typical scales)" for combination, sd in known.hardly]
+    return (*lines, *hardly)
+
+
+def _training(experiment: Experiment, dataset: Dataset) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    settings, chosen = experiment.settings.validation, np.arange(len(dataset), dtype=np.intp)
+    if settings.train_groups:
+        labels = labels_of(experiment, dataset)
+        chosen = np.flatnonzero([label in settings.train_groups for label in labels])
+    elif settings.holdout and settings.train_ids is None and len(dataset) > 2:
+        chosen = hold_out(len(dataset), settings.holdout, settings.seed, experiment.poses(dataset)).train
+    return chosen if len(chosen) else np.arange(len(dataset), dtype=np.intp)
+
+
+def _restricted(
+    problem: Problem, records: Sequence[FactorRecords], train: np.ndarray[tuple[int], np.dtype[np.intp]]
+) -> tuple[Problem, tuple[FactorRecords, ...]]:
+    training = problem.subset(records, train)
+    return restricted(problem, training), training
+
+
+def _joints_to_vary(problem: Problem, dataset: Dataset, scaled: Array, rank: int) -> tuple[str, ...]:
+    """Joints whose motion from the newest postures, the contact kept, adds most information (log determinant)."""
+    joints = {
+        f"{name}.{joint}": _TURN if kind == "angle" else _SLIDE
+        for name, arm in problem.blueprint.arms.items()
+        for joint, kind in arm.commanded.items()
+    }
+    newest = range(max(0, len(dataset) - _ABOUT), len(dataset))
+    both = replace(dataset.subset([*newest, *newest]), ids=tuple(str(i) for i in range(2 * len(newest))))
+    signs = np.repeat([1.0, -1.0], len(newest))
+    scales, values = problem.parameters.scales(), problem.parameters.nominal()
+    base = scaled.T @ scaled
+    base += np.eye(len(scales)) * _RIDGE * max(float(np.trace(base)) / max(rank, 1), 1e-300)
+    gains: dict[str, float] = {}
+    for channel, step in joints.items():
+        try:
+            channels = {**both.channels, channel: both.column(channel) + step * signs}
+            seen, _ = as_seen(problem, values, replace(both, channels=channels))
+            moved = projected(problem, values, problem.records(seen))
+            rows = problem.triangular_factor(values, moved) * scales
+        except ArmcalError:
+            continue
+        gains[channel] = float(np.linalg.slogdet(base + rows.T @ rows)[1] - np.linalg.slogdet(base)[1])
+    best = max(gains.values(), default=0.0)
+    ranked = sorted((c for c, gain in gains.items() if gain > _WORTH * best > 0), key=lambda c: -gains[c])
+    alone = len(problem.blueprint.arms) == 1
+    return tuple(c.partition(".")[2] if alone else c for c in ranked[:_MOST_NAMED])
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What is known, and what would help.
+
+    Attributes:
+        accuracy: how well what a user wants to know is known, a sentence a measurement.
+        deviations: standard deviations of the instruments' own coordinates (SI); finite ones alone.
+        next: the posture that would help most, for people; empty where none is better than others.
+        commands: it, by channel (rad or m).
+        shrink: what it would multiply standard deviations by, on average.
+    """
+
+    accuracy: tuple[str, ...] = ()
+    deviations: Mapping[str, float] = field(default_factory=dict)
+    next: str = ""
+    commands: Mapping[str, float] = field(default_factory=dict)
+    shrink: float = 1.0
+
+    def fell_by(self, before: Self) -> float | None:
+        """The share by which the instruments' standard deviations fell; None while nothing can be compared."""
+        ratios = [sd / before.deviations[name] for name, sd in self.deviations.items() if name in before.deviations]
+        return 1 - float(np.median(ratios)) if ratios else None
+
+
+def advice(fitter: QuickFitter, fitted: Fitted, dataset: Dataset, joints: Mapping[str, str]) -> Advice:
+    """What a fit says of postures that an instrument read; nothing of contacts, which only few postures can make.
+
+    Raises:
+        ArmcalError: it cannot be judged.
+    """
+    problem = fitter.problem
+    if not all(kernel.factor.output_channels for kernel in problem.kernels) or not problem.parameters.free:
+        return Advice()
+    acting = problem.weighted(fitter.records, [fitted.used.astype(float)] * len(fitter.records))
+    made = estimate(problem, acting, Solution(fitted.values, _QUICK))
+    made = widened(problem, acting, made, np.arange(len(dataset)))
+    best = suggest(problem, dataset.subset(np.flatnonzero(fitted.used)), made, joints, 1)
+    own = {f"{n}.{local}": sd for n in problem.blueprint.measurements for local, sd in own_deviations(made, n).items()}
+    finite = {name: sd for name, sd in own.items() if np.isfinite(sd) and sd > 0}
+    known = Advice(tuple(known_accuracies(problem, made)), finite)
+    return replace(known, next=best[0].text, commands=best[0].commands, shrink=best[0].shrink) if best else known
+
 
 _CHANCE = 1e-4
 _CHANCE_LATER = 1e-5

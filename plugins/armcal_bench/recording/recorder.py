@@ -15,8 +15,7 @@ from armcal.io.file_set import write_over
 from armcal.measure.environment import warn_beyond_limits
 
 from armcal_bench.bench import Bench
-from armcal_bench.recording.agreement import Assessment, Assessor
-from armcal_bench.recording.knowledge import Advice
+from armcal_bench.recording.agreement import Advice, Assessment, Assessor
 from armcal_bench.recording.labels import Labels
 from armcal_bench.recording.recording_log import IMAGES, Posture, RecordingLog, dataset_of, write_dataset
 from armcal_bench.recording.window import JointKinds, Mean, SampleWindow

@@ -3,23 +3,218 @@
 import errno
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import yaml
 from armcal.arm.servo import PulseTable
 from armcal.base.config_text import finite
-from armcal.config.servo_file import BoardSettings, ServoFile, ServoSettings, load_servo_file, servo_file_text
+from armcal.base.units import split_suffix
+from armcal.config.servo_file import (
+    BoardSettings,
+    ServoFile,
+    ServoSettings,
+    board_fields,
+    load_servo_file,
+    servo_fields,
+    servo_file_text,
+)
 from armcal.errors import ConfigError
 from armcal.io.journal.files import REAL_FILES, write_whole
 from armcal.io.plain_files import writing
 
-from armcal_bench.servo.file_edit import edited_text
-from armcal_bench.servo.findings import findings, is_usable
-from armcal_bench.servo.fit import FittedServo
 from armcal_bench.servo.outcome import Outcome
+from armcal_bench.servo.problem import FittedServo
 from armcal_bench.servo.record import next_name
+
+_SENSIBLE_HZ = (23e6, 27e6)
+_FAR_CHANGE = 0.1
+_SAG_WORTH = math.radians(0.1)
+
+
+def is_usable(servo: FittedServo) -> bool:
+    try:
+        PulseTable(servo.angles, servo.pulses)
+    except ValueError:
+        return False
+    return True
+
+
+def findings(outcome: Outcome) -> list[str]:
+    """A sentence each, of servos, zeros, boards and springs."""
+    texts = [f"{joint}: the table is left as it was: {why}." for joint, why in outcome.silent.items()]
+    for servo in outcome.fit.servos.values():
+        texts += list(_of_servo(servo, outcome))
+    if outcome.zero == "kept":
+        texts.append("zeros: each servo's pulse at 0 deg was kept; the angles were measured from one another.")
+    for board, clock in outcome.fit.clocks.items():
+        if not any(servo.known.board == board for servo in outcome.fit.servos.values()):
+            continue
+        if board not in outcome.fit.oscillator_sds:
+            texts.append(
+                f"{board}: the oscillator cannot be found from tables that are not known, so it is left at "
+                f"{clock.oscillator_hz / 1e6:.3f} MHz and the tables count by it. Angles are right all the same. To "
+                "know the oscillator, measure a pulse (bench.servo.measured_pulses) or trust a table "
+                "(bench.servo.trusted)."
+            )
+        if not _SENSIBLE_HZ[0] <= clock.oscillator_hz <= _SENSIBLE_HZ[1]:
+            texts.append(
+                f"{board}: an oscillator of {clock.oscillator_hz / 1e6:.2f} MHz is outside "
+                f"{_SENSIBLE_HZ[0] / 1e6:.0f} to {_SENSIBLE_HZ[1] / 1e6:.0f} MHz: check what it was measured by."
+            )
+    return texts + _of_springs(outcome)
+
+
+def _of_servo(servo: FittedServo, outcome: Outcome) -> Iterator[str]:
+    joint = servo.known.joint
+    if not is_usable(servo):
+        yield (
+            f"{joint}: the pulses found neither rise nor fall with the angle: the table is left as it was. "
+            "Look at its linkage."
+        )
+        return
+    before, after = (np.sign(pulses[-1] - pulses[0]) for pulses in (servo.known.table.pulses, servo.pulses))
+    if before != after:
+        yield (
+            f"{joint}: the servo turns the other way than its table said, or the tracker's frame is left-handed: "
+            "look which way it turns."
+        )
+    for angle, is_determined in zip(servo.angles, servo.determined, strict=True):
+        beyond = max(servo.reach[0] - angle, angle - servo.reach[1])
+        if not is_determined:
+            yield f"{joint}: no measurement determines the pulse at {math.degrees(angle):g} deg; it is the stated one."
+        elif beyond > math.radians(15):
+            yield (
+                f"{joint}: the pulse at {math.degrees(angle):g} deg is extrapolated linearly from "
+                "the measured range, "
+                f"{math.degrees(servo.reach[0]):.0f} to {math.degrees(servo.reach[1]):.0f} deg."
+            )
+    if before == after and _gain_change(servo) > _FAR_CHANGE:
+        yield (
+            f"{joint}: its pulses a degree differ from the stated ones by {100 * _gain_change(servo):.0f} %: is it the "
+            "servo that was meant, and does the tracker follow this arm's tool?"
+        )
+    if servo.lag is None:
+        yield f"{joint}: it was approached from one side only, so its backlash is not known."
+    elif servo.lag < -3 * servo.lag_sd and servo.lag < -math.radians(0.05):
+        over = -math.degrees(servo.lag)
+        yield f"{joint}: it overshoots by {over:.2f} deg rather than lags: does it stand before it is measured?"
+    if servo.scale > 3:
+        yield (
+            f"{joint}: the spread of the angles is {math.degrees(servo.scatter):.2f} deg, {servo.scale:.0f} times the "
+            "stated one; the deviations are enlarged by that."
+        )
+    for outlier in servo.outliers:
+        angle = math.degrees(outlier.angle)
+        yield f"{joint}: the angle at {outlier.counts} counts ({angle:.1f} deg) lies far off and was set aside."
+
+
+def _gain_change(servo: FittedServo) -> float:
+    angles = np.array(servo.angles)
+    stated, fitted = np.diff(servo.known.pulses_at(angles)), np.diff(servo.pulses)
+    return float(np.max(np.abs(fitted / stated - 1.0)))
+
+
+def _of_springs(outcome: Outcome) -> list[str]:
+    tracked = [joint for joint, sweeps in outcome.sweeps.items() if sweeps.by is not None]
+    if not tracked:
+        return []
+    if not any(outcome.sag_span.values()):
+        return [
+            "springs: the model has no deflection of the arm under its weight; the tables contain it. Give the springs "
+            "their compliances, or bench.servo.sag: fitted."
+        ]
+    worst = max(outcome.sag_span, key=lambda joint: outcome.sag_span[joint])
+    if outcome.sag_span[worst] < _SAG_WORTH:
+        return []
+    how = "found with the tables" if outcome.compliances or outcome.fit.undetermined else "the model's"
+    return [
+        f"springs: over a sweep they turn the tool by up to {math.degrees(outcome.sag_span[worst]):.1f} deg ({worst}); "
+        f"that is taken out by compliances that are {how}."
+    ]
+
+
+Edit = tuple[int, int, str]
+"""The characters from here to there become this."""
+
+
+def edited_text(text: str, before: ServoFile, after: ServoFile) -> str | None:
+    """A servo file's text with the numbers of ``after`` in place of those of ``before``.
+
+    None where it has no such place: a part stands in another file that this one extends, or is written by an alias (an
+    anchor's text would change all that refer to it).
+    """
+    try:
+        if any(isinstance(token, yaml.AliasToken | yaml.AnchorToken) for token in yaml.scan(text)):
+            return None
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        edits = [*_of_parts(root, "boards", before, after), *_of_parts(root, "servos", before, after)]
+    except (yaml.YAMLError, LookupError):
+        return None
+    for start, end, new in sorted(edits, reverse=True):
+        text = text[:start] + new + text[end:]
+    return text
+
+
+def _of_parts(root: yaml.Node | None, section: str, before: ServoFile, after: ServoFile) -> Iterator[Edit]:
+    parts = _value(root, section)
+    for name, part in getattr(after, section).items():
+        if part != getattr(before, section)[name]:
+            yield from _of_part(_value(parts, name), getattr(before, section)[name], part)
+
+
+def _of_part(
+    node: yaml.Node, before: BoardSettings | ServoSettings, after: BoardSettings | ServoSettings
+) -> Iterator[Edit]:
+    """Every field that changed: its value anew, or key and value where the unit changes or it was not there."""
+    was, now = _fields(before), _fields(after)
+    for field, (key, text) in now.items():
+        if was.get(field) == (key, text):
+            continue
+        try:
+            name, value = _entry(node, field)
+        except LookupError:
+            end, indent = _end(node.value[-1][1]), " " * node.value[0][0].start_mark.column
+            yield end, end, f", {key}: {text}" if _is_flow(node) else f"\n{indent}{key}: {text}"
+            continue
+        yield name.start_mark.index, _end(value), f"{key}: {text}"
+
+
+def _fields(part: BoardSettings | ServoSettings) -> dict[str, tuple[str, str]]:
+    """Key and text by the field's name without its unit."""
+    pairs = board_fields(part) if isinstance(part, BoardSettings) else servo_fields(part)
+    return {_bare(key): (key, text) for key, text in pairs}
+
+
+def _bare(key: str) -> str:
+    split = split_suffix(key)
+    return key if split is None else split[0]
+
+
+def _entry(node: yaml.Node | None, field: str) -> tuple[yaml.Node, yaml.Node]:
+    pairs = node.value if isinstance(node, yaml.MappingNode) else []
+    matches = [(pair[0], pair[1]) for pair in pairs if field in (pair[0].value, _bare(str(pair[0].value)))]
+    if not matches:
+        raise LookupError(field)
+    return matches[0]
+
+
+def _value(node: yaml.Node | None, field: str) -> yaml.Node:
+    return _entry(node, field)[1]
+
+
+def _end(node: yaml.Node) -> int:
+    if not isinstance(node, yaml.CollectionNode) or _is_flow(node) or not node.value:
+        return int(node.end_mark.index)
+    last = node.value[-1]
+    return _end(last[1] if isinstance(last, tuple) else last)
+
+
+def _is_flow(node: yaml.Node) -> bool:
+    return isinstance(node, yaml.CollectionNode) and bool(node.flow_style)
+
 
 RESULTS = "servo.json"
 _APART = math.radians(0.5)

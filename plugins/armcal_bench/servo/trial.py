@@ -13,9 +13,8 @@ from armcal.devices.wiring import WiringRecord
 from armcal.errors import InputError
 from scipy.spatial.transform import Rotation
 
-from armcal_bench.servo.nominal import NominalArm
+from armcal_bench.servo.nominal import NominalArm, turn_of_point, twist_angles
 from armcal_bench.servo.record import BEGUN, POSE
-from armcal_bench.servo.turning import turn_of_point, twist_angles
 from armcal_bench.settling import pose_of
 
 _LEVER_M = 0.1

@@ -8,8 +8,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from armcal.arm.assembly import Arm
-from armcal.arm.environment import unstated_payload
 from armcal.arm.joints import by_dimension, joint_limits, unknown_joint
+from armcal.arm.statics import unstated_payload
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters

@@ -11,7 +11,7 @@ from typing import Literal, get_args
 import casadi as ca
 import numpy as np
 from armcal.arm.assembly import Arm
-from armcal.arm.environment import gravity_tilt, unstated_payload
+from armcal.arm.statics import gravity_tilt, unstated_payload
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.quaternions import quaternion_matrix

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.errors import ArmcalError
-from armcal.estimate.loss import median_norm, tuned
 from armcal.estimate.online import Gaussian
+from armcal.estimate.robust import median_norm, tuned
 
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.decisions import Decision

@@ -13,8 +13,7 @@ from armcal.estimate.online import Linearised, Observation
 from armcal.functions.c_source import LANES
 from armcal.measure.groups import NO_GROUP, group_key, group_name, group_numbers, owner_of
 from armcal.measure.measurement import GroupedMeasurement
-from armcal.problem.grouped_kernel import HELD
-from armcal.problem.kernel import Kernel
+from armcal.problem.kernel import HELD, Kernel
 from armcal.problem.problem import Problem
 from scipy.linalg import block_diag
 from typing_extensions import override

@@ -9,11 +9,10 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from armcal.arm.equilibrium import MOST_DEFLECTION
+from armcal.arm.evaluator import MOST_DEFLECTION
 from armcal.base.arrays import Array
 from armcal.functions.c_source import LANES
-from armcal.problem.backend import Compiled
-from armcal.problem.kernel import Kernel
+from armcal.problem.kernel import Compiled, Kernel
 
 
 class OneRecord:

@@ -14,8 +14,8 @@ from itertools import groupby
 import numpy as np
 from armcal.base.arrays import Array, Indices
 from armcal.errors import NotConvergedError
-from armcal.estimate.loss import Loss, median_norm, tuned
 from armcal.estimate.online import Gaussian, normalised_innovation_squared
+from armcal.estimate.robust import Loss, median_norm, tuned
 from scipy.linalg import cho_factor, cho_solve
 
 from armcal_online.tracking.belief import Belief

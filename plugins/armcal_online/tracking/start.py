@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from armcal.arm.environment import gravity_tilt, unstated_payload
+from armcal.arm.statics import gravity_tilt, unstated_payload
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Interval
@@ -15,8 +15,8 @@ from armcal.calibration.calibration import Calibration
 from armcal.config.selection import quantity
 from armcal.errors import ConfigError, Location
 from armcal.estimate.online import Gaussian
+from armcal.measure.groups import PairedMeasurement
 from armcal.measure.measurement import Measurement
-from armcal.measure.partners import PairedMeasurement
 from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.problem.problem import Problem
 

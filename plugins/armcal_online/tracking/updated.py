@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
-from armcal.arm.environment import unstated_payload
+from armcal.arm.statics import unstated_payload
 from armcal.base.arrays import Array
 from armcal.base.domains import Interval
 from armcal.calibration.calibration import Calibration

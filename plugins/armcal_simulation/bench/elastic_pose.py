@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 from armcal.arm.assembly import Arm, ArmInputs, ArmState, scoped
-from armcal.arm.environment import STATICS, Environment, tilted
 from armcal.arm.evaluator import ElasticPass, Evaluator
+from armcal.arm.statics import STATICS, Environment, tilted
 from armcal.base import se3
 from armcal.base.arrays import Array
 from armcal.base.parameters import Parameters

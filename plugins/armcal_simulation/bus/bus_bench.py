@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from armcal.arm.horn import SPLINE_TEETH
 from armcal.arm.joints import unknown_joint
+from armcal.arm.servo import SPLINE_TEETH
 from armcal.devices.simulated import BenchRequest, SimulatedBench
 from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from armcal.base.arrays import Array
-from armcal_camera.board import AnyBoard, Aprilgrid, Board, Charuco, Chessboard, Tag
-from armcal_camera.pattern import outline
+from armcal_camera.board import AnyBoard, Aprilgrid, Board, Charuco, Chessboard, Tag, outline
 from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 

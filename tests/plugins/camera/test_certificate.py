@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from armcal.base.arrays import Array
 from armcal_camera import certificate as of
-from armcal_camera.certificate import certificate, sentence
-from armcal_camera.hand_eye import HandEye, hand_eye
+from armcal_camera.hand_eye import HandEye, certificate, hand_eye, sentence
 from scipy.spatial.transform import Rotation
 
 from tests.plugins.camera.test_hand_eye import noisy, pose

@@ -14,7 +14,7 @@ from armcal.base.units import to_unit
 from armcal.errors import DataError
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
-from armcal_camera.corners_csv import corners_text
+from armcal_camera.images_reader import corners_text
 
 from tests.plugins.camera.simulated_views import MIDDLE, base_T, configured, estimated, numbers, pose, simulated
 

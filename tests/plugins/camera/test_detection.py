@@ -14,10 +14,9 @@ from armcal.errors import DataError, PluginError
 
 pytest.importorskip("cv2")
 import cv2
-from armcal_camera.board import Board, Charuco, Chessboard
+from armcal_camera.board import Board, Charuco, Chessboard, dark_rectangles, outline
 from armcal_camera.detection import detect
 from armcal_camera.images import Grey, grey_image, opencv
-from armcal_camera.pattern import dark_rectangles, outline
 from armcal_camera.render import Exposure, Lens, render
 
 from tests.plugins.camera.sheets import APRILGRID, CHARUCO, CHESSBOARD, SIZE, TAG, facing

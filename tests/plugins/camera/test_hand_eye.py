@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from armcal.base.arrays import Array
-from armcal.measure.points import Reading
-from armcal_camera.first_guess import Setup, first_guess
-from armcal_camera.hand_eye import hand_eye, open_motion
+from armcal.measure.instrument import Reading
+from armcal_camera.camera import Setup, first_guess
+from armcal_camera.hand_eye import board_pose, hand_eye, homography, intrinsics, open_motion
 from armcal_camera.intrinsics import DISTORTION
-from armcal_camera.views import board_pose, homography, intrinsics
 from scipy.spatial.transform import Rotation
 
 BOARD = np.array([[25e-3 * x, 25e-3 * y] for y in range(6) for x in range(9)])

@@ -20,8 +20,7 @@ pytest.importorskip("cv2")
 import cv2
 from armcal_camera import images_reader
 from armcal_camera.board import Board, Chessboard
-from armcal_camera.corners_csv import corners_text, read_corners
-from armcal_camera.images_reader import ImagesReader, ImagesSettings
+from armcal_camera.images_reader import ImagesReader, ImagesSettings, corners_text, read_corners
 from armcal_camera.pose_table import FLANGE
 from armcal_camera.render import Exposure, Lens, render
 from scipy.spatial.transform import Rotation

@@ -11,7 +11,7 @@ from armcal.base.arrays import Array
 from armcal.calibration.exporter import rigid_tools
 from armcal.errors import DataError
 from armcal.run.experiment import Experiment
-from armcal_camera.flange_pose import recovered_joints
+from armcal_camera.pose_table import recovered_joints
 
 DEMO = Path(__file__).resolve().parents[3] / "configs" / "camera" / "demo.yaml"
 START = np.deg2rad([10.0, -85.0, 95.0, -100.0, -80.0, 15.0])

@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 from armcal.calibration.joint_zeros import Zero
 from armcal.errors import DataError, InputError
-from armcal_lerobot.calibration_file import read_motors
-from armcal_lerobot.check import rezeroed
-from armcal_lerobot.motors import Motor, teeth_of, zero_shift_deg
+from armcal_lerobot.comparison import rezeroed
+from armcal_lerobot.motor_file import Motor, read_motors, teeth_of, zero_shift_deg
 
 from tests.plugins.lerobot.planted import motor_entries, write_motors
 

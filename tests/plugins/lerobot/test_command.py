@@ -13,8 +13,8 @@ from armcal.cli.main import cli
 from armcal.errors import ArmcalError, DataError, InputError
 from armcal.plugins import discover
 from armcal_lerobot.command import lerobot
-from armcal_lerobot.gripper import Gripper, wiring_of
-from armcal_lerobot.motors import Motor
+from armcal_lerobot.motor_file import Motor
+from armcal_lerobot.rest_records import Gripper, wiring_of
 from armcal_servobus.joints import drivable
 from click.testing import CliRunner
 

@@ -12,8 +12,8 @@ from armcal.errors import DataError, PluginError
 pytest.importorskip("pyarrow")
 import pyarrow as pa
 import pyarrow.parquet as pq
-from armcal_lerobot.motion import read_motion
 from armcal_lerobot.recordings import ACTION, STATE, Recording, open_recording
+from armcal_lerobot.tracking import read_motion
 
 from tests.plugins.lerobot.planted import MOTORS, episodes, write_dataset
 
@@ -156,7 +156,7 @@ def test_without_pyarrow_one_sentence(folder: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_large_data_sets_are_thinned_by_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("armcal_lerobot.motion.MOST_FRAMES", 200)
+    monkeypatch.setattr("armcal_lerobot.tracking.MOST_FRAMES", 200)
     folder = write_dataset(tmp_path / "set", episodes({}, count=6, frames=100), "v3.0")
     motion = read_motion(open_recording(folder), "degrees", None)
     assert (motion.frames, motion.of) == (200, 600)

@@ -12,9 +12,9 @@ from click.testing import CliRunner
 
 pytest.importorskip("pyarrow")
 from armcal_lerobot.command import lerobot
-from armcal_lerobot.motion import read_motion
 from armcal_lerobot.recordings import open_recording
 from armcal_lerobot.rest_records import records_of
+from armcal_lerobot.tracking import read_motion
 
 from tests.plugins.lerobot.planted import FPS, MOTORS, write_dataset, write_motors
 
@@ -66,7 +66,7 @@ def test_rests_are_found_with_the_side_they_came_from(tmp_path: Path, version: s
 def test_percent_becomes_degrees_by_the_file(tmp_path: Path) -> None:
     recording = open_recording(write_dataset(tmp_path / "set", with_rests(1)))
     file = write_motors(tmp_path / "arm.json")
-    from armcal_lerobot.calibration_file import read_motors
+    from armcal_lerobot.motor_file import read_motors
 
     records = records_of(recording, "percent", read_motors(file), "action", 0.5, 0.5)
     assert records[0].degrees[MOTORS.index("shoulder_pan")] == pytest.approx(10 * 1137.5 * 360 / 4095 / 100)

@@ -12,12 +12,10 @@ import pytest
 
 pytest.importorskip("pyarrow")
 from armcal.plugins import discover
-from armcal_lerobot.comparison import findings_of, gripper_error, shift_findings, shifts
-from armcal_lerobot.gripper import Gripper
-from armcal_lerobot.motion import Motion, read_motion
+from armcal_lerobot.comparison import compare_content, findings_of, gripper_error, page, shift_findings, shifts
 from armcal_lerobot.recordings import open_recording
-from armcal_lerobot.tracking import Tracking, trackings
-from armcal_lerobot.tracking_report import compare_content, page
+from armcal_lerobot.rest_records import Gripper
+from armcal_lerobot.tracking import Motion, Tracking, read_motion, trackings
 
 from tests.plugins.lerobot.planted import MOTORS, Planted, episodes, write_dataset
 

@@ -17,7 +17,7 @@ import yaml
 from armcal.base.dataset import Dataset
 from armcal.errors import DataError
 from armcal.run.experiment import Experiment
-from armcal_ros2.nominal import is_inverted
+from armcal_ros2.reader import is_inverted
 from scipy.spatial.transform import Rotation
 
 TOPIC = "geometry_msgs/msg/PointStamped"

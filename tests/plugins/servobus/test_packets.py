@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pytest
+from armcal_servobus.bus import FRAMINGS, Instruction, checksum, crc16
 from armcal_servobus.models import MODELS, Register
-from armcal_servobus.packets import FRAMINGS, Instruction, checksum, crc16
 from hypothesis import given
 from hypothesis import strategies as st
 

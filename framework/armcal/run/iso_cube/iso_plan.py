@@ -16,8 +16,7 @@ from armcal.calibration.compensation.request import Options
 from armcal.calibration.tool_expression import arm_expression
 from armcal.run.experiment import Experiment
 from armcal.run.iso_cube.placement import DIRECTED, NAMES, Cube, Placed, placed
-from armcal.run.plan_approaches import approach_channels
-from armcal.run.plan_context import values_about
+from armcal.run.plan import approach_channels, values_about
 from armcal.run.plan_poses import JointSpace, clearance_of, spread
 from armcal.run.settings import PlanSettings
 
