@@ -137,28 +137,21 @@ def conclusions(designs: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def _table(designs: Mapping[str, Mapping[str, Any]]) -> TextTable:
-    """A row a design and area, and one for the score of a design with several areas."""
-    cells = [area for design in designs.values() for area in design["areas"].values()]
-    held, shown = any(area["held"] is not None for area in cells), [n for n in _SHORT if n in cells[0]["quantities"]]
-    headings = ["Reached", *(["Held"] if held else []), "Score", *(_SHORT[name] for name in shown)]
+    """A row an area, and one for the score of several areas; the name of a design stands in its first row."""
+    areas = list(next(iter(designs.values()))["areas"].values())
+    is_held, shown = areas[0]["held"] is not None, [name for name in _SHORT if name in areas[0]["quantities"]]
     rows = []
     for design, own in designs.items():
-        first = next(iter(own["areas"]))
-        for name, area in own["areas"].items():
-            row = [
-                design if name == first else "",
-                name,
-                _share(area["reached"]),
-                *([_share(area["held"])] if held else []),
-            ]
-            row.append(count(area["orientations"]))
-            row += [_number(area["quantities"][quantity]["mean"]) for quantity in shown]
-            rows.append(tuple(row))
-        if len(own["areas"]) > 1:
-            rows.append(("", "total", "", *([""] if held else []), count(own["score"]), *([""] * len(shown))))
-    return TextTable(
-        _CAPTION, (("Design", False), ("Area", False), *((words, True) for words in headings)), tuple(rows)
-    )
+        for number, (name, area) in enumerate(own["areas"].items()):
+            row = [design if number == 0 else "", name, _share(area["reached"]), _share(area["held"])]
+            row += [count(area["orientations"]), *(_number(area["quantities"][q]["mean"]) for q in shown)]
+            rows.append(row)
+        if len(areas) > 1:
+            rows.append(["", "total", "", "", count(own["score"]), *([""] * len(shown))])
+    headings = [("Design", False), ("Area", False), *((words, True) for words in ("Reached", "Held", "Score"))]
+    headings += [(_SHORT[name], True) for name in shown]
+    kept = [i for i in range(len(headings)) if (i or len(designs) > 1) and (is_held or i != 3)]
+    return TextTable(_CAPTION, tuple(headings[i] for i in kept), tuple(tuple(row[i] for i in kept) for row in rows))
 
 
 def _areas_text(surveys: Mapping[str, Survey]) -> str:
