@@ -376,17 +376,14 @@ def studied(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
 
 @pytest.mark.slow
 def test_every_design_has_its_areas_and_its_score(tmp_path: Path) -> None:
-    out, told = study(tmp_path / "out")
-    assert next(iter(told["designs"])) == "60 deg, as built" and "60 deg, + 1 and + 2 cm" in told["designs"]
-    rows = list(csv.DictReader((out / "designs.csv").open()))
-    assert [(r["design"], r["area"]) for r in rows] == [(d, a) for d in told["designs"] for a in ("basket", "ground")]
-    for row in rows:
-        design = told["designs"][row["design"]]
-        area = design["areas"][row["area"]]
-        assert float(row["reached"]) == pytest.approx(area["reached"], rel=1e-5)
-        assert 0 <= area["held"] <= area["reached"] <= 1
-        assert int(row["score"]) == design["score"] == sum(a["orientations"] for a in design["areas"].values())
-        assert float(row["sag_mm_mean"]) == pytest.approx(area["quantities"]["sag_mm"]["mean"], rel=1e-5)
+    _, told = study(tmp_path / "out")
+    assert next(iter(told["designs"])) == "60 deg, as built" and len(told["designs"]) == 7
+    for design in told["designs"].values():
+        assert list(design["areas"]) == ["basket", "ground"]
+        assert design["score"] == sum(area["orientations"] for area in design["areas"].values())
+        assert design["most"] == 6 * sum(area["cells"] for area in design["areas"].values())
+        for area in design["areas"].values():
+            assert 0 <= area["held"] <= area["reached"] <= 1 and area["quantities"]["sag_mm"]["mean"] > 5
 
 
 @pytest.mark.slow

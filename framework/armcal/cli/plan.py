@@ -16,8 +16,7 @@ from armcal.estimate.identifiability import Measure
 from armcal.measure.csv_writer import write_csv
 from armcal.planning.criterion import GOALS
 from armcal.run.experiment import Experiment
-from armcal.run.iso_cube.iso_plan import IsoPlan, make_iso_plan
-from armcal.run.iso_cube.placement import NAMES
+from armcal.run.iso_plan import NAMES, IsoPlan, make_iso_plan
 from armcal.run.plan import PlanResult, make_plan
 from armcal.run.plan_poses import counts_text, stated_beyond
 from armcal.run.settings import PlanSettings
