@@ -184,79 +184,47 @@ def armcal_run_ended(name: str, folder: str, converged: bool) -> None:
     """
 
 
-_MEASURE = "armcal.measure.measurement"
-COMPONENTS: Mapping[str, ComponentKind] = MappingProxyType(
-    {
-        "model": ComponentKind(
-            "armcal_register_models",
-            "Model(settings)",
-            "armcal.arm.model:ArmModel",
-            ("armcal.arm.assembly:MassiveModel",),
-        ),
-        "effect": ComponentKind(
-            "armcal_register_effects",
-            "Effect(settings, joint_names)",
-            "armcal.arm.effects:JointEffect",
-            ("armcal.arm.servo:SteppedEffect",),
-        ),
-        "residual": ComponentKind(
-            "armcal_register_residuals",
-            "Residual(settings, joint_names)",
-            "armcal.arm.pose_residual:PoseResidual",
-        ),
-        "measurement": ComponentKind(
-            "armcal_register_measurements",
-            "Measurement(settings, arm_names)",
-            f"{_MEASURE}:Measurement",
-            (
-                "armcal.measure.instrument:Instrument",
-                f"{_MEASURE}:RecordNoise",
-                f"{_MEASURE}:DimensionedResidual",
-                f"{_MEASURE}:GroupedMeasurement",
-                f"{_MEASURE}:NamesGroups",
-                "armcal.measure.groups:PairedMeasurement",
-            ),
-        ),
-        "reader": ComponentKind("armcal_register_readers", "Reader(settings)", "armcal.measure.reader:Reader"),
-        "estimator": ComponentKind(
-            "armcal_register_estimators",
-            "Estimator(settings)",
-            "armcal.estimate.estimator:Estimator",
-            ("armcal.estimate.estimator:SpreadableEstimator",),
-        ),
-        "online": ComponentKind(
-            "armcal_register_online_estimators", "Estimator(settings)", "armcal.estimate.online:OnlineEstimator"
-        ),
-        "simulator": ComponentKind(
-            "armcal_register_simulators", "Simulator(settings)", "armcal.estimate.simulation:Simulator"
-        ),
-        "exporter": ComponentKind(
-            "armcal_register_exporters", "Exporter(settings)", "armcal.calibration.exporter:Exporter"
-        ),
-        "link": ComponentKind(
-            "armcal_register_links", "Link(settings)", "armcal.devices.link:Link", ("armcal.devices.link:GuardedLink",)
-        ),
-        "device": ComponentKind(
-            "armcal_register_devices",
-            "Device(settings, joint_names, link or None)",
-            "armcal.devices.device:JointDevice",
-            ("armcal.devices.device:PulseDevice", "armcal.devices.device:MeasuringDevice"),
-        ),
-        "tracker": ComponentKind("armcal_register_trackers", "Tracker(settings)", "armcal.devices.live:Tracker"),
-        "joints": ComponentKind(
-            "armcal_register_joint_streams",
-            "Stream(settings)",
-            "armcal.devices.live:JointStream",
-            ("armcal.devices.live:RestStream",),
-        ),
-        "camera": ComponentKind("armcal_register_cameras", "Camera(settings)", "armcal.devices.live:LiveCamera"),
-        "bench": ComponentKind("armcal_register_benches", "Bench(settings)", "armcal.devices.simulated:SimulatedBench"),
-        "command": ComponentKind("armcal_register_commands", "Command", "armcal.hooks:Command"),
-        "report_section": ComponentKind(
-            "armcal_register_report_sections", "Section(result)", "armcal.report.sections:SectionMaker"
-        ),
-    }
-)
+def _kind(hook: str, built_as: str, protocol: str, *beside: str) -> ComponentKind:
+    contracts = [f"armcal.{target}" for target in (protocol, *beside)]
+    return ComponentKind(f"armcal_register_{hook}", built_as, contracts[0], tuple(contracts[1:]))
+
+
+_KINDS = {
+    "model": _kind("models", "Model(settings)", "arm.model:ArmModel", "arm.assembly:MassiveModel"),
+    "effect": _kind("effects", "Effect(settings, joint_names)", "arm.effects:JointEffect", "arm.servo:SteppedEffect"),
+    "residual": _kind("residuals", "Residual(settings, joint_names)", "arm.pose_residual:PoseResidual"),
+    "measurement": _kind(
+        "measurements",
+        "Measurement(settings, arm_names)",
+        "measure.measurement:Measurement",
+        "measure.instrument:Instrument",
+        *(f"measure.measurement:{name}" for name in ("RecordNoise", "DimensionedResidual", "GroupedMeasurement")),
+        "measure.measurement:NamesGroups",
+        "measure.groups:PairedMeasurement",
+    ),
+    "reader": _kind("readers", "Reader(settings)", "measure.reader:Reader"),
+    "estimator": _kind(
+        "estimators",
+        "Estimator(settings)",
+        *(f"estimate.estimator:{name}" for name in ("Estimator", "SpreadableEstimator")),
+    ),
+    "online": _kind("online_estimators", "Estimator(settings)", "estimate.online:OnlineEstimator"),
+    "simulator": _kind("simulators", "Simulator(settings)", "estimate.simulation:Simulator"),
+    "exporter": _kind("exporters", "Exporter(settings)", "calibration.exporter:Exporter"),
+    "link": _kind("links", "Link(settings)", "devices.link:Link", "devices.link:GuardedLink"),
+    "device": _kind(
+        "devices",
+        "Device(settings, joint_names, link or None)",
+        *(f"devices.device:{name}" for name in ("JointDevice", "PulseDevice", "MeasuringDevice")),
+    ),
+    "tracker": _kind("trackers", "Tracker(settings)", "devices.live:Tracker"),
+    "joints": _kind("joint_streams", "Stream(settings)", "devices.live:JointStream", "devices.live:RestStream"),
+    "camera": _kind("cameras", "Camera(settings)", "devices.live:LiveCamera"),
+    "bench": _kind("benches", "Bench(settings)", "devices.simulated:SimulatedBench"),
+    "command": _kind("commands", "Command", "hooks:Command"),
+    "report_section": _kind("report_sections", "Section(result)", "report.sections:SectionMaker"),
+}
+COMPONENTS: Mapping[str, ComponentKind] = MappingProxyType(_KINDS)
 """The kinds of component."""
 
 KINDS: Mapping[str, str] = MappingProxyType({kind: component.hook for kind, component in COMPONENTS.items()})

@@ -282,7 +282,7 @@ def discover(points: Iterable[EntryPoint] | None = None) -> PluginRegistry:
             a plugin that is to be left out is not there.
     """
     loaded = []
-    for plugin, load in _chosen(_installed(tuple(map(_state, sys.path))) if points is None else points):
+    for plugin, load in _chosen(_installed(tuple(sys.path)) if points is None else points):
         try:
             module = load()
         except (Exception, SystemExit) as fault:  # whatever a third party's module does, the others must work
@@ -294,16 +294,8 @@ def discover(points: Iterable[EntryPoint] | None = None) -> PluginRegistry:
     return _registered(tuple(loaded))
 
 
-def _state(folder: str) -> tuple[str, int]:
-    """A place where modules are found, and when anything was last put into it or taken out (ns)."""
-    try:
-        return folder, Path(folder).stat().st_mtime_ns
-    except OSError:
-        return folder, 0
-
-
 @lru_cache(maxsize=8)
-def _installed(path: tuple[tuple[str, int], ...]) -> tuple[EntryPoint, ...]:
+def _installed(path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
     return tuple(entry_points(group=hooks.PROJECT))
 
 

@@ -177,13 +177,12 @@ def unstated_payload() -> tuple[ParameterBlock, ...]:
 def tilted(load: Load, values: Mapping[str, Expression]) -> Load:
     """A load under the real gravity.
 
-    ``values`` are those of ``gravity_tilt``, and those of ``unstated_payload`` where it is followed, by local
-    name; or nothing.
+    ``values`` are those of ``gravity_tilt`` and those of ``unstated_payload``, by local name, where they are followed.
     """
-    if not values:
-        return load
-    about_x, about_y = (se3.rotation_about(axis, values[f"gravity_r{axis}"]).rotation for axis in "xy")
-    real = replace(load, gravity=ca.mtimes(about_y, ca.mtimes(about_x, load.gravity)))
+    real = load
+    if "gravity_rx" in values:
+        about_x, about_y = (se3.rotation_about(axis, values[f"gravity_r{axis}"]).rotation for axis in "xy")
+        real = replace(load, gravity=ca.mtimes(about_y, ca.mtimes(about_x, load.gravity)))
     if "payload" not in values:
         return real
     return replace(real, beyond=(values["payload"], ca.vertcat(*(values[f"payload_moment_{axis}"] for axis in "xyz"))))

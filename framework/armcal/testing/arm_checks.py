@@ -24,7 +24,7 @@ from armcal.measure.measurement import Channel, GroupedMeasurement, Measurement
 from armcal.measure.reader import surroundings
 from armcal.problem.factor import Factor, build_factor
 from armcal.problem.readings import readings_by_residual
-from armcal.testing.checking import PLUGIN_FAULTS, ContractError, Subject, expect, needed
+from armcal.testing.checking import PLUGIN_FAULTS, ContractError, Subject, check, expect
 from armcal.testing.planar import ARM, GRAVITY, planar_arms, skewed_arms
 
 C = TypeVar("C")
@@ -46,8 +46,8 @@ _CHOICES = {
 # --- parameters and expressions of any component --------------------------------------------------------------------
 
 
-@needed
-def its_parameters_are_declared_in_si_units_and_can_move(s: Subject) -> None:
+def _declare(s: Subject) -> None:
+    """The parameters of a component that was built, in SI units, plausible in them, and able to move."""
     s.blocks = declared(s.built)
     for _, block in scalars(s.blocks, *_LARGEST):
         (largest, widest), worst = _LARGEST[block.unit], max((abs(number) for number in block.nominal), default=0.0)
@@ -171,8 +171,8 @@ def expect_gain(gain: float, what: str, of: str, unit: str) -> None:
 POSES = 20
 
 
-@needed
-def the_model_builds_with_joints_named_once(s: Subject) -> None:
+@check("model", needed=True)
+def the_model_builds_with_joints_and_parameters_in_si_units(s: Subject) -> None:
     s.built = s.build()
     names = s.names = tuple(s.built.joint_names)
     expect(len(names) > 0, "found no joints, expected at least one")
@@ -180,9 +180,10 @@ def the_model_builds_with_joints_named_once(s: Subject) -> None:
         expect(isinstance(name, str) and bool(name), f"found the joint name {name!r}, expected text")
         expect("." not in name, f"found the joint name {name!r}, expected one without a dot")
     expect(len(set(names)) == len(names), f"found {', '.join(names)}, expected every name once")
+    _declare(s)
 
 
-@needed
+@check("model", needed=True)
 def its_chain_has_one_joint_for_each_name(s: Subject) -> None:
     s.chain = chain = s.built.chain(s.values)
     check_chain(s.built.chain, chain, s.names)
@@ -203,6 +204,7 @@ def its_chain_has_one_joint_for_each_name(s: Subject) -> None:
         expect(len(set(names)) == len(names), f"found {', '.join(names)}, expected every name once")
 
 
+@check("model")
 def its_chain_depends_on_its_parameters_and_does_not_branch_on_them(s: Subject) -> None:
     chain = s.chain
     transforms = [chain.base_T_mount, chain.tool.joint_T_frame, *(joint.parent_T_joint for joint in chain.joints)]
@@ -214,17 +216,7 @@ def its_chain_depends_on_its_parameters_and_does_not_branch_on_them(s: Subject) 
     expect_all_used(parts, s.values)
 
 
-def the_model_is_the_same_each_time(s: Subject) -> None:
-    def picture(model: Any) -> Array:
-        expect(tuple(model.parameters()) == s.blocks, "found other parameters another time")
-        values = symbols(s.blocks)
-        poses = _poses(stacked(list(values.values())), model.chain(values))
-        return np.asarray(poses(_point(s, np.random.default_rng(4))))
-
-    expect_repeated(picture, s.built, s.build())
-
-
-@needed
+@check("model", needed=True)
 def random_poses_are_rigid_motions(s: Subject) -> None:
     s.poses, random = _poses(s.given, s.chain), np.random.default_rng(1)
     s.reach = [2.0 if joint.is_revolute else 0.2 for joint in s.chain.joints]
@@ -238,11 +230,24 @@ def random_poses_are_rigid_motions(s: Subject) -> None:
         expect(handed <= _ROTATION_TOLERANCE, f"found a rotation with determinant off 1 by {handed:.1e}")
 
 
+@check("model")
+def the_model_is_the_same_each_time(s: Subject) -> None:
+    def picture(model: Any) -> Array:
+        expect(tuple(model.parameters()) == s.blocks, "found other parameters another time")
+        values = symbols(s.blocks)
+        poses = _poses(stacked(list(values.values())), model.chain(values))
+        return np.asarray(poses(_point(s, np.random.default_rng(4))))
+
+    expect_repeated(picture, s.built, s.build())
+
+
+@check("model")
 def derivatives_of_poses_agree_with_differences(s: Subject) -> None:
     names = (*Parameters(s.blocks).entry_names, *(joint.name for joint in s.chain.joints))
     expect_derivatives(s.poses, _point(s, np.random.default_rng(2)), "the poses", names)
 
 
+@check("model")
 def lengths_move_it_by_lengths_and_angles_by_angles(s: Subject) -> None:  # m for each m, rad for each rad
     random, jacobian = np.random.default_rng(5), s.poses.jacobian()
     points = [_point(s, random) for _ in range(3)]
@@ -267,33 +272,24 @@ def _point(s: Subject, random: np.random.Generator) -> Array:
     return np.concatenate([near_nominal(s.blocks, random), random.uniform(-1, 1, len(s.reach)) * s.reach])
 
 
-MODEL = (
-    the_model_builds_with_joints_named_once,
-    its_parameters_are_declared_in_si_units_and_can_move,
-    its_chain_has_one_joint_for_each_name,
-    its_chain_depends_on_its_parameters_and_does_not_branch_on_them,
-    random_poses_are_rigid_motions,
-    the_model_is_the_same_each_time,
-    derivatives_of_poses_agree_with_differences,
-    lengths_move_it_by_lengths_and_angles_by_angles,
-)
-
 # --- joint effects, on joints q1, q2 and q3 -------------------------------------------------------------------------
 
 
-@needed
-def the_effect_builds_for_three_joints(s: Subject) -> None:
+@check("effect", needed=True)
+def the_effect_builds_with_parameters_in_si_units(s: Subject) -> None:
     s.built = s.build(JOINTS)
     bases = ", ".join(base.__name__ for base in type(s.built).__bases__)
     expect(isinstance(s.built, JointEffect), f"found that it derives from {bases}, expected armcal.JointEffect")
     s.recorded = ca.SX.sym("recorded", 2 * len(JOINTS))  # command and approach of each joint
+    _declare(s)
 
 
-@needed
+@check("effect", needed=True)
 def it_gives_a_displacement_for_every_joint(s: Subject) -> None:
     s.moved = _displacements(s.built, s.values, s.recorded)
 
 
+@check("effect")
 def its_displacements_are_finite_and_smooth_in_its_parameters(s: Subject) -> None:
     expect_only(s.moved, [s.recorded, s.given])
     expect_no_choice(s.moved, s.recorded, s.given)
@@ -305,6 +301,7 @@ def its_displacements_are_finite_and_smooth_in_its_parameters(s: Subject) -> Non
             expect(bool(np.isfinite(shown).all()), f"found {shown.ravel()} {state}, expected finite numbers")
 
 
+@check("effect")
 def lengths_and_angles_move_a_joint_by_as_much(s: Subject) -> None:  # at commands and approaches of either sign
     slope = ca.Function("slope", [s.given, s.recorded], [ca.densify(ca.jacobian(s.moved, s.given))])
     entries = near_nominal(s.blocks, np.random.default_rng(3))
@@ -314,6 +311,7 @@ def lengths_and_angles_move_a_joint_by_as_much(s: Subject) -> None:  # at comman
         expect_gain(float(gains[place]), "a joint's displacement", block.name, block.unit)
 
 
+@check("effect")
 def the_effect_is_the_same_each_time(s: Subject) -> None:
     entries = near_nominal(s.blocks, np.random.default_rng(4))
 
@@ -331,6 +329,7 @@ def the_effect_is_the_same_each_time(s: Subject) -> None:
     expect_repeated(picture, s.built, s.build(JOINTS))
 
 
+@check("effect")
 def the_columns_it_reads_are_declared_and_change_its_shape(s: Subject) -> None:
     effect = s.built
     if not (reshapes(effect) or effect.conditions):
@@ -348,7 +347,7 @@ def the_columns_it_reads_are_declared_and_change_its_shape(s: Subject) -> None:
         expect(fault.args[0] in given, f"found that it reads {fault.args[0]!r}, expected it among its conditions")
 
 
-@needed
+@check("effect", needed=True)
 def its_springs_have_a_site_unit_directions_and_one_deflection_a_coordinate(s: Subject) -> None:
     s.springs = check_springs(s.built.springs, s.built.springs(s.values), len(JOINTS))
     s.loads = ca.SX.sym("loads", sum(spring.size for spring in s.springs))
@@ -362,11 +361,13 @@ def its_springs_have_a_site_unit_directions_and_one_deflection_a_coordinate(s: S
     s.laws = stacked(parts)
 
 
+@check("effect")
 def every_parameter_of_the_effect_has_an_influence(s: Subject) -> None:
     conditions = {name: ca.SX.sym(name) for name in _condition_names(s.built)}
     expect_all_used(stacked([s.moved, s.laws, _shape(s.built, conditions, s.values)]), s.values)
 
 
+@check("effect")
 def its_laws_are_finite_smooth_and_in_rad_at_zero_load_too(s: Subject) -> None:
     expect_only(s.laws, [s.loads, s.recorded, s.given])
     expect_no_choice(s.laws, s.recorded, stacked([s.loads, s.given]))
@@ -422,60 +423,44 @@ def _command(spring: Spring, recorded: Expression) -> JointCommand:
     return JointCommand(spring.site - 1, recorded[at], recorded[at + 1]) if spring.site else MOUNT
 
 
-EFFECT = (
-    the_effect_builds_for_three_joints,
-    its_parameters_are_declared_in_si_units_and_can_move,
-    it_gives_a_displacement_for_every_joint,
-    its_displacements_are_finite_and_smooth_in_its_parameters,
-    lengths_and_angles_move_a_joint_by_as_much,
-    its_springs_have_a_site_unit_directions_and_one_deflection_a_coordinate,
-    the_effect_is_the_same_each_time,
-    the_columns_it_reads_are_declared_and_change_its_shape,
-    every_parameter_of_the_effect_has_an_influence,
-    its_laws_are_finite_smooth_and_in_rad_at_zero_load_too,
-)
+# --- pose residuals, on joints q1, q2 and q3, of a tool that is off by what joint q2 commands ------------------------
 
-# --- pose residuals, on joints q1, q2 and q3 ------------------------------------------------------------------------
-
-_SIZE = len(OF_TOOL) + len(JOINTS)
-_COUNT = 240
-_NOISE_M = 1e-4
+_COUNT, _NOISE_M = 240, 1e-4
 
 
-@needed
-def the_residual_learns_an_error_of_a_joint(s: Subject) -> None:
+@check("residual", needed=True)
+def the_residual_learns_an_error_that_its_commands_explain(s: Subject) -> None:
     residual = s.built = s.build(JOINTS)
     expect(isinstance(residual, PoseResidual), f"found {type(residual).__name__}, expected an armcal.PoseResidual")
     expect(not residual.is_learned, "found that it corrects something before it was shown records")
     expect(residual.learned(_errors(2)) is None, "found that it learned from 2 records")
-    s.learned = residual.learned(_errors(_COUNT))
+    s.learned, s.unseen = residual.learned(_errors(_COUNT)), _errors(2 * _COUNT).postures.subset(slice(_COUNT, None))
     expect(s.learned is not None and s.learned.is_learned, f"found that it learned nothing from {_COUNT} records")
-    s.unseen = _errors(2 * _COUNT).postures.subset(slice(_COUNT, None))
-    shape = s.learned.corrections(s.unseen).shape
-    expect(shape == (_SIZE, _COUNT), f"found corrections of {shape}, expected {_SIZE} x {_COUNT}: tool and joints")
+    corrections, size = s.learned.corrections(s.unseen), len(OF_TOOL) + len(JOINTS)
+    shape = f"found corrections of {corrections.shape}, expected {size} x {_COUNT}: tool and joints"
+    expect(corrections.shape == (size, _COUNT), shape)
+    before = _shift(s.unseen.commands)
+    after = (
+        before - corrections[:3].T - np.einsum("nij,jn->ni", _levers(s.unseen.commands), corrections[len(OF_TOOL) :])
+    )
+    smaller = float(np.linalg.norm(after) / np.linalg.norm(before))
+    expect(smaller < 0.7, f"found unseen errors {smaller:.2f} times as large, expected them smaller")
 
 
-def what_it_learned_makes_unseen_errors_smaller_and_corrects_nothing_beyond(s: Subject) -> None:
-    before, after = _remaining(s.unseen, None), _remaining(s.unseen, s.learned)
-    expect(after < 0.7 * before, f"found {after:.3g} m, without it {before:.3g} m")
-    turned = Postures(s.unseen.commands + 2 * np.pi, s.unseen.approaches)
+@check("residual")
+def it_corrects_nothing_beyond_and_is_less_sure_away_from_what_it_learned(s: Subject) -> None:
+    turned, away = (Postures(s.unseen.commands + angle, s.unseen.approaches) for angle in (2 * np.pi, np.pi))
     expect(not s.learned.corrections(turned).any(), "found corrections beyond the commands that it learned from")
-
-
-def its_correction_depends_on_commands_approaches_and_surroundings_alone(s: Subject) -> None:
+    near, far = (s.learned.deviations(own) for own in (s.unseen, away))
+    expect(bool(np.isfinite(near).all() and np.isfinite(far).all()), "found deviations that are not finite")
+    expect(bool((near >= 0).all()), "found deviations below zero")
+    expect(float(np.linalg.norm(far)) > float(np.linalg.norm(near)), "found that they do not grow")
     given = [ca.SX.sym(name, len(JOINTS)) for name in ("commands", "approaches")]
     around = {name: ca.SX.sym(name) for name in SURROUNDINGS}
     expect_only(s.learned.correction(given[0], given[1], around), [*given, *around.values()])
 
 
-def its_deviations_are_finite_and_larger_away_from_what_it_learned(s: Subject) -> None:
-    away = Postures(s.unseen.commands + np.pi, s.unseen.approaches)
-    near, far = (s.learned.deviations(own) for own in (s.unseen, away))
-    expect(bool(np.isfinite(near).all() and np.isfinite(far).all()), "found deviations that are not finite")
-    expect(bool((near >= 0).all()), "found deviations below zero")
-    expect(float(np.linalg.norm(far)) > float(np.linalg.norm(near)), "found that they do not grow")
-
-
+@check("residual")
 def what_it_learned_is_kept_in_its_settings_and_the_same_each_time(s: Subject) -> None:
     learned, unseen = s.learned, s.unseen
     again = type(learned)(type(learned.settings).model_validate(learned.settings.to_config()), JOINTS)
@@ -487,19 +472,18 @@ def what_it_learned_is_kept_in_its_settings_and_the_same_each_time(s: Subject) -
 
 
 def _errors(count: int) -> ModelErrors:
-    """Of joint q2 (rad), of which the tool sees 0.3 m."""
     random = np.random.default_rng(5)
     commands = random.uniform(-2, 2, (len(JOINTS), count))
-    slopes = np.zeros((count, 3, _SIZE))
-    slopes[:, :, :3] = -np.eye(3)
-    slopes[:, :, len(OF_TOOL) :] = -_levers(commands)
-    errors = _levers(commands)[:, :, 1] * _truth(commands)[:, None] + random.normal(0, _NOISE_M, (count, 3))
+    slopes = np.zeros((count, 3, len(OF_TOOL) + len(JOINTS)))
+    slopes[:, :, :3], slopes[:, :, len(OF_TOOL) :] = -np.eye(3), -_levers(commands)
+    errors = _shift(commands) + random.normal(0, _NOISE_M, (count, 3))
     postures = Postures(commands, np.zeros_like(commands))
     return ModelErrors(postures, ("angle",) * len(JOINTS), errors / _NOISE_M, slopes / _NOISE_M, 3)
 
 
-def _truth(commands: Array) -> Array:
-    return np.asarray(2e-3 * np.sin(2 * commands[1]))
+def _shift(commands: Array) -> Array:
+    """Of the tool (N x 3; m), by joint q2, which turns it further than its command."""
+    return np.asarray(_levers(commands)[:, :, 1] * (2e-3 * np.sin(2 * commands[1]))[:, None])
 
 
 def _levers(commands: Array) -> Array:
@@ -510,23 +494,6 @@ def _levers(commands: Array) -> Array:
         levers[:, joint, joint] = 0.1 * np.cos(command)
     return levers
 
-
-def _remaining(postures: Postures, learned: PoseResidual | None) -> float:
-    levers = _levers(postures.commands)
-    errors = levers[:, :, 1] * _truth(postures.commands)[:, None]
-    if learned is not None:
-        corrections = learned.corrections(postures)
-        errors = errors - corrections[:3].T - np.einsum("nij,jn->ni", levers, corrections[len(OF_TOOL) :])
-    return float(np.sqrt(np.mean(errors**2)))
-
-
-RESIDUAL = (
-    the_residual_learns_an_error_of_a_joint,
-    what_it_learned_makes_unseen_errors_smaller_and_corrects_nothing_beyond,
-    its_correction_depends_on_commands_approaches_and_surroundings_alone,
-    its_deviations_are_finite_and_larger_away_from_what_it_learned,
-    what_it_learned_is_kept_in_its_settings_and_the_same_each_time,
-)
 
 # --- measurements, on planar arms -----------------------------------------------------------------------------------
 
@@ -591,8 +558,8 @@ class _Case:
         return np.asarray(self.function(expression)(np.concatenate(at))).ravel()
 
 
-@needed
-def the_measurement_builds_for_one_arm_or_for_two(s: Subject) -> None:
+@check("measurement", needed=True)
+def the_measurement_builds_with_parameters_in_si_units(s: Subject) -> None:
     refused = []
     for names in ARM_NAMES:
         try:
@@ -605,9 +572,10 @@ def the_measurement_builds_for_one_arm_or_for_two(s: Subject) -> None:
     unknown = [name for name in s.built.arms if name.removesuffix(OTHER) not in s.arms]
     usual = f"found the arms {tuple(s.built.arms)}, expected some of {s.arms}"
     expect(len(s.built.arms) > 0 and not unknown, usual)
+    _declare(s)
 
 
-@needed
+@check("measurement", needed=True)
 def its_channels_have_names_and_dimensions(s: Subject) -> None:
     s.channels = tuple(s.built.channels())
     listed = [channel.name for channel in s.channels]
@@ -620,7 +588,7 @@ def its_channels_have_names_and_dimensions(s: Subject) -> None:
             units_of(channel.dimension)
 
 
-@needed
+@check("measurement", needed=True)
 def it_makes_a_residual_with_plausible_noise(s: Subject) -> None:
     s.case = _Case.of(s.built, planar_arms(s.arms), s.blocks, s.channels)
     factor = s.case.factor
@@ -631,6 +599,7 @@ def it_makes_a_residual_with_plausible_noise(s: Subject) -> None:
     expect_only(stacked([factor.residual, factor.outputs]), [factor.values, factor.record])
 
 
+@check("measurement")
 def the_residual_is_zero_where_outputs_are_measured(s: Subject) -> None:
     measured = {f"{_INSTRUMENT}.{channel.name}" for channel in s.channels}
     if s.case.factor.output_channels and set(s.case.factor.output_channels) == measured:
@@ -638,6 +607,7 @@ def the_residual_is_zero_where_outputs_are_measured(s: Subject) -> None:
         expect(worst <= 1e-9, f"found a residual of {worst:.1e}, expected zero")
 
 
+@check("measurement")
 def its_jacobian_is_finite_and_agrees_with_differences(s: Subject) -> None:
     case, (values, reading) = s.case, s.case.point()
     disturbed = reading + 0.01 * np.random.default_rng(2).uniform(-1, 1, len(reading))
@@ -647,6 +617,7 @@ def its_jacobian_is_finite_and_agrees_with_differences(s: Subject) -> None:
     expect_derivatives(function, np.concatenate([values, disturbed]), "the residual", names)
 
 
+@check("measurement")
 def the_measurement_is_the_same_each_time(s: Subject) -> None:
     def picture(made: Measurement) -> Array:
         same = tuple(made.parameters()) == tuple(s.case.own)
@@ -658,6 +629,7 @@ def the_measurement_is_the_same_each_time(s: Subject) -> None:
     expect_repeated(picture, s.built, s.build(s.arms))
 
 
+@check("measurement")
 def its_groups_have_the_same_parameters_which_a_record_fits(s: Subject) -> None:
     measurement, case = s.built, s.case
     if not isinstance(measurement, GroupedMeasurement):
@@ -677,11 +649,12 @@ def its_groups_have_the_same_parameters_which_a_record_fits(s: Subject) -> None:
         expect(worst <= 1e-9, f"found a residual of {worst:.1e} with what the record itself says, expected zero")
 
 
-@needed
+@check("measurement", needed=True)
 def it_makes_a_residual_of_any_arm(s: Subject) -> None:  # every point of whose tool moves in a way of its own
     s.general = _Case.of(s.built, skewed_arms(s.arms), s.blocks, s.channels)
 
 
+@check("measurement")
 def every_parameter_of_the_measurement_has_an_influence(s: Subject) -> None:
     case = s.general
     place, values = sum(block.size for block in case.arm_blocks), {}
@@ -691,6 +664,7 @@ def every_parameter_of_the_measurement_has_an_influence(s: Subject) -> None:
     expect_all_used(stacked([case.factor.residual, case.factor.outputs]), values)
 
 
+@check("measurement")
 def its_residual_is_in_m_and_rad(s: Subject) -> None:
     """What a length or an angle, of a parameter or as it is read, changes in a residual of the same dimension."""
     case, factor, slopes = s.general, s.general.factor, []
@@ -715,6 +689,7 @@ def its_residual_is_in_m_and_rad(s: Subject) -> None:
         expect_gain(float(column[units == unit].max(initial=0.0)), "the residual", name, unit)
 
 
+@check("measurement")
 def the_noise_of_every_reading_follows_from_its_residual(s: Subject) -> None:
     """Also that a position's residual is x, y, z, measured minus predicted: a run tells axes apart by them."""
     case, factor = s.general, s.general.factor
@@ -740,19 +715,3 @@ def the_noise_of_every_reading_follows_from_its_residual(s: Subject) -> None:
             f"found a position's residual that changes by {np.round(of_position, 3).tolist()} with x, y and z, "
             "expected measured minus predicted of x, y and z in this order",
         )
-
-
-MEASUREMENT = (
-    the_measurement_builds_for_one_arm_or_for_two,
-    its_parameters_are_declared_in_si_units_and_can_move,
-    its_channels_have_names_and_dimensions,
-    it_makes_a_residual_with_plausible_noise,
-    the_residual_is_zero_where_outputs_are_measured,
-    its_jacobian_is_finite_and_agrees_with_differences,
-    the_measurement_is_the_same_each_time,
-    its_groups_have_the_same_parameters_which_a_record_fits,
-    it_makes_a_residual_of_any_arm,
-    every_parameter_of_the_measurement_has_an_influence,
-    its_residual_is_in_m_and_rad,
-    the_noise_of_every_reading_follows_from_its_residual,
-)

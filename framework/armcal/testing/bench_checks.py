@@ -27,8 +27,7 @@ from armcal.devices.device import (
 from armcal.devices.link import GuardedLink, LinkIdentity
 from armcal.devices.live import JointSample, TrackerFrame, frames_of, samples_of
 from armcal.errors import InputError
-from armcal.testing.checking import ContractError, NotRun, Subject, expect, needed, raises_only
-from armcal.testing.data_checks import it_builds
+from armcal.testing.checking import ContractError, NotRun, Subject, check, expect, raises_only
 
 T = TypeVar("T")
 JOINTS, CHANNELS = ("q1", "q2"), ("arm.q1", "arm.q2")
@@ -67,13 +66,12 @@ def _expect_lost(what: str, call: Callable[[], object], *others: type[Exception]
 # --- links, devices, simulated benches ------------------------------------------------------------------------------
 
 
+@check("bench")
 def it_can_serve(s: Subject) -> None:  # serving takes an experiment and does not end by itself
     _expect_methods(s.built, "serve")
 
 
-BENCH = (it_builds, it_can_serve)
-
-
+@check("link")
 def the_link_is_lost_before_it_is_opened_and_may_be_closed_twice(s: Subject) -> None:
     link = s.built
     _expect_methods(link, "open", "write", "read")
@@ -86,10 +84,7 @@ def the_link_is_lost_before_it_is_opened_and_may_be_closed_twice(s: Subject) -> 
         expect(not link.took_over, "found that somebody took over before it was opened")
 
 
-LINK = (it_builds, the_link_is_lost_before_it_is_opened_and_may_be_closed_twice)
-
-
-@needed
+@check("device", needed=True)
 def the_device_builds_and_has_its_methods(s: Subject) -> None:
     s.built = s.build(JOINTS, _MemoryLink("nobody is there."))
     _expect_methods(
@@ -98,6 +93,7 @@ def the_device_builds_and_has_its_methods(s: Subject) -> None:
     expect(tuple(s.built.joint_names) == JOINTS, f"found {s.built.joint_names}, expected {JOINTS}")
 
 
+@check("device")
 def without_its_link_every_call_is_an_error_and_it_may_be_closed_twice(s: Subject) -> None:
     device = s.built
     device.close()
@@ -109,6 +105,7 @@ def without_its_link_every_call_is_an_error_and_it_may_be_closed_twice(s: Subjec
         _expect_lost("a call before it is opened", call)
 
 
+@check("device")
 def angles_that_pulses_can_set_stand_where_they_are_told(s: Subject) -> None:
     once = standing_at(s.built, dict.fromkeys(JOINTS, 0.1))
     again = standing_at(s.built, once)
@@ -121,7 +118,7 @@ def angles_that_pulses_can_set_stand_where_they_are_told(s: Subject) -> None:
             raise ContractError(f"found {standing} for {angle:g} rad, {refused}")
 
 
-@needed
+@check("device", needed=True)
 def on_a_bus_of_registers_it_sets_the_angles_that_it_says(s: Subject) -> None:
     s.link = _MemoryLink()
     device = s.device = s.build(JOINTS, s.link)
@@ -136,6 +133,7 @@ def on_a_bus_of_registers_it_sets_the_angles_that_it_says(s: Subject) -> None:
     _expect_at(device, dict(zip(JOINTS, (-0.4, 0.5), strict=True)), "command()")
 
 
+@check("device")
 def its_state_is_read_from_the_board_and_a_released_joint_has_no_angle(s: Subject) -> None:
     before, there = s.link.snapshot(), state_of(s.device).angles
     s.device.command(dict.fromkeys(JOINTS, 0.15))
@@ -151,6 +149,7 @@ def its_state_is_read_from_the_board_and_a_released_joint_has_no_angle(s: Subjec
     expect(JOINTS[1] in angles, f"found {JOINTS[1]} without an angle after release() of {JOINTS[0]}")
 
 
+@check("device")
 def it_passes_on_that_the_link_was_lost(s: Subject) -> None:
     device, s.link.lost = s.device, "the link was cut."
     _expect_lost("state()", device.state)
@@ -207,18 +206,10 @@ class _MemoryLink:
         return self._registers.setdefault(address, bytearray(_REGISTERS))
 
 
-DEVICE = (
-    the_device_builds_and_has_its_methods,
-    without_its_link_every_call_is_an_error_and_it_may_be_closed_twice,
-    angles_that_pulses_can_set_stand_where_they_are_told,
-    on_a_bus_of_registers_it_sets_the_angles_that_it_says,
-    its_state_is_read_from_the_board_and_a_released_joint_has_no_angle,
-    it_passes_on_that_the_link_was_lost,
-)
-
 # --- live sources ---------------------------------------------------------------------------------------------------
 
 
+@check("camera")
 def the_camera_refuses_without_a_measurement_and_may_be_closed_at_any_time(s: Subject) -> None:
     camera = s.built
     camera.close()
@@ -232,10 +223,7 @@ def the_camera_refuses_without_a_measurement_and_may_be_closed_at_any_time(s: Su
     expect(_within(camera.shots) == [], "found an image after close(), expected none")
 
 
-CAMERA = (it_builds, the_camera_refuses_without_a_measurement_and_may_be_closed_at_any_time)
-
-
-@needed
+@check("tracker", "joints", needed=True)
 def it_opens_or_refuses_by_an_armcal_error(s: Subject) -> None:
     is_tracker = s.kind == "tracker"
     s.opening = () if is_tracker else (CHANNELS,)
@@ -245,6 +233,7 @@ def it_opens_or_refuses_by_an_armcal_error(s: Subject) -> None:
         _within(lambda: s.built.open(RealClock(), *s.opening))
 
 
+@check("tracker", "joints")
 def it_gives_what_has_come_without_waiting_and_nothing_once_closed(s: Subject) -> None:
     for item in _within(lambda: s.take(s.built)):
         expect(isinstance(item, s.item), f"found {type(item).__name__}, expected {s.item.__name__}")
@@ -256,6 +245,7 @@ def it_gives_what_has_come_without_waiting_and_nothing_once_closed(s: Subject) -
     expect(_within(lambda: s.take(s.built)) == [], "found something that came after close(), expected nothing")
 
 
+@check("tracker", "joints")
 def damaged_bytes_are_passed_over_and_counted(s: Subject) -> None:
     """By UDP or in a file: each is passed over, and some of them are counted."""
     with TemporaryDirectory() as folder:
@@ -320,11 +310,3 @@ def _settings_to_feed(s: Subject, path: Path) -> Mapping[str, Any]:
         if name in fields:
             return {**example, name: str(path)}
     raise NotRun("its settings have no port, path or source by which the checks could feed it")
-
-
-SOURCE = (
-    it_builds,
-    it_opens_or_refuses_by_an_armcal_error,
-    it_gives_what_has_come_without_waiting_and_nothing_once_closed,
-    damaged_bytes_are_passed_over_and_counted,
-)

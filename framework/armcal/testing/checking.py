@@ -36,13 +36,22 @@ class Subject(SimpleNamespace):
 
 
 Check = Callable[[Subject], None]
+CHECKS: dict[str, list[Check]] = {}
+"""Of each kind what is checked, in this order, after what every component is checked for."""
 NEEDED: set[Check] = set()
 
 
-def needed(check: Check) -> Check:
-    """Mark a check that those after it build on: unless it passes, they do not run."""
-    NEEDED.add(check)
-    return check
+def check(*kinds: str, needed: bool = False) -> Callable[[Check], Check]:
+    """Make a function a check of these kinds; unless one that is ``needed`` passes, those after it do not run."""
+
+    def listed(function: Check) -> Check:
+        for kind in kinds:
+            CHECKS.setdefault(kind, []).append(function)
+        if needed:
+            NEEDED.add(function)
+        return function
+
+    return listed
 
 
 def expect(holds: bool, fault: str) -> None:
@@ -62,3 +71,9 @@ def raises_only(*allowed: type[Exception], expected: str = "", when: str = "") -
     except Exception as fault:
         expected = expected or f"{allowed[0].__module__}.{allowed[0].__name__}"
         raise ContractError(f"found {type(fault).__name__} ({fault}){when}, expected {expected}") from fault
+
+
+@check("reader", "simulator", "exporter", "estimator", "online", "link", "bench", needed=True)
+@check("tracker", "joints", "camera", needed=True)
+def it_builds(s: Subject) -> None:
+    s.built = s.build()

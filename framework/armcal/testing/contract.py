@@ -23,8 +23,8 @@ from armcal.base.units import split_suffix
 from armcal.errors import ArmcalError
 from armcal.hooks import KINDS
 from armcal.plugins import Component, PluginInfo, PluginRegistry
-from armcal.testing import arm_checks, bench_checks, data_checks
-from armcal.testing.checking import NEEDED, PLUGIN_FAULTS, Check, ContractError, NotRun, Subject, expect, needed
+from armcal.testing import arm_checks, bench_checks, data_checks  # noqa: F401 - their checks are listed as they are imported
+from armcal.testing.checking import CHECKS, NEEDED, PLUGIN_FAULTS, Check, ContractError, NotRun, Subject, check, expect
 
 MOST_CHARACTERS = 400
 _LONGEST_IMPORT_S = 60
@@ -51,12 +51,12 @@ class CheckResult:
 # --- what every component must do -----------------------------------------------------------------------------------
 
 
-@needed
+@check(needed=True)
 def it_imports(s: Subject) -> None:
     s.made = s.load()
 
 
-@needed
+@check(needed=True)
 def it_has_checked_settings_typed_and_with_units(s: Subject) -> None:
     settings_class: Any = getattr(s.made, "Settings", None)
     expect(
@@ -78,7 +78,7 @@ def it_has_checked_settings_typed_and_with_units(s: Subject) -> None:
         )
 
 
-@needed
+@check(needed=True)
 def its_example_is_accepted_kept_by_to_config_and_an_unknown_key_refused(s: Subject) -> None:
     settings_class, example = s.made.Settings, getattr(s.made, "EXAMPLE", {})
     expect(isinstance(example, Mapping), f"found an EXAMPLE that is no mapping of settings: {type(example).__name__}")
@@ -135,11 +135,13 @@ def _process() -> dict[str, Any]:
     }
 
 
+@check("command")
 def it_is_a_click_command_that_says_what_it_does(s: Subject) -> None:
     expect(isinstance(s.made, click.Command), f"found {type(s.made).__name__}, expected a click.Command")
     expect(bool(s.made.help), f"found no help of the command {s.made.name!r}, expected a docstring")
 
 
+@check("report_section")
 def it_is_a_function_of_a_runs_result(s: Subject) -> None:
     expect(callable(s.made), f"found {type(s.made).__name__}, expected a function of a RunResult")
     count = len([p for p in inspect.signature(s.made).parameters.values() if p.default is p.empty])
@@ -151,27 +153,14 @@ _OF_ANY = (
     it_has_checked_settings_typed_and_with_units,
     its_example_is_accepted_kept_by_to_config_and_an_unknown_key_refused,
 )
-_MANNERS = it_prints_nothing_and_leaves_the_process_alone
-CHECKS: Mapping[str, Sequence[Check]] = {
-    "model": (*_OF_ANY, *arm_checks.MODEL, _MANNERS),
-    "effect": (*_OF_ANY, *arm_checks.EFFECT, _MANNERS),
-    "residual": (*_OF_ANY, *arm_checks.RESIDUAL, _MANNERS),
-    "measurement": (*_OF_ANY, *arm_checks.MEASUREMENT, _MANNERS),
-    "reader": (*_OF_ANY, *data_checks.READER, _MANNERS),
-    "estimator": (*_OF_ANY, *data_checks.ESTIMATOR, _MANNERS),
-    "online": (*_OF_ANY, *data_checks.ONLINE, _MANNERS),
-    "simulator": (*_OF_ANY, *data_checks.SIMULATOR, _MANNERS),
-    "exporter": (*_OF_ANY, *data_checks.EXPORTER, _MANNERS),
-    "link": (*_OF_ANY, *bench_checks.LINK, _MANNERS),
-    "device": (*_OF_ANY, *bench_checks.DEVICE, _MANNERS),
-    "tracker": (*_OF_ANY, *bench_checks.SOURCE, _MANNERS),
-    "joints": (*_OF_ANY, *bench_checks.SOURCE, _MANNERS),
-    "camera": (*_OF_ANY, *bench_checks.CAMERA, _MANNERS),
-    "bench": (*_OF_ANY, *bench_checks.BENCH, _MANNERS),
-    "command": (it_imports, it_is_a_click_command_that_says_what_it_does),
-    "report_section": (it_imports, it_is_a_function_of_a_runs_result),
-}
-"""The checks of each kind, in their order."""
+_LAST = it_prints_nothing_and_leaves_the_process_alone
+
+
+def checks_of(kind: str) -> tuple[Check, ...]:
+    if kind in ("command", "report_section"):
+        return (it_imports, *CHECKS[kind])
+    return (*_OF_ANY, *CHECKS[kind], _LAST)
+
 
 # --- running them ---------------------------------------------------------------------------------------------------
 
@@ -203,7 +192,7 @@ def assert_contract(component: type | str, kind: str, *, at_least: int | None = 
     results = _checked(kind, name, load)
     faults = [f"  {result.check}: {result.fault}" for result in results if result.fault]
     idle = [f"  {result.check}" for result in results if result.not_run]
-    ran, expected = len(results) - len(idle), len(CHECKS[kind]) if at_least is None else at_least
+    ran, expected = len(results) - len(idle), len(checks_of(kind)) if at_least is None else at_least
     if faults:
         raise AssertionError("\n".join([f"{kind} {name} breaks the plugin contract:", *faults]))
     if ran < expected:
@@ -231,25 +220,25 @@ def check_plugin(plugin: PluginInfo, registry: PluginRegistry) -> list[CheckResu
             registry.find(component.kind, component.name)
 
     subject, results = Subject(), list[CheckResult]()
-    for check in (
+    for own in (
         it_loads_with_no_hook_that_armcal_does_not_know,
         its_registration_prints_and_imports_nothing_heavy,
         each_component_is_offered_once,
     ):
-        results.append(_tried(check, f"plugin {plugin.name}", subject))
+        results.append(_tried(own, f"plugin {plugin.name}", subject))
         if plugin.fault:
             return results
-    return results + [result for own in registry.announced_by(plugin) for result in check_component(own)]
+    return results + [result for component in registry.announced_by(plugin) for result in check_component(component)]
 
 
 def _checked(kind: str, name: str, load: Callable[[], Any]) -> list[CheckResult]:
     subject = Subject(kind=kind, load=load, heard=io.StringIO(), process=_process())
     results, ended = list[CheckResult](), False
     with redirect_stdout(subject.heard):
-        for check in CHECKS[kind]:
-            if not ended or check is _MANNERS:
-                results.append(_tried(check, f"{kind} {name}", subject))
-                ended = ended or (check in NEEDED and bool(results[-1].fault or results[-1].not_run))
+        for own in checks_of(kind):
+            if not ended or own is _LAST:
+                results.append(_tried(own, f"{kind} {name}", subject))
+                ended = ended or (own in NEEDED and bool(results[-1].fault or results[-1].not_run))
     return results
 
 

@@ -24,7 +24,7 @@ from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.measure.measurement import Measurement
 from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.problem.problem import FactorRecords, Problem
-from armcal.testing.checking import ContractError, NotRun, Subject, expect, needed, raises_only
+from armcal.testing.checking import ContractError, NotRun, Subject, check, expect, raises_only
 from armcal.testing.planar import (
     ARM,
     GRAVITY,
@@ -42,11 +42,6 @@ from armcal.testing.planar import (
 )
 
 MISSING_FILE = "/no/such/folder/measurements"
-
-
-@needed
-def it_builds(s: Subject) -> None:
-    s.built = s.build()
 
 
 # --- readers --------------------------------------------------------------------------------------------------------
@@ -75,6 +70,7 @@ class _Source:
         return len(next(iter(self.channels.values())))
 
 
+@check("reader")
 def it_refuses_a_missing_file_a_damaged_one_and_a_folder_in_place_of_one(s: Subject) -> None:
     """By an armcal error; a folder that holds damaged files, too."""
     method = getattr(s.built, "read", None)
@@ -88,7 +84,7 @@ def it_refuses_a_missing_file_a_damaged_one_and_a_folder_in_place_of_one(s: Subj
         _expect_refused(s, folder / "data", "a file in place of a folder", of_records=True)
 
 
-@needed
+@check("reader", needed=True)
 def it_reads_a_known_file_in_si_a_record_a_row_the_same_each_time(s: Subject) -> None:
     refused = []
     for source in _sources(s.made):
@@ -113,6 +109,7 @@ def it_reads_a_known_file_in_si_a_record_a_row_the_same_each_time(s: Subject) ->
     raise NotRun("it reads no plain table, and has no EXAMPLE_SOURCE")
 
 
+@check("reader")
 def a_cell_that_is_wrong_or_empty_is_reported_never_passed_over(s: Subject) -> None:
     """The last number of the second to last line becomes another text, in each file that has such a line."""
     source: _Source = s.source
@@ -210,16 +207,10 @@ def _table(measurements: Mapping[str, Measurement], more: tuple[str, ...]) -> _S
     return _Source({"data.csv": "\n".join([header, *rows, ""]).encode()}, "data.csv", channels, measurements)
 
 
-READER = (
-    it_builds,
-    it_refuses_a_missing_file_a_damaged_one_and_a_folder_in_place_of_one,
-    it_reads_a_known_file_in_si_a_record_a_row_the_same_each_time,
-    a_cell_that_is_wrong_or_empty_is_reported_never_passed_over,
-)
-
 # --- simulators and exporters, of a planar arm ----------------------------------------------------------------------
 
 
+@check("simulator")
 def it_simulates_what_every_instrument_reads_the_same_each_time(s: Subject) -> None:
     arms, refused = planar_arms([ARM]), []
     choices: tuple[Mapping[str, Measurement], ...] = ({TRACKER: Tip()}, {WALLS: Walls()})
@@ -243,9 +234,7 @@ def it_simulates_what_every_instrument_reads_the_same_each_time(s: Subject) -> N
             expect(bool(np.array_equal(values, again.channels[name])), f"found other numbers in {name} another time")
 
 
-SIMULATOR = (it_builds, it_simulates_what_every_instrument_reads_the_same_each_time)
-
-
+@check("exporter")
 def an_arm_is_written_the_same_each_time_or_refused_by_an_armcal_error(s: Subject) -> None:
     first = _exported(s.built, _request())
     for other in (s.built, s.build()):
@@ -277,8 +266,6 @@ def _exported(exporter: Any, request: ExportRequest) -> Exported | str:
         expect(plain, f"found the companion {name!r}, expected the plain name of a file")
     return exported
 
-
-EXPORTER = (it_builds, an_arm_is_written_the_same_each_time_or_refused_by_an_armcal_error)
 
 # --- estimators: exact tip positions of an arm whose parameters are known -------------------------------------------
 
@@ -319,24 +306,27 @@ class _Case:
         )
 
 
-@needed
+@check("estimator", needed=True)
 def it_gives_a_value_for_every_entry_and_converges(s: Subject) -> None:
     s.case = _case(Interval(upper=_UPPER_SIDE_M), None, _UPPER_SIDE_M)
     s.solution = s.case.solved_by(s.built)
     expect(s.solution.verdict.converged, f"found the verdict {s.solution.verdict.status!r}, expected convergence")
 
 
+@check("estimator")
 def it_keeps_to_the_bounds_and_finds_the_truth(s: Subject) -> None:
     s.case.problem.parameters.check(s.solution.values)
     s.case.expect_near(s.solution)
 
 
+@check("estimator")
 def it_weighs_priors(s: Subject) -> None:
     data, prior = _POSES / NOISE_M**2, 1 / _PRIOR_SD_M**2  # information on ``side``, which the prior puts at zero
     case = _case(Interval(), _PRIOR_SD_M, _TRUTH["side"] * data / (data + prior))
     case.expect_near(case.solved_by(s.built))
 
 
+@check("estimator")
 def it_weighs_records_in_any_order(s: Subject) -> None:
     scattered = _scattered()
     solution = scattered.solved_by(s.built)
@@ -347,12 +337,14 @@ def it_weighs_records_in_any_order(s: Subject) -> None:
     expect(off <= _TOLERANCE, f"found values that differ by {off:.1e} for another order of records")
 
 
+@check("estimator")
 def it_does_the_same_twice(s: Subject) -> None:
     for estimator in (s.built, s.build()):
         off = float(np.abs(s.case.solved_by(estimator).values - s.solution.values).max())
         expect(off == 0.0, f"found values that differ by {off:.1e} from the first time")
 
 
+@check("estimator")
 def cut_short_it_reports_that_it_did_not_converge(s: Subject) -> None:
     if "max_iterations" not in type(s.settings).model_fields:
         raise NotRun("its settings have no max_iterations")
@@ -389,16 +381,6 @@ def _scattered() -> _Case:
     return replace(case, records=weighted, answer=answer, judged=(_SIDE,))
 
 
-ESTIMATOR = (
-    it_builds,
-    it_gives_a_value_for_every_entry_and_converges,
-    it_keeps_to_the_bounds_and_finds_the_truth,
-    it_weighs_priors,
-    it_weighs_records_in_any_order,
-    it_does_the_same_twice,
-    cut_short_it_reports_that_it_did_not_converge,
-)
-
 # --- online estimators: a linear problem whose answer is a sum of information ---------------------------------------
 
 _RECORDS, _STATES, _ROWS = 12, 4, 2
@@ -419,7 +401,7 @@ class _Line(Observation):
         return Linearised(self.measured - self.slope @ point, self.slope, self.noise)
 
 
-@needed
+@check("online", needed=True)
 def it_takes_a_record(s: Subject) -> None:
     window = s.built.window
     whole = isinstance(window, int) and window >= 1
@@ -428,6 +410,7 @@ def it_takes_a_record(s: Subject) -> None:
     s.updates = _taken(s.built, s.prior, s.lines)
 
 
+@check("online")
 def it_finds_what_prior_and_records_say_together(s: Subject) -> None:
     for place, update in enumerate(s.updates, start=1):
         covariance = update.posterior.covariance
@@ -447,6 +430,7 @@ def it_finds_what_prior_and_records_say_together(s: Subject) -> None:
     expect(off < _SHARE, f"found an innovation or its covariance (the NIS) {off:.1e} off for the first record")
 
 
+@check("online")
 def it_changes_nothing_that_it_is_given_and_keeps_nothing(s: Subject) -> None:
     """From one update to the next, too."""
     mean, covariance = s.prior.mean.copy(), s.prior.covariance.copy()
@@ -459,6 +443,7 @@ def it_changes_nothing_that_it_is_given_and_keeps_nothing(s: Subject) -> None:
         expect(same, "the same records gave other beliefs the second time")
 
 
+@check("online")
 def a_variance_below_zero_is_an_error(s: Subject) -> None:
     line = s.lines[0]
     blind = _Line(line.measured, line.slope * [1, 1, 1, 0], line.noise)
@@ -503,12 +488,3 @@ def _known(prior: Gaussian, lines: Sequence[_Line]) -> Gaussian:
         information, projected = information + weighted @ line.slope, projected + weighted @ line.measured
     covariance = np.linalg.inv(information)
     return Gaussian(covariance @ projected, covariance)
-
-
-ONLINE = (
-    it_builds,
-    it_takes_a_record,
-    it_finds_what_prior_and_records_say_together,
-    it_changes_nothing_that_it_is_given_and_keeps_nothing,
-    a_variance_below_zero_is_an_error,
-)
