@@ -25,11 +25,11 @@ from armcal_online.replaying.replay import (
     WARM_UP,
     Comparison,
     JournalReplayer,
+    ReplayVerifier,
     compared,
     replay,
     side_by_side,
 )
-from armcal_online.replaying.replay_verifier import ReplayVerifier
 from armcal_online.running.session import OURS
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import RecalibrateSettings, load_settings
@@ -131,9 +131,6 @@ def _show(
         console.line(f"{counts}, all the same to the last bit")
     else:
         counts = f"{counts}, {verifier.equal} the same to the last bit"
-        if verifier.measured:
-            widest = f"{verifier.widest.values:.1e} sd ({verifier.widest.covariance:.1e} in the covariance)"
-            counts += f"; {verifier.measured} of the others were noted in full and differ by at most {widest}"
         console.line(f"{counts}; all {verifier.decisions} decisions and levels are the same")
     if other is not None:
         console.out.print(_table(done, other))
@@ -172,8 +169,7 @@ def _as_json(
         "entries": done.entries,
         "first": done.first,
         "last": done.last,
-        "states": {"compared": verifier.states, "same_to_the_last_bit": verifier.equal, "measured": verifier.measured},
-        "largest_difference_sd": {"values": verifier.widest.values, "covariance": verifier.widest.covariance},
+        "states": {"compared": verifier.states, "same_to_the_last_bit": verifier.equal},
         "evaluator": done.session.evaluator,
         "other_evaluator": list(verifier.others),
         "difference": {"after": difference.sequence, "sentence": difference.sentence} if difference else None,

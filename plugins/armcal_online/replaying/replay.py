@@ -1,7 +1,7 @@
 """A journal replayed: every entry does to a session what it did when it was written; two replays compared."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,15 +10,104 @@ from armcal.base.config_text import finite
 from armcal.errors import DataError
 from armcal.io.journal.segment import CHECKPOINT, Entry, JournalDamagedError, Segment
 
+from armcal_online.evaluator import differences
 from armcal_online.replaying.kept_journal import KeptJournal, good_segments
-from armcal_online.replaying.replay_verifier import DiffersError, ReplayVerifier
 from armcal_online.running.state_replayer import DECISION, NOTED, RECORD, ROLLBACK, Event, StateReplayer, parsing
 from armcal_online.tracking.recalibrator import Recalibrator
+from armcal_online.tracking.state import State
 
 Progress = Callable[[str, float], None]
 
 WARM_UP = 50
 """So many records at the beginning are left out of the mean innovation."""
+
+
+class DiffersError(Exception):
+    """The first difference between a replay and its journal: after which entry, and what."""
+
+    def __init__(self, sequence: int, sentence: str) -> None:
+        self.sequence, self.sentence = sequence, sentence
+        super().__init__(sentence)
+
+
+_COMPARED = ("event", "sequence", "kind", "joint", "from", "to")
+"""Keys of a decision that other last digits do not change."""
+
+
+class ReplayVerifier:
+    """Compares states and decisions with those that were noted; mutable.
+
+    States are compared to the last bit. Where a segment was written by another evaluator they differ in the last
+    digits: decisions, levels and counts are compared, and the session goes on from each state that was noted in full.
+
+    Attributes:
+        states, equal: how many states were noted, and how many of them came out to the last bit.
+        decisions: how many were noted.
+        others: in what the journal's evaluators differ from this one's.
+    """
+
+    def __init__(self, evaluator: Mapping[str, Any]) -> None:
+        self._evaluator = dict(evaluator)
+        self._writer: Any = None
+        self._is_ours = self._is_new = False
+        self.states = self.equal = self.decisions = 0
+        self.others: tuple[str, ...] = ()
+
+    def begin_segment(self, segment: Segment) -> None:
+        writer = segment.header.get("evaluator")
+        self._is_new = self._writer is not None and writer != self._writer
+        self._writer = writer
+        texts = differences(self._evaluator, writer)
+        self._is_ours = not texts
+        self.others = tuple(dict.fromkeys([*self.others, *texts]))
+
+    def compare_checkpoint(self, checkpoint: Entry, session: Recalibrator) -> None:
+        """A full state that was noted where the session is now."""
+        is_new, self._is_new = self._is_new, False
+        with parsing(checkpoint.sequence):
+            state, digest = checkpoint.content["state"], str(checkpoint.content["digest"])
+        if self._is_ours and not is_new:
+            self.compare_digest(checkpoint.sequence, digest, session)
+            return
+        with parsing(checkpoint.sequence):
+            written = _summary(State.from_dict(state))
+        self.states += 1
+        self.equal += digest == session.digest()
+        if written != _summary(session.state):
+            raise DiffersError(checkpoint.sequence, f"Found {_summary(session.state)}; noted was {written}.")
+        session.restore(state)
+
+    def compare_digest(self, sequence: int, noted: str, session: Recalibrator) -> None:
+        """The digest of a state that was noted where the session is now."""
+        digest = session.digest()
+        self.states += 1
+        self.equal += digest == noted
+        if self._is_ours and digest != noted:
+            raise DiffersError(sequence, f"The state is {digest}, {noted} was noted, and the evaluator is the same.")
+
+    def compare_events(self, sequence: int, noted: list[Event], replayed: list[Event]) -> None:
+        self.decisions += len(noted)
+        compared = (noted, replayed) if self._is_ours else (_without_digits(noted), _without_digits(replayed))
+        if compared[0] != compared[1]:
+            raise DiffersError(sequence, f"Found {_listed(replayed)}; noted was {_listed(noted)}.")
+
+    def unnoted_events(self, sequence: int, replayed: list[Event]) -> None:
+        """Events of a record in the replay, where none was noted though the writer went on."""
+        # A full disk takes notes too; where all bits are the same, the states are compared anyway.
+        if not self._is_ours:
+            self.compare_events(sequence, [], replayed)
+
+
+def _without_digits(events: Sequence[Event]) -> list[dict[str, Any]]:
+    return [{key: event[key] for key in _COMPARED if key in event} for event in events]
+
+
+def _listed(events: Sequence[Event]) -> str:
+    return "; ".join(str(event.get("sentence") or event["event"]) for event in events) or "nothing"
+
+
+def _summary(state: State) -> str:
+    return ", ".join(f"{count} {what}" for what, count in state.counts.items()) + f", level {state.health.level}"
 
 
 @dataclass(frozen=True)
