@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation
 KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 FARTHEST_M, FARTHEST_RAD = 0.03, math.radians(5)
 """Frames of a calibrated arm further off the nominal ones are of another arm, or in other units."""
+_FARTHEST = FARTHEST_M, FARTHEST_RAD
+_UNKNOWN = "Check units (m, rad), or use a URDF of the arm itself."
 _NEAR_M, _NEAR_RAD = 0.02, 0.1
 """A frame as near to its nominal one stays where it is; another is shifted along its axis, and turned about it."""
 _ALONG = 0.9
@@ -123,41 +125,31 @@ def ur_rows(name: str) -> tuple[Array, Array, Array, Array]:
     return np.zeros(6), np.array([0, a2, a3, 0, 0, 0]), np.array([d1, 0, 0, d4, d5, d6]), _UR_ALPHA
 
 
-def nearest(candidates: Mapping[str, Array], robot: str | None, where: Location | None = None) -> Nominal:
-    """The stated arm, or the nearest of those by whose name ``candidates`` has frames (parent_T_joint, n x 4 x 4).
+def nearest(candidates: Mapping[str, Array], where: Location | None = None) -> Nominal:
+    """The nearest of the arms by whose names ``candidates`` has frames (parent_T_joint, n x 4 x 4).
 
     Raises:
-        DataError: the arm is not known, or the frames are not near to it.
+        DataError: the frames are near to none.
     """
-    arms = nominal_arms()
-    if robot is not None and robot not in arms:
-        raise DataError(f"the arm {robot!r} is not known.", where=where, hint=f"The arms are {', '.join(arms)}.")
-    off = {}
+    arms, off = nominal_arms(), {}
     for name, frames in candidates.items():
-        if len(frames) == len(arms[name].frames):
-            shifts, turns = differences(at_zero(frames), at_zero(arms[name].frames))
-            off[name] = float(shifts.max()), float(turns.max())
-    best = min(off, key=lambda candidate: off[candidate], default="any arm that is known")
-    name, none = robot or best, (math.inf, math.inf)
-    shift, turn = off.get(name, none)
+        shifts, turns = differences(at_zero(frames), at_zero(arms[name].frames))
+        off[name] = float(shifts.max()), float(turns.max())
+    if not off:
+        raise DataError("it has other joints than the arms that armcal knows.", where=where, hint=_UNKNOWN)
+    best = min(off, key=lambda candidate: off[candidate])
+    shift, turn = off[best]
     if shift <= FARTHEST_M and turn <= FARTHEST_RAD:
-        return arms[name]
-    hint = "It fits no arm that armcal knows: check units (m, rad), or use a URDF of the arm itself."
-    if best in off and off[best][0] <= FARTHEST_M and off[best][1] <= FARTHEST_RAD:
-        hint = f"It fits {best}, {1000 * off[best][0]:.2g} mm off: name that one, or check whose calibration it is."
-    apart = f"{1000 * shift:.3g} mm and {math.degrees(turn):.2g} deg off" if shift < math.inf else "it has other joints"
-    limits = f"{1000 * FARTHEST_M:g} mm and {math.degrees(FARTHEST_RAD):g} deg"
-    raise DataError(f"it is not a calibration of {name}: {apart}, expected {limits} at most.", where=where, hint=hint)
+        return arms[best]
+    apart, limits = (f"{1000 * m:.3g} mm and {math.degrees(r):.2g} deg" for m, r in (off[best], _FARTHEST))
+    text = f"it is not a calibration of {best}, the nearest arm: {apart} off, expected {limits} at most."
+    raise DataError(text, where=where, hint=_UNKNOWN)
 
 
-def pose(six: Sequence[float], order: str = "xyz") -> Array:
-    """x, y, z (m), roll, pitch, yaw (rad) as a 4x4 matrix.
-
-    ``xyz`` turns about the fixed axes, as a URDF does: Rz(yaw) Ry(pitch) Rx(roll) [URDF]; ``XYZ`` about the moving
-    ones: Rx(roll) Ry(pitch) Rz(yaw).
-    """
+def pose(six: Sequence[float]) -> Array:
+    """x, y, z (m), roll, pitch, yaw (rad) about the fixed axes as a 4x4 matrix, Rz(yaw) Ry(pitch) Rx(roll) [URDF]."""
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = Rotation.from_euler(order, six[3:]).as_matrix(), six[:3]
+    matrix[:3, :3], matrix[:3, 3] = Rotation.from_euler("xyz", six[3:]).as_matrix(), six[:3]
     return matrix
 
 

@@ -16,17 +16,14 @@ from armcal_makers.arms import at_zero, differences, tips
 from armcal_makers.kinematics import MakersArm, read_kinematics
 
 _MAX_BYTES, _SEED = 1 << 18, 1
-_SAME_M = 1e-5
-"""Two readings of a file that are nearer than this are not worth a warning."""
 
 
 @click.command()
 @click.argument("file", type=FILE)
-@click.option("--robot", metavar="NAME", help="Which arm it is: ur5e, xarm6 [default: the nearest].")
 @click.option("--out", type=FILE, help="The URDF to write.")
 @click.option("--force", is_flag=True, help="Overwrite a file that is there.")
 @speaking
-def maker(console: Console, file: Path, robot: str | None, out: Path | None, force: bool) -> None:
+def maker(console: Console, file: Path, out: Path | None, force: bool) -> None:
     """Compare a maker's calibration with the nominal arm, and write it as a URDF for `armcal new robot --urdf`.
 
     FILE is the kinematics YAML of ur_calibration or of xarm_ros2.
@@ -35,7 +32,7 @@ def maker(console: Console, file: Path, robot: str | None, out: Path | None, for
         spare_inputs(out, file)
         check_output(out, InputError)
     text = text_of(input_bytes(file, _MAX_BYTES, "a maker's calibration"), file, "Save the file as UTF-8.")
-    arm = read_kinematics(text, file, robot)
+    arm = read_kinematics(text, file)
     if out is not None:
         (write_over if force else write_new)({out: _urdf(arm)})
     nominal = arm.nominal
@@ -49,10 +46,8 @@ def maker(console: Console, file: Path, robot: str | None, out: Path | None, for
         name: {"shift_mm": 1000 * float(shift), "turn_deg": float(np.degrees(turn))}
         for name, shift, turn in zip(nominal.joints, *differences(arm.frames, nominal.frames), strict=True)
     }
-    other = arm.other_order_m(commands)
     facts = {"robot": nominal.name, "source": nominal.family.format, "hash": arm.hash, "poses": POSES}
-    facts |= {"other_order_mm": None if other is None else 1000 * other, "out": None if out is None else str(out)}
-    console.result({**facts, **sizes, "joints": joints})
+    console.result({**facts, **sizes, "joints": joints, "out": None if out is None else str(out)})
     console.line(f"{nominal.name} as its maker calibrated it, {nominal.family.format} {arm.hash}".rstrip())
     console.line(
         f"tool against the nominal {nominal.name} in {POSES} random poses: median {sizes['median_mm']:.3f} mm, "
@@ -60,11 +55,6 @@ def maker(console: Console, file: Path, robot: str | None, out: Path | None, for
     )
     rows = ((name, f"{part['shift_mm']:.3f}", f"{part['turn_deg']:.4f}") for name, part in joints.items())
     console.table("Each joint, on the one before it", ("joint", "shift, mm", "turn, deg"), rows)
-    if other is not None and other > _SAME_M:
-        console.warn(
-            "roll, pitch and yaw are read as a URDF, and so ROS, reads them. ur_calibration computes them in the other "
-            f"order: so read, the flange is up to {1000 * other:.3f} mm elsewhere."
-        )
     if out is not None:
         console.line(f"written: {out}; next: armcal new robot NAME --urdf {out}")
 

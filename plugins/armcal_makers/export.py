@@ -36,24 +36,15 @@ from armcal_makers.arms import (
     six_of,
     tips,
 )
-from armcal_makers.kinematics import HASH, MARK, read_kinematics
+from armcal_makers.kinematics import HASH, read_kinematics
 
 TOLERANCE = 1e-9
 """m and rad."""
 _NOTHING = 1e-7
 
 
-class XarmSettings(Settings):
-    """Which arm it is (``xarm6``); the nearest one unless given."""
-
-    robot: str | None = None
-
-
-class UrSettings(XarmSettings):
-    """Which arm it is (``ur5e``), and the hash of the robot's own calibration (``calib_...``).
-
-    A calibration whose URDF ``armcal maker`` wrote knows the hash.
-    """
+class UrSettings(Settings):
+    """The hash of the robot's own calibration (``calib_...``), which one whose URDF ``armcal maker`` wrote knows."""
 
     hash: str | None = None
 
@@ -61,7 +52,7 @@ class UrSettings(XarmSettings):
 class XarmExporter:
     """``kinematics:``, and six numbers of each joint: the file that ``kinematics_suffix`` names."""
 
-    Settings: ClassVar[type[XarmSettings]] = XarmSettings
+    Settings: ClassVar[type[Settings]] = Settings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {}
     family: ClassVar[Family] = XARM
 
@@ -86,10 +77,10 @@ class XarmExporter:
         zero = placed(axes, flange if near else drawn[-1], drawn)
         sixes = (dict(zip(KEYS, six_of(frame), strict=True)) for frame in _between(zero))
         content = {"kinematics": {**dict(zip(nominal.keys, sixes, strict=True)), **self._more(request)}}
-        head = f"{MARK}: {nominal.name}; roll, pitch and yaw are about the fixed axes, as in a URDF.\n"
+        head = f"# Calibrated by armcal: {nominal.name}; roll, pitch and yaw are about the fixed axes, as in a URDF.\n"
         text = (head + yaml.safe_dump(content, sort_keys=False)).encode()
         left = np.linalg.solve(zero[-1], flange)
-        written = read_kinematics(text.decode(), Path(request.out or "kinematics.yaml"), nominal.name)
+        written = read_kinematics(text.decode(), Path(request.out or "kinematics.yaml"))
         _compare(request, chain, self.family, written.frames, left)
         return Exported(text, changed_numbers(request), tuple(request.arm.effects), remarks=_of_tool(left))
 
@@ -97,19 +88,19 @@ class XarmExporter:
         return {}
 
     def _nominal(self, axes: Array) -> Nominal:
-        """The arm that is meant: by its name, or the one whose links are nearest."""
+        """The arm whose links are nearest."""
         candidates = {}
         for name, arm in nominal_arms().items():
             if arm.family is self.family and len(arm.frames) == len(axes):
                 drawn = at_zero(arm.frames)
                 candidates[name] = _between(placed(axes, drawn[-1], drawn))
-        return nearest(candidates, self._settings.robot)
+        return nearest(candidates)
 
 
 class UrExporter(XarmExporter):
     """``kinematics:``, six numbers of each link and a hash: the ``kinematics_params_file`` of the UR driver."""
 
-    Settings: ClassVar[type[XarmSettings]] = UrSettings
+    Settings: ClassVar[type[Settings]] = UrSettings
     family: ClassVar[Family] = UR
 
     def _more(self, request: ExportRequest) -> Mapping[str, str]:

@@ -12,10 +12,8 @@ from armcal.config.yaml_nodes import Node, Origin, entries_of, read_nodes
 from armcal.errors import DataError, Location
 from armcal.io.plain_files import refuse
 
-from armcal_makers.arms import KEYS, UR, Nominal, nearest, nominal_arms, pose, tips
+from armcal_makers.arms import KEYS, UR, Nominal, nearest, nominal_arms, pose
 
-MARK = "# Calibrated by armcal"
-"""How files begin that armcal wrote, in which there is no doubt about the order of angles."""
 HASH = re.compile(r"calib_\d+")
 _LONGEST_M, _WIDEST = 3.0, 2 * math.pi + 1e-6
 _AGAIN = "Extract the file from the robot again."
@@ -28,21 +26,10 @@ class MakersArm:
     nominal: Nominal
     frames: Array  # parent_T_joint (n x 4 x 4)
     hash: str = ""  # by which the maker's driver knows the calibration (calib_...); empty where the file has none
-    moving_axes: Array | None = None  # the frames, if roll, pitch, yaw are about the moving axes; None: one reading
-
-    def other_order_m(self, commands: Array) -> float | None:
-        """How far the flange moves at commands (N x n; rad), at most, between both readings of roll, pitch and yaw.
-
-        ur_calibration computes them about the moving axes, and a URDF takes them about the fixed ones.
-        """
-        if self.moving_axes is None:
-            return None
-        apart = tips(self.frames, commands)[:, :3, 3] - tips(self.moving_axes, commands)[:, :3, 3]
-        return float(np.linalg.norm(apart, axis=1).max())
 
 
-def read_kinematics(text: str, path: Path, robot: str | None = None) -> MakersArm:
-    """An arm from the text of a maker's file; ``path`` names it in messages. The nearest arm, unless one is stated.
+def read_kinematics(text: str, path: Path) -> MakersArm:
+    """An arm from the text of a maker's file; ``path`` names it in messages.
 
     Raises:
         DataError: what was found, what was expected, the line, and what to do.
@@ -67,7 +54,7 @@ def read_kinematics(text: str, path: Path, robot: str | None = None) -> MakersAr
         _refuse(section, ("kinematics",), text)
     rows = [_six(joints[key], ("kinematics", key)) for key in known[0].keys]
     frames = np.array([pose(row) for row in rows])
-    nominal = nearest({arm.name: frames for arm in known}, robot, Location(str(path)))
+    nominal = nearest({arm.name: frames for arm in known}, Location(str(path)))
     if nominal.family is not UR:
         return MakersArm(nominal, frames)
     value = joints["hash"].value if "hash" in joints else ""
@@ -75,8 +62,7 @@ def read_kinematics(text: str, path: Path, robot: str | None = None) -> MakersAr
         hint = "Without it the driver cannot tell whose calibration it is. Extract the file from the robot again."
         shown = repr(str(value)[:40]) if value else "no hash"
         _refuse(section, ("kinematics",), f"found {shown}, expected hash: calib_ and a number.", hint)
-    moving = None if text.startswith(MARK) else np.array([pose(row, "XYZ") for row in rows])
-    return MakersArm(nominal, frames, value, moving)
+    return MakersArm(nominal, frames, value)
 
 
 def _six(section: Node, keys: tuple[str, ...]) -> list[float]:

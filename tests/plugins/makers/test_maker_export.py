@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from armcal.base.settings import Settings
 from armcal.calibration.exporter import request_of
 from armcal.cli.main import cli
 from armcal.errors import ConfigError, InputError
 from armcal_makers.arms import ur_rows
-from armcal_makers.export import UrExporter, UrSettings, XarmExporter, XarmSettings
+from armcal_makers.export import UrExporter, UrSettings, XarmExporter
 from click.testing import CliRunner
 
 from tests.made_calibrations import made_calibration
@@ -73,7 +74,7 @@ def of_maker(folder, text, name):
 
 
 @pytest.mark.parametrize(
-    ("exporter", "text"), [(UrExporter(UrSettings()), UR5E_YAML), (XarmExporter(XarmSettings()), XARM6_YAML)]
+    ("exporter", "text"), [(UrExporter(UrSettings()), UR5E_YAML), (XarmExporter(Settings()), XARM6_YAML)]
 )
 def test_a_makers_file_comes_back_number_by_number(tmp_path, exporter, text):
     request = made(tmp_path, of_maker(tmp_path, text, "arm.urdf"))
@@ -148,9 +149,7 @@ def test_effects_are_named(tmp_path):
     [
         (UrExporter(UrSettings()), "ur5", "no hash"),
         (UrExporter(UrSettings(hash="1")), "ur5", "expected the hash"),
-        (UrExporter(UrSettings(hash=HASH, robot="ur9")), "ur5", "is not known"),
-        (UrExporter(UrSettings(hash=HASH, robot="ur10")), "ur5", "not a calibration of ur10.*It fits ur5"),
-        (XarmExporter(XarmSettings()), "ur5", "not a calibration of"),
+        (XarmExporter(Settings()), "ur5", "not a calibration of"),
     ],
 )
 def test_other_arms_are_refused(tmp_path, exporter, robot, message):

@@ -38,9 +38,9 @@ def armcal(*arguments):
     return CliRunner().invoke(cli, [str(argument) for argument in arguments])
 
 
-def read(folder, text, name="file.yaml", robot=None):
+def read(folder, text, name="file.yaml"):
     (folder / name).write_text(text)
-    return read_kinematics(text, folder / name, robot)
+    return read_kinematics(text, folder / name)
 
 
 def urdf_tips(path, q):
@@ -75,14 +75,6 @@ def test_the_table_is_the_distance_to_the_nominal_arm(tmp_path):
     assert "median 0.89" in ran.stdout and "ur5e" in ran.stdout
 
 
-def test_both_readings_of_the_angles_are_compared(tmp_path):
-    arm, q = read(tmp_path, UR5_YAML), poses()
-    apart = np.linalg.norm((yaml_tip(UR5_ROWS, q) - yaml_tip(UR5_ROWS, q, urdf=False))[:, :3, 3], axis=1)
-    assert arm.other_order_m(q) == pytest.approx(max(apart), rel=1e-6)
-    assert "in the other" in armcal("maker", tmp_path / "file.yaml").stderr
-    assert read(tmp_path, XARM6_YAML).other_order_m(q) is None
-
-
 def test_nominal_arms_are_what_their_makers_publish():
     arms = nominal_arms()
     angles = (
@@ -107,33 +99,30 @@ def without(text, start):
 
 DEGREES = yaml_of([(*row[:3], *map(math.degrees, row[3:])) for row in UR5E_ROWS])
 WRONG = {
-    "empty": ("", None, "no keys"),
-    "not yaml": ("a: [1\n", None, "not valid YAML"),
-    "another file": ("arms: {arm: {model: {type: mdh}}}\n", None, "expected kinematics"),
-    "degrees": (DEGREES, None, "looks like degrees"),
-    "millimetres": (yaml_of([(*(1000 * x for x in row[:3]), *row[3:]) for row in UR5E_ROWS]), None, "expected metres"),
-    "100 times": (UR5E_YAML.replace("-0.425", "-2.425"), None, "not a calibration of"),
-    "other robot": (UR5E_YAML, "ur10e", "It fits ur5e"),
-    "unknown robot": (UR5E_YAML, "ur9", "not known"),
-    "other joints' count": (XARM6_YAML, "xarm7", "other joints"),
-    "other names": (UR5E_YAML.replace("forearm", "lower_arm"), None, "found the joints shoulder, upper_arm, lower_arm"),
-    "missing number": (without(UR5E_YAML, "yaw"), None, "found x, y, z, roll, pitch, expected"),
-    "text": (UR5E_YAML.replace("z: 0.1627", "z: high # "), None, "found 'high', expected a number"),
-    "not finite": (UR5E_YAML.replace("z: 0.1627122445743823", "z: .nan"), None, "expected a number"),
-    "hash missing": (without(UR5E_YAML, "hash"), None, "no hash"),
-    "hash wrong": (UR5E_YAML.replace("calib_1", "1"), None, "expected hash: calib_"),
-    "twice": (UR5E_YAML + "  shoulder: {x: 1}\n", None, "here and at line 2"),
-    "calibration.conf": ("[mounting]\ndelta_theta = [0, 0, 0, 0, 0, 0]\n", None, "with ur_calibration"),
+    "empty": ("", "no keys"),
+    "not yaml": ("a: [1\n", "not valid YAML"),
+    "another file": ("arms: {arm: {model: {type: mdh}}}\n", "expected kinematics"),
+    "degrees": (DEGREES, "looks like degrees"),
+    "millimetres": (yaml_of([(*(1000 * x for x in row[:3]), *row[3:]) for row in UR5E_ROWS]), "expected metres"),
+    "100 times": (UR5E_YAML.replace("-0.425", "-2.425"), "not a calibration of"),
+    "other names": (UR5E_YAML.replace("forearm", "lower_arm"), "found the joints shoulder, upper_arm, lower_arm"),
+    "missing number": (without(UR5E_YAML, "yaw"), "found x, y, z, roll, pitch, expected"),
+    "text": (UR5E_YAML.replace("z: 0.1627", "z: high # "), "found 'high', expected a number"),
+    "not finite": (UR5E_YAML.replace("z: 0.1627122445743823", "z: .nan"), "expected a number"),
+    "hash missing": (without(UR5E_YAML, "hash"), "no hash"),
+    "hash wrong": (UR5E_YAML.replace("calib_1", "1"), "expected hash: calib_"),
+    "twice": (UR5E_YAML + "  shoulder: {x: 1}\n", "here and at line 2"),
+    "calibration.conf": ("[mounting]\ndelta_theta = [0, 0, 0, 0, 0, 0]\n", "with ur_calibration"),
 }
 
 
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_files_are_refused_and_named(tmp_path, case):
-    text, robot, expected = WRONG[case]
+    text, expected = WRONG[case]
     path = tmp_path / "wrong.yaml"
     path.write_text(text)
     with pytest.raises(InputError) as refused:
-        read_kinematics(text, path, robot)
+        read_kinematics(text, path)
     assert expected in str(refused.value) and "wrong.yaml" in str(refused.value)
 
 
