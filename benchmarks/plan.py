@@ -90,10 +90,10 @@ def _one_start(task: Task, start: Indices) -> Row:
     found: dict[str, Indices] = {}
 
     def ours() -> None:
-        found["ours"] = detmax(task, start)[0]
+        found["ours"] = detmax(task, start)
 
     def obvious() -> None:
-        found["svd"] = detmax(task, start, SvdTally(task.candidates))[0]
+        found["svd"] = detmax(task, start, SvdTally(task.candidates))
 
     times = best_times({"ours": ours, "svd": obvious}, repeats=3)
     ends = [value_of(task.candidates, task.criterion, found[name]) for name in ("ours", "svd")]
@@ -112,7 +112,7 @@ def _many_starts(task: Task, starts: list[Indices]) -> Row:
         plans.append(choose(task))
 
     def others() -> None:
-        values.extend(value_of(task.candidates, task.criterion, detmax(task, start)[0]) for start in starts)
+        values.extend(value_of(task.candidates, task.criterion, detmax(task, start)) for start in starts)
 
     times = best_times({"ours": ours, "others": others}, repeats=2)
     note = f"log det {plans[0].value:.4f}, the best random start's {max(values):.4f}"

@@ -15,11 +15,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from typing_extensions import override
 
 from armcal.base.arrays import Array, Indices, Mask
 from armcal.planning.candidates import Candidates
@@ -51,21 +50,12 @@ _FIRST_STEP, _SHRINK, _GAIN = 0.125, 0.5, 1e-9  # of a pose that is moved throug
 
 @dataclass(frozen=True)
 class Plan:
-    """A chosen set of poses.
+    """A chosen set of poses."""
 
-    Attributes:
-        chosen: candidates in the order in which each adds most to those before it (repeated where that was allowed).
-        value: of the criterion, with what is known before.
-        starts: how many were made.
-        swaps: how many poses came in for others, over all starts.
-        relaxation: that the starts began from; of the log determinant where the criterion is no sum over eigenvalues.
-    """
-
-    chosen: Indices
-    value: float
-    starts: int
-    swaps: int
-    relaxation: Relaxation
+    chosen: Indices  # in the order in which each adds most to those before it (repeated where that was allowed)
+    value: float  # of the criterion, with what is known before
+    starts: int  # how many were made
+    relaxation: Relaxation  # of the log determinant where the criterion is no sum over eigenvalues
 
 
 def value_of(candidates: Candidates, by: Criterion, chosen: Indices) -> float:
@@ -102,19 +92,17 @@ def choose(task: Task, starts: int | None = None, seed: int = 0, begin: Indices 
     random = np.random.default_rng(seed)
     given += [_drawn(smaller, relaxed.weights[few], random) for _ in range(starts)]
     kicks = starts * (KICKS_A_START if quick else 1)
-    chosen, swaps = _best(smaller, given, kicks, random)
-    chosen = few[chosen]
+    chosen = few[_best(smaller, given, kicks, random)]
     if len(few) < task.candidates.count:
-        chosen, more = detmax(task, chosen, longest=0)
-        swaps += more
+        chosen = detmax(task, chosen, longest=0)
     chosen = in_order(task, chosen)
-    return Plan(chosen, value_of(task.candidates, task.criterion, chosen), len(given) + 1 + kicks, swaps, relaxed)
+    return Plan(chosen, value_of(task.candidates, task.criterion, chosen), len(given) + 1 + kicks, relaxed)
 
 
 def built_up(task: Task) -> Indices:
     """A plan without a relaxation: pose by pose, then led to where no swap helps; in the order of ``in_order``."""
     held = tally(task.candidates, task.criterion)
-    return in_order(task, detmax(task, _built_up(task, held), held)[0])
+    return in_order(task, detmax(task, _built_up(task, held), held))
 
 
 def in_order(task: Task, chosen: Indices) -> Indices:
@@ -123,14 +111,14 @@ def in_order(task: Task, chosen: Indices) -> Indices:
     return chosen[_built_up(part, tally(part.candidates, part.criterion))]
 
 
-def _best(task: Task, starts: list[Indices], kicks: int, random: np.random.Generator) -> tuple[Indices, int]:
-    """The best plan of these starts, of one built up pose by pose, and of kicks; and how many poses came in over all.
+def _best(task: Task, starts: list[Indices], kicks: int, random: np.random.Generator) -> Indices:
+    """The best plan of these starts, of one built up pose by pose, and of kicks.
 
     A kick exchanges a few poses of the best plan for any others and climbs again: better plans lie near good ones.
     """
     held = tally(task.candidates, task.criterion)
     starts = [*starts, _built_up(task, held)]
-    best, best_value, swaps = starts[0], -np.inf, 0
+    best, best_value = starts[0], -np.inf
     for number in range(len(starts) + kicks):
         if number < len(starts):
             start = starts[number]
@@ -140,11 +128,11 @@ def _best(task: Task, starts: list[Indices], kicks: int, random: np.random.Gener
             size = min(max(1, round(_KICKED * task.count)), len(others))
             kept = random.permutation(best)[: task.count - size]
             start = np.concatenate([kept, random.choice(others, size, replace=False)]).astype(np.intp)
-        chosen, moves = detmax(task, start, held)
-        value, swaps = value_of(task.candidates, task.criterion, chosen), swaps + moves
+        chosen = detmax(task, start, held)
+        value = value_of(task.candidates, task.criterion, chosen)
         if value > best_value:
             best, best_value = chosen, value
-    return best, swaps
+    return best
 
 
 def _drawn(task: Task, weights: Array, random: np.random.Generator) -> Indices:
@@ -190,7 +178,7 @@ class _Climb:
     """A plan under exchange: its poses, how often each is in it, its value beside the start's."""
 
     def __init__(self, task: Task, held: Tally, start: Indices) -> None:
-        self.task, self.held, self.moves = task, held, 0
+        self.task, self.held = task, held
         self.begin(np.asarray(start, dtype=np.intp))
 
     def begin(self, chosen: Indices) -> None:
@@ -226,7 +214,6 @@ class _Climb:
         self.held.add(candidate)
         self.chosen.append(candidate)
         self.times[candidate] += 1
-        self.moves += 1
 
     def _leave(self, place: int) -> None:
         candidate = self.chosen.pop(place)
@@ -234,10 +221,8 @@ class _Climb:
         self.times[candidate] -= 1
 
 
-def detmax(
-    task: Task, start: Indices, held: Tally | None = None, longest: int = _LONGEST_EXCURSION
-) -> tuple[Indices, int]:
-    """DETMAX from a start, then exchanges until none helps: the plan, and how many poses came in."""
+def detmax(task: Task, start: Indices, held: Tally | None = None, longest: int = _LONGEST_EXCURSION) -> Indices:
+    """DETMAX from a start, then exchanges until none helps."""
     climb = _Climb(task, held or tally(task.candidates, task.criterion), start)
     reachable = min(longest, task.count - 1, task.candidates.count * task.limit - task.count)
     length = 1
@@ -250,7 +235,7 @@ def detmax(
         gains = [climb.swap(climb.chosen.index(candidate)) for candidate in plan if candidate in climb.chosen]
         if not any(gain > 0 for gain in gains):
             break
-    return np.sort(np.array(climb.chosen, dtype=np.intp)), climb.moves
+    return np.sort(np.array(climb.chosen, dtype=np.intp))
 
 
 def _excursion(climb: _Climb, length: int) -> bool:
@@ -266,29 +251,8 @@ def _excursion(climb: _Climb, length: int) -> bool:
     return False
 
 
-class Tally(Protocol):
-    """A plan in the making. Values are the criterion's."""
-
-    def restart(self, chosen: Indices) -> None:
-        """Begin anew with these."""
-
-    def add(self, candidate: int) -> None:
-        """Let one in."""
-
-    def remove(self, candidate: int) -> None:
-        """Take one out."""
-
-    def if_added(self) -> Array:
-        """The change of value with each candidate let in (N)."""
-
-    def if_removed(self, chosen: Indices) -> Array:
-        """The change of value without each of these."""
-
-    def if_swapped(self, candidate: int) -> Array:
-        """The change of value with each candidate instead of this one (N)."""
-
-    def tolerance(self) -> float:
-        """Changes below it may be rounding."""
+Tally: TypeAlias = "DeterminantTally | SpectralTally"
+"""The value of a plan as poses enter and leave it: for every candidate at once."""
 
 
 def tally(candidates: Candidates, criterion: Criterion) -> Tally:
@@ -297,8 +261,8 @@ def tally(candidates: Candidates, criterion: Criterion) -> Tally:
     return SpectralTally(candidates, criterion)
 
 
-class DeterminantTally(Tally):
-    """Log determinant. Symmetric n_r x n_r matrices of all candidates are kept packed (pairs x N)."""
+class DeterminantTally:
+    """The log determinant of a plan in the making; n_r x n_r matrices of all candidates are kept packed (pairs x N)."""
 
     def __init__(self, candidates: Candidates) -> None:
         self._candidates = candidates
@@ -308,35 +272,32 @@ class DeterminantTally(Tally):
         self._known = candidates.known() + candidates.ridge() * np.eye(self._size)
         self.restart(np.zeros(0, dtype=np.intp))
 
-    @override
     def restart(self, chosen: Indices) -> None:
         rows = self._candidates.rows[:, chosen, :].reshape(-1, self._size)
         self._settle(self._known + rows.T @ rows)
 
-    @override
     def add(self, candidate: int) -> None:
         self._change(candidate, 1.0)
 
-    @override
     def remove(self, candidate: int) -> None:
         self._change(candidate, -1.0)
 
-    @override
     def if_added(self) -> Array:
+        """The change of value with each candidate let in (N)."""
         return _packed_log_det(self._seen, self._n_rows)  # log det(I + H C H')
 
-    @override
     def if_removed(self, chosen: Indices) -> Array:
+        """The change of value without each of these."""
         return _packed_log_det(-self._seen[:, chosen], self._n_rows)  # log det(I - H C H')
 
-    @override
     def if_swapped(self, candidate: int) -> Array:
+        """The change of value with each candidate instead of this one (N)."""
         loss = self.if_removed(np.array([candidate]))[0]
         half, _ = self._half(candidate, -1.0)
         return _packed_log_det(self._seen + self._outer(half, half), self._n_rows) + float(loss)
 
-    @override
     def tolerance(self) -> float:
+        """Changes below it may be rounding."""
         return _TOLERANCE
 
     def _settle(self, information: Array) -> None:
@@ -389,15 +350,12 @@ class DeterminantTally(Tally):
 class TraceTally(DeterminantTally):
     """Minus the trace of the covariance; H C^2 H' is kept beside H C H'."""
 
-    @override
     def if_added(self) -> Array:
         return _packed_trace(self._seen, self._squared, self._n_rows)  # tr (I + H C H')^-1 H C^2 H'
 
-    @override
     def if_removed(self, chosen: Indices) -> Array:
         return -_packed_trace(-self._seen[:, chosen], self._squared[:, chosen], self._n_rows)
 
-    @override
     def if_swapped(self, candidate: int) -> Array:
         loss = self.if_removed(np.array([candidate]))[0]
         half, factor = self._half(candidate, -1.0)
@@ -405,7 +363,6 @@ class TraceTally(DeterminantTally):
         squared = self._squared_after(half, factor, -1.0)
         return _packed_trace(seen, squared, self._n_rows) + float(loss)
 
-    @override
     def tolerance(self) -> float:
         return _TOLERANCE * float(np.trace(self._inverse))
 
@@ -427,7 +384,7 @@ class TraceTally(DeterminantTally):
         return np.asarray(self._squared - sign * cross + self._outer(mixed, half))
 
 
-class SpectralTally(Tally):
+class SpectralTally:
     """Any function of eigenvalues, by decomposition; beyond ``SHORTLIST`` candidates, of those that promise most."""
 
     def __init__(self, candidates: Candidates, criterion: Criterion) -> None:
@@ -435,32 +392,25 @@ class SpectralTally(Tally):
         self._known = candidates.known() + candidates.ridge() * np.eye(candidates.size)
         self.restart(np.zeros(0, dtype=np.intp))
 
-    @override
     def restart(self, chosen: Indices) -> None:
         rows = self._candidates.rows[:, chosen, :].reshape(-1, self._candidates.size)
         self._settle(self._known + rows.T @ rows)
 
-    @override
     def add(self, candidate: int) -> None:
         self._settle(self._information + self._of(np.array([candidate]))[0])
 
-    @override
     def remove(self, candidate: int) -> None:
         self._settle(self._information - self._of(np.array([candidate]))[0])
 
-    @override
     def if_added(self) -> Array:
         return self._tried(self._information)
 
-    @override
     def if_removed(self, chosen: Indices) -> Array:
         return self._values(self._information - self._of(chosen)) - self._value
 
-    @override
     def if_swapped(self, candidate: int) -> Array:
         return self._tried(self._information - self._of(np.array([candidate]))[0])
 
-    @override
     def tolerance(self) -> float:
         return _TOLERANCE * abs(self._value)
 
