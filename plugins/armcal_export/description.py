@@ -1,137 +1,204 @@
-"""What the formats ``yaml`` and ``json`` say of an arm: every field with its unit, its frame and its meaning."""
+"""The exporters ``yaml`` and ``json``: a description of the arm, read again and rebuilt before it is written."""
 
-from typing import Annotated, Any, Literal
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from importlib import resources
+from typing import Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+import numpy as np
+import yaml
+from armcal.arm.model import Mimic
+from armcal.base.arrays import Array
+from armcal.base.settings import Settings
+from armcal.calibration.exporter import Exported, ExportRequest, changed_numbers
+from armcal.calibration.rigid_chain import RigidChain, RigidJoint
+from armcal.errors import ProblemError
+from typing_extensions import override
 
-SCHEMA = 1
+from armcal_export.content import REPORT, content_of, require_same_tools
+
 SCHEMA_FILE = "arm.schema.json"
-
-Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
-Rotation = Annotated[list[Vector], Field(min_length=3, max_length=3)]
-
-
-class _Entry(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
+_SCHEMA = 1
+_HEAD = f"# A calibrated robot arm; {SCHEMA_FILE} says what each field means. Units are SI, angles in rad.\n"
 
 
-class Pose(_Entry):
-    """A frame in another one."""
+class DescriptionSettings(Settings):
+    """What is written beside the description.
 
-    position_m: Vector = Field(description="Where the frame's origin is.")
-    rotation: Rotation = Field(description="Rows of the rotation matrix: its columns are the frame's axes.")
-
-
-class Calibration(_Entry):
-    """Where the numbers come from."""
-
-    experiment: str
-    created: str = Field(description="ISO 8601.")
-    software: dict[str, str]
-    identity: dict[str, str] = Field(description="SHA-256 of what the calibration was made from.")
-    digest: str = Field(description="SHA-256 of the arm's description and its calibrated values.")
-
-
-class Follows(_Entry):
-    """A joint's displacement is multiplier times that of another joint's command, plus offset."""
-
-    joint: str
-    multiplier: float
-    offset: float = Field(description="rad or m.")
-
-
-class Joint(_Entry):
-    """A joint at zero command: it moves what is beyond it about or along its axis."""
-
-    name: str
-    kind: Literal["revolute", "prismatic"]
-    base_T_joint: Pose = Field(description="Its frame in the base frame with all commands zero.")
-    axis: Vector = Field(description="Unit vector in its own frame, through its origin.")
-    scale: float = Field(description="How far it moves for a command of one (rad per rad, m per m).")
-    pitch: float = Field(description="Of a revolute joint how far it slides as it turns (m/rad); else rad/m.")
-    lower: float | None = Field(description="Lowest command (rad or m); null where none is known.")
-    upper: float | None = Field(description="Highest command (rad or m); null where none is known.")
-    endless: bool = Field(description="Whether it may turn on and on.")
-    follows: Follows | None = Field(description="The joint that it follows; null for one that is commanded.")
-
-
-class Effect(_Entry):
-    """What stands between command and motion; its parameters are those named ARM.NAME.*."""
-
-    name: str
-    type: str
-    settings: dict[str, Any] = Field(description="As in armcal's configuration, SI units in the keys.")
-
-
-class SpringEntry(_Entry):
-    """An elastic deflection at a site: axes times (compliance times the load's components along the axes)."""
-
-    effect: str
-    site: int = Field(description="0: the mount; i: joint i, from 1, after its motion.")
-    axes: list[Vector] = Field(description="Unit vectors in the site's frame; the load is the moment about them.")
-    along: bool = Field(description="Whether it slides along its axis, under the force and not the moment.")
-    compliance: list[list[float]] = Field(description="rad/(N m), or m/N; under a small load if not linear.")
-    linear: bool
-
-
-class MassEntry(_Entry):
-    """A mass of the arm."""
-
-    name: str
-    mass_kg: float
-    com_m: Vector = Field(description="Its centre in the base frame with all commands zero.")
-    moved_by: int = Field(description="The joint that moves it, from 1; 0: none.")
-    loads_up_to: int = Field(description="The last joint that it was taken to load, from 1.")
-
-
-class Statics(_Entry):
-    """What acts on the arm where nothing is said."""
-
-    gravity_m_s2: Vector = Field(description="In the base frame, as calibrated.")
-    payload_kg: float | None = Field(description="On the tool, beside the masses; null where it was not stated.")
-    payload_com_m: Vector = Field(description="In the tool frame.")
-    force_N: Vector
-    torque_Nm: Vector
-
-
-class Servo(_Entry):
-    """Pulses of a joint's servo, linear between the points and beyond them."""
-
-    joint: str
-    angles_rad: list[float]
-    pulses_s: list[float]
-    tick_s: float = Field(description="Length of one count of the board.")
-
-
-class Parameter(_Entry):
-    """A number of the calibration."""
-
-    name: str
-    unit: str
-    nominal: float
-    value: float
-    free: bool
-    sd: float | None = Field(description="Standard deviation; null where it is not known.")
-    determined: bool | None = Field(description="Whether the measurements determined it.")
-
-
-class ArmDescription(_Entry):
-    """A calibrated arm. All units are SI, angles in rad.
-
-    Rigid kinematics: base_T_tool(q) = S1(q1) ... Sn(qn) base_T_tool(0), where Si moves along joint i's axis as it
-    stands at zero command: a turn by scale * q about it and a slide by pitch * scale * q along it (revolute), or a
-    slide by scale * q and a turn by pitch * scale * q (prismatic).
+    Attributes:
+        beside: ``schema`` writes the JSON schema into the same folder, ``nothing`` leaves it out.
     """
 
-    armcal_arm: Literal[1] = Field(description="Version of this schema.")
-    arm: str
-    calibration: Calibration
-    joints: list[Joint] = Field(description="From the base to the tool.")
-    base_T_mount: Pose = Field(description="What joint 1 stands on, in the base frame.")
-    base_T_tool: Pose = Field(description="The tool in the base frame with all commands zero, without effects.")
-    effects: list[Effect]
-    springs: list[SpringEntry]
-    masses: list[MassEntry]
-    statics: Statics
-    servos: list[Servo]
-    parameters: list[Parameter]
+    beside: Literal["schema", "nothing"] = "schema"
+
+
+class YamlExporter:
+    """As YAML."""
+
+    Settings: ClassVar[type[DescriptionSettings]] = DescriptionSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {}
+
+    def __init__(self, settings: DescriptionSettings) -> None:
+        self._settings = settings
+
+    def export(self, request: ExportRequest) -> Exported:
+        """The description and its schema.
+
+        Raises:
+            ProblemError: the tool hangs on a joint before the last, or what reads back is another arm.
+        """
+        description = described(request)
+        content = self.written(description)
+        again = self.read(content)
+        require_same_tools(request, read_chain(again))
+        if again != description:
+            raise ProblemError("what reads back is not the calibrated arm to the last digit.", hint=REPORT)
+        schema = resources.files("armcal_export").joinpath(SCHEMA_FILE)
+        beside = {SCHEMA_FILE: schema.read_bytes()} if self._settings.beside == "schema" else {}
+        return Exported(content, changed_numbers(request), companions=beside)
+
+    def written(self, description: Mapping[str, Any]) -> bytes:
+        text = yaml.dump(
+            description, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110, default_flow_style=None
+        )
+        return (_HEAD + text).encode("utf-8")
+
+    def read(self, content: bytes) -> dict[str, Any]:
+        return dict(yaml.safe_load(content))
+
+
+class JsonExporter(YamlExporter):
+    """As JSON."""
+
+    @override
+    def written(self, description: Mapping[str, Any]) -> bytes:
+        return f"{json.dumps(description, indent=2, ensure_ascii=False, allow_nan=False)}\n".encode()
+
+    @override
+    def read(self, content: bytes) -> dict[str, Any]:
+        return dict(json.loads(content))
+
+
+class _Dumper(yaml.SafeDumper):
+    """Rows of numbers on one line, and text of several lines in double quotes, which keep every kind of line end."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _quoted(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=None if text.isprintable() else '"')
+
+
+_Dumper.add_representer(str, _quoted)
+
+
+def described(request: ExportRequest) -> dict[str, Any]:
+    """The arm as ``arm.schema.json`` has it."""
+    content, origin, statics = content_of(request), request.origin, request.environment
+    effects: Mapping[str, Mapping[str, Any]] = request.description.get("effects", {})
+    return {
+        "armcal_arm": _SCHEMA,
+        "arm": request.name,
+        "calibration": {
+            "experiment": origin.experiment,
+            "created": origin.created,
+            "software": dict(origin.software),
+            "identity": dict(origin.identity),
+            "digest": request.digest,
+        },
+        "joints": [_joint(joint) for joint in content.rigid.joints],
+        "base_T_mount": _pose(content.rigid.base_T_mount),
+        "base_T_tool": _pose(content.rigid.base_T_tool),
+        "effects": [
+            {
+                "name": name,
+                "type": str(effects.get(name, {}).get("type", "")),
+                "settings": _plain({key: value for key, value in effects.get(name, {}).items() if key != "type"}),
+            }
+            for name in request.arm.effects
+        ],
+        "springs": [asdict(spring) for spring in content.springs],
+        "masses": [asdict(mass) for mass in content.masses],
+        "statics": {
+            "gravity_m_s2": content.gravity,
+            "payload_kg": float(statics.payload_mass) if request.payload_stated else None,
+            "payload_com_m": _floats(statics.payload_com),
+            "force_N": _floats(statics.force),
+            "torque_Nm": _floats(statics.torque),
+        },
+        "servos": [
+            {
+                "joint": name,
+                "angles_rad": _floats(table.angles),
+                "pulses_s": _floats(table.pulses),
+                "tick_s": float(clock.tick),
+            }
+            for name, (table, clock) in request.expression().servos.items()
+        ],
+        "parameters": _parameters(request),
+    }
+
+
+def _joint(joint: RigidJoint) -> dict[str, Any]:
+    lower, upper = map(float, joint.limits) if joint.limits else (None, None)
+    mimic = joint.mimic
+    return {
+        "name": joint.name,
+        "kind": "prismatic" if joint.slides else "revolute",
+        "base_T_joint": _pose(joint.base_T_joint),
+        "axis": joint.axis.tolist(),
+        "scale": float(joint.scale),
+        "pitch": float(joint.pitch),
+        "lower": lower,
+        "upper": upper,
+        "endless": joint.endless,
+        "follows": mimic
+        and {"joint": mimic.master, "multiplier": float(mimic.multiplier), "offset": float(mimic.offset)},
+    }
+
+
+def _parameters(request: ExportRequest) -> list[dict[str, Any]]:
+    if request.entries:
+        names = ("name", "unit", "nominal", "value", "free", "sd", "determined")
+        return [{name: getattr(entry, name) for name in names} for entry in request.entries]
+    blocks = {block.name: block for block in request.arm.parameters()}
+    unknown = {"free": False, "sd": None, "determined": None}
+    return [
+        {"name": name, "unit": blocks[key].entry_unit, "nominal": nominal, "value": float(value), **unknown}
+        for key, numbers in request.values.items()
+        for name, nominal, value in zip(blocks[key].entry_names, blocks[key].nominal, numbers, strict=True)
+    ]
+
+
+def read_chain(description: Mapping[str, Any]) -> RigidChain:
+    """The rigid arm that a description specifies."""
+    joints = []
+    for joint in description["joints"]:
+        follows, axis, at = joint["follows"], np.array(joint["axis"]), _matrix(joint["base_T_joint"])
+        mimic = follows and Mimic(follows["joint"], follows["multiplier"], follows["offset"])
+        slides, law = joint["kind"] == "prismatic", (joint["pitch"], joint["scale"])
+        joints.append(RigidJoint(joint["name"], at, axis, slides, *law, mimic=mimic))
+    return RigidChain(tuple(joints), _matrix(description["base_T_mount"]), _matrix(description["base_T_tool"]))
+
+
+def _pose(matrix: Array) -> dict[str, Any]:
+    return {"position_m": matrix[:3, 3].tolist(), "rotation": matrix[:3, :3].tolist()}
+
+
+def _matrix(pose: Mapping[str, Any]) -> Array:
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = pose["rotation"], pose["position_m"]
+    return result
+
+
+def _floats(numbers: Any) -> list[float]:
+    return [float(number) for number in numbers]
+
+
+def _plain(value: Any) -> Any:
+    """Settings as JSON has them: lists for tuples."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(own) for key, own in value.items()}
+    return [_plain(own) for own in value] if isinstance(value, list | tuple) else value

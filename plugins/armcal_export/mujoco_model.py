@@ -1,8 +1,14 @@
-"""The exporter ``mujoco``: an MJCF model, loaded by MuJoCo, brought to rest and compared before it is written."""
+"""The exporter ``mujoco``: an MJCF model, loaded by MuJoCo, brought to rest and compared before it is written. [MJCF]
 
+Bodies stand for joints, passive hinges in series with the drives for linear springs, inertials for masses.
+"""
+
+import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from importlib import resources
 from typing import Annotated, Any, ClassVar
 
 import casadi as ca
@@ -10,6 +16,7 @@ import numpy as np
 from armcal.arm.assembly import scoped
 from armcal.arm.effects import JointCommand, reshapes
 from armcal.base.arrays import Array
+from armcal.base.quaternions import quaternion_of
 from armcal.base.settings import Settings
 from armcal.calibration.exporter import (
     POSES,
@@ -20,21 +27,24 @@ from armcal.calibration.exporter import (
     random_commands,
     rigid_tools,
 )
-from armcal.calibration.rigid_chain import RigidChain, require_plain_axes, rigid_chain
+from armcal.calibration.rigid_chain import RigidChain, require_plain_axes
 from armcal.errors import InputError, NotConvergedError, ProblemError
 from pydantic import Field
 
-from armcal_export.describe import REPORT, chain_of, describe
-from armcal_export.description import ArmDescription, SpringEntry
-from armcal_export.mjcf import Drive, Hinge, mjcf
-from armcal_export.mujoco_rest import LoadedModel
-from armcal_export.reference import in_equilibrium
+from armcal_export.content import REPORT, ArmContent, ArmMass, ArmSpring, content_of, in_equilibrium
 
 TOLERANCE = 1e-9
 """m, and entries of rotation matrices, of the rigid arm."""
+NO_MASS_KG = 1e-9
+"""What MuJoCo is told of a body without a mass: it refuses none, and this bends nothing."""
+_DAMPING = 0.1
+"""Of a spring, for the root of its stiffness: so that models come to rest in a few seconds."""
+_RADIUS_M = 0.03
+"""Masses are told as small balls: armcal knows their weight and centre, and not how they resist turning."""
 _COMMANDS = (-0.31, 0.42)
 _NO_SPRING = 1e-12
 """rad/(N m) or m/N: what gives less than this is no spring."""
+_TURNS, _AT_REST, _FARTHEST, _DIFFERENCE = 60, 1e-12, 1.5, 1e-6
 
 
 class MujocoSettings(Settings):
@@ -67,72 +77,33 @@ class MujocoExporter:
             InputError: MuJoCo is not installed, or the arm has joints that MJCF has not.
             ProblemError: MuJoCo's arm is another one.
         """
-        chain = chain_of(request)
-        rigid, arm_description = rigid_chain(chain), describe(request)
-        require_plain_axes(rigid, "mujoco")
-        drive = Drive(self._settings.gain, self._settings.damping, self._settings.armature)
-        content = mjcf(arm_description, rigid, _hinges(arm_description.springs), drive)
-        loaded = _loaded(content, rigid)
+        arm = content_of(request)
+        require_plain_axes(arm.rigid, "mujoco")
+        environment = request.environment
+        payload = (environment.payload_mass if request.payload_stated else 0.0, environment.payload_com)
+        content = mjcf(arm, payload, hinges_of(arm.springs), self._settings)
+        loaded = _loaded(content, arm.rigid)
         commands = random_commands(request.arm, POSES)
         tools = np.array([loaded.rigid_tool(command) for command in commands.T])
         apart = float(np.abs(tools - rigid_tools(request.arm, request.values, commands)).max())
         if not apart <= TOLERANCE:
             text = f"MuJoCo's arm is {apart:.3g} m or 1 off the calibrated one, expected {TOLERANCE:g} at most."
             raise ProblemError(text, hint=REPORT)
-        reach = _reach(request, loaded, commands)
-        left_out = _left_out(request, arm_description)
+        expression, reach = request.expression(), 0.0
+        expected, _, settled = in_equilibrium(expression, expression.records(commands).T)
+        for command, tool in zip(commands.T[settled], expected[settled], strict=True):
+            with suppress(NotConvergedError):
+                reach = max(reach, float(np.linalg.norm(loaded.tool_at_rest(command)[:3, 3] - tool[:, 3])))
+        left_out = _left_out(request, arm)
         if not left_out and reach > TOLERANCE and not leaves_residual_out(self, request):
             left_out = ("turns of second order in its springs",)
         return Exported(content, changed_numbers(request), left_out, reach=reach)
 
 
-def _loaded(content: bytes, rigid: RigidChain) -> LoadedModel:
-    try:
-        return LoadedModel(content, rigid)
-    except ModuleNotFoundError as fault:
-        raise InputError(
-            "the format mujoco needs MuJoCo, which is not installed.", hint="Install it: pip install armcal[mujoco]."
-        ) from fault
-    except ValueError as fault:
-        raise ProblemError(f"MuJoCo does not take the model: {str(fault)[:300]}.", hint=REPORT) from fault
-
-
-def _hinges(springs: Sequence[SpringEntry]) -> Mapping[int, Sequence[Hinge]]:
-    """Linear springs as hinges along principal axes, by site."""
-    turning: dict[int, Array] = defaultdict(lambda: np.zeros((3, 3)))
-    sliding: dict[int, float] = defaultdict(float)
-    axes: dict[int, Array] = {}
-    for spring in springs:
-        if not spring.linear:
-            continue
-        if spring.along:
-            sliding[spring.site] += spring.compliance[0][0]
-            axes[spring.site] = np.array(spring.axes[0])
-        else:
-            about = np.array(spring.axes)
-            turning[spring.site] += about.T @ np.array(spring.compliance) @ about
-    hinges: dict[int, list[Hinge]] = defaultdict(list)
-    for site, compliance in sliding.items():
-        hinges[site] += _kept([(axes[site], compliance)], slides=True)
-    for site, matrix in turning.items():
-        sizes, directions = np.linalg.eigh(0.5 * (matrix + matrix.T))
-        # without the rounding of eigenvectors that are coordinate axes
-        near = np.round(directions)
-        directions = np.where(np.isclose(directions, near, rtol=0, atol=1e-12).all(axis=0), near, directions)
-        hinges[site] += _kept(list(zip(directions.T, sizes, strict=True)), slides=False)
-    return hinges
-
-
-def _kept(axes: Sequence[tuple[Array, float]], slides: bool) -> list[Hinge]:
-    return [
-        Hinge((float(a[0]), float(a[1]), float(a[2])), slides, float(size)) for a, size in axes if size > _NO_SPRING
-    ]
-
-
-def _left_out(request: ExportRequest, arm_description: ArmDescription) -> tuple[str, ...]:
-    bent = {spring.effect for spring in arm_description.springs if not spring.linear}
+def _left_out(request: ExportRequest, arm: ArmContent) -> tuple[str, ...]:
+    bent = {spring.effect for spring in arm.springs if not spring.linear}
     effects = [name for name in request.arm.effects if name in bent or _displaces(request, name)]
-    masses = [mass.name for mass in arm_description.masses if mass.loads_up_to != mass.moved_by and mass.mass_kg > 0]
+    masses = [mass.name for mass in arm.masses if mass.loads_up_to != mass.moved_by and mass.mass_kg > 0]
     counted = [f"what {', '.join(masses)} load beyond the joints that carry them"] if masses else []
     acting = np.any(request.environment.force) or np.any(request.environment.torque)
     wrench = ["the force and torque on the tool"] if acting else []
@@ -146,18 +117,220 @@ def _displaces(request: ExportRequest, name: str) -> bool:
         return True
     values = {full: ca.SX(list(map(float, value))) for full, value in request.values.items()}
     local = scoped(values, f"{request.name}.{name}.")
-    joint_commands = [
-        JointCommand(i, ca.SX(command), ca.SX(1.0))
-        for i in range(len(request.arm.joint_names))
-        for command in _COMMANDS
+    joints = range(len(request.arm.joint_names))
+    commands = [JointCommand(i, ca.SX(command), ca.SX(1.0)) for i in joints for command in _COMMANDS]
+    return any(float(ca.evalf(ca.SX(effect.displacement(command, local)))) != 0.0 for command in commands)
+
+
+@dataclass(frozen=True)
+class Hinge:
+    """A passive spring: about or along a unit vector of its site's frame (rad/(N m) or m/N)."""
+
+    axis: tuple[float, float, float]
+    slides: bool
+    compliance: float
+
+
+def hinges_of(springs: Sequence[ArmSpring]) -> Mapping[int, Sequence[Hinge]]:
+    """Linear springs as hinges along principal axes, by site (0: the mount)."""
+    turning: dict[int, Array] = defaultdict(lambda: np.zeros((3, 3)))
+    sliding: dict[int, float] = defaultdict(float)
+    hinges: dict[int, list[Hinge]] = defaultdict(list)
+    along: dict[int, Array] = {}
+    for spring in springs:
+        if spring.linear and spring.along:
+            sliding[spring.site] += spring.compliance[0][0]
+            along[spring.site] = np.array(spring.axes[0])
+        elif spring.linear:
+            about = np.array(spring.axes)
+            turning[spring.site] += about.T @ np.array(spring.compliance) @ about
+    axes = [(site, along[site], compliance, True) for site, compliance in sliding.items()]
+    for site, matrix in turning.items():
+        sizes, directions = np.linalg.eigh(0.5 * (matrix + matrix.T))
+        # without the rounding of eigenvectors that are coordinate axes
+        near = np.round(directions)
+        directions = np.where(np.isclose(directions, near, rtol=0, atol=1e-12).all(axis=0), near, directions)
+        axes += [(site, axis, size, False) for axis, size in zip(directions.T, sizes, strict=True)]
+    for site, axis, compliance, slides in axes:
+        if compliance > _NO_SPRING:
+            hinges[site].append(Hinge((float(axis[0]), float(axis[1]), float(axis[2])), slides, float(compliance)))
+    return hinges
+
+
+def mjcf(
+    arm: ArmContent,
+    payload: tuple[float, Sequence[float]],
+    springs: Mapping[int, Sequence[Hinge]],
+    drive: MujocoSettings,
+) -> bytes:
+    """The model; ``payload`` is its mass (kg) and its centre in the tool frame (m)."""
+    import jinja2
+
+    rigid, (carried, com) = arm.rigid, payload
+    bodies = [_body(arm, "mount", 0, np.eye(4), rigid.base_T_mount, springs)]
+    here = rigid.base_T_mount
+    for number, joint in enumerate(rigid.joints, start=1):
+        body = _body(arm, joint.name, number, here, joint.base_T_joint, springs)
+        kind = "slide" if joint.slides else "hinge"
+        body["joint"] = {"name": joint.name, "type": kind, "axis": _row(joint.axis), "range": _row(joint.limits or ())}
+        bodies.append(body)
+        here = joint.base_T_joint
+    at_tool = np.linalg.inv(here) @ rigid.base_T_tool
+    hung = {"pos": _row((at_tool @ [*com, 1.0])[:3]), "mass": _row([carried]), "inertia": _row([_ball(carried)] * 3)}
+    following = [(joint.name, joint.mimic) for joint in rigid.joints if joint.mimic is not None]
+    template = resources.files("armcal_export").joinpath("templates", "arm.xml.j2").read_text(encoding="utf-8")
+    environment = jinja2.Environment(
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    text = environment.from_string(template).render(
+        name=arm.name,
+        gravity=_row(arm.gravity),
+        no_mass=NO_MASS_KG,
+        bodies=bodies,
+        tool=_placed(at_tool),
+        payload=hung if carried > 0 else None,
+        following=[
+            {"name": name, "master": mimic.master, "polycoef": _row([mimic.offset, mimic.multiplier, 0.0, 0.0, 0.0])}
+            for name, mimic in following
+        ],
+        commanded=[{"name": j.name, "range": _row(j.limits or ())} for j in rigid.joints if j.mimic is None],
+        **drive.model_dump(),
+    )
+    return text.encode("utf-8")
+
+
+def _body(
+    arm: ArmContent, site: str, number: int, above: Array, here: Array, springs: Mapping[int, Sequence[Hinge]]
+) -> dict[str, Any]:
+    """What a joint moves, or the mount: where it is, its springs, and its masses as one."""
+    listed = [
+        {
+            "name": f"{site}_spring{place}",
+            "type": "slide" if hinge.slides else "hinge",
+            "axis": _row(hinge.axis),
+            "stiffness": _row([1.0 / hinge.compliance]),
+            "damping": _row([_DAMPING * math.sqrt(1.0 / hinge.compliance)]),
+        }
+        for place, hinge in enumerate(springs.get(number, ()), start=1)
     ]
-    return any(float(ca.evalf(ca.SX(effect.displacement(command, local)))) != 0.0 for command in joint_commands)
+    masses = [mass for mass in arm.masses if mass.moved_by == number and mass.mass_kg > 0]
+    inertial = _inertial(masses, here) if masses else None
+    placed = _placed(np.linalg.inv(above) @ here)
+    return {"name": f"{arm.name}_{site}", **placed, "joint": None, "springs": listed, "inertial": inertial}
 
 
-def _reach(request: ExportRequest, loaded: LoadedModel, commands: Array) -> float:
-    expression, largest = request.expression(), 0.0
-    tools, _, settled = in_equilibrium(expression, expression.records(commands).T)
-    for command, tool in zip(commands.T[settled], tools[settled], strict=True):
-        with suppress(NotConvergedError):
-            largest = max(largest, float(np.linalg.norm(loaded.tool_at_rest(command)[:3, 3] - tool[:, 3])))
-    return largest
+def _inertial(masses: Sequence[ArmMass], base_T_body: Array) -> dict[str, str]:
+    back = np.linalg.inv(base_T_body)
+    at = np.array([(back @ [*mass.com_m, 1.0])[:3] for mass in masses])
+    weights = np.array([mass.mass_kg for mass in masses])
+    centre = weights @ at / weights.sum()
+    beside = at - centre
+    spread = np.einsum("i,ij,ij->", weights, beside, beside) * np.eye(3) - (beside.T * weights) @ beside
+    inertia = spread + _ball(weights.sum()) * np.eye(3)
+    full = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+    return {"pos": _row(centre), "mass": _row([weights.sum()]), "inertia": _row(full)}
+
+
+def _ball(mass: float) -> float:
+    return 0.4 * mass * _RADIUS_M**2
+
+
+def _placed(pose: Array) -> dict[str, str]:
+    return {"pos": _row(pose[:3, 3]), "quat": _row(quaternion_of(pose[:3, :3]))}
+
+
+def _row(numbers: Sequence[float] | Array) -> str:
+    return " ".join(repr(float(number)) for number in numbers)
+
+
+def _loaded(content: bytes, rigid: RigidChain) -> "LoadedModel":
+    try:
+        return LoadedModel(content, rigid)
+    except ModuleNotFoundError as fault:
+        raise InputError(
+            "the format mujoco needs MuJoCo, which is not installed.", hint="Install it: pip install armcal[mujoco]."
+        ) from fault
+    except ValueError as fault:
+        raise ProblemError(f"MuJoCo does not take the model: {str(fault)[:300]}.", hint=REPORT) from fault
+
+
+class LoadedModel:
+    """A model that MuJoCo took.
+
+    Raises:
+        ModuleNotFoundError: MuJoCo is not installed.
+        ValueError: it refuses the model.
+    """
+
+    def __init__(self, content: bytes, rigid: RigidChain) -> None:
+        import mujoco
+
+        self._mujoco: Any = mujoco
+        self._model: Any = self._mujoco.MjModel.from_xml_string(content.decode("utf-8"))
+        self._data: Any = self._mujoco.MjData(self._model)
+        self._rigid = rigid
+        self._site = self._model.site("tool").id
+        self._places = {joint.name: int(self._model.joint(joint.name).qposadr[0]) for joint in rigid.joints}
+        driven = set(self._places.values())
+        self._springs = np.array([i for i in range(self._model.nq) if i not in driven], dtype=int)
+
+    def rigid_tool(self, command: Array) -> Array:
+        """base_T_tool (4 x 4) with no spring bent, at commands of the commanded joints."""
+        self._set(command)
+        return self._tool()
+
+    def tool_at_rest(self, command: Array) -> Array:
+        """base_T_tool (4 x 4) where the springs balance gravity and the joints stand at their commands.
+
+        Raises:
+            NotConvergedError: they find no balance.
+        """
+        self._set(command)
+        if len(self._springs):
+            self._settle()
+        return self._tool()
+
+    def _set(self, command: Array) -> None:
+        content = dict(zip([j.name for j in self._rigid.joints if j.mimic is None], command, strict=True))
+        self._data.qpos[:] = 0.0
+        for joint in self._rigid.joints:
+            q = content[joint.name] if joint.mimic is None else content[joint.mimic.master] * joint.mimic.multiplier
+            self._data.qpos[self._places[joint.name]] = q + (joint.mimic.offset if joint.mimic else 0.0)
+        self._data.qvel[:] = 0.0
+
+    def _settle(self) -> None:
+        """Newton's steps on spring torque minus weight, with slopes by differences."""
+        springs = self._springs
+        for _ in range(_TURNS):
+            missing = self._missing()
+            slope = np.empty((len(springs), len(springs)))
+            for column, place in enumerate(springs):
+                self._data.qpos[place] += _DIFFERENCE
+                slope[:, column] = (self._missing() - missing) / _DIFFERENCE
+                self._data.qpos[place] -= _DIFFERENCE
+            step = np.linalg.solve(slope, -missing)
+            longest = float(np.abs(step).max())
+            self._data.qpos[springs] += step * min(1.0, 0.3 / max(longest, _AT_REST))
+            if longest <= _AT_REST:
+                return
+            if not np.abs(self._data.qpos[springs]).max() < _FARTHEST:
+                break
+        if not longest <= 1e-9:
+            raise NotConvergedError("the model in MuJoCo finds no balance.", hint="Check masses and compliances.")
+
+    def _missing(self) -> Array:
+        """What keeps the springs from rest (N m or N): weight minus spring."""
+        self._mujoco.mj_forward(self._model, self._data)
+        both = self._data.qfrc_bias - self._data.qfrc_passive
+        return np.asarray(both[self._springs])
+
+    def _tool(self) -> Array:
+        self._mujoco.mj_kinematics(self._model, self._data)
+        result = np.eye(4)
+        result[:3, :3] = self._data.site_xmat[self._site].reshape(3, 3)
+        result[:3, 3] = self._data.site_xpos[self._site]
+        return result

@@ -19,10 +19,8 @@ from armcal.base.settings import Settings
 from pydantic import Field
 from typing_extensions import override
 
-from armcal_residual.correlations import Correlations, ProcessSettings, TermSettings, roots_of
-from armcal_residual.joint_processes import of_joints
-from armcal_residual.linear import unpacked
-from armcal_residual.tool_processes import of_tool
+from armcal_residual.features import Correlations, ProcessSettings, TermSettings, roots_of, unpacked
+from armcal_residual.processes import of_joints, of_tool
 
 _LEAST_RECORDS = 20
 _AT_A_TIME = 4096

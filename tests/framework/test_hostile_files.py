@@ -15,8 +15,7 @@ import pytest
 from armcal.base.config_text import shown
 from armcal.cli.main import cli
 from armcal_bench.commands.common import QueuedOutput
-from armcal_export.c_text import in_comment
-from armcal_export.ros2_text import read_ros2, ros2_text
+from armcal_export.c_code import in_comment
 from click.testing import CliRunner, Result
 from made_calibrations import written
 from small_arms import calibration
@@ -60,15 +59,14 @@ def test_a_name_with_brackets_and_escapes_is_shown_and_steers_nothing(tmp_path: 
     assert checked(armcal("check", config), 0).startswith("[/x] \\x1b")
     log = (tmp_path / "run" / "log.txt").read_text(encoding="utf-8")
     assert shown(log) == log
-    export = ("export", tmp_path / "run" / "calibration.yaml", "--format", "ros2", "--out", tmp_path / "arm.ros2.yaml")
+    export = ("export", tmp_path / "run" / "calibration.yaml", "--format", "c", "--out", tmp_path / "arm.c")
     checked(armcal(*export), 0)
-    assert ESCAPE not in (tmp_path / "arm.ros2.yaml").read_text(encoding="utf-8")
+    assert ESCAPE not in (tmp_path / "arm.c").read_text(encoding="utf-8")
 
 
-def test_a_name_ends_no_comment_of_ros_2() -> None:
-    text = ros2_text("arm", {"a": HOSTILE}, in_comment(f"{HOSTILE}\n b: 1"))
-    assert text.isprintable() or set(text) - {"\n"} == {c for c in text if c.isprintable()}
-    assert read_ros2(text) == {"arm": {"a": HOSTILE}}
+def test_a_name_ends_no_comment_of_c() -> None:
+    text = in_comment(f"{HOSTILE} */ b\n: 1")
+    assert text.isprintable() and text.isascii() and "*/" not in text
 
 
 @pytest.mark.parametrize("place", ["header", "cell", "id"])

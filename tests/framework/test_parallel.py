@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
 import signal
@@ -208,20 +209,41 @@ def _blas(task: None) -> str | None:
     return os.environ.get("OPENBLAS_NUM_THREADS")
 
 
-@pytest.mark.slow
-def test_a_dask_cluster_of_two_processes_gives_the_same_bits(lrm) -> None:
+@pytest.fixture(scope="module")
+def cluster():
+    """The address of a dask cluster of two processes on this machine."""
     distributed = pytest.importorskip("distributed", reason='needs: pip install "dask[distributed]"')
     local = distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1"
     )
-    with local as cluster:
-        cluster.wait_for_workers(2)
-        executor = parse_executor(f"dask:{cluster.scheduler_address}")
-        pids = {pid for _, pid in executor.map(_who, list(range(8)))}
-        assert len(pids) == 2 and os.getpid() not in pids
-        assert np.array_equal(_fold_errors(lrm, executor), _fold_errors(lrm, None))
-        with pytest.raises(ConfigError, match=r"a.yaml:7: found 3\. Give another\."):
-            executor.map(_refuse, list(range(6)))
+    with local as running:
+        running.wait_for_workers(2)
+        yield running.scheduler_address
+
+
+@pytest.mark.slow
+def test_a_dask_cluster_of_two_processes_gives_the_same_bits(lrm, cluster: str) -> None:
+    executor = parse_executor(f"dask:{cluster}")
+    pids = {pid for _, pid in executor.map(_who, list(range(8)))}
+    assert len(pids) == 2 and os.getpid() not in pids
+    assert np.array_equal(_fold_errors(lrm, executor), _fold_errors(lrm, None))
+    with pytest.raises(ConfigError, match=r"a.yaml:7: found 3\. Give another\."):
+        executor.map(_refuse, list(range(6)))
+
+
+@pytest.mark.slow
+def test_a_study_on_a_dask_cluster_finds_the_same_figures(tmp_path: Path, cluster: str) -> None:
+    asked = ["study", str(CONFIGS / "study_demo.yaml"), "--set", "evaluator=interpreted", "--set", "study.folds=3"]
+    told = {}
+    for place in ("1", f"dask:{cluster}"):
+        done = CliRunner().invoke(cli, [*asked, "--out", str(tmp_path / place[:4]), "--parallel", place, "--json"])
+        assert done.exit_code == 0, done.output
+        told[place] = json.loads(done.stdout)
+    one, other = told.values()
+    figures = ("name", "free", "error_mm", "change_mm", "converged", "failed_folds")
+    assert [[v[f] for f in figures] for v in one["variants"]] == [[v[f] for f in figures] for v in other["variants"]]
+    assert one["lowest"] == other["lowest"]
+    assert (tmp_path / "1" / "study.csv").read_bytes() == (tmp_path / "dask" / "study.csv").read_bytes()
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from armcal.base.dataset import Dataset
 from armcal.calibration.exporter import Origin, random_commands, request_of
 from armcal.errors import ConfigError, InputError, ProblemError
 from armcal.functions.compiler import find_compiler
-from armcal_export import c_code, c_expressions
+from armcal_export import c_code
 from armcal_export.c_code import CExporter, CExportSettings
 from scipy.spatial.transform import Rotation
 
@@ -295,7 +295,7 @@ def test_arms_that_passes_lead_astray_settle_by_newton(arms):
 @pytest.mark.slow
 def test_slopes_column_by_column_are_the_same(arms, monkeypatch, tmp_path):
     calibration, compiled = arms("elastic")
-    monkeypatch.setattr(c_expressions, "MOST_WHOLE", 0)
+    monkeypatch.setattr(c_code, "MOST_WHOLE", 0)
     other = CompiledArm(request_of(calibration, None, "other.c"), tmp_path)
     assert b"Column by column" in other.exported.content
     assert b"Column by column" not in compiled.exported.content
@@ -373,7 +373,7 @@ def test_what_differs_or_warns_is_not_handed_out(monkeypatch):
 
 
 def test_without_a_compiler_the_code_is_written_and_that_is_said(monkeypatch):
-    monkeypatch.setattr("armcal_export.c_check.find_compiler", lambda: None)
+    monkeypatch.setattr("armcal_export.c_code.find_compiler", lambda: None)
     request = request_of(made_calibration(LRM / "arm.yaml"), None, "arm.c")
     assert "not compiled" in CExporter(CExportSettings()).export(request).remarks[0]
 
@@ -382,8 +382,8 @@ def test_without_room_to_compile_the_temporary_folder_is_named(monkeypatch):
     def full(*given, **more):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("armcal_export.c_check.find_compiler", lambda: "cc")
-    monkeypatch.setattr("armcal_export.c_check.tempfile.TemporaryDirectory", full)
+    monkeypatch.setattr("armcal_export.c_code.find_compiler", lambda: "cc")
+    monkeypatch.setattr("armcal_export.c_code.tempfile.TemporaryDirectory", full)
     request = request_of(made_calibration(LRM / "arm.yaml"), None, "arm.c")
     with pytest.raises(InputError, match=r"the temporary folder: it cannot be written .*set TMPDIR"):
         CExporter(CExportSettings()).export(request)

@@ -29,7 +29,7 @@ def calibration(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def no_compiler(monkeypatch):
-    monkeypatch.setattr("armcal_export.c_check.find_compiler", lambda: None)
+    monkeypatch.setattr("armcal_export.c_code.find_compiler", lambda: None)
 
 
 @pytest.mark.slow
@@ -127,7 +127,6 @@ def test_files_get_the_rights_of_new_files(calibration, tmp_path):
         (("--format", "c", "--out", "x.c", "--option", "prefix=[a"), "command line (--option prefix)"),
         (("--format", "c", "--out", "x.c", "--option", "conditions=[heat]"), "nothing of the arm depends on 'heat'"),
         (("--format", "json", "--out", "x.json", "--option", "beside=it"), "expected 'schema' or 'nothing'"),
-        (("--format", "ros2", "--out", "x.yaml", "--option", "node=a b"), "no name of a node"),
         (("--format", "mujoco", "--out", "x.xml", "--option", "gain=-1"), "gain"),
         (("--format", "mujoco", "--out", "x.xml", "--option", "gain=.nan"), "gain"),
         (("--format", "urdf", "--out", "x.urdf", "--option", "a=1"), "unknown key"),

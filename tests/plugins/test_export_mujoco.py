@@ -11,13 +11,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from armcal.calibration.exporter import random_commands, request_of, rigid_tools
-from armcal.calibration.rigid_chain import rigid_chain
 from armcal.errors import InputError, ProblemError
 from armcal_export import mujoco_model
-from armcal_export.describe import chain_of, describe
-from armcal_export.mjcf import Drive, Hinge, mjcf
-from armcal_export.mujoco_model import MujocoExporter, MujocoSettings
-from armcal_export.mujoco_rest import LoadedModel
+from armcal_export.content import content_of
+from armcal_export.mujoco_model import Hinge, LoadedModel, MujocoExporter, MujocoSettings, mjcf
 
 from tests.made_calibrations import following_arm, made_calibration
 
@@ -41,7 +38,7 @@ def exported(config, *overrides, change=None, **settings):
 
 
 def loaded(found, request):
-    return LoadedModel(found.content, rigid_chain(chain_of(request)))
+    return LoadedModel(found.content, content_of(request).rigid)
 
 
 mujoco_only = pytest.mark.skipif(
@@ -144,11 +141,10 @@ def test_an_arm_that_reads_back_differently_is_not_written(monkeypatch):
 def test_names_of_a_urdf_stay_names_in_the_model():
     """Whatever XML lets a joint be called; MuJoCo need not be there."""
     request = request_of(made_calibration(CONFIGS / "mukca" / "panda.yaml"), None)
-    rigid, told, odd = rigid_chain(chain_of(request)), describe(request), "j<2>&\"'é"
-    named = replace(rigid, joints=(replace(rigid.joints[0], name=odd), *rigid.joints[1:]))
-    springs = {1: [Hinge((0.0, 0.0, 1.0), False, 0.01)]}
-    named_arm = told.model_copy(update={"arm": odd})
-    model = ElementTree.fromstring(mjcf(named_arm, named, springs, Drive(1000.0, 20.0, 0.01)))
+    arm, odd = content_of(request), "j<2>&\"'é"
+    rigid = replace(arm.rigid, joints=(replace(arm.rigid.joints[0], name=odd), *arm.rigid.joints[1:]))
+    springs, nothing = {1: [Hinge((0.0, 0.0, 1.0), False, 0.01)]}, (0.0, (0.0, 0.0, 0.0))
+    model = ElementTree.fromstring(mjcf(replace(arm, name=odd, rigid=rigid), nothing, springs, MujocoSettings()))
     assert model.get("model") == odd
     names = [each.get("name") for each in model.iter("joint")]
     assert names[:2] == [odd, f"{odd}_spring1"]
