@@ -21,9 +21,6 @@ SECTIONS = {
     "distribution": "#distribution",
     "records": "#records",
     "parameters": "#parameters",
-    "compliances": "#compliances",
-    "correlations": "#correlations",
-    "determined": "#determined",
 }
 """Each picture of the report page, and the part of report.html that it shows."""
 WIDTH = 1000

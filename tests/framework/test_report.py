@@ -27,7 +27,7 @@ from armcal.run.errors import ErrorTable, RecordErrors
 from armcal.run.result import RunResult
 
 SECTIONS = ("verdict", "accuracy", "distribution", "records", "parameters")
-SECTIONS += ("compliances", "correlations", "determined", "data", "reproduce")
+SECTIONS += ("correlations", "determined", "data", "reproduce")
 CHROMIUM = shutil.which("chromium")
 FLAGS = (
     "--headless",
@@ -260,7 +260,7 @@ def test_a_usual_run_is_complete() -> None:
 def test_every_figure_has_words_for_those_who_hear_it() -> None:
     html = render(result_of())
     figures = re.findall(r"<svg .*?</svg>", html, re.DOTALL)
-    assert len(figures) >= 9
+    assert len(figures) >= 7
     for figure in figures:
         named = re.search(r'aria-labelledby="(\S+) (\S+)"', figure)
         assert named and all(f'id="{ident}"' in figure for ident in named.groups())
@@ -305,7 +305,6 @@ def test_no_free_parameter_and_nothing_known() -> None:
     result = replace(known, provenance={}, seconds={}, warnings=(), verdict=Verdict("Nothing was free.", ()))
     page = checked(render(result))
     assert "No parameter was free" in page.text
-    assert "No compliance was free" in page.text
 
 
 def test_undetermined_parameters_and_numbers_that_are_none() -> None:
@@ -327,9 +326,7 @@ def test_blocks_of_several_entries() -> None:
 
 def test_two_hundred_parameters() -> None:
     page = checked(render(result_of(parameters=blocks(200, 60))))
-    assert "200 parameters are too many for a map" in page.text
     assert "The strongest" in page.text
-    assert "40 of 60: at a bound, or the largest" in page.text and "ended at its bound" in page.text
 
 
 def test_a_hundred_thousand_records_stay_small() -> None:

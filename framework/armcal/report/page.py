@@ -9,7 +9,7 @@ import numpy as np
 
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import CORRELATED, POOR_CONDITION, bound_together, correlated_pairs, correlations
-from armcal.report import error_figures, interval_figures, parameter_figures, workspace
+from armcal.report import figures
 from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural, ratio, significant, unbroken
 from armcal.report.sections import PluginSection
 from armcal.report.tables import (
@@ -39,7 +39,6 @@ def render(result: RunResult, sections: Sequence[PluginSection] = ()) -> str:
     """One self-contained HTML file, plugins' sections too: no scripts, no references to anything outside of it."""
     grades = [finding.grade for finding in result.verdict.findings]
     parameters, aside, worst = parameter_rows(result.estimate), result.dataset.set_aside, worst_records(result)
-    springs = [row for row in parameters if row.si_unit == "rad_per_Nm"]
     content = {
         "result": result,
         "unit": result.errors.unit,
@@ -49,23 +48,21 @@ def render(result: RunResult, sections: Sequence[PluginSection] = ()) -> str:
         "worst_grade": next((g for g in _WORDS if g in grades), "note"),
         "grades": [(g, grades.count(g)) for g in _WORDS if g in grades],
         **_accuracy(result),
-        "distribution": error_figures.distribution(result),
-        "workspace": workspace.views(result),
-        "moved": workspace.moved_views(result),
+        "distribution": figures.distribution(result),
+        "workspace": figures.views(result),
+        "moved": figures.moved_views(result),
         "moved_rows": moved_rows(result),
-        "order": error_figures.in_order(result, worst),
+        "order": figures.in_order(result, worst),
         "worst": worst_rows(result, worst),
         "missed": result.evidence.large_errors,
         "crossed": bool(np.isfinite(result.errors.cross_validated_mm).any()),
-        "shares": interval_figures.share_rows(result.intervals),
-        "levels": interval_figures.level_names(),
-        "radii": interval_figures.predicted_against_found(result),
-        "profiles": interval_figures.profile_rows(result),
-        "profile_figures": interval_figures.profile_figures(result),
+        "shares": figures.share_rows(result.intervals),
+        "levels": figures.level_names(),
+        "radii": figures.predicted_against_found(result),
+        "profiles": figures.profile_rows(result),
+        "profile_figures": figures.profile_figures(result),
         "parameters": parameters,
         "fixed": fixed_rows(result.estimate),
-        "compliance": parameter_figures.compliances(springs),
-        "springs": springs,
         **_correlations(result.estimate),
         **_determined(result.estimate),
         "suspicious": result.noise.suspicious[:MOST_LISTED],
@@ -119,25 +116,21 @@ def _accuracy(result: RunResult) -> dict[str, Any]:
 def _correlations(estimate: Estimate) -> dict[str, Any]:
     names = estimate.names
     if len(names) < 2:
-        return {"map": None, "pairs": (), "more_pairs": 0, "too_many": False, "strongest": ()}
+        return {"pairs": (), "more_pairs": 0, "strongest": ()}
     with np.errstate(invalid="ignore"):
         matrix = correlations(estimate.covariance)
     matrix = np.where(np.outer(estimate.determined, estimate.determined), matrix, 0.0)
     pairs = correlated_pairs(matrix, names, CORRELATED, bound_together(estimate.parameters))
-    strongest: list[tuple[str, str, str]] = []
-    if not pairs or len(names) > parameter_figures.MOST_MAPPED:
-        # The strongest pairs whatever their size, zeros left out.
-        rows, columns = np.triu_indices(len(names), 1)
-        sizes = np.abs(matrix[rows, columns])
-        order = [k for k in np.argsort(-sizes, kind="stable")[:_STRONGEST] if sizes[k] > 0]
-        ends = [(int(rows[k]), int(columns[k])) for k in order]
-        strongest = [(names[i], names[j], fixed(float(matrix[i, j]), 3, signed=True)) for i, j in ends]
+    # The strongest pairs whatever their size, zeros left out.
+    rows, columns = np.triu_indices(len(names), 1)
+    sizes = np.abs(matrix[rows, columns])
+    order = [k for k in np.argsort(-sizes, kind="stable")[:_STRONGEST] if sizes[k] > 0]
+    ends = [(names[i], names[j], float(matrix[i, j])) for i, j in zip(rows[order], columns[order], strict=True)]
+    listed = {(a, b) for a, b, _ in pairs}
     return {
-        "map": parameter_figures.correlation_map(matrix, names, estimate.determined),
         "pairs": [(a, b, fixed(r, 3, signed=True)) for a, b, r in pairs[:MOST_LISTED]],
         "more_pairs": max(len(pairs) - MOST_LISTED, 0),
-        "too_many": len(names) > parameter_figures.MOST_MAPPED,
-        "strongest": [] if len(pairs) >= _STRONGEST else strongest[len(pairs) :],
+        "strongest": [(a, b, fixed(r, 3, signed=True)) for a, b, r in ends if (a, b) not in listed],
     }
 
 
@@ -150,7 +143,6 @@ def _determined(estimate: Estimate) -> dict[str, Any]:
         "poor": len(known) > 0 and known.condition > POOR_CONDITION,
         "poor_limit": f"{POOR_CONDITION:.0e}".replace("e+0", "e"),
         "weakest": str(known.weakest) if len(known) and known.rank else "",
-        "singular": parameter_figures.singular_values(known),
     }
 
 

@@ -87,17 +87,6 @@ def judged(table: ErrorTable) -> Judged | None:
 
 
 @dataclass(frozen=True)
-class RawParameter:
-    """The numbers of a row, in the unit shown."""
-
-    nominal: float
-    value: float
-    sd: float
-    lower: float
-    upper: float
-
-
-@dataclass(frozen=True)
 class ParameterRow:
     """One free parameter, in words; ``held`` where only a prior holds it, or nothing."""
 
@@ -111,55 +100,34 @@ class ParameterRow:
     interval: str
     at_bound: bool
     determined: bool
-    raw: RawParameter
     held: bool
 
 
 def parameter_rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
-    """One row a free canonical entry."""
-    names = estimate.names
-    nominal = estimate.parameters.nominal()
+    """One row a free canonical entry, numbers aligned at their points."""
+    nominal, numbers, decimals = estimate.parameters.nominal(), [], []
     units = [entry_unit(b, suffix) for b in estimate.parameters.free for suffix in b.domain.entries]
-    raw, decimals = [], []
     for i, entry in enumerate(estimate.free_entries):
-        factor, _ = shown_unit(units[i])
-        interval = estimate.intervals[i]
-        numbers = (nominal[entry], estimate.values[entry], estimate.deviations[i], interval.lower, interval.upper)
-        raw.append(RawParameter(*(float(n) * factor for n in numbers)))
-        own = raw[-1]
+        own = (estimate.values[entry], nominal[entry], estimate.deviations[i])
+        value, before, sd = (float(number) * shown_unit(units[i])[0] for number in own)
         # Two digits of the standard deviation; five of the value where there is none, three decimals of a zero.
-        known = math.isfinite(own.sd) and own.sd > 0
-        size = own.sd if known else max(abs(own.value), abs(own.nominal)) / 1000
+        size = sd if math.isfinite(sd) and sd > 0 else max(abs(value), abs(before)) / 1000
+        numbers.append((value, before, sd))
         decimals.append(decimals_for(size) if size else 3)
-    widest = max(decimals, default=0)
-    return tuple(_row(estimate, i, units[i], raw[i], decimals[i], widest) for i in range(len(names)))
-
-
-def _row(estimate: Estimate, i: int, si_unit: str, raw: RawParameter, decimals: int, widest: int) -> ParameterRow:
-    def aligned(value: float, signed: bool = False) -> str:
-        padding = _FIGURE_SPACE * (widest - decimals) + (_POINT_SPACE if decimals == 0 < widest else "")
-        written = fixed(value, decimals, signed)
-        return written if written == NONE else written + padding
-
-    determined = math.isfinite(raw.sd)
-    lower, upper = fixed(raw.lower, decimals), fixed(raw.upper, decimals)
-    written = f"{lower} to {upper}" if determined else NONE
-    if determined and (bound := estimate.intervals[i].bound):
-        written = f"≤ {upper}" if bound == "lower" else f"≥ {lower}"
-    return ParameterRow(
-        name=estimate.names[i],
-        unit=shown_unit(si_unit)[1],
-        si_unit=si_unit,
-        nominal=aligned(raw.nominal),
-        value=aligned(raw.value),
-        correction=aligned(raw.value - raw.nominal, signed=True),
-        sd=aligned(raw.sd),
-        interval=written,
-        at_bound=estimate.names[i] in estimate.at_bound,
-        determined=determined,
-        raw=raw,
-        held=not estimate.identified_by_data[i],
-    )
+    rows, widest = [], max(decimals, default=0)
+    for i, (name, (value, before, sd), digits) in enumerate(zip(estimate.names, numbers, decimals, strict=True)):
+        factor, unit = shown_unit(units[i])
+        padding = _FIGURE_SPACE * (widest - digits) + (_POINT_SPACE if digits == 0 < widest else "")
+        written = [fixed(value, digits), fixed(before, digits), fixed(value - before, digits, True), fixed(sd, digits)]
+        interval = estimate.intervals[i]
+        lower, upper = (fixed(float(end) * factor, digits) for end in (interval.lower, interval.upper))
+        words = f"{lower} to {upper}" if math.isfinite(sd) else NONE
+        if math.isfinite(sd) and interval.bound:
+            words = f"≤ {upper}" if interval.bound == "lower" else f"≥ {lower}"
+        shown, was, moved, deviation = (text if text == NONE else text + padding for text in written)
+        flags = (name in estimate.at_bound, math.isfinite(sd), not estimate.identified_by_data[i])
+        rows.append(ParameterRow(name, unit, units[i], was, shown, moved, deviation, words, *flags))
+    return tuple(rows)
 
 
 def fixed_rows(estimate: Estimate) -> list[tuple[str, str, str]]:
