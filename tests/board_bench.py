@@ -14,8 +14,7 @@ from armcal.config.servo_file import BoardSettings, ServoFile, ServoSettings, se
 from armcal.devices.device import DeviceError
 from armcal.devices.link import LinkIdentity
 from armcal_simulation.boards.framed_board import BoardIdentity, FramedBoard
-from armcal_simulation.boards.i2c_bus import I2cBus
-from armcal_simulation.boards.pca9685_model import Pca9685Model
+from armcal_simulation.boards.pca9685_model import I2cBus, Pca9685Model
 
 LRM_PULSES_US = {
     "q1": (620, 1540, 2460),

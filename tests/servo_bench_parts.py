@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 from armcal_simulation.bench.serial_line import SerialLine, delimited
 from armcal_simulation.boards.framed_board import FramedBoard
-from armcal_simulation.boards.i2c_bus import I2cBus
-from armcal_simulation.boards.pca9685_model import Pca9685Model
+from armcal_simulation.boards.pca9685_model import I2cBus, Pca9685Model
 
 from tests.arduino_sketch import SketchBoard
 

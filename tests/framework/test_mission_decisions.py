@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from armcal_online.mission.simulator import ArmEventSettings, CameraSettings, Event, PayloadSettings
-from armcal_online.tracking.directions import LINK
+from armcal_online.tracking.hypotheses import LINK
 
 from tests.mission_decisions import Decision, occurrences, verdicts
 

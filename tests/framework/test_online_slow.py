@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 from armcal.estimate.online import Gaussian, Linearised, kalman_update, log_likelihood
-from armcal_online.tracking.belief import Belief
+from armcal_online.tracking.belief import Belief, GaussMarkovStates, ProcessNoise, shared_error
 from armcal_online.tracking.hypotheses import Hypothesis
-from armcal_online.tracking.process_noise import GaussMarkovStates, ProcessNoise, shared_error
 from armcal_online.tracking.slow_changes import SlowChanges, SlowState
 from online_arm import World, begun, settings, told
 

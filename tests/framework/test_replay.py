@@ -22,9 +22,8 @@ from armcal.io.journal.journal import JournalLimits
 from armcal.io.journal.reader import read_entries, read_segments, read_until
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
-from armcal_online.replaying.kept_journal import kept_calibration, kept_journal
-from armcal_online.replaying.replay import DiffersError, ReplayVerifier, replay
 from armcal_online.running.loop import Pace, Recalibration
+from armcal_online.running.replay import DiffersError, ReplayVerifier, kept_calibration, kept_journal, replay
 from armcal_online.running.session import Setup, opened
 from armcal_online.sources.source import Incoming
 from armcal_online.tracking.recalibrator import Recalibrator

@@ -12,7 +12,7 @@ from armcal.devices.framed.frames import Frame, FrameDecoder, encoded
 from armcal.devices.link import GuardedLink
 from armcal_pca9685.device import Pca9685Device
 from armcal_pca9685.framed_link import FramedLink
-from armcal_simulation.boards.i2c_bus import ADDRESS_ONLY
+from armcal_simulation.boards.pca9685_model import ADDRESS_ONLY
 from board_bench import JOINTS, PtyBoard, servo_file, written
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from armcal_simulation.boards.i2c_bus import ADDRESS_ONLY, BusStuckError, I2cBus
-from armcal_simulation.boards.pca9685_model import Pca9685Model
+from armcal_simulation.boards.pca9685_model import ADDRESS_ONLY, BusStuckError, I2cBus, Pca9685Model
 from hypothesis import given
 from hypothesis import strategies as st
 

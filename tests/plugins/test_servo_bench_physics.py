@@ -14,8 +14,8 @@ from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.run.experiment import Experiment
-from armcal_simulation.bench.elastic_pose import ElasticPose
 from armcal_simulation.bench.parts import ServoBenchSettings, tracked_arm
+from armcal_simulation.bench.physics import ElasticPose
 from armcal_simulation.bench.servo_model import ServoHeat, ServoJointSettings, ServoModel
 from hypothesis import given
 from hypothesis import strategies as st

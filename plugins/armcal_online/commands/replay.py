@@ -13,20 +13,18 @@ from armcal.errors import EXIT_BAD_INPUT, EXIT_FAULT, InputError, Location
 from armcal.io.journal.files import REAL_FILES, write_whole
 from rich.table import Table
 
-from armcal_online.replaying.kept_journal import (
+from armcal_online.running.replay import (
+    WARM_UP,
+    Comparison,
+    JournalReplayer,
     KeptJournal,
+    ReplayVerifier,
+    compared,
     journal_folder,
     kept_calibration,
     kept_in,
     kept_journal,
     kept_settings,
-)
-from armcal_online.replaying.replay import (
-    WARM_UP,
-    Comparison,
-    JournalReplayer,
-    ReplayVerifier,
-    compared,
     replay,
     side_by_side,
 )

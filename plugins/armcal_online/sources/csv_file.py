@@ -15,8 +15,7 @@ from armcal.io.lines import MAX_LINE_BYTES
 from armcal.io.plain_files import input_file
 from typing_extensions import override
 
-from armcal_online.sources.reading import LineReading
-from armcal_online.sources.row_parser import KINDS, Kind, LineParser, RowParser
+from armcal_online.sources.row_parser import KINDS, Kind, LineParser, LineReading, RowParser
 from armcal_online.sources.source import AtEnd, Incoming, Source, key_of, wait_until
 
 _IDENTIFYING: Mapping[Kind, int] = {"csv": 2, "json": 1}

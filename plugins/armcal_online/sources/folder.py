@@ -12,8 +12,7 @@ from armcal.errors import InputError
 from armcal.io.plain_files import input_file
 from typing_extensions import override
 
-from armcal_online.sources.reading import LineReading, WholeReading
-from armcal_online.sources.row_parser import KINDS, LineParser, RowParser, faulty
+from armcal_online.sources.row_parser import KINDS, LineParser, LineReading, RowParser, WholeReading, faulty
 from armcal_online.sources.source import THROUGH, Incoming, Place, Source, key_of, wait_until
 
 SETTLED_S = 1.0

@@ -13,8 +13,7 @@ from typing import Any
 from armcal.io.udp import MAX_DATAGRAM_BYTES, listening
 from typing_extensions import override
 
-from armcal_online.sources.reading import LineReading
-from armcal_online.sources.row_parser import LineParser, RowParser, faulty
+from armcal_online.sources.row_parser import LineParser, LineReading, RowParser, faulty
 from armcal_online.sources.source import Incoming, Place, Source
 
 _WAITING = 64

@@ -3,15 +3,28 @@
 The belief stays the Gaussian that the records make, even beyond bounds: to cut it off at a bound after each record
 would count the bound as evidence, again and again. What is handed out is its most likely point within the bounds,
 where a fit of all records at once would end, to first order; the covariance is not touched. [Simon2010]
+
+Between records parameters walk at random, and Gauss-Markov states beside them change: stationary processes of unit
+standard deviation whose correlation falls by e over a distance (Ornstein-Uhlenbeck [Rasmussen2006]), in records or in
+time, coordinates of the belief after those of the parameters. One that is a drift moves a parameter; one of a shared
+error, the part of the model's error that neighbouring records have in common, shifts what an instrument reads.
 """
 
 from __future__ import annotations
 
+import fnmatch
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from armcal.base.arrays import Array
-from armcal.estimate.online import Gaussian
+from armcal.base.arrays import Array, Indices
+from armcal.base.parameters import Parameters
+from armcal.base.units import amount_in_time
+from armcal.config.selection import quantity
+from armcal.errors import ConfigError, Location
+from armcal.estimate.online import Gaussian, checked
+from armcal.problem.correlation import kept, passed_on
 from scipy.optimize import lsq_linear
 
 from armcal_online.tracking.state_space import StateSpace
@@ -96,3 +109,125 @@ def _nearest_in_cones(root: Array, given: Array, ends: tuple[Array, Array], scal
     except cvxpy.error.SolverError:
         return given
     return given if x.value is None else np.array(x.value, dtype=float)
+
+
+@dataclass(frozen=True)
+class GaussMarkovState:
+    """One process.
+
+    Attributes:
+        name: for people.
+        over: the distance over which it forgets, in units of the channel.
+        channel: ``sequence`` (places in a recording), ``record`` (one by one) or ``time`` (s).
+        coordinate: of the parameter that it moves; None for a shift of readings.
+        size: its standard deviation: in scaled coordinates of the parameter.
+        instance: the measurement whose readings it shifts.
+        shift: how it shifts the residual's entries, a standard deviation long (n_r; m or rad).
+    """
+
+    name: str
+    over: float
+    channel: str
+    coordinate: int | None = None
+    size: float = 0.0
+    instance: str = ""
+    shift: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class GaussMarkovStates:
+    """All of them (m)."""
+
+    states: tuple[GaussMarkovState, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    @property
+    def drifts(self) -> tuple[Indices, Indices, Array]:
+        """Of those that move a parameter: their places, the parameters' coordinates, and by how much."""
+        drifts = [(i, s.coordinate, s.size) for i, s in enumerate(self.states) if s.coordinate is not None]
+        which, coordinate, size = zip(*drifts, strict=True) if drifts else ((), (), ())
+        return np.array(which, dtype=np.intp), np.array(coordinate, dtype=np.intp), np.array(size)
+
+    def shifts(self, instance: str, rows: int) -> Array:
+        columns = [s.shift if s.instance == instance else (0.0,) * rows for s in self.states]
+        return np.array(columns).reshape(len(self.states), rows).T
+
+    def kept(self, passed: Mapping[str, float]) -> Array:
+        return kept(np.array([max(passed.get(s.channel, 0.0), 0.0) / s.over for s in self.states]))
+
+
+def shared_error(instance: str, covariance: Array, over: float, channel: str) -> Sequence[GaussMarkovState]:
+    """States that make up a covariance of an instrument's readings (n_r x n_r) that neighbours share."""
+    size, directions = np.linalg.eigh(covariance)
+    roots = directions * np.sqrt(np.maximum(size, 0.0))
+    return [
+        GaussMarkovState(f"{instance}.shared{i + 1}", over, channel, instance=instance, shift=tuple(column.tolist()))
+        for i, column in enumerate(roots.T)
+        if float(column @ column) > 0
+    ]
+
+
+@dataclass(frozen=True)
+class ProcessNoise:
+    """How a belief widens between records.
+
+    Attributes:
+        rates: variance that each parameter's scaled coordinate gains in a second (n).
+        gauss_markov: the states beside the parameters.
+    """
+
+    rates: Array
+    gauss_markov: GaussMarkovStates
+
+    def faded(self, belief: Belief, passed: Mapping[str, float]) -> Belief:
+        """The belief after some distance in ``time`` (s), ``record`` and ``sequence`` (records)."""
+        n, seconds = len(self.rates), max(passed.get("time", 0.0), 0.0)
+        covariance, mean = belief.gaussian.covariance, belief.gaussian.mean
+        if seconds > 0 and self.rates.any():
+            covariance = covariance.copy()
+            covariance[np.arange(n), np.arange(n)] += self.rates * seconds
+        if len(self.gauss_markov):
+            left = np.ones(len(mean))
+            left[n:] = self.gauss_markov.kept(passed)
+            covariance = passed_on(covariance, left)
+            mean = mean * left
+        return Belief(belief.origin, checked(Gaussian(mean, covariance)))
+
+
+def variance_rates(parameters: Parameters, stated: Mapping[str, str]) -> Array:
+    """Variance that each free coordinate gains, in its scaled unit squared per s (n).
+
+    Args:
+        parameters: with the free ones.
+        stated: by glob, a standard deviation and the time in which it comes about: ``0.05 deg in 30 d``.
+
+    Raises:
+        ConfigError: a glob matches nothing, or nothing free; a text is no such rate.
+    """
+    rates = {block.name: 0.0 for block in parameters.free}
+    for glob, text in stated.items():
+        where = Location(f"process_noise.{glob}")
+        names = [name for name in fnmatch.filter(parameters.names, glob) if name in rates]
+        if not names:
+            raise ConfigError(
+                f"{glob!r} matches no parameter that the calibration found.",
+                where=where,
+                hint="armcal check -v lists the names; list others under free to let them move.",
+            )
+        try:
+            amount, seconds = amount_in_time(str(text))
+        except ValueError as fault:
+            message = f"found {text!r}, expected how far a parameter may wander in which time."
+            hint = 'Write for example "0.05 deg in 30 d", "0.1 mm in a week" or "0.02 in 1 month".'
+            raise ConfigError(message, where=where, hint=hint) from fault
+        for name in names:
+            size: str | float
+            block, size = parameters[name], amount
+            if block.unit == "1":
+                with suppress(ValueError):
+                    size = float(amount)
+            deviation = quantity(block, size, None, ())
+            rates[name] = (deviation / block.scale) ** 2 / seconds
+    return np.array([rates[block.name] for block in parameters.coordinate_blocks])

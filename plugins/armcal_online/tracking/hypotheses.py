@@ -3,24 +3,266 @@
 Each hypothesis starts from the belief before a record that did not fit, with the variance that it reopens. Its
 evidence is the likelihood of the records since [Willsky1976]. What it reopens costs it evidence by itself: a wider
 belief predicts every single record less well.
+
+What a step of a joint or of an instrument's frame is in terms of the parameters is found by trying, so that it holds
+for any arm model and effect: the combination of parameters that moves the prediction in some poses as the step does.
+Where one parameter alone does (a joint's offset), it is that one.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal, get_args
 
+import casadi as ca
 import numpy as np
+from armcal.arm.assembly import Arm
+from armcal.arm.statics import gravity_tilt, unstated_payload
 from armcal.base.arrays import Array
+from armcal.base.dataset import Dataset
+from armcal.base.quaternions import quaternion_matrix
+from armcal.calibration.calibration import Calibration
+from armcal.errors import ArmcalError
+from armcal.problem.problem import FactorRecords, Problem
 
 from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.directions import CAUSES, Cause, CauseKind, Steps
-from armcal_online.tracking.observer import JointNoise, Reading
+from armcal_online.tracking.observer import JointNoise, Observer, Reading
 from armcal_online.tracking.settings import ChangeSettings
 from armcal_online.tracking.state_space import StateSpace
+
+CauseKind = Literal["payload_changed", "gravity_tilted", "link_bent"]
+CAUSES: tuple[CauseKind, ...] = get_args(CauseKind)
+PAYLOAD, GRAVITY, LINK = "payload", "gravity", "link "
+"""Subjects of these kinds; a link's is followed by the joint that carries it."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A change at once: its kind, what it is of, and the scaled coordinates that it changes."""
+
+    kind: CauseKind
+    subject: str
+    coordinates: tuple[int, ...]
+
+
+def spoken(subject: str) -> str:
+    """What a change is of, in words: a joint's channel and a measurement are their own names."""
+    if subject.startswith(LINK):
+        return f"the link behind {subject.removeprefix(LINK)}"
+    return {PAYLOAD: "the payload", GRAVITY: "the direction of gravity"}.get(subject, subject)
+
+
+def find_causes(calibration: Calibration, space: StateSpace, offsets: Collection[str]) -> tuple[Cause, ...]:
+    """Those that the free parameters can follow; ``offsets`` are parameters that are a joint's own zero, no link's."""
+    place = {name: i for i, name in enumerate(space.names)}
+    named: list[tuple[CauseKind, str, list[str]]] = [
+        ("payload_changed", PAYLOAD, [block.name for block in unstated_payload()]),
+        ("gravity_tilted", GRAVITY, [block.name for block in gravity_tilt()]),
+    ]
+    for arm in calibration.system.arms.values():
+        named += [("link_bent", LINK + joint, names) for joint, names in _links(arm, space)]
+    coordinates = [
+        (kind, subject, [n for n in names if n in place and n not in offsets]) for kind, subject, names in named
+    ]
+    return tuple(Cause(kind, subject, tuple(place[n] for n in names)) for kind, subject, names in coordinates if names)
+
+
+def _links(arm: Arm, space: StateSpace) -> Iterator[tuple[str, list[str]]]:
+    symbols = {block.name: ca.SX.sym(block.name, block.size) for block in arm.parameters()}
+    chain = arm.chain(symbols)
+    single = {block.name for block in space.parameters.free if block.size == 1 and block.unit in ("m", "rad")}
+    free = [name for name in symbols if name in single]
+    behind = [joint.parent_T_joint for joint in chain.joints[1:]]
+    if chain.tool.joint == len(chain.joints):
+        behind.append(chain.tool.joint_T_frame)
+    for joint, fixed in zip(chain.joints, behind, strict=False):
+        numbers = ca.vertcat(ca.vec(fixed.rotation), fixed.translation)
+        yield f"{arm.name}.{joint.name}", [name for name in free if ca.depends_on(numbers, symbols[name])]
+
+
+_POSES = 60
+_REACH = {"angle": 1.2, "length": 0.1}
+_ALONE = 0.999
+_LOCAL = 0.98
+_EXPLAINED = 0.97
+_CUT = 1e-6
+_AXES = ("x", "y", "z", "rx", "ry", "rz")
+
+
+@dataclass(frozen=True)
+class JointStep:
+    """A step of one joint.
+
+    Attributes:
+        joint: its channel, ``arm.q3``.
+        dimension: ``angle`` or ``length``.
+        direction: in scaled coordinates, of a step of 1 rad or m (n).
+        local: coordinates that act along this joint's motion alone, the offset left out: what a new servo changes.
+        parameter: the one that is the joint's offset; empty if it takes several.
+    """
+
+    joint: str
+    dimension: str
+    direction: Array
+    local: tuple[int, ...]
+    parameter: str
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Steps that the filter can follow.
+
+    Attributes:
+        joints: those that parameters can make.
+        unfollowed: joints whose steps no combination of parameters makes.
+        sensors: by measurement, scaled coordinates of shifts (m) and turns (rad) of its frame (n x up to 6), and
+            which of ``x y z rx ry rz`` they are.
+        causes: what else may change at once.
+    """
+
+    joints: tuple[JointStep, ...]
+    unfollowed: tuple[str, ...]
+    sensors: Mapping[str, tuple[Array, tuple[str, ...]]]
+    causes: tuple[Cause, ...] = ()
+
+    def dimension(self, joint: str) -> str:
+        """Of a joint's step: ``angle`` or ``length``; empty for what is no joint."""
+        return next((step.dimension for step in self.joints if step.joint == joint), "")
+
+
+def find_steps(calibration: Calibration, observer: Observer, values: Array) -> Steps:
+    """The steps that the free parameters can follow; none where no instrument reads a single pose."""
+    problem, space, arms = observer.problem, observer.space, calibration.system.arms.values()
+    poses = _probing_poses(arms)
+    nothing, environment = np.zeros(len(poses)), problem.blueprint.environment
+    conditions = {name: nothing for arm in arms for name in arm.conditions}
+    try:
+        read, _ = calibration.predict(Dataset(poses.ids, {**poses.channels, **conditions, "payload": nothing}))
+        # Other channels of the kernels: those of a record at rest in the stated surroundings.
+        rest = {f"gravity_{a}": g for a, g in zip("xyz", environment.gravity, strict=True)}
+        rest |= {f"payload_{a}": g for a, g in zip("xyz", environment.payload_com, strict=True)}
+        rest["payload"] = environment.payload_mass
+        names = [channel for kernel in problem.kernels for channel in kernel.factor.channels]
+        others = {name: np.full(len(poses), rest.get(name, 0.0)) for name in names}
+        complete = Dataset(poses.ids, {**others, **poses.channels, **read})
+        records = problem.records(complete)
+        jacobians = problem.jacobians(values, records)
+        rows = [np.moveaxis(j, 2, 0).reshape(-1, j.shape[1]) for j in jacobians]  # record by record
+        slopes = space.by_coordinates(values, -np.concatenate(rows))
+        commanded = {f"{arm.name}.{joint}": dimension for arm in arms for joint, dimension in arm.commanded.items()}
+        by_joint = _whitened(problem, values, records, list(commanded))
+        motions = -np.concatenate([block.reshape(-1, len(commanded)) for block in by_joint])
+        steps = {
+            channel: _joint_step(channel, dimension, moved, slopes, space.names)
+            for (channel, dimension), moved in zip(commanded.items(), motions.T, strict=True)
+        }
+        factors = [kernel.factor.name for kernel in problem.kernels]
+        motions_of = {name: _sensor_motion(problem, values, records, name, complete, slopes) for name in factors}
+    except ArmcalError:
+        return Steps((), (), {})
+    return Steps(
+        tuple(step for step in steps.values() if step is not None),
+        tuple(channel for channel, step in steps.items() if step is None),
+        {name: motion for name, motion in motions_of.items() if motion is not None},
+        _seen_causes(find_causes(calibration, space, {step.parameter for step in steps.values() if step}), slopes),
+    )
+
+
+def _seen_causes(causes: Sequence[Cause], slopes: Array) -> tuple[Cause, ...]:
+    """Causes with the coordinates that move a prediction in some pose; none where no pose shows any."""
+    seen = np.sum(slopes**2, axis=0) > _CUT * len(slopes)
+    narrowed = [replace(cause, coordinates=tuple(i for i in cause.coordinates if seen[i])) for cause in causes]
+    return tuple(cause for cause in narrowed if cause.coordinates)
+
+
+def _probing_poses(arms: Iterable[Arm]) -> Dataset:
+    random, channels = np.random.default_rng(0), {}
+    for arm in arms:
+        limits = {joint.name: joint.limits for joint in arm.nominal_chain.joints}
+        for joint, dimension in arm.commanded.items():
+            reach = _REACH[dimension]
+            low, high = limits.get(joint) or (-reach, reach)
+            channels[f"{arm.name}.{joint}"] = random.uniform(max(low, -reach), max(min(high, reach), low), _POSES)
+            channels[f"{arm.name}.approach.{joint}"] = random.choice([-1.0, 1.0], _POSES)
+    return Dataset(tuple(str(i) for i in range(_POSES)), channels)
+
+
+def _whitened(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], channels: Sequence[str]
+) -> list[Array]:
+    slopes = zip(problem.kernels, problem.channel_slopes(values, records, channels), strict=True)
+    return [np.moveaxis(slope / np.array(kernel.factor.noise)[:, None, None], 2, 0) for kernel, slope in slopes]
+
+
+def _joint_step(channel: str, dimension: str, moved: Array, slopes: Array, names: Sequence[str]) -> JointStep | None:
+    """What makes a joint's motion (rows); None where it is not seen, or no combination of parameters makes it."""
+    power = float(moved @ moved)
+    if power < _CUT * len(moved):
+        return None
+    size, along = np.sum(slopes**2, axis=0), slopes.T @ moved
+    alike = np.where(size > 0, along**2 / np.where(size > 0, size, 1.0), 0.0) / power
+    # Coordinates that move every pose's prediction along the joint's own motion; one row alone has no direction.
+    local: list[int] = []
+    blocks = slopes.reshape(-1, 3, slopes.shape[1]) if len(slopes) % 3 == 0 else slopes[:, None]
+    if blocks.shape[1] > 1:
+        directions = moved.reshape(blocks.shape[:2])
+        norms = np.linalg.norm(directions, axis=1, keepdims=True)
+        unit = np.where(norms > 1e-9, directions / np.where(norms > 1e-9, norms, 1.0), 0.0)
+        inline = np.sum(np.einsum("kr,krn->kn", unit, blocks) ** 2, axis=0)
+        local = [i for i in range(slopes.shape[1]) if size[i] > _CUT and inline[i] > _LOCAL * size[i]]
+    best = int(np.argmax(alike))
+    if alike[best] > _ALONE:
+        direction = np.zeros(len(names))
+        direction[best] = along[best] / size[best]
+        return JointStep(channel, dimension, direction, tuple(i for i in local if i != best), names[best])
+    several = _combination(slopes, moved)
+    return None if several is None else JointStep(channel, dimension, several, tuple(local), "")
+
+
+def _combination(slopes: Array, moved: Array) -> Array | None:
+    """The parameters' combination (n) that makes a motion (rows); None where none explains it."""
+    several = np.asarray(np.linalg.lstsq(slopes, moved, rcond=_CUT)[0])
+    left = moved - slopes @ several
+    return several if float(left @ left) <= (1 - _EXPLAINED) * float(moved @ moved) else None
+
+
+def _sensor_motion(
+    problem: Problem, values: Array, records: Sequence[FactorRecords], instance: str, poses: Dataset, slopes: Array
+) -> tuple[Array, tuple[str, ...]] | None:
+    """How the free parameters make a rigid motion of an instrument's frame; None for one that reads no position."""
+    position, turn = ([f"{instance}.{axis}" for axis in axes] for axes in (_AXES[:3], ("qw", "qx", "qy", "qz")))
+    if not all(poses.has(channel) for channel in position):
+        return None
+    channels = position + (turn if all(poses.has(channel) for channel in turn) else [])
+    moved = []
+    for kernel, block in zip(problem.kernels, _whitened(problem, values, records, channels), strict=True):
+        rows = np.zeros((*block.shape[:2], len(_AXES)))
+        if kernel.factor.name == instance:
+            for k in range(len(poses)):
+                rows[k] = block[k] @ _rigid([poses.column(c)[k] for c in channels])
+        moved.append(rows.reshape(-1, len(_AXES)))
+    motion = np.concatenate(moved)
+    made = {axis: _combination(slopes, column) for axis, column in zip(_AXES, motion.T, strict=True)}
+    columns = {axis: column for axis, column in made.items() if column is not None}
+    return (np.array([*columns.values()]).T, tuple(columns)) if columns else None
+
+
+def _rigid(read: Sequence[float]) -> Array:
+    """How a reading (3, or 7 with a unit quaternion) changes with a shift and a turn of what it is read in (by 6)."""
+    x, y, z = read[:3]
+    change = np.zeros((len(read), 6))
+    change[:3, :3] = np.eye(3)
+    change[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+    if len(read) > 3:
+        for axis in range(3):
+            turn = np.zeros(4)
+            turn[1 + axis] = 0.5
+            change[3:, 3 + axis] = quaternion_matrix(turn) @ np.array(read[3:])
+    return change
+
 
 _SCALES = (1.0, 0.1)
 """A change is of the stated size, or small: to a prior wide enough for a slipped tooth a small step is unlikely."""

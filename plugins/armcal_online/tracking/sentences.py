@@ -8,8 +8,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from armcal_online.tracking.decisions import Decision, log_odds_of, per_cent
-from armcal_online.tracking.directions import CAUSES, Steps, spoken
-from armcal_online.tracking.hypotheses import Explanation, Hypothesis
+from armcal_online.tracking.hypotheses import CAUSES, Explanation, Hypothesis, Steps, spoken
 from armcal_online.tracking.settings import ChangeSettings
 from armcal_online.tracking.sizes import Size
 from armcal_online.tracking.state import State

@@ -11,8 +11,7 @@ from armcal.estimate.online import log_density
 from armcal.estimate.validation import error_dimension, error_unit
 
 from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.directions import Steps
-from armcal_online.tracking.hypotheses import Hypothesis, Recent
+from armcal_online.tracking.hypotheses import Hypothesis, Recent, Steps
 from armcal_online.tracking.observer import Observer
 from armcal_online.tracking.state_space import StateSpace
 

@@ -14,9 +14,8 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.estimate.online import Gaussian, Linearised
 
-from armcal_online.tracking.belief import Belief
+from armcal_online.tracking.belief import Belief, ProcessNoise
 from armcal_online.tracking.hypotheses import GRADUAL, Hypothesis
-from armcal_online.tracking.process_noise import ProcessNoise
 
 
 @dataclass(frozen=True)

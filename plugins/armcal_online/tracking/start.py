@@ -20,15 +20,15 @@ from armcal.measure.measurement import Measurement
 from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.problem.problem import Problem
 
-from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.observer import Observer
-from armcal_online.tracking.process_noise import (
+from armcal_online.tracking.belief import (
+    Belief,
     GaussMarkovState,
     GaussMarkovStates,
     ProcessNoise,
     shared_error,
     variance_rates,
 )
+from armcal_online.tracking.observer import Observer
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.sizes import ModelError
 from armcal_online.tracking.state_space import StateSpace

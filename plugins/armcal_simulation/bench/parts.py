@@ -18,8 +18,7 @@ from armcal.run.plan_clearance import clearance_check
 from pydantic import Field, model_validator
 
 from armcal_simulation.bench.dtrack_sender import DTrackSenderSettings
-from armcal_simulation.bench.elastic_pose import ElasticPose, TrackedArm, without_effects
-from armcal_simulation.bench.physics import BenchPhysics, Seen, Torques
+from armcal_simulation.bench.physics import BenchPhysics, ElasticPose, Seen, Torques, TrackedArm, without_effects
 from armcal_simulation.bench.safety import Bounds, SafetySettings
 from armcal_simulation.bench.servo_model import JointServo, ServoJointSettings
 

@@ -19,9 +19,9 @@ from armcal.io.signals import Signals
 from armcal.io.unix_socket import vacate
 
 from armcal_simulation.bench.dtrack_sender import DTrackSender
-from armcal_simulation.bench.elastic_pose import TrackedArm
 from armcal_simulation.bench.faults import FaultCalendar, FaultRequest
 from armcal_simulation.bench.parts import BenchTruthSettings, physics_of
+from armcal_simulation.bench.physics import TrackedArm
 from armcal_simulation.bench.safety import Bounds, Safety, appended_to
 from armcal_simulation.bench.serial_line import LINE_FAULTS, SerialLine, Split
 from armcal_simulation.bench.servo_model import JointServo

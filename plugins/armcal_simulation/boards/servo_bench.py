@@ -17,8 +17,7 @@ from armcal_simulation.bench.serial_line import delimited
 from armcal_simulation.bench.servo_model import ServoModel
 from armcal_simulation.bench.world import BenchWorld
 from armcal_simulation.boards.framed_board import BoardIdentity, FramedBoard
-from armcal_simulation.boards.i2c_bus import I2cBus
-from armcal_simulation.boards.pca9685_model import Commit, Pca9685Model
+from armcal_simulation.boards.pca9685_model import Commit, I2cBus, Pca9685Model
 
 EXAMPLE_SERVOS = Path(__file__).with_name("example_servos.yaml")
 _EEPROM = "eeprom.json"

@@ -1,1 +1,0 @@
-"""A journal gone through again: the same states, or what other settings would have done."""
