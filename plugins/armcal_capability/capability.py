@@ -61,10 +61,13 @@ def capability(console: Console, source: Path, out: Path, settings: Path | None,
     content |= {"holding_Nm": dict(task.settings.holding), "designs": designs}
     with watch.stage("figure"):
         picture = figure_of(surveys, designs, task.settings)
-    table, sentences = _table(designs), conclusions(designs)
+    table, best = _table(designs), max(designs, key=lambda name: designs[name]["score"])
+    has = f"{best} has the most, " if len(designs) > 1 else ""
+    score = f"{count(designs[best]['score'])} of {count(designs[best]['most'])}"
+    sentence = f"Score, points times tool orientations reached: {has}{score}."
     facts = {"command": command_line(), "files": ", ".join(sorted({str(file) for file in task.files}))}
     facts |= {"samples": str(task.settings.samples), "seed": str(task.settings.seed)}
-    page = render_page("Capability", source.name, sentences, [table], facts, picture, _DESCRIPTION)
+    page = render_page("Capability", source.name, [sentence], [table], facts, picture, _DESCRIPTION)
     kept.place(
         {
             "capability.png": picture,
@@ -75,8 +78,7 @@ def capability(console: Console, source: Path, out: Path, settings: Path | None,
     )
     console.result({**content, "folder": str(out)})
     console.table(table.caption, [words for words, _ in table.headings], table.rows, left=("Area",))
-    for text in sentences:
-        console.line(text)
+    console.line(sentence)
     for stage, seconds in watch.seconds.items():
         console.detail(f"{stage}: {seconds:.1f} s")
     console.line(f"page: {out / 'capability.html'}  ({watch.total():.1f} s)")
@@ -112,28 +114,6 @@ def _area_summary(area: AreaMap, among: Mask) -> dict[str, Any]:
         "postures_per_cell": float(np.mean(area.counts)),
         "quantities": quantities,
     }
-
-
-def conclusions(designs: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """The findings of a survey, in sentences: the score, then who is best in which area."""
-    best = max(designs, key=lambda name: designs[name]["score"])
-    most, texts = count(designs[best]["most"]), []
-    if len(designs) > 1:
-        texts.append(
-            f"Score, points times tool orientations reached: {best} has the most, {count(designs[best]['score'])} of "
-            f"{most}."
-        )
-        for area in designs[best]["areas"]:
-            own = {name: design["areas"][area] for name, design in designs.items()}
-            widest = max(own, key=lambda name: own[name]["reached"])
-            least = min(own, key=lambda name: own[name]["quantities"]["sag_mm"]["mean"])
-            texts.append(
-                f"{area}: most is reached by {widest}, {_share(own[widest]['reached'])}; least sag has {least}, "
-                f"{_number(own[least]['quantities']['sag_mm']['mean'])} mm in the mean of the points that all reach."
-            )
-    else:
-        texts.append(f"Score, points times tool orientations reached: {count(designs[best]['score'])} of {most}.")
-    return texts
 
 
 def _table(designs: Mapping[str, Mapping[str, Any]]) -> TextTable:
