@@ -726,11 +726,10 @@ ENTRIES: tuple[Entry, ...] = (
     ),
     entry(
         "export-others",
-        "the calibrated arm as YAML, JSON and a ROS 2 file",
+        "the calibrated arm as YAML and JSON",
         "export runs/lrm-demo/calibration.yaml --format yaml --out {out}/arm.yaml --json",
         "export runs/lrm-demo/calibration.yaml --format json --out {out}/arm.json --json",
-        "export runs/lrm-demo/calibration.yaml --format ros2 --out {out}/params.yaml --json",
-        reads=["0.out", "1.out", "2.out", "arm.yaml", "arm.json", "params.yaml"],
+        reads=["0.out", "1.out", "arm.yaml", "arm.json"],
         needs=["lrm-demo"],
     ),
     entry(

@@ -165,11 +165,11 @@ class StudyResult:
         nested, grouped = self.nested, {}
         if self.group_by is not None:
             cells = [cell.as_dict() for cell in self.cells]
-            grouped = {"group_by": self.group_by, "groups": dict(self.groups), "cells": cells}
+            grouped = {"group_by": self.group_by, "simulated": self.simulated, "groups": dict(self.groups)}
+            grouped["cells"] = cells
         content = {
             "study": self.name,
             "records": len(self.dataset),
-            "simulated": self.simulated,
             "folds": self.folds,
             "repeats": self.repeats,
             "variants": [variant.as_dict() for variant in self.variants],
