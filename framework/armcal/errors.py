@@ -10,14 +10,10 @@ EXIT_DONE = 0
 EXIT_FAULT = 1
 EXIT_BAD_INPUT = 2
 EXIT_NOT_CONVERGED = 3
-EXIT_DO_NOT_USE = EXIT_NOT_CONVERGED
-"""A calibration whose verdict is bad is as little use as none."""
-EXIT_INCOMPLETE = 3
-"""It came to its end, and a part of what was asked for is missing: tables, poses, or the safety of a rehearsal."""
-EXIT_STOPPED = 4
-"""A measuring run held or parked before its end; it can be resumed."""
-EXIT_INTERRUPTED = 130
-"""Ctrl-C: 128 and the number of SIGINT, as shells have it."""
+EXIT_DO_NOT_USE = EXIT_NOT_CONVERGED  # a calibration whose verdict is bad is as little use as none
+EXIT_INCOMPLETE = 3  # a part of what was asked for is missing: tables, poses, or the safety of a rehearsal
+EXIT_STOPPED = 4  # a measuring run held or parked before its end; it can be resumed
+EXIT_INTERRUPTED = 130  # Ctrl-C: 128 and the number of SIGINT, as shells have it
 
 
 @dataclass(frozen=True)

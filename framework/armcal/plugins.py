@@ -262,15 +262,6 @@ def spoken(kind: str) -> str:
 # --- discovery and registration ------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Loaded:
-    """A plugin and its module; equal to another only with the very same module."""
-
-    plugin: PluginInfo
-    identity: int = 0
-    module: Any = field(default=None, compare=False)
-
-
 def discover(points: Iterable[EntryPoint] | None = None) -> PluginRegistry:
     """Load every registration module.
 
@@ -281,17 +272,9 @@ def discover(points: Iterable[EntryPoint] | None = None) -> PluginRegistry:
         PluginError: a plugin's file is not there, does not load or registers nothing, or has another plugin's name; or
             a plugin that is to be left out is not there.
     """
-    loaded = []
-    for plugin, load in _chosen(_installed(tuple(sys.path)) if points is None else points):
-        try:
-            module = load()
-        except (Exception, SystemExit) as fault:  # whatever a third party's module does, the others must work
-            if plugin.is_file:
-                raise
-            loaded.append(_Loaded(replace(plugin, fault=said(fault))))
-        else:
-            loaded.append(_Loaded(plugin, id(module), module))
-    return _registered(tuple(loaded))
+    if points is None:
+        return _registered(_chosen(_installed(tuple(sys.path))))
+    return _registered.__wrapped__(_chosen(points))
 
 
 @lru_cache(maxsize=8)
@@ -305,50 +288,49 @@ def _published(distribution: Distribution | None) -> tuple[str, str]:
     return (distribution.name, distribution.version) if distribution else ("", "")
 
 
-def _chosen(installed: Iterable[EntryPoint]) -> list[tuple[PluginInfo, Callable[[], Any]]]:
-    """Installed plugins and files, without those that are to be left out, by name, and what loads each.
+def _chosen(installed: Iterable[EntryPoint]) -> tuple[tuple[PluginInfo, EntryPoint | ModuleType], ...]:
+    """Installed plugins, and files, which are imported; without those that are to be left out, by name.
 
     Raises:
-        PluginError: a file takes an installed plugin's name, or one that is to be left out is not there.
+        PluginError: a file takes an installed plugin's name or does not import, or one that is to be left out is not
+            there.
     """
-    origins: dict[tuple[str, str], tuple[PluginInfo, Callable[[], Any]]] = {
-        (p.name, p.value): (PluginInfo(p.name, p.value, *_published(p.dist)), p.load) for p in installed
+    origins: dict[tuple[str, str], tuple[PluginInfo, EntryPoint | Path]] = {
+        (p.name, p.value): (PluginInfo(p.name, p.value, *_published(p.dist)), p) for p in installed
     }
     out = _listed(DISABLED)
     for name, file in plugin_files().items():
         for other in (plugin for plugin, _ in origins.values() if plugin.name == name and name not in out):
             text = " ".join((other.module, other.distribution, other.version)).strip()
             raise PluginError(f"two plugins are called {name!r}: {file} and {text}.", hint="Rename the file.")
-        module = f"{__name__}.{name}"
-        origins[name, module] = PluginInfo(name, module, file.name, _digest(file)), partial(_import_file, module, file)
+        plugin = PluginInfo(name, f"{__name__}.{name}", file.name, _digest(file))
+        origins[name, plugin.module] = plugin, file
     names = sorted({name for name, _ in origins})
     for name in out:
         if name not in names:
             raise PluginError(f"no plugin is called {name!r}, to be left out.", hint=f"Installed: {', '.join(names)}.")
-    return [origins[key] for key in sorted(origins) if key[0] not in out]
+    remaining = [origin for (name, _), origin in sorted(origins.items(), key=lambda item: item[0]) if name not in out]
+    return tuple((p, _import_file(p.module, own) if isinstance(own, Path) else own) for p, own in remaining)
 
 
 @lru_cache(maxsize=8)  # a command, its experiment and its calibration each look for plugins
-def _registered(loaded: tuple[_Loaded, ...]) -> PluginRegistry:
+def _registered(chosen: tuple[tuple[PluginInfo, EntryPoint | ModuleType], ...]) -> PluginRegistry:
     manager = pluggy.PluginManager(hooks.PROJECT)
     manager.add_hookspecs(hooks)
     plugins, components = [], list[Component]()
-    for one in loaded:
-        plugin, module, file = one.plugin, one.module, getattr(one.module, "__file__", None)
-        if not plugin.fault:
-            try:
-                components += _announced(manager, plugin, module)
-            except (Exception, SystemExit) as fault:  # whatever a third party's module does, the others must work
-                plugin = replace(plugin, fault=said(fault))
-                if manager.is_registered(module):
-                    manager.unregister(module)
-                if plugin.is_file:
-                    where = Location(file, line=_line(fault, file))
-                    kind = PluginError if isinstance(fault, PluginError) else BrokenPluginError
-                    raise kind(plugin.fault, where=where) from fault
-            if plugin.is_file and not manager.get_hookcallers(module):
-                text = "it registers nothing: write a function armcal_register_... after @hookimpl."
-                raise PluginError(text, where=Location(file))
+    for plugin, origin in chosen:
+        module = None
+        try:
+            module = origin.load() if isinstance(origin, EntryPoint) else origin
+            components += _announced(manager, plugin, module)
+        except (Exception, SystemExit) as fault:  # whatever a third party's module does, the others must work
+            if plugin.is_file:
+                file = getattr(module, "__file__", None)
+                kind = PluginError if isinstance(fault, PluginError) else BrokenPluginError
+                raise kind(said(fault), where=Location(file, line=_line(fault, file))) from fault
+            if manager.is_registered(module):
+                manager.unregister(module)
+            plugin = replace(plugin, fault=said(fault))
         plugins.append(plugin)
     return PluginRegistry(tuple(plugins), tuple(components), manager)
 
@@ -373,6 +355,8 @@ def _announced(manager: pluggy.PluginManager, plugin: PluginInfo, module: Any) -
         for own in getattr(manager.hook, hook).get_hookimpls():
             if own.plugin is module:
                 own.function(*[register for _ in own.argnames])
+    if plugin.is_file and not manager.get_hookcallers(module):
+        raise PluginError("it registers nothing: write a function armcal_register_... after @hookimpl.")
     return announced
 
 
