@@ -1,6 +1,5 @@
 """``armcal replay``."""
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -15,7 +14,6 @@ from rich.table import Table
 
 from armcal_online.running.replay import (
     WARM_UP,
-    Comparison,
     JournalReplayer,
     KeptJournal,
     ReplayVerifier,
@@ -26,7 +24,6 @@ from armcal_online.running.replay import (
     kept_journal,
     kept_settings,
     replay,
-    side_by_side,
 )
 from armcal_online.running.session import OURS
 from armcal_online.tracking.recalibrator import Recalibrator
@@ -73,19 +70,27 @@ def replay_command(
     verifier = ReplayVerifier(session.evaluator)
     with console.progress() as progress:
         done = replay(held, session, verifier, until, progress)
-        other = None
+        others: JournalReplayer | None = None
         if other_settings is not None:
-            others = Recalibrator(begun_from, _evaluated(other_settings, evaluator), registry)
-            other = compared(done, replay(held, others, None, until, progress, "with other settings"))
-    chosen = other.replayer if other else done
+            begun = Recalibrator(begun_from, _evaluated(other_settings, evaluator), registry)
+            others = replay(held, begun, None, until, progress, "with other settings")
+    chosen = others or done
     written = calibration if calibration and not done.difference else None
     if written:
         write_whole(REAL_FILES, written, chosen.session.calibration_text().encode())
-    console.result(_as_json(held, done, verifier, other, written))
-    _show(console, held, done, verifier, other)
+    content = _content(held, done, verifier, others, written)
+    console.result(content)
+    _show(console, content, verifier)
     if written:
         console.line(f"the calibration after entry {chosen.last}: {written}")
-    _leave(held, done)
+    if held.cut is not None:
+        console.warn(held.cut.sentence)
+    context = click.get_current_context()
+    if held.damage is not None:
+        say(f"armcal: {held.damage}", err=True)
+        context.exit(EXIT_BAD_INPUT)
+    if done.difference is not None:
+        context.exit(EXIT_FAULT)
 
 
 def _evaluated(settings: RecalibrateSettings, evaluator: str | None) -> RecalibrateSettings:
@@ -104,66 +109,18 @@ def _check_out(out: Path | None, folder: Path) -> None:
         raise InputError("no file can be written there.", where=Location(str(out)), hint="Give a file in a folder.")
 
 
-def _leave(held: KeptJournal, done: JournalReplayer) -> None:
-    context = click.get_current_context()
-    if held.damage is not None:
-        say(f"armcal: {held.damage}", err=True)
-        context.exit(EXIT_BAD_INPUT)
-    if done.difference is not None:
-        context.exit(EXIT_FAULT)
-
-
-def _show(
-    console: Console, held: KeptJournal, done: JournalReplayer, verifier: ReplayVerifier, other: Comparison | None
-) -> None:
-    header = held.first.header
-    console.line(f"{held.folder}: begun from {header['path']}, replayed from entry {done.first} to {done.last}")
-    same = "as the journal was written" if not verifier.others else f"another than the journal's: {verifier.others[0]}"
-    console.line(f"evaluator: {done.session.evaluator['backend']}, {same}")
-    for text in verifier.others[1:]:
-        console.detail(f"  {text}")
-    counts = f"{done.entries} entries, {verifier.states} states compared"
-    if done.difference is not None:
-        console.line(f"{counts}; after entry {done.difference.sequence} they differ. {done.difference.sentence}")
-    elif verifier.equal == verifier.states:
-        console.line(f"{counts}, all the same to the last bit")
-    else:
-        counts = f"{counts}, {verifier.equal} the same to the last bit"
-        console.line(f"{counts}; all {verifier.decisions} decisions and levels are the same")
-    if other is not None:
-        console.out.print(_table(done, other))
-    else:
-        state = done.session.state
-        counts = ", ".join(f"{count} {verdict}" for verdict, count in state.counts.items())
-        console.line(f"{done.records} records, of these in the estimate: {counts}; level {state.health.level}")
-    if held.cut is not None:
-        console.warn(held.cut.sentence)
-
-
-def _table(done: JournalReplayer, other: Comparison) -> Table:
-    """Both courses."""
-    table = Table(title="what was done, and what other settings would have done")
-    for heading in ("", "done", "with other settings"):
-        table.add_column(heading)
-    for number, one, two in side_by_side(done, other.replayer):
-        table.add_row(f"entry {number}", one or "-", two or "-")
-    table.add_section()
-    states = done.session.state, other.replayer.session.state
-    for what in states[0].counts:
-        table.add_row(what, *(str(state.counts[what]) for state in states))
-    table.add_row("level at the end", *(state.health.level for state in states))
-    name = f"mean innovation of {other.records} records after the first {WARM_UP} that both accept"
-    table.add_row(name, *("-" if math.isnan(size) else f"{1000 * size:.3f} mm" for size in other.innovation_m))
-    table.add_row("largest difference of a parameter", "", f"{other.apart_sd:.3g} sd, {other.parameter}")
-    return table
-
-
-def _as_json(
-    held: KeptJournal, done: JournalReplayer, verifier: ReplayVerifier, other: Comparison | None, written: Path | None
-) -> Mapping[str, Any]:
+def _content(
+    held: KeptJournal,
+    done: JournalReplayer,
+    verifier: ReplayVerifier,
+    others: JournalReplayer | None,
+    written: Path | None,
+) -> dict[str, Any]:
+    """Everything that terminal and other programs show."""
     difference = done.difference
     content: dict[str, Any] = {
         "journal": str(held.folder),
+        "begun_from": held.first.header["path"],
         "entries": done.entries,
         "first": done.first,
         "last": done.last,
@@ -176,14 +133,9 @@ def _as_json(
         "calibration": str(written) if written else None,
         **_outcome(done),
     }
-    if other is not None:
-        content["other_settings"] = {
-            **_outcome(other.replayer),
-            "mean_innovation_mm": [1000 * size for size in other.innovation_m],
-            "innovations_compared": other.records,
-            "largest_difference": {"parameter": other.parameter, "sd": other.apart_sd},
-        }
-    return cast(Mapping[str, Any], finite(content))
+    if others is not None:
+        content["other_settings"] = {**_outcome(others), **compared(done, others)}
+    return cast(dict[str, Any], finite(content))
 
 
 def _outcome(done: JournalReplayer) -> dict[str, Any]:
@@ -194,3 +146,48 @@ def _outcome(done: JournalReplayer) -> dict[str, Any]:
         "level": state.health.level,
         "decisions": [event for event in done.decisions if event["event"] == "decision"],
     }
+
+
+def _show(console: Console, content: Mapping[str, Any], verifier: ReplayVerifier) -> None:
+    first, last, others = content["first"], content["last"], content["other_evaluator"]
+    console.line(f"{content['journal']}: begun from {content['begun_from']}, replayed from entry {first} to {last}")
+    same = f"another than the journal's: {others[0]}" if others else "as the journal was written"
+    console.line(f"evaluator: {content['evaluator']['backend']}, {same}")
+    for text in others[1:]:
+        console.detail(f"  {text}")
+    counts, difference = f"{content['entries']} entries, {verifier.states} states compared", content["difference"]
+    if difference is not None:
+        console.line(f"{counts}; after entry {difference['after']} they differ. {difference['sentence']}")
+    elif verifier.equal == verifier.states:
+        console.line(f"{counts}, all the same to the last bit")
+    else:
+        counts = f"{counts}, {verifier.equal} the same to the last bit"
+        console.line(f"{counts}; all {verifier.decisions} decisions and levels are the same")
+    if "other_settings" in content:
+        console.out.print(_table(content, content["other_settings"]))
+    else:
+        texts = ", ".join(f"{count} {verdict}" for verdict, count in content["counts"].items())
+        console.line(f"{content['records']} records, of these in the estimate: {texts}; level {content['level']}")
+
+
+def _table(done: Mapping[str, Any], other: Mapping[str, Any]) -> Table:
+    """Both courses."""
+    table = Table(title="what was done, and what other settings would have done")
+    for heading in ("", "done", "with other settings"):
+        table.add_column(heading)
+    sentences: dict[int, list[str]] = {}
+    for place, course in enumerate((done, other)):
+        for event in course["decisions"]:
+            row = sentences.setdefault(event["sequence"], ["", ""])
+            row[place] = f"{row[place]} {event['sentence']}".strip()
+    for number, (one, two) in sorted(sentences.items()):
+        table.add_row(f"entry {number}", one or "-", two or "-")
+    table.add_section()
+    for what in done["counts"]:
+        table.add_row(what, *(str(course["counts"][what]) for course in (done, other)))
+    table.add_row("level at the end", done["level"], other["level"])
+    name = f"mean innovation of {other['innovations_compared']} records after the first {WARM_UP} that both accept"
+    table.add_row(name, *("-" if size is None else f"{size:.3f} mm" for size in other["mean_innovation_mm"]))
+    farthest = other["largest_difference"]
+    table.add_row("largest difference of a parameter", "", f"{farthest['sd']:.3g} sd, {farthest['parameter']}")
+    return table

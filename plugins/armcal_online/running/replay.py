@@ -272,22 +272,13 @@ def _summary(state: State) -> str:
     return ", ".join(f"{count} {what}" for what, count in state.counts.items()) + f", level {state.health.level}"
 
 
-@dataclass(frozen=True)
-class Judged:
-    """A record, and what became of it; ``residual_m`` is NaN where no position was measured."""
-
-    sequence: int
-    verdict: str
-    residual_m: float
-
-
 class JournalReplayer:
     """Moves a session on by entries; mutable.
 
     Attributes:
         entries, records: how many were gone through.
         first, last: sequence numbers of the first checkpoint and of the last entry.
-        judged: each record.
+        accepted: how far off the tip was predicted at each record (m); NaN if it was not accepted, or has no position.
         decisions: events of the kinds that a journal notes, and rollbacks.
         difference: the first one from the journal; None where there is none.
     """
@@ -303,7 +294,7 @@ class JournalReplayer:
         self._pending_after = 0
         self._is_lost = False
         self.entries = self.records = self.first = self.last = 0
-        self.judged: list[Judged] = []
+        self.accepted: dict[int, float] = {}
         self.decisions: list[Event] = []
         self.difference: DiffersError | None = None
 
@@ -385,9 +376,8 @@ class JournalReplayer:
                 self.decisions += self._pending
                 for event in events:
                     if event["event"] == RECORD:
-                        residual = event.get("residual_mm")
-                        size = math.hypot(*residual) / 1000 if residual else math.nan
-                        self.judged.append(Judged(entry.sequence, event["verdict"], size))
+                        residual = event.get("residual_mm") if event["verdict"] == "accepted" else None
+                        self.accepted[entry.sequence] = math.hypot(*residual) / 1000 if residual else math.nan
 
     def _compare_note(self, sequence: int, content: Mapping[str, Any]) -> None:
         if self._is_lost:
@@ -436,33 +426,11 @@ def replay(
     return replayer
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """A replay beside what was done.
-
-    Attributes:
-        replayer: of the other settings.
-        innovation_m: the mean distance of measured and predicted tips in each, over the records that both
-            accepted after the first ``WARM_UP``; NaN without such a record.
-        records: how many these are.
-        apart_sd: the largest difference of a parameter that is free in both, in the standard deviation of the first.
-        parameter: which one that is.
-    """
-
-    replayer: JournalReplayer
-    innovation_m: tuple[float, float]
-    records: int
-    apart_sd: float
-    parameter: str
-
-
-def compared(one: JournalReplayer, other: JournalReplayer) -> Comparison:
-    """Two replays of one journal."""
-    theirs = {judged.sequence: judged for judged in other.judged}
-    pairs = [(judged, theirs[judged.sequence]) for judged in one.judged[WARM_UP:] if judged.sequence in theirs]
-    sizes = [(a.residual_m, b.residual_m) for a, b in pairs if a.verdict == b.verdict == "accepted"]
-    known = np.array([size for size in sizes if np.isfinite(size).all()]).reshape(-1, 2)
-    means = known.mean(axis=0).tolist() if len(known) else [np.nan, np.nan]
+def compared(one: JournalReplayer, other: JournalReplayer) -> dict[str, Any]:
+    """A replay with other settings beside what was done: how far off the records that both accept were predicted, in
+    the mean, and the parameter that is free in both and farthest apart, in the standard deviation of the first."""
+    pairs = [(size, other.accepted.get(sequence, math.nan)) for sequence, size in [*one.accepted.items()][WARM_UP:]]
+    known = np.array([pair for pair in pairs if np.isfinite(pair).all()]).reshape(-1, 2)
     second = other.session.estimate
     apart = {
         name: abs(second[name][0] - value) / sd
@@ -470,21 +438,11 @@ def compared(one: JournalReplayer, other: JournalReplayer) -> Comparison:
         if name in second and sd > 0
     }
     farthest = max(apart, key=lambda name: apart[name], default="")
-    return Comparison(other, (means[0], means[1]), len(known), apart.get(farthest, 0.0), farthest)
-
-
-def side_by_side(one: JournalReplayer, other: JournalReplayer) -> list[tuple[int, str, str]]:
-    """Decisions by entry: the sequence number, and the sentences of each replay there."""
-    first, second = _sentences(one.decisions), _sentences(other.decisions)
-    return [(n, first.get(n, ""), second.get(n, "")) for n in sorted({*first, *second})]
-
-
-def _sentences(events: list[Event]) -> Mapping[int, str]:
-    sentences: dict[int, str] = {}
-    for event in events:
-        if event["event"] == "decision":
-            sentences[event["sequence"]] = f"{sentences.get(event['sequence'], '')} {event['sentence']}".strip()
-    return sentences
+    return {
+        "mean_innovation_mm": (1000 * known.mean(axis=0)).tolist() if len(known) else [None, None],
+        "innovations_compared": len(known),
+        "largest_difference": {"parameter": farthest, "sd": apart.get(farthest, 0.0)},
+    }
 
 
 class NoRecords(Source):
