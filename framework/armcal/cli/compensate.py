@@ -16,8 +16,7 @@ from armcal.calibration.compensation.request import Redundancy
 from armcal.calibration.recorded_range import beyond_records
 from armcal.cli.common import FILE, Console, accept, arm, point, spare_inputs, speaking, within
 from armcal.errors import InputError, Location
-from armcal.run.compensate import Assessed, Bench, assess, commanded, summary, write_commands
-from armcal.run.target_file import TargetFile, check_units
+from armcal.run.compensate import Assessed, Bench, TargetFile, assess, check_units, commanded, summary, write_commands
 
 _SHOWN = 5
 _SAME_POINT_M = 1e-5

@@ -16,8 +16,6 @@ from armcal.report.svg import DIAMOND, Axis, Box, Figure
 from armcal.run.judging import IntervalResult
 from armcal.run.result import RunResult
 
-PLAIN_POINTS = 3000
-"""More records than this are drawn as bands, not one by one."""
 _CURVE_POINTS = 240
 _LOG_FROM = 6.0
 _OUTLIER = 4.0
@@ -98,27 +96,25 @@ def in_order(result: RunResult, worst: Indices) -> Figure | None:
     ninety_five, largest = float(np.percentile(finite, 95)), float(finite.max())
     clipped = len(finite) > 20 and largest > _OUTLIER * ninety_five > 0
     top = 2 * ninety_five if clipped else max(largest * 1.06, 1e-9)
-    thinned = len(errors) > PLAIN_POINTS
+    chosen = _thinned(errors, np.flatnonzero(np.isfinite(errors)))
     beyond = int(np.sum(finite > top)) if clipped else 0
     words = "The dashed line marks 95 % of all records; rings mark the ten worst. "
-    if thinned:
-        words += f"{plural(len(errors), 'record')} are too many to draw one by one: drawn as bands. "
-    else:
-        words += "The dark line is the running median: where it wanders, the setup changed on the way. "
+    words += "The dark line is the running median: where it wanders, the setup changed on the way. "
+    words += _drawn(len(chosen), len(finite))
     words += f"Triangles: {plural(beyond, 'record')} beyond the axis." if beyond else ""
     few = len(finite) < FEWEST_FOR_P95
     most = f"all lie below {significant(largest)}" if few else f"95 % lie below {significant(ninety_five)}"
     said = f"{plural(len(errors), 'record')}; {most} {result.errors.unit}."
 
     def draw(width: float) -> tuple[float, list[str]]:
-        start, parts = svg.legend(52, width - 60, _order_legend(result, thinned))
+        start, parts = svg.legend(52, width - 60, _order_legend(result))
         box = Box(52, start + 2, width - 16, start + (270 if width > svg.NARROW else 220))
         x = Axis(0.5, len(errors) + 0.5, box.left, box.right)
         y = Axis(0, top, box.bottom, box.top)
         labels = ("record, in recorded order", f"calibrated error, {result.errors.unit}")
         parts += svg.frame(box, x, y, labels, (10 if width > svg.NARROW else 5, 5))
         parts.append(svg.line(box.left, y.of(ninety_five), box.right, y.of(ninety_five), "guide"))
-        parts += _banded(result, x, y) if thinned else _one_by_one(result, x, y)
+        parts += _one_by_one(result, chosen, x, y)
         ringed = worst[np.isfinite(errors[worst])]
         parts += [svg.circle(x.of(i + 1), y.of(float(errors[i])), 6, "ring") for i in ringed]
         return box.bottom + 44, parts
@@ -126,59 +122,47 @@ def in_order(result: RunResult, worst: Indices) -> Figure | None:
     return svg.both("order", ("Error of each record in recorded order", said, words), draw)
 
 
-def _order_legend(result: RunResult, thinned: bool) -> list[tuple[str, str]]:
+def _order_legend(result: RunResult) -> list[tuple[str, str]]:
     _, holdout = _roles(result)
-    if thinned:
-        entries = [('<path class="spread" d="M0-6h22v12h-22z"/>', "5 to 95 % of the records")]
-        entries.append(('<path class="running" d="M0 0h22"/>', "train, median"))
-        held = ('<path class="curve holdout" d="M0 0h22"/>', "holdout, median")
-    else:
-        entries = [('<path class="dot train" d="M11 0h0"/>', "train")]
-        held = (f'<path class="diamond" d="M11 0{DIAMOND}"/>', "holdout")
+    entries = [('<path class="dot train" d="M11 0h0"/>', "train")]
     if holdout.any():
-        entries.append(held)
+        entries.append((f'<path class="diamond" d="M11 0{DIAMOND}"/>', "holdout"))
     ring = '<circle cx="11" cy="0" r="6" class="ring"/>'
     return [*entries, (ring, "ten worst" if len(holdout) > 10 else "worst first")]
 
 
-def _one_by_one(result: RunResult, x: Axis, y: Axis) -> list[str]:
-    errors = result.errors.calibrated_mm
-    train, holdout = _roles(result)
-    place = np.arange(1, len(errors) + 1, dtype=float)
-    inside, above = errors <= y.high, np.isfinite(errors) & (errors > y.high)
+def _one_by_one(result: RunResult, chosen: Indices, x: Axis, y: Axis) -> list[str]:
+    whole = result.errors.calibrated_mm
+    train, holdout = (role[chosen] for role in _roles(result))
+    errors, place = whole[chosen], chosen.astype(np.float64) + 1
+    inside, above = errors <= y.high, errors > y.high
     dotted = ((train & inside, "dot train"), (~train & ~holdout & inside, "dot before"))
-    parts = [svg.dots(x.at(place[chosen]), y.at(errors[chosen]), css) for chosen, css in dotted]
+    parts = [svg.dots(x.at(place[some]), y.at(errors[some]), css) for some, css in dotted]
     held = holdout & inside
     parts.append(svg.marks(x.at(place[held]), y.at(errors[held]), DIAMOND, "diamond"))
-    for chosen, css in ((above & ~holdout, "fill-train"), (above & holdout, "fill-holdout")):
-        parts.append(svg.marks(x.at(place[chosen]), y.at(errors[chosen]), _TRIANGLE, css))
-    if np.isfinite(errors).all() and len(errors) >= 30:
-        window = max(15, len(errors) // 12)
-        middle = np.median(np.lib.stride_tricks.sliding_window_view(errors, window), axis=1)
-        centre = place[: len(middle)] + (window - 1) / 2
-        parts.append(svg.polyline(x.at(centre), y.at(middle), "running"))
+    for some, css in ((above & ~holdout, "fill-train"), (above & holdout, "fill-holdout")):
+        parts.append(svg.marks(x.at(place[some]), y.at(errors[some]), _TRIANGLE, css))
+    if np.isfinite(whole).all() and len(whole) >= 30:
+        window = max(15, len(whole) // 12)
+        starts = np.unique(np.linspace(0, len(whole) - window, _CURVE_POINTS).astype(np.intp))
+        middle = np.array([np.median(whole[start : start + window]) for start in starts])
+        parts.append(svg.polyline(x.at(starts.astype(np.float64) + (window + 1) / 2), y.at(middle), "running"))
     return parts
 
 
-def _banded(result: RunResult, x: Axis, y: Axis) -> list[str]:
-    errors = np.where(np.isfinite(result.errors.calibrated_mm), result.errors.calibrated_mm, np.nan)
-    train, holdout = _roles(result)
-    number = max(20, int(abs(x.end - x.start) / 5))
-    bins = np.array_split(np.arange(len(errors)), number)
-    centre = x.at([float(b.mean()) + 1 for b in bins])
-    spread = np.array([_percentiles(errors[b], (5, 95)) for b in bins])
-    known = np.isfinite(spread).all(axis=1)
-    parts = [svg.band(centre[known], y.at(spread[known, 0]), y.at(spread[known, 1]), "spread")]
-    for mask, css in ((train, "running"), (holdout, "curve holdout")):
-        middle = np.array([_percentiles(errors[b][mask[b]], (50,))[0] for b in bins])
-        seen = np.isfinite(middle)
-        parts.append(svg.polyline(centre[seen], y.at(middle[seen]), css))
-    return parts
+def _thinned(numbers: Array, known: Indices) -> Indices:
+    """Of records, evenly through the recorded order, and those with the largest numbers in any case."""
+    if len(known) <= MOST_POINTS:
+        return known
+    worst = known[np.argsort(-numbers[known], kind="stable")[:50]]
+    even = known[np.linspace(0, len(known) - 1, MOST_POINTS - 50).astype(np.intp)]
+    return np.unique(np.concatenate([even, worst]))
 
 
-def _percentiles(values: Array, shares: tuple[int, ...]) -> Array:
-    values = values[np.isfinite(values)]
-    return np.percentile(values, shares) if len(values) else np.full(len(shares), np.nan)
+def _drawn(chosen: int, total: int) -> str:
+    if chosen == total:
+        return ""
+    return f"{count(chosen)} of {count(total)} drawn, evenly chosen, the 50 worst among them. "
 
 
 @dataclass(frozen=True)
@@ -222,11 +206,7 @@ def _views(result: RunResult, what: Coloured) -> list[Figure]:
     known = np.flatnonzero(np.isfinite(what.numbers) & np.isfinite(position[:3]).all(axis=0))
     if not len(known):
         return []
-    chosen = known
-    if len(known) > MOST_POINTS:  # evenly through the recorded order, and the worst in any case
-        worst = known[np.argsort(-what.numbers[known], kind="stable")[:50]]
-        even = known[np.linspace(0, len(known) - 1, MOST_POINTS - 50).astype(np.intp)]
-        chosen = np.unique(np.concatenate([even, worst]))
+    chosen = _thinned(what.numbers, known)
     chosen = chosen[np.argsort(what.numbers[chosen], kind="stable")]
     return [_view(position, what, chosen, len(known), axes) for axes in ((0, 1), (0, 2))]
 
@@ -253,8 +233,7 @@ def _view(position: Array, what: Coloured, chosen: Indices, total: int, axes: tu
     caption = f"Predicted tip positions; the darker, the larger the {what.name}."
     if enlarged:
         caption += f" Lines: residuals, {significant(enlarged, 1)} times enlarged."
-    if len(chosen) < total:
-        caption += f" {count(len(chosen))} of {count(total)} drawn, evenly chosen, the 50 worst among them."
+    caption += f" {_drawn(len(chosen), total)}".rstrip()
     said = (
         f"{plural(len(chosen), 'tip position')} seen along {({'xy': 'z', 'xz': 'y'})[across + up]}; the largest "
         f"{what.name}, {significant(float(numbers[-1]))} {unit}, "

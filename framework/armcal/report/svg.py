@@ -126,10 +126,8 @@ def line(x1: float, y1: float, x2: float, y2: float, css: str) -> str:
     return f'<path class="{css}" d="M{x1:.1f} {y1:.1f}L{x2:.1f} {y2:.1f}"/>'
 
 
-def rect(x: float, y: float, width: float, height: float, fill: str, title: str = "") -> str:
-    """A filled rectangle, with a tooltip if a title is given."""
-    head = f'<rect x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" fill="{fill}"'
-    return f"{head}><title>{escape(title)}</title></rect>" if title else f"{head}/>"
+def rect(x: float, y: float, width: float, height: float, fill: str) -> str:
+    return f'<rect x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" fill="{fill}"/>'
 
 
 def circle(x: float, y: float, radius: float, css: str) -> str:
@@ -139,10 +137,6 @@ def circle(x: float, y: float, radius: float, css: str) -> str:
 def polyline(x: Array, y: Array, css: str) -> str:
     points = "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
     return f'<path class="{css}" d="M{points}"/>' if points else ""
-
-
-def band(x: Array, low: Array, high: Array, css: str) -> str:
-    return polyline(np.concatenate([x, x[::-1]]), np.concatenate([low, high[::-1]]), css)
 
 
 def dots(x: Array, y: Array, css: str, colour: str = "") -> str:
