@@ -79,17 +79,11 @@ class Pca9685Settings(Settings):
 
 @dataclass(frozen=True)
 class _Guard:
-    """What a board does by itself when its host falls silent: where to go, how fast, after which silence.
+    """What a board does by itself when its host falls silent: where to go, how fast, after which silence."""
 
-    Attributes:
-        waypoints: counts by joint.
-        rate: rad/s.
-        after_s: s.
-    """
-
-    waypoints: tuple[Mapping[str, int], ...]
-    rate: float
-    after_s: float
+    waypoints: tuple[Mapping[str, int], ...]  # counts by joint
+    rate: float  # rad/s
+    after_s: float  # s
 
     def hand_over(self, link: GuardedLink, servos: Mapping[str, Servo], standing: Mapping[str, int]) -> None:
         """To the board, for the joints that have pulses.

@@ -31,25 +31,15 @@ from armcal_online.tracking.state import State
 
 @dataclass(frozen=True)
 class KeptJournal:
-    """What a journal holds, as far as it is good.
+    """What a journal holds, as far as it is good."""
 
-    Attributes:
-        folder: of its files.
-        first: its oldest segment.
-        entries: how many there are, headers and checkpoints not counted.
-        last: the sequence number of the last one.
-        targets: where rollbacks go to.
-        cut: what a stop of the writer left at its end.
-        damage: where it stops being good.
-    """
-
-    folder: Path
-    first: Segment
-    entries: int
-    last: int
-    targets: tuple[int, ...]
-    cut: Cut | None
-    damage: JournalDamagedError | None
+    folder: Path  # of its files
+    first: Segment  # its oldest segment
+    entries: int  # how many there are, headers and checkpoints not counted
+    last: int  # the sequence number of the last one
+    targets: tuple[int, ...]  # where rollbacks go to
+    cut: Cut | None  # what a stop of the writer left at its end
+    damage: JournalDamagedError | None  # where it stops being good
 
     def check_until(self, until: int | None, name: str = "--until") -> None:
         """Refuse an entry to end with that the journal does not hold; ``name`` is what was given.

@@ -39,19 +39,15 @@ class Setup:
     """A recalibration, but for its source and its recalibrator.
 
     Attributes:
-        folder: of everything that it keeps.
-        calibration: the file it begins from.
         stream: where events are written to, besides the file.
-        pace: how often other things are.
-        limits: how large the journal may grow; None: as the settings have it.
         kept: the header of the journal that is gone on with, where ``calibration`` may be gone.
     """
 
-    folder: Path
-    calibration: Path
+    folder: Path  # of everything that it keeps
+    calibration: Path  # the file it begins from
     stream: StandardOutput = field(default_factory=lambda: StandardOutput(None))
-    pace: Pace = field(default_factory=Pace)
-    limits: JournalLimits | None = None
+    pace: Pace = field(default_factory=Pace)  # how often other things are
+    limits: JournalLimits | None = None  # how large the journal may grow; None: as the settings have it
     files: FileLayer = REAL_FILES
     kept: Mapping[str, Any] | None = None
 

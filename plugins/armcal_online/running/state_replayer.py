@@ -38,21 +38,13 @@ Reach = Callable[[int], tuple[Entry, tuple[Entry, ...]]]
 
 @dataclass
 class Progress:
-    """Rows taken by file, the records taken last, and whether records are passed over.
+    """Rows taken by file, the records taken last, and whether records are passed over."""
 
-    Attributes:
-        records: how many records were journalled, from the beginning.
-        paused: whether records are passed over.
-        rows: the last one taken, by file.
-        through: all files up to this name were taken.
-        recent: sequence numbers of the last records of streams.
-    """
-
-    records: int = 0
-    paused: bool = False
-    rows: dict[str, int] = field(default_factory=dict)
-    through: str = ""
-    recent: dict[str, int] = field(default_factory=dict)
+    records: int = 0  # how many records were journalled, from the beginning
+    paused: bool = False  # whether records are passed over
+    rows: dict[str, int] = field(default_factory=dict)  # the last one taken, by file
+    through: str = ""  # all files up to this name were taken
+    recent: dict[str, int] = field(default_factory=dict)  # sequence numbers of the last records of streams
 
     @property
     def positions(self) -> dict[str, int]:

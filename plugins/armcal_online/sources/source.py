@@ -30,23 +30,17 @@ class Incoming:
     """One record as it came.
 
     Attributes:
-        record_id: its id; the row where its source gives none.
         channels: SI numbers by channel (``arm.q1``, ``tracker.x``, ``gravity_z``, ``time``); NaN where a value is
             missing, infinite as given.
-        labels: text columns that no channel claims (a socket's name).
-        arrived: unix seconds, by our clock.
-        source_key: the file within the source, or empty.
-        source_row: the row in it, from 1 (the line in a text file).
-        fault: why it could not be read, a sentence; there are no channels then.
     """
 
-    record_id: str
+    record_id: str  # its id; the row where its source gives none
     channels: Mapping[str, float]
-    labels: Mapping[str, str]
-    arrived: float
-    source_key: str = ""
-    source_row: int = 0
-    fault: str = ""
+    labels: Mapping[str, str]  # text columns that no channel claims (a socket's name)
+    arrived: float  # unix seconds, by our clock
+    source_key: str = ""  # the file within the source, or empty
+    source_row: int = 0  # the row in it, from 1 (the line in a text file)
+    fault: str = ""  # why it could not be read, a sentence; there are no channels then
 
     def as_dict(self) -> dict[str, Any]:
         """As JSON: floats exactly, those that are not finite as ``nan``, ``inf`` and ``-inf``."""

@@ -113,25 +113,15 @@ def _nearest_in_cones(root: Array, given: Array, ends: tuple[Array, Array], scal
 
 @dataclass(frozen=True)
 class GaussMarkovState:
-    """One process.
+    """One process."""
 
-    Attributes:
-        name: for people.
-        over: the distance over which it forgets, in units of the channel.
-        channel: ``sequence`` (places in a recording), ``record`` (one by one) or ``time`` (s).
-        coordinate: of the parameter that it moves; None for a shift of readings.
-        size: its standard deviation: in scaled coordinates of the parameter.
-        instance: the measurement whose readings it shifts.
-        shift: how it shifts the residual's entries, a standard deviation long (n_r; m or rad).
-    """
-
-    name: str
-    over: float
-    channel: str
-    coordinate: int | None = None
-    size: float = 0.0
-    instance: str = ""
-    shift: tuple[float, ...] = ()
+    name: str  # for people
+    over: float  # the distance over which it forgets, in units of the channel
+    channel: str  # ``sequence`` (places in a recording), ``record`` (one by one) or ``time`` (s)
+    coordinate: int | None = None  # of the parameter that it moves; None for a shift of readings
+    size: float = 0.0  # its standard deviation: in scaled coordinates of the parameter
+    instance: str = ""  # the measurement whose readings it shifts
+    shift: tuple[float, ...] = ()  # how it shifts the residual's entries, a standard deviation long (n_r; m or rad)
 
 
 @dataclass(frozen=True)
@@ -171,15 +161,10 @@ def shared_error(instance: str, covariance: Array, over: float, channel: str) ->
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """How a belief widens between records.
+    """How a belief widens between records."""
 
-    Attributes:
-        rates: variance that each parameter's scaled coordinate gains in a second (n).
-        gauss_markov: the states beside the parameters.
-    """
-
-    rates: Array
-    gauss_markov: GaussMarkovStates
+    rates: Array  # variance that each parameter's scaled coordinate gains in a second (n)
+    gauss_markov: GaussMarkovStates  # the states beside the parameters
 
     def faded(self, belief: Belief, passed: Mapping[str, float]) -> Belief:
         """The belief after some distance in ``time`` (s), ``record`` and ``sequence`` (records)."""

@@ -30,20 +30,13 @@ class DecisionKind:
     ``do`` and ``confirm`` are whole sentences for somebody who cannot reach the arm. They may hold ``{subject}`` (the
     joint, instrument or link), ``{candidates}`` (all that it may be), ``{calm}`` (how many records in a row without
     trouble improve the level) and ``{good}`` (where to roll back to).
-
-    Attributes:
-        means: what happened, in general; for the page of all decisions.
-        do: what to do now.
-        confirm: what would confirm it, or show that it is wrong.
-        level: of health that it means; None: it says nothing about the arm.
-        explains: whether what did not fit is explained by it.
     """
 
-    means: str
-    do: str
-    confirm: str
-    level: Level | None
-    explains: bool = False
+    means: str  # what happened, in general; for the page of all decisions
+    do: str  # what to do now
+    confirm: str  # what would confirm it, or show that it is wrong
+    level: Level | None  # of health that it means; None: it says nothing about the arm
+    explains: bool = False  # whether what did not fit is explained by it
 
 
 KINDS: Mapping[str, DecisionKind] = {
@@ -225,27 +218,16 @@ LEVEL_ADVICE: Mapping[Level, str] = {
 
 @dataclass(frozen=True)
 class Decision:
-    """Something that was decided.
+    """Something that was decided."""
 
-    Attributes:
-        kind: its name in ``KINDS``.
-        what: what happened, a clause without a full stop.
-        why: the evidence, a clause without a full stop.
-        log_odds: of this against everything else that was considered.
-        since: the number of the first record that it affects.
-        subject: a joint's channel, a measurement, or that of a cause.
-        candidates: what these records cannot distinguish, the likeliest first.
-        size: of a step.
-    """
-
-    kind: str
-    what: str
-    why: str
-    log_odds: float
-    since: int
-    subject: str = ""
-    candidates: tuple[str, ...] = ()
-    size: Size | None = None
+    kind: str  # its name in ``KINDS``
+    what: str  # what happened, a clause without a full stop
+    why: str  # the evidence, a clause without a full stop
+    log_odds: float  # of this against everything else that was considered
+    since: int  # the number of the first record that it affects
+    subject: str = ""  # a joint's channel, a measurement, or that of a cause
+    candidates: tuple[str, ...] = ()  # what these records cannot distinguish, the likeliest first
+    size: Size | None = None  # of a step
 
     @property
     def level(self) -> Level:

@@ -97,18 +97,14 @@ class JointStep:
     """A step of one joint.
 
     Attributes:
-        joint: its channel, ``arm.q3``.
-        dimension: ``angle`` or ``length``.
-        direction: in scaled coordinates, of a step of 1 rad or m (n).
         local: coordinates that act along this joint's motion alone, the offset left out: what a new servo changes.
-        parameter: the one that is the joint's offset; empty if it takes several.
     """
 
-    joint: str
-    dimension: str
-    direction: Array
+    joint: str  # its channel, ``arm.q3``
+    dimension: str  # ``angle`` or ``length``
+    direction: Array  # in scaled coordinates, of a step of 1 rad or m (n)
     local: tuple[int, ...]
-    parameter: str
+    parameter: str  # the one that is the joint's offset; empty if it takes several
 
 
 @dataclass(frozen=True)
@@ -116,17 +112,14 @@ class Steps:
     """Steps that the filter can follow.
 
     Attributes:
-        joints: those that parameters can make.
-        unfollowed: joints whose steps no combination of parameters makes.
         sensors: by measurement, scaled coordinates of shifts (m) and turns (rad) of its frame (n x up to 6), and
             which of ``x y z rx ry rz`` they are.
-        causes: what else may change at once.
     """
 
-    joints: tuple[JointStep, ...]
-    unfollowed: tuple[str, ...]
+    joints: tuple[JointStep, ...]  # those that parameters can make
+    unfollowed: tuple[str, ...]  # joints whose steps no combination of parameters makes
     sensors: Mapping[str, tuple[Array, tuple[str, ...]]]
-    causes: tuple[Cause, ...] = ()
+    causes: tuple[Cause, ...] = ()  # what else may change at once
 
     def dimension(self, joint: str) -> str:
         """Of a joint's step: ``angle`` or ``length``; empty for what is no joint."""
@@ -303,50 +296,29 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Recent:
-    """A record that was judged not long ago.
+    """A record that was judged not long ago."""
 
-    Attributes:
-        sequence: its number.
-        readings: by the measurements.
-        joint_noise: by reading.
-        passed: the distance from the record before, by channel.
-        before: the belief when it came.
-        rejected: whether it was.
-        nis: its normalised innovation squared.
-        dof: of that.
-    """
-
-    sequence: int
-    readings: tuple[Reading, ...]
-    joint_noise: JointNoise
-    passed: Mapping[str, float]
-    before: Belief
-    rejected: bool
-    nis: float
-    dof: int
+    sequence: int  # its number
+    readings: tuple[Reading, ...]  # by the measurements
+    joint_noise: JointNoise  # by reading
+    passed: Mapping[str, float]  # the distance from the record before, by channel
+    before: Belief  # the belief when it came
+    rejected: bool  # whether it was
+    nis: float  # its normalised innovation squared
+    dof: int  # of that
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """A hypothesis from its likeliest onset (a place among the last records).
+    """A hypothesis from its likeliest onset (a place among the last records)."""
 
-    Attributes:
-        hypothesis: the change.
-        onset: the first record after the change.
-        log_odds: of it against no change, its prior probability included.
-        share: of the NIS of the records that it takes for good ones, how much it takes away.
-        large: how many records with a large NIS it explains.
-        rejected: how many of them had been rejected.
-        outliers: how many records since the onset it takes for wrong ones, and of how many.
-    """
-
-    hypothesis: Hypothesis
-    onset: int
-    log_odds: float
-    share: float
-    large: int
-    rejected: int
-    outliers: tuple[int, int]
+    hypothesis: Hypothesis  # the change
+    onset: int  # the first record after the change
+    log_odds: float  # of it against no change, its prior probability included
+    share: float  # of the NIS of the records that it takes for good ones, how much it takes away
+    large: int  # how many records with a large NIS it explains
+    rejected: int  # how many of them had been rejected
+    outliers: tuple[int, int]  # how many records since the onset it takes for wrong ones, and of how many
 
 
 @dataclass(frozen=True)

@@ -91,19 +91,12 @@ JointNoise = tuple[Array | None, ...]
 
 @dataclass(frozen=True)
 class Reading:
-    """One record as one measurement reads it.
+    """One record as one measurement reads it."""
 
-    Attributes:
-        factor: which of the problem's measurements.
-        record: its channels in the kernel's order (n_c).
-        group: the place of its group; 0 without groups.
-        noise: covariance of its own error (n_r x n_r).
-    """
-
-    factor: int
-    record: Array
-    group: int
-    noise: Array
+    factor: int  # which of the problem's measurements
+    record: Array  # its channels in the kernel's order (n_c)
+    group: int  # the place of its group; 0 without groups
+    noise: Array  # covariance of its own error (n_r x n_r)
 
 
 class Observer:
@@ -255,19 +248,15 @@ class RecordObservation(Observation):
     """One record about an origin.
 
     Attributes:
-        observer: of the problem.
-        origin: values within their domains, where the model is evaluated.
         base: scaled coordinates (N) of the belief's mean, which may lie off the origin where that is at a bound: the
             model is evaluated as far from the origin as a point is from the base, and continued in a straight line.
-        readings: of the record.
-        joint_noise: by reading.
     """
 
-    observer: Observer
-    origin: Array
+    observer: Observer  # of the problem
+    origin: Array  # values within their domains, where the model is evaluated
     base: Array
-    readings: tuple[Reading, ...]
-    joint_noise: JointNoise = ()
+    readings: tuple[Reading, ...]  # of the record
+    joint_noise: JointNoise = ()  # by reading
     _last: dict[bytes, Linearised] = field(default_factory=dict, compare=False, repr=False)
 
     @override

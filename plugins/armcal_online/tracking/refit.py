@@ -42,19 +42,12 @@ class NetRecord:
 
 @dataclass(frozen=True)
 class Refit:
-    """Where the refit of a window stands.
+    """Where the refit of a window stands."""
 
-    Attributes:
-        origin: values within their domains, as a belief's.
-        mean: scaled coordinates of the parameters about it (n), off it where the records alone leave the domains.
-        widening: of the prior's standard deviations.
-        taken: how many numbers of the records the parameters take up.
-    """
-
-    origin: Array
-    mean: Array
-    widening: float = 1.0
-    taken: float = 0.0
+    origin: Array  # values within their domains, as a belief's
+    mean: Array  # scaled coordinates of the parameters about it (n), off it where the records alone leave the domains
+    widening: float = 1.0  # of the prior's standard deviations
+    taken: float = 0.0  # how many numbers of the records the parameters take up
 
 
 @dataclass(frozen=True)
@@ -275,18 +268,10 @@ class Prediction:
 
 @dataclass(frozen=True)
 class NetState:
-    """What the net knows between two records.
+    """What the net knows between two records."""
 
-    Attributes:
-        seconds: for which parameters have had time to wander since the calibration.
-        records: the last ones.
-        refits: of each window that was filled once.
-        predictions: of the last records, since the filter was last corrected.
-        taken: how many records it has seen.
-    """
-
-    seconds: float = 0.0
-    records: tuple[NetRecord, ...] = ()
-    refits: tuple[Refit, ...] = ()
-    predictions: tuple[Prediction, ...] = ()
-    taken: int = 0
+    seconds: float = 0.0  # for which parameters have had time to wander since the calibration
+    records: tuple[NetRecord, ...] = ()  # the last ones
+    refits: tuple[Refit, ...] = ()  # of each window that was filled once
+    predictions: tuple[Prediction, ...] = ()  # of the last records, since the filter was last corrected
+    taken: int = 0  # how many records it has seen

@@ -20,23 +20,14 @@ from armcal_online.tracking.hypotheses import GRADUAL, Hypothesis
 
 @dataclass(frozen=True)
 class SlowEvidence:
-    """What the records since one speak for, of all slow changes (m columns) together.
+    """What the records since one speak for, of all slow changes (m columns) together."""
 
-    Attributes:
-        since: the number of the record before which the changes would have begun.
-        records: how many have been used since.
-        seconds: since then.
-        effect: how far the belief's mean would be off now, by change (N x m).
-        information: of the records about the changes (m x m).
-        score: their weighted innovations along the changes (m).
-    """
-
-    since: int
-    records: int
-    seconds: float
-    effect: Array
-    information: Array
-    score: Array
+    since: int  # the number of the record before which the changes would have begun
+    records: int  # how many have been used since
+    seconds: float  # since then
+    effect: Array  # how far the belief's mean would be off now, by change (N x m)
+    information: Array  # of the records about the changes (m x m)
+    score: Array  # their weighted innovations along the changes (m)
 
 
 @dataclass(frozen=True)

@@ -43,25 +43,17 @@ class FilterSetup:
     """What a recalibration starts with.
 
     Attributes:
-        problem: compiled once.
-        space: of its free parameters.
-        observer: makes observations of records.
-        belief: that of the calibration.
-        process_noise: how beliefs widen between records.
-        request: what a source should look for.
-        left_out: measurements that cannot be taken one record at a time.
-        held: parameters that are as they were calibrated until a decision opens them.
         model_errors: what the model itself errs by, by measurement; those that err by no more than noise are left out.
     """
 
-    problem: Problem
-    space: StateSpace
-    observer: Observer
-    belief: Belief
-    process_noise: ProcessNoise
-    request: ReadRequest
-    left_out: tuple[str, ...]
-    held: frozenset[str]
+    problem: Problem  # compiled once
+    space: StateSpace  # of its free parameters
+    observer: Observer  # makes observations of records
+    belief: Belief  # that of the calibration
+    process_noise: ProcessNoise  # how beliefs widen between records
+    request: ReadRequest  # what a source should look for
+    left_out: tuple[str, ...]  # measurements that cannot be taken one record at a time
+    held: frozenset[str]  # parameters that are as they were calibrated until a decision opens them
     model_errors: Mapping[str, ModelError]
 
 

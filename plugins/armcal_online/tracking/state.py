@@ -82,21 +82,13 @@ def _span(seconds: float) -> str:
 
 @dataclass(frozen=True)
 class Arrival:
-    """A record that came.
+    """A record that came."""
 
-    Attributes:
-        record_id: its own name.
-        content: a hash of it.
-        sequence: its number.
-        at: its time (as ``State.at``).
-        is_good: whether it was accepted, nothing was decided, and the level was nominal after it.
-    """
-
-    record_id: str
-    content: str
-    sequence: int
-    at: float
-    is_good: bool = False
+    record_id: str  # its own name
+    content: str  # a hash of it
+    sequence: int  # its number
+    at: float  # its time (as ``State.at``)
+    is_good: bool = False  # whether it was accepted, nothing was decided, and the level was nominal after it
 
 
 @dataclass(frozen=True)
@@ -104,50 +96,31 @@ class State:
     """Between two records; with it and the records after, everything comes out again.
 
     Attributes:
-        belief: about parameters and Gauss-Markov states.
-        anchor: the belief before the records that the estimator still holds.
-        held: those records; none for a filter.
-        recent: the last records, for judgement.
-        clock: by records.
-        place: the last record's ``sequence``; None before the first.
-        health: and why.
-        nis_window: NIS and degrees of freedom of the last accepted records.
         counts: of accepted, rejected and ignored records.
-        ids: the last records, in order.
-        good: the last good record of those before.
-        wary: whether the last records look like a change, which is not certain yet.
         suspects: joints that could not be distinguished when one of them stepped, each followed by itself.
-        suspected: the first record after that.
-        before_change: the belief before it.
-        drifted: how often in a row the NIS as a whole was too large.
-        changes: sequence numbers of the last changes that nothing explained.
-        sequence: of the last entry.
-        at: time of the last record (unix seconds, or as records count it).
-        net: the windows of records that are refitted beside the filter.
-        slow: evidence of slow changes, and trends that were found.
     """
 
-    belief: Belief
-    anchor: Belief
-    held: tuple[Recent, ...] = ()
-    recent: tuple[Recent, ...] = ()
-    clock: Clock = field(default_factory=Clock)
-    place: float | None = None
-    health: Health = field(default_factory=Health)
-    nis_window: tuple[tuple[float, int], ...] = ()
+    belief: Belief  # about parameters and Gauss-Markov states
+    anchor: Belief  # the belief before the records that the estimator still holds
+    held: tuple[Recent, ...] = ()  # those records; none for a filter
+    recent: tuple[Recent, ...] = ()  # the last records, for judgement
+    clock: Clock = field(default_factory=Clock)  # by records
+    place: float | None = None  # the last record's ``sequence``; None before the first
+    health: Health = field(default_factory=Health)  # and why
+    nis_window: tuple[tuple[float, int], ...] = ()  # NIS and degrees of freedom of the last accepted records
     counts: Mapping[str, int] = field(default_factory=lambda: {"accepted": 0, "rejected": 0, "ignored": 0})
-    ids: tuple[Arrival, ...] = ()
-    good: Arrival | None = None
-    wary: bool = False
+    ids: tuple[Arrival, ...] = ()  # the last records, in order
+    good: Arrival | None = None  # the last good record of those before
+    wary: bool = False  # whether the last records look like a change, which is not certain yet
     suspects: tuple[Candidate, ...] = ()
-    suspected: int = 0
-    before_change: Belief | None = None
-    drifted: int = 0
-    changes: tuple[int, ...] = ()
-    sequence: int = 0
-    at: float = 0.0
-    net: NetState = field(default_factory=NetState)
-    slow: SlowState = field(default_factory=SlowState)
+    suspected: int = 0  # the first record after that
+    before_change: Belief | None = None  # the belief before it
+    drifted: int = 0  # how often in a row the NIS as a whole was too large
+    changes: tuple[int, ...] = ()  # sequence numbers of the last changes that nothing explained
+    sequence: int = 0  # of the last entry
+    at: float = 0.0  # time of the last record (unix seconds, or as records count it)
+    net: NetState = field(default_factory=NetState)  # the windows of records that are refitted beside the filter
+    slow: SlowState = field(default_factory=SlowState)  # evidence of slow changes, and trends that were found
 
     def following(self, belief: Belief, **changes: Any) -> State:
         return replace(self, belief=belief, anchor=belief, held=(), **changes)

@@ -61,16 +61,13 @@ class TrackerFaults:
     """What is wrong with the tracker now; to be changed at any time.
 
     Attributes:
-        hidden: bodies that it cannot see.
-        silent: it sends nothing, while its frame counter goes on.
         frozen: it sends the last frame again and again, with a ``rising`` counter or the ``same``.
-        skew_ppm: how much its clock gains on top of the settings.
     """
 
-    hidden: set[str] = field(default_factory=set)
-    silent: bool = False
+    hidden: set[str] = field(default_factory=set)  # bodies that it cannot see
+    silent: bool = False  # it sends nothing, while its frame counter goes on
     frozen: Literal["no", "rising", "same"] = "no"
-    skew_ppm: float = 0.0
+    skew_ppm: float = 0.0  # how much its clock gains on top of the settings
 
 
 class DTrackSender:

@@ -14,37 +14,21 @@ Seconds = Annotated[float, Field(ge=0)]
 
 
 class FaultRequest(Settings):
-    """One fault.
+    """One fault."""
 
-    Attributes:
-        kind: which.
-        at: when (simulated s; now by default).
-        after: serial faults and ``nack``: how many messages or writes pass before it.
-        count: serial faults: to how many messages or bytes it happens.
-        direction: serial faults.
-        unit: serial faults: whole frames, or single bytes.
-        byte: ``nack``: the index in the data; -1 is the address.
-        seconds: ``stuck``: for so long.
-        joint: ``disconnect`` to ``put``, and ``brown_out``, of smart servos: whose; all by default.
-        angle: ``put``: where somebody moves the joint by hand (rad); one that holds stays.
-        body: ``lost`` and ``seen``: which; all by default.
-        counter: ``frozen``: what the frame counter does.
-        ppm: ``skew``: how much the tracker's clock gains.
-    """
-
-    kind: str
-    at: Seconds | None = None
-    after: Count = 0
-    count: Annotated[int, Field(ge=1, le=1_000_000)] = 1
-    direction: Literal["to_host", "to_board"] = "to_board"
-    unit: Literal["frames", "bytes"] = "frames"
-    byte: Annotated[int, Field(ge=-1, le=240)] = -1
-    seconds: Seconds = 0.05
-    joint: str | None = None
-    angle: float = 0.0
-    body: str | None = None
-    counter: Literal["rising", "same"] = "rising"
-    ppm: float = 0.0
+    kind: str  # which
+    at: Seconds | None = None  # when (simulated s; now by default)
+    after: Count = 0  # serial faults and ``nack``: how many messages or writes pass before it
+    count: Annotated[int, Field(ge=1, le=1_000_000)] = 1  # serial faults: to how many messages or bytes it happens
+    direction: Literal["to_host", "to_board"] = "to_board"  # serial faults
+    unit: Literal["frames", "bytes"] = "frames"  # serial faults: whole frames, or single bytes
+    byte: Annotated[int, Field(ge=-1, le=240)] = -1  # ``nack``: the index in the data; -1 is the address
+    seconds: Seconds = 0.05  # ``stuck``: for so long
+    joint: str | None = None  # ``disconnect`` to ``put``, and ``brown_out``, of smart servos: whose; all by default
+    angle: float = 0.0  # ``put``: where somebody moves the joint by hand (rad); one that holds stays
+    body: str | None = None  # ``lost`` and ``seen``: which; all by default
+    counter: Literal["rising", "same"] = "rising"  # ``frozen``: what the frame counter does
+    ppm: float = 0.0  # ``skew``: how much the tracker's clock gains
 
 
 class FaultCalendar:

@@ -43,8 +43,6 @@ class BenchWorld(ABC):
     Attributes:
         now: simulated seconds since the bench began.
         stopped: a client has asked for the end.
-        split: gives messages on the line.
-        faults: kinds of its own, beside those of line and tracker.
 
     Args:
         settings: the truth.
@@ -54,8 +52,8 @@ class BenchWorld(ABC):
         folder: for the log, the port and the clock's socket.
     """
 
-    split: Split
-    faults: ClassVar[tuple[str, ...]]
+    split: Split  # gives messages on the line
+    faults: ClassVar[tuple[str, ...]]  # kinds of its own, beside those of line and tracker
 
     def __init__(
         self,

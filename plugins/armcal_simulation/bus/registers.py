@@ -54,25 +54,18 @@ class Register:
 
 @dataclass(frozen=True)
 class ServoTable:
-    """One model of servo.
-
-    Attributes:
-        bauds: by their codes.
-        count: one step of the encoder (rad); ``counts``: how many it has.
-        speed_unit: rad/s; ``acceleration_unit``: rad/s^2, None where it has no such register.
-        volt: how many units of the voltage register make one volt.
-    """
+    """One model of servo."""
 
     name: str
     protocol: ProtocolName
     number: int
     registers: tuple[Register, ...]
-    bauds: dict[int, int]
-    count: float
+    bauds: dict[int, int]  # by their codes
+    count: float  # one step of the encoder (rad); ``counts``: how many it has
     counts: int
-    speed_unit: float
+    speed_unit: float  # rad/s; ``acceleration_unit``: rad/s^2, None where it has no such register
     acceleration_unit: float | None
-    volt: int = 10
+    volt: int = 10  # how many units of the voltage register make one volt
 
     @cached_property
     def by_name(self) -> dict[str, Register]:
