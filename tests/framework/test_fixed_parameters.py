@@ -16,8 +16,7 @@ from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 from armcal.run.fixed_parameters import FixedParameters, fixed_parameters
 from armcal.run.prepare import Stopwatch, assemble
-from armcal.scaffold.dh_table import read_rows
-from armcal.scaffold.robot import robot_of_rows
+from armcal.scaffold.robot import read_rows, robot_of_rows
 from armcal.scaffold.robot_files import SIMULATED, write_robot
 from click.testing import CliRunner
 

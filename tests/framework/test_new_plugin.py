@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 from armcal.errors import InputError
 from armcal.plugins import discover
-from armcal.scaffold.naming import LONGEST, plugin_name
-from armcal.scaffold.plugin_files import KINDS, write_plugin
+from armcal.scaffold.plugin_files import KINDS, LONGEST, plugin_name, write_plugin
 from docs_commands import blocks, commands, plain_words
 from scaffolds import armcal, files_of, install, need, page, run
 

@@ -21,11 +21,9 @@ from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from armcal.run.prepare import Stopwatch, prepare
-from armcal.scaffold.dh_table import read_rows
-from armcal.scaffold.rendering import number, word
-from armcal.scaffold.robot import RobotJoint, Row, robot_of_rows
+from armcal.scaffold.plugin_files import number, word
+from armcal.scaffold.robot import RobotJoint, Row, read_rows, robot_of_rows, robot_of_urdf
 from armcal.scaffold.robot_files import RECORDS, SIMULATED, RobotFolder, _levels, write_robot
-from armcal.scaffold.urdf_source import robot_of_urdf
 from click.testing import CliRunner, Result
 from scaffolds import ROOT, commands_of, files_of, page
 

@@ -6,8 +6,7 @@ from typing import Any
 import click
 
 from armcal.cli.common import FILE, Console, speaking
-from armcal.scaffold.naming import plugin_name
-from armcal.scaffold.plugin_files import KINDS, write_plugin
+from armcal.scaffold.plugin_files import KINDS, plugin_name, write_plugin
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})

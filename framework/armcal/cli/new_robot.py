@@ -5,28 +5,28 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from armcal import scaffold
 from armcal.base.units import from_unit, parse_quantity
 from armcal.cli.common import Console, command_line
 from armcal.cli.console import say
 from armcal.errors import EXIT_FAULT, EXIT_NOT_CONVERGED, ConfigError
 from armcal.io.cells import is_number
 from armcal.plugins import PluginRegistry
-from armcal.scaffold import dh_table
-from armcal.scaffold.dh_table import read_rows
-from armcal.scaffold.naming import robot_name
 from armcal.scaffold.robot import (
     MOST,
     WIDTHS,
     Convention,
     Robot,
     Unit,
+    read_rows,
+    robot_name,
     robot_of_rows,
+    robot_of_urdf,
 )
 from armcal.scaffold.robot_files import try_out, write_robot
-from armcal.scaffold.urdf_source import robot_of_urdf
 
 CONVENTIONS: dict[str, Convention] = {"standard": "standard", "modified": "craig"}
-SKELETONS = {path.stem: path for path in sorted(Path(dh_table.__file__).with_name("skeletons").glob("*.csv"))}
+SKELETONS = {path.stem: path for path in sorted(Path(scaffold.__file__).with_name("skeletons").glob("*.csv"))}
 """Rows of arms that many people have, in round numbers, by the name that begins one."""
 
 

@@ -1,12 +1,137 @@
-"""The files of a new plugin: one small component with its registration and a test, as one file or as a package."""
+"""Files of new projects: a plugin's component with its registration and test; texts from templates, names, folders that
+appear whole or not at all."""
 
-from collections.abc import Mapping
+import importlib.util
+import json
+import keyword
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
+import numpy as np
+
+from armcal.errors import InputError, Location
 from armcal.hooks import KINDS as HOOKS
-from armcal.scaffold.naming import PREFIX
-from armcal.scaffold.rendering import rendered_file, staged, write_texts
+from armcal.io.plain_files import writing
+from armcal.plugins import PluginRegistry
+
+LONGEST = 20
+"""Characters; lines with a longer name would no longer fit the width that the plugin's own linter asks for."""
+PREFIX = "armcal_"
+_PLUGIN = re.compile(r"[a-z][a-z0-9_]*")
+
+
+TEMPLATES = Path(__file__).with_name("templates")
+SUFFIX = ".j2"
+_PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+_YAML_WORDS = frozenset({"y", "n", "yes", "no", "on", "off", "true", "false", "null"})
+_DIGITS = 12
+
+
+def rendered(folder: str, context: Mapping[str, Any]) -> dict[str, str]:
+    root = TEMPLATES / folder
+    names = [path.relative_to(root).as_posix() for path in sorted(root.rglob(f"*{SUFFIX}"))]
+    return {name.removesuffix(SUFFIX): rendered_file(f"{folder}/{name}", context) for name in names}
+
+
+def rendered_file(template: str, context: Mapping[str, Any]) -> str:
+    """One template, by its path below all."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,
+    )
+    environment.filters |= {"word": word, "number": number}
+    return environment.get_template(template).render(context)
+
+
+def word(text: str) -> str:
+    """A text as a YAML scalar: plain where YAML reads it as text, else in double quotes."""
+    plain = _PLAIN.fullmatch(text) and text.lower() not in _YAML_WORDS
+    return text if plain else json.dumps(text, ensure_ascii=False)
+
+
+def number(value: float) -> str:
+    """A number as YAML 1.1 and people read it: no exponent, 12 digits."""
+    text = np.format_float_positional(float(f"{value:.{_DIGITS}g}"), trim="-")
+    return "0" if text == "-0" else text
+
+
+@contextmanager
+def staged(folder: Path) -> Iterator[Path]:
+    """A folder beside ``folder`` that takes its place at the end; on any fault nothing is left of it.
+
+    Raises:
+        InputError: something is there already, or the place cannot be written.
+    """
+    if folder.exists() or folder.is_symlink():
+        hint = "Give another --out, or move it away."
+        raise InputError("it is there already.", where=Location(str(folder)), hint=hint)
+    with writing(folder, "Give --out a place that can be written."):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        place = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        try:
+            yield place
+            place.chmod(0o755)
+            place.rename(folder)
+        finally:
+            shutil.rmtree(place, ignore_errors=True)
+
+
+def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
+    """Texts by their path in a folder, in UTF-8 with plain line ends."""
+    for name, text in texts.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8", newline="\n")
+
+
+def plugin_name(text: str, registry: PluginRegistry) -> str:
+    """The name of a new plugin and its component, hyphens made underscores.
+
+    Raises:
+        InputError: it is no name for a Python module, or is taken.
+    """
+    name = text.replace("-", "_")
+    check_length(text, name)
+    if name.startswith(PREFIX):
+        mend = f"Leave {PREFIX} out: the package gets it by itself."
+        raise InputError(f"found the name {text!r}, expected what comes after {PREFIX}.", hint=mend)
+    if not _PLUGIN.fullmatch(name) or keyword.iskeyword(name):
+        raise InputError(
+            f"found the name {text!r}, expected a Python name of small letters, digits, - and _.",
+            hint="Begin with a letter, as in draw-wire.",
+        )
+    taken = ""
+    if any(plugin.name == name for plugin in registry.plugins):
+        taken = f"a plugin is called {name!r} already"
+    for component in registry.components:
+        if component.name == name:
+            taken = f"the plugin {component.plugin!r} offers the {component.kind} {name!r} already"
+    if not taken and importlib.util.find_spec(PREFIX + name) is not None:
+        taken = f"a package {PREFIX}{name} is installed already"
+    if taken:
+        raise InputError(f"{taken}.", hint="Choose another name; `armcal plugins list` shows those that are taken.")
+    return name
+
+
+def check_length(text: str, name: str) -> None:
+    if len(name) > LONGEST:
+        shown = text if len(text) <= 2 * LONGEST else f"{text[: 2 * LONGEST]}..."
+        raise InputError(
+            f"found the name {shown!r} of {len(name)} characters, expected at most {LONGEST}.", hint="Shorten it."
+        )
+
 
 _EXAMPLES: Mapping[str, str] = MappingProxyType(
     {
@@ -27,7 +152,7 @@ def write_plugin(name: str, kind: str, folder: Path, package: bool = False) -> t
     """Write a plugin; gives the files by their place in the folder.
 
     Args:
-        name: of plugin and component, as ``naming.plugin_name`` gives it.
+        name: of plugin and component, as ``plugin_name`` gives it.
         kind: one of ``KINDS``.
         folder: to be made.
         package: whether it is to be installed, with a registration that imports nothing heavy; else one file.

@@ -11,8 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.units import display_unit, to_unit
+from armcal.base.domains import Rotation
+from armcal.base.parameters import Parameters
+from armcal.base.units import display_unit, shown_unit, to_unit
 from armcal.errors import InputError
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.identifiability import MinimalSet, minimal_set
@@ -26,9 +29,8 @@ from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from armcal.run.prepare import Stopwatch, assemble
 from armcal.run.result import RunResult
-from armcal.scaffold import truth
-from armcal.scaffold.rendering import number, rendered, staged, write_texts
-from armcal.scaffold.robot import Robot, RobotJoint
+from armcal.scaffold.plugin_files import number, rendered, staged, write_texts
+from armcal.scaffold.robot import Robot, RobotJoint, Unit
 
 MOST_UNCERTAIN = 0.5
 """In typical scales: what the declared noise leaves less certain than this is held."""
@@ -84,25 +86,25 @@ def _fill(place: Path, robot: Robot, registry: PluginRegistry) -> MinimalSet:
     parameters = experiment.parameters
     masses = [b for b in parameters.blocks if b.name.startswith("arm.links.") and b.name.endswith(".mass")]
     weight_N = GRAVITY_M_S2 * sum(block.nominal[0] for block in masses)
-    random = np.random.default_rng(truth.SEED)
+    random = np.random.default_rng(SEED)
     commands = {f"arm.{j.name}": random.uniform(*j.limits, _TRIED_POSES) for j in robot.joints}
     poses = Dataset(tuple(str(i) for i in range(_TRIED_POSES)), commands)
     exact = measured_without_noise(experiment.simulation_request, poses)
-    reach = truth.reach(np.array([exact[f"tracker.{axis}"] for axis in "xyz"]))
+    reach = _reach(np.array([exact[f"tracker.{axis}"] for axis in "xyz"]))
     if not reach > _SMALLEST_REACH_M:
         raise InputError(
             f"in all poses the tip stays within {1000 * reach:.3g} mm.",
             hint="Check the lengths a and d and their units.",
         )
-    target = {} if robot.target else {name: share * reach for name, share in truth.UNSTATED_TARGET.items()}
-    true = truth.made_up(parameters, weight_N * reach, target, robot.widths)
-    _write(place, robot, nothing, truth.as_text(parameters, true))
+    target = {} if robot.target else {name: share * reach for name, share in UNSTATED_TARGET.items()}
+    true = _made_up(parameters, weight_N * reach, target, robot.widths)
+    _write(place, robot, nothing, _as_text(parameters, true))
     experiment = Experiment.load(place / SIMULATED, registry=registry)
     dataset = experiment.simulator().simulate(experiment.simulation_request)
     write_csv(place / RECORDS, dataset, experiment.request(measured=True).channels)
-    freed = f"parameters.free={json.dumps(truth.candidates(parameters))}"
+    freed = f"parameters.free={json.dumps(_candidates(parameters))}"
     chosen = _choose_free(Experiment.load(place / SIMULATED, [freed], registry=registry), robot, target)
-    _write(place, robot, chosen, truth.as_text(parameters, true))
+    _write(place, robot, chosen, _as_text(parameters, true))
     return chosen
 
 
@@ -136,7 +138,7 @@ def _write(place: Path, robot: Robot, choice: MinimalSet, true: Mapping[str, str
         "gravity": [number(-GRAVITY_M_S2 * along) for along in robot.up or ()],
         "noise_mm": number(NOISE_MM),
         "count": RECORDS_MADE,
-        "truth_seed": truth.SEED,
+        "truth_seed": SEED,
         "seed": NOISE_SEED,
         "shown": _shown,
         "levels": _levels,
@@ -202,3 +204,66 @@ def try_out(made: RobotFolder, registry: PluginRegistry, command: str = "", prog
     held = (table.nominal["holdout"].mean, table.calibrated["holdout"].mean)
     nominal, calibrated = (math.nan if error is None else error for error in held)
     return Trial(result, folder, nominal, calibrated, NOISE_MM * _MEAN_LENGTH)
+
+
+SEED = 1
+LENGTH_SD_M, ANGLE_SD_RAD = 0.001, 0.003
+SAG_RAD = 0.002
+"""What a joint gives under half the moment that the arm's whole weight has at its full reach."""
+UNSTATED_TARGET = {"tracker.target_x": 0.06, "tracker.target_y": -0.04, "tracker.target_z": 0.03}
+"""Of the reach: where a target sits whose place was not stated. Most sit beside the last axis, and show more there."""
+_MOST_SD = 2.0
+_SPRING = (0.5, 1.5)
+_UNITS = frozenset({"m", "rad", "rad_per_Nm"})
+
+
+def _candidates(parameters: Parameters) -> tuple[str, ...]:
+    """What a first calibration may look for: placement, geometry, springs, the target; no masses, no gravity."""
+    return tuple(
+        block.name
+        for block in parameters.blocks
+        if block.unit in _UNITS
+        and (block.size == 1 or isinstance(block.domain, Rotation))
+        and not fnmatch.fnmatch(block.name, "arm.links.*")
+        and not block.name.startswith("statics.")
+    )
+
+
+def _made_up(
+    parameters: Parameters, load_Nm: float, target: Mapping[str, float], widths: Mapping[Unit, float]
+) -> dict[str, float]:
+    """True values (SI) of every candidate that is one number; a rotation stays as it was stated.
+
+    Args:
+        parameters: of the robot, with their nominal values.
+        load_Nm: the moment of its whole weight at its full reach; 0 if its masses are not known.
+        target: how far parameters of the target are off beside that (m).
+        widths: of the priors, by unit: errors are no larger.
+    """
+    random = np.random.default_rng(SEED)
+    deviations = {"m": min(LENGTH_SD_M, 1e-3 * widths["mm"]), "rad": min(ANGLE_SD_RAD, math.radians(widths["deg"]))}
+    names = [name for name in _candidates(parameters) if parameters[name].size == 1]
+    values = {}
+    for name in names:
+        block = parameters[name]
+        if block.unit == "rad_per_Nm":
+            drawn = float(random.uniform(*_SPRING))
+            error = drawn * SAG_RAD / (0.5 * load_Nm) if load_Nm > 0 else 0.0
+        else:
+            error = deviations[block.unit] * float(np.clip(random.normal(), -_MOST_SD, _MOST_SD))
+        values[name] = float(block.nominal[0]) + error + target.get(name, 0.0)
+    return values
+
+
+def _as_text(parameters: Parameters, values: Mapping[str, float]) -> dict[str, str]:
+    lines = {}
+    for name, value in values.items():
+        factor, unit = shown_unit(parameters[name].unit)
+        lines[name] = f"{number(float(f'{factor * value:.6g}'))} {unit}"
+    return lines
+
+
+def _reach(tips: Array) -> float:
+    """How far a tip comes from the middle of where it goes (3 x N, m)."""
+    middle = tips.mean(axis=1, keepdims=True)
+    return float(np.linalg.norm(tips - middle, axis=0).max())
