@@ -15,8 +15,7 @@ from armcal.plugins import refuse
 MODE1, MODE2, LED0, ALL_LED, PRE_SCALE = 0x00, 0x01, 0x06, 0xFA, 0xFE
 RESTART, EXTCLK, AUTO_INCREMENT, SLEEP, SUB_ADDRESSES, ALL_CALL = 0x80, 0x40, 0x20, 0x10, 0x0E, 0x01
 OUTDRV = 0x04
-FULL = 0x1000
-"""In ON: always high. In OFF: no pulses, which wins."""
+FULL = 0x1000  # in ON: always high. In OFF: no pulses, which wins.
 CHANNELS = 16
 CHANNEL_BYTES = 4
 OSCILLATOR_STARTS_S = 0.0005

@@ -15,8 +15,7 @@ from armcal_online.running.loop import Recalibration
 from armcal_online.running.state_replayer import RECORD
 
 SOCKET = "control.sock"
-GOOD = "good"
-"""In place of a sequence number: that of the last good record."""
+GOOD = "good"  # in place of a sequence number: that of the last good record
 COMMANDS = ("status", "pause", "resume", "rollback", "finish")
 
 

@@ -18,8 +18,7 @@ from armcal_online.running.state_replayer import DECISION, NOTED, PAUSE, RECORD,
 from armcal_online.sources.source import Incoming, Source
 from armcal_online.tracking.recalibrator import Recalibrator
 
-WAIT_S = 0.1
-"""How long a source is waited for before control and signals are looked at again."""
+WAIT_S = 0.1  # how long a source is waited for before control and signals are looked at again
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ CALIBRATION = "calibration.yaml"
 STATUS = "status.json"
 RESERVE = "calibration.reserve"
 """As much room as a calibration and a status need: the journal would take all that is left of a disk."""
-RETRY_S = 10.0
-"""What could not be written is tried again after so long."""
+RETRY_S = 10.0  # what could not be written is tried again after so long
 _SENTENCES = {
     "events": ("The events are not written to a file ({}).", "The events are written to a file again."),
     "status": ("The status is not written ({}).", "The status is written again."),

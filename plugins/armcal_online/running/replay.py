@@ -170,8 +170,7 @@ def kept_settings(header: Mapping[str, Any], overrides: Sequence[str] = ()) -> R
 
 Progress = Callable[[str, float], None]
 
-WARM_UP = 50
-"""So many records at the beginning are left out of the mean innovation."""
+WARM_UP = 50  # so many records at the beginning are left out of the mean innovation
 
 
 class DiffersError(Exception):

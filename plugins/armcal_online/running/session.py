@@ -30,8 +30,7 @@ OURS = (JOURNAL, EVENTS, EARLIER, SOCKET, *_REPLACED, *(f"{name}.new" for name i
 
 _NOT_DECIDING = ("output", "journal")
 """Settings on which no decision hangs: they may differ when a recalibration is gone on with."""
-_DECIDING = ("calibration", "settings")
-"""Keys of the journal's header that may not differ when it is resumed."""
+_DECIDING = ("calibration", "settings")  # keys of the journal's header that may not differ when it is resumed
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,8 @@ from armcal.io.journal.segment import Entry
 from armcal_online.sources.source import THROUGH, Incoming
 from armcal_online.tracking.recalibrator import Recalibrator
 
-MAX_FILES = 2000
-"""So many files are remembered one by one; of the others, that all up to a name were taken."""
-RECENT = 256
-"""So many records are remembered, so that one that is sent again counts once."""
+MAX_FILES = 2000  # so many files are remembered one by one; of the others, that all up to a name were taken
+RECENT = 256  # so many records are remembered, so that one that is sent again counts once
 
 RECORD = "record"
 ROLLBACK = "rollback"
@@ -29,8 +27,7 @@ PAUSE = "pause"
 RESUME = "resume"
 STARTED = "started"
 DECISION = "decision"
-NOTED = ("decision", "level")
-"""Events that a journal notes."""
+NOTED = ("decision", "level")  # events that a journal notes
 Event = dict[str, Any]
 Reach = Callable[[int], tuple[Entry, tuple[Entry, ...]]]
 """The last checkpoint at or before a sequence number, and the entries after it up to that number."""

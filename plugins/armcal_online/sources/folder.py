@@ -17,15 +17,12 @@ from armcal_online.sources.source import THROUGH, Incoming, Place, Source, key_o
 
 SETTLED_S = 1.0
 """A file whose size has not changed for so long is read; one that never stops growing after ``IMPATIENT_S``."""
-IMPATIENT_S = 10.0
-"""A last line without an end is taken after so long."""
+IMPATIENT_S = 10.0  # a last line without an end is taken after so long
 
 _WHOLE = ".json"
 _GONE = -1
-_KEPT_OPEN = 16
-"""So many of the files that were read last are read further when they grow."""
-_RESCAN_S = 5.0
-"""The directory is listed when it changes, and this often besides: its time may have too few digits."""
+_KEPT_OPEN = 16  # so many of the files that were read last are read further when they grow
+_RESCAN_S = 5.0  # the directory is listed when it changes, and this often besides: its time may have too few digits
 
 
 class _Watched:

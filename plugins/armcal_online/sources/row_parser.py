@@ -28,12 +28,10 @@ MAX_FAULT = 500
 
 Kind = Literal["csv", "json", "either"]
 """What lines are; in ``either``, those that begin with a brace are JSON and others CSV."""
-KINDS: Mapping[str, Kind] = {".csv": "csv", ".jsonl": "json", ".ndjson": "json"}
-"""By the ending of a file's name."""
+KINDS: Mapping[str, Kind] = {".csv": "csv", ".jsonl": "json", ".ndjson": "json"}  # by the ending of a file's name
 
 _APPROACH = ".approach."
-_PLANS = 64
-"""So many sets of names are remembered, each with its plan or why there is none; a sender has one or two."""
+_PLANS = 64  # so many sets of names are remembered, each with its plan or why there is none; a sender has one or two
 
 
 @dataclass(frozen=True)

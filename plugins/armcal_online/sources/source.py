@@ -8,12 +8,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
-AtEnd = Literal["stop", "wait"]
-"""What a file's end means: there is no more, or more may come."""
-POLL_S = 0.05
-"""How often a file is looked at again."""
-THROUGH = "/"
-"""Before a name among positions: all files up to that name were taken. No file's name begins so."""
+AtEnd = Literal["stop", "wait"]  # what a file's end means: there is no more, or more may come
+POLL_S = 0.05  # how often a file is looked at again
+THROUGH = "/"  # before a name among positions: all files up to that name were taken. No file's name begins so.
 
 
 @dataclass(frozen=True)

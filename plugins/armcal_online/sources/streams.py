@@ -16,8 +16,7 @@ from typing_extensions import override
 from armcal_online.sources.row_parser import LineParser, LineReading, RowParser, faulty
 from armcal_online.sources.source import Incoming, Place, Source
 
-_WAITING = 64
-"""So many senders are remembered until their records are acknowledged; there is one unless a disk is full."""
+_WAITING = 64  # so many senders are remembered until their records are acknowledged; there is one unless a disk is full
 
 
 class Lines(Source):

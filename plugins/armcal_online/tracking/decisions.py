@@ -17,10 +17,8 @@ from scipy.special import bdtrc, chdtrc, chdtri, fdtrc, fdtri
 if TYPE_CHECKING:  # the watcher reads this table, and has no need of numpy
     from armcal_online.tracking.sizes import Size
 
-Level = Literal["nominal", "watch", "suspect", "lost"]
-"""Of health."""
-LEVELS: tuple[Level, ...] = get_args(Level)
-"""From the best to the worst."""
+Level = Literal["nominal", "watch", "suspect", "lost"]  # of health
+LEVELS: tuple[Level, ...] = get_args(Level)  # from the best to the worst
 
 
 @dataclass(frozen=True)

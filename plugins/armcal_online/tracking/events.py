@@ -17,8 +17,7 @@ from armcal_online.tracking.start import FilterSetup
 from armcal_online.tracking.state import Arrival, State
 
 _MOST_LOG_ODDS = 700.0
-_FIRST_DATE, _LAST_DATE = 1e8, 1e11
-"""Unix seconds (1973 to 5138); other times are of a clock that began elsewhere."""
+_FIRST_DATE, _LAST_DATE = 1e8, 1e11  # unix seconds (1973 to 5138); other times are of a clock that began elsewhere
 
 
 def started(

@@ -393,11 +393,9 @@ def _columns(columns: Sequence[Array], size: int) -> Array:
     return whole
 
 
-LEAST_RECORDS = 3
-"""So many records that do not fit are needed: two fit two changes of their own too easily."""
+LEAST_RECORDS = 3  # so many records that do not fit are needed: two fit two changes of their own too easily
 _MOST = 7
-_TOGETHER = 0.01
-"""How probable it is that another certain change comes with one."""
+_TOGETHER = 0.01  # how probable it is that another certain change comes with one
 _ENOUGH = 0.9
 
 

@@ -27,25 +27,18 @@ from armcal_online.tracking.state import State
 from armcal_online.tracking.state_space import StateSpace
 from armcal_online.tracking.window_evidence import HypothesisFilter
 
-_LARGE = 0.01
-"""A record with an NIS as large as this is one in a hundred: two of them near each other are looked into."""
+_LARGE = 0.01  # a record with an NIS as large as this is one in a hundred: two of them near each other are looked into
 _AGREEING = 2
 """A change explains at least so many of the records that do not fit, and at least this share of the misfit: one wrong
 record alone is no evidence of it. Two changes, a load or a bent link fit two records too easily."""
 _SHARE = 0.5
-_LEFT = 0.01
-"""What explains the records leaves no more outliers among them than chance makes with this probability."""
+_LEFT = 0.01  # what explains the records leaves no more outliers among them than chance makes with this probability
 _MOST_WIDENING = 3.0
-_UNNAMED = 2.0
-"""Standard deviations are made so many times larger where something slow moves that has no name."""
-_UNEXPLAINED = 3
-"""So many changes that nothing explains, or windows of too large NIS: the model no longer fits."""
-_LONGEST_NAMING = 100
-"""After so many records joints that could not be distinguished are left so."""
-_STATED = 40
-"""The stated share of outliers counts as if it came from so many records."""
-_TOO_MANY = 1e-3
-"""More outliers than chance makes with this probability are a reason to watch."""
+_UNNAMED = 2.0  # standard deviations are made so many times larger where something slow moves that has no name
+_UNEXPLAINED = 3  # so many changes that nothing explains, or windows of too large NIS: the model no longer fits
+_LONGEST_NAMING = 100  # after so many records joints that could not be distinguished are left so
+_STATED = 40  # the stated share of outliers counts as if it came from so many records
+_TOO_MANY = 1e-3  # more outliers than chance makes with this probability are a reason to watch
 
 
 class Judge:

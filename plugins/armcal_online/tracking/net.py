@@ -21,22 +21,16 @@ from armcal_online.tracking.refit import NetRecord, NetState, Prediction, Prior,
 from armcal_online.tracking.start import FilterSetup
 from armcal_online.tracking.state import State
 
-WINDOWS = (10, 20, 40, 80)
-"""Lengths of the windows: which of them counts is decided by what they predict."""
-_REMEMBERED = 64
-"""So many predictions are compared."""
-_MOST_GAIN = 4.0
-"""What one record can say for a window or against it, in log odds: no outlier decides alone."""
+WINDOWS = (10, 20, 40, 80)  # lengths of the windows: which of them counts is decided by what they predict
+_REMEMBERED = 64  # so many predictions are compared
+_MOST_GAIN = 4.0  # what one record can say for a window or against it, in log odds: no outlier decides alone
 _ODDS = float(np.log(1e8))
 """Log odds at which a window takes over: neighbours that resemble each other say less than as many that do not."""
-_ALERT = 2.0
-"""Log odds from which on all windows are refitted with each record."""
+_ALERT = 2.0  # log odds from which on all windows are refitted with each record
 _ROUNDS = 2
-_LARGE = 3.0
-"""A prediction so many times farther off than its median under the stated noise is one that fails."""
+_LARGE = 3.0  # a prediction so many times farther off than its median under the stated noise is one that fails
 _LOOKED_AT = 10
-_NUMBERS = 3
-"""Predictions of all measurements are compared by the loss of so many numbers."""
+_NUMBERS = 3  # predictions of all measurements are compared by the loss of so many numbers
 _FARTHEST = 1e9
 
 

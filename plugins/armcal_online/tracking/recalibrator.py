@@ -42,10 +42,8 @@ from armcal_online.tracking.state import Arrival, State, Tick, advanced, remembe
 from armcal_online.tracking.updated import calibration_text, deviations
 from armcal_online.tracking.window_evidence import HypothesisFilter
 
-_WEEK = 7.0
-"""days"""
-_FARTHEST = 100.0
-"""rad or m; a joint beyond it is a fault of the record."""
+_WEEK = 7.0  # days
+_FARTHEST = 100.0  # rad or m; a joint beyond it is a fault of the record
 
 
 class Recalibrator:

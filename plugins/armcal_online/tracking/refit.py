@@ -22,13 +22,11 @@ from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.observer import JointNoise, Observer, Reading, RecordObservation
 
 _HALVINGS = 3
-_SETTLED = 0.3
-"""Steps shorter than so many standard deviations end a refit."""
+_SETTLED = 0.3  # steps shorter than so many standard deviations end a refit
 _LEAST_FREEDOM = 0.1
 """A window whose records are all taken up by parameters keeps this share of them as degrees of freedom of its scale."""
 _MOST_WIDENING = 100.0
-_FLOOR = 1e-12
-"""Variance of a coordinate (in its typical scale) that counts as known."""
+_FLOOR = 1e-12  # variance of a coordinate (in its typical scale) that counts as known
 
 
 @dataclass(frozen=True)

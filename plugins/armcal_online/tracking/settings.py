@@ -12,8 +12,7 @@ from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, Location
 from pydantic import Field, model_validator
 
-SECTION = "recalibrate"
-"""A file may hold more than a recalibration: the recalibration then stands under this key."""
+SECTION = "recalibrate"  # a file may hold more than a recalibration: the recalibration then stands under this key
 DAY = 86400.0
 Probability = Annotated[float, Field(gt=0, lt=1)]
 

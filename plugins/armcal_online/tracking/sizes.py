@@ -24,8 +24,7 @@ SHOWN = {
 }
 """By dimension: the key in an event, the unit, and how many of it make one in SI."""
 _DIMENSIONS = {"rad": "angle", "m": "length"}
-_CLEAR = 3.0
-"""So many standard deviations from zero a number is worth saying."""
+_CLEAR = 3.0  # so many standard deviations from zero a number is worth saying
 
 
 @dataclass(frozen=True)

@@ -42,13 +42,11 @@ class SlowState:
     wander: Array | None = None
 
 
-_LONGEST = 200
-"""Records of a track; at half of them the next begins."""
+_LONGEST = 200  # records of a track; at half of them the next begins
 _FEWEST = 24
 _DAY_S = 86400.0
 _ROUNDING = 1e-6
-_WANDERS = 0.25
-"""A trend may become as much faster or slower in the time that it took to be weighing."""
+_WANDERS = 0.25  # a trend may become as much faster or slower in the time that it took to be weighing
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,7 @@ from armcal_online.tracking.sizes import ModelError
 from armcal_online.tracking.state_space import StateSpace
 
 _VECTORS = ("gravity", "payload", "force", "torque")
-_SIGNIFICANT_SD = 3.0
-"""Residuals above the stated noise by less are chance's."""
+_SIGNIFICANT_SD = 3.0  # residuals above the stated noise by less are chance's
 
 
 @dataclass(frozen=True)

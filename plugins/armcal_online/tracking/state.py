@@ -23,10 +23,8 @@ from armcal_online.tracking.settings import ClockSettings
 from armcal_online.tracking.slow_changes import SlowState
 from armcal_online.tracking.start import FilterSetup
 
-REMEMBERED = 128
-"""So many records are remembered: to know one that comes twice, and to name the first after a change."""
-_REFRESHED = 25
-"""After so many accepted records the origin is put where it is most likely within the bounds."""
+REMEMBERED = 128  # so many records are remembered: to know one that comes twice, and to name the first after a change
+_REFRESHED = 25  # after so many accepted records the origin is put where it is most likely within the bounds
 
 
 @dataclass(frozen=True)

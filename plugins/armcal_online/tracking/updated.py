@@ -20,8 +20,7 @@ from armcal_online.tracking.state_space import StateSpace
 
 _QUANTILE = float(ndtri(0.975))
 _FLOOR = 1e-12
-_LEAST_MASS = 0.005
-"""kg"""
+_LEAST_MASS = 0.005  # kg
 
 
 def deviations(space: StateSpace, belief: Belief) -> Array:

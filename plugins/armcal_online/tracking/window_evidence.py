@@ -99,8 +99,7 @@ def log_density_of_outlier(innovation: Array, expected: Array, stated: Array, fr
     )
 
 
-_MOST_ONSETS = 5
-"""So many of the last records with a large NIS are tried as the first after a change."""
+_MOST_ONSETS = 5  # so many of the last records with a large NIS are tried as the first after a change
 _ROUNDS = 3
 _STEPS = 8
 _SETTLED = 0.02

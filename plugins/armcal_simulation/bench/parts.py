@@ -22,8 +22,7 @@ from armcal_simulation.bench.physics import BenchPhysics, ElasticPose, Seen, Tor
 from armcal_simulation.bench.safety import Bounds, SafetySettings
 from armcal_simulation.bench.servo_model import JointServo, ServoJointSettings
 
-ALL = "all"
-"""In the place of a joint's name: settings of all joints, beneath each joint's own."""
+ALL = "all"  # in the place of a joint's name: settings of all joints, beneath each joint's own
 
 
 _JointSettings = TypeVar("_JointSettings", bound=ServoJointSettings)

@@ -106,10 +106,8 @@ def _body(
     return position, state.base_T_tool.rotation
 
 
-FALL_STEP_S = 0.02
-"""How often the torque on a servo that gives way is looked up."""
-SLOW_S = 0.1
-"""How often torques and heat are, else."""
+FALL_STEP_S = 0.02  # how often the torque on a servo that gives way is looked up
+SLOW_S = 0.1  # how often torques and heat are, else
 _HANGING_S = 60.0
 
 Seen = Callable[[float, Array | None], None]

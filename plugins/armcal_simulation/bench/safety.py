@@ -15,8 +15,7 @@ from armcal_simulation.bench.servo_model import JointServo, Positive
 from armcal_simulation.boards.pca9685_model import COUNTS, Commit
 
 SPEED_SLACK = 1.05
-_TICK_S = 0.02
-"""Hosts command at ticks: a command of a window's first moment may be of one tick before."""
+_TICK_S = 0.02  # hosts command at ticks: a command of a window's first moment may be of one tick before
 _AT_ONCE = 512
 _AT_REST_S = 1.0
 _NO_TIME = -1e9

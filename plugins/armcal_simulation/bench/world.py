@@ -30,8 +30,7 @@ WALL_AT_START = 1893456000.0
 """2030-01-01, 0:00 UTC: no bench is there at two times, and results are the same whenever they are made."""
 LONGEST_ADVANCE_S = 86400.0
 _TAKEN = "another simulated bench is running here.", "Stop it first, or give another folder."
-_LOOK_UP_S = 0.25
-"""How often it is looked whether the end was asked for."""
+_LOOK_UP_S = 0.25  # how often it is looked whether the end was asked for
 _FAULTS = ("unplug", "replug", "lost", "silent", "frozen", "skew", "seen")
 
 

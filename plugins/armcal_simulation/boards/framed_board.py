@@ -28,8 +28,7 @@ from armcal.devices.framed.messages import (
 from armcal_simulation.boards.pca9685_model import COUNTS, FULL, LED0, BusStuckError, I2cBus
 
 TICK_S = 0.02
-_RATE_UNIT = 16
-"""Rates come in so many parts of a count per second."""
+_RATE_UNIT = 16  # rates come in so many parts of a count per second
 
 
 @dataclass(frozen=True)

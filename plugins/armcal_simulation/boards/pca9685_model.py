@@ -15,8 +15,7 @@ MODE1, MODE2, SUBADR1, ALLCALLADR, LED0, LED_END = 0x00, 0x01, 0x02, 0x05, 0x06,
 ALL_LED, PRE_SCALE, TEST = 0xFA, 0xFE, 0xFF
 RESTART, EXTCLK, AI, SLEEP, SUB1, ALLCALL = 0x80, 0x40, 0x20, 0x10, 0x08, 0x01
 INVRT, OCH, OUTDRV = 0x10, 0x08, 0x04
-FULL = 0x10
-"""In ON_H: always on. In OFF_H: always off, which wins."""
+FULL = 0x10  # in ON_H: always on. In OFF_H: always off, which wins.
 GENERAL_CALL, SOFTWARE_RESET = 0x00, 0x06
 OSCILLATOR_STARTS_S = 0.0005
 LEAST_PRESCALE = 3
@@ -306,8 +305,7 @@ class Pca9685Model:
         self.violations.append(Violation(self._clock(), rule))
 
 
-ADDRESS_ONLY = -1
-"""In the place of a byte's index: the address itself is not acknowledged."""
+ADDRESS_ONLY = -1  # in the place of a byte's index: the address itself is not acknowledged
 
 
 class BusStuckError(Exception):

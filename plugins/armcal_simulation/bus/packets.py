@@ -29,10 +29,8 @@ class Instruction:
 class Framing(Protocol):
     """How a protocol's packets look."""
 
-    address_size: int
-    """Bytes of an address, and of a count of bytes."""
-    head: re.Pattern[bytes]
-    """What stands before the id, which the length follows."""
+    address_size: int  # bytes of an address, and of a count of bytes
+    head: re.Pattern[bytes]  # what stands before the id, which the length follows
 
     def split(self, data: bytes) -> tuple[list[bytes], bytes]:
         """Whole packets, without whatever stood before them, and the beginning of one that is not whole yet."""

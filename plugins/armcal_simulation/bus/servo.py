@@ -17,11 +17,9 @@ UNDERVOLTAGE, ANGLE_LIMIT, OVERHEAT, RANGE, CHECKSUM, OVERLOAD, INSTRUCTION = 1,
 """Bits of a status byte; the first, third and sixth also of protocol 2's hardware error status."""
 NOT_UNDERSTOOD, BAD_CRC, BEYOND_RANGE, BEYOND_LIMIT, NO_ACCESS, ALERT = 2, 3, 4, 6, 7, 0x80
 """Error numbers of protocol 2."""
-_MIDDLE_HERE = 128
-"""Feetech, in the place of torque on and off: choose the homing offset by which this is the middle."""
+_MIDDLE_HERE = 128  # Feetech, in the place of torque on and off: choose the homing offset by which this is the middle
 _AIR_C = 25.0
-_SHUTDOWN_SHARE, _SHUTDOWN_AFTER_S = 0.9, 1.0
-"""Of Dynamixels, whose table does not say."""
+_SHUTDOWN_SHARE, _SHUTDOWN_AFTER_S = 0.9, 1.0  # of Dynamixels, whose table does not say
 
 
 class BusServo:

@@ -19,11 +19,9 @@ from armcal_simulation.bus.packets import (
 )
 from armcal_simulation.bus.servo import BAD_CRC, CHECKSUM, BusServo
 
-LOOK_S = 0.1
-"""How often servos look at their temperature, voltage and load."""
+LOOK_S = 0.1  # how often servos look at their temperature, voltage and load
 _BAUD_TOLERANCE = 0.02
-_LATEST_BYTES = 3
-"""By so much two servos that answer at once are apart at most."""
+_LATEST_BYTES = 3  # by so much two servos that answer at once are apart at most
 
 
 class ServoBus:
