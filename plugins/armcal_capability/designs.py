@@ -17,8 +17,7 @@ from armcal.calibration.tool_expression import ToolExpression, arm_expression
 from armcal.config.selection import with_values
 from armcal.config.system import System, build_system
 from armcal.config.validate import validate
-from armcal.config.yaml_nodes import entries_of, override, set_at, steps_of
-from armcal.config.yaml_source import ConfigSource, Reader, as_source, load_config, root_of
+from armcal.config.yaml_source import ConfigSource, load_config, load_variants
 from armcal.errors import ConfigError, Location
 from armcal.plugins import PluginRegistry
 from armcal.run.plan_clearance import clearance_check
@@ -27,6 +26,7 @@ from pydantic import Field, model_validator
 
 SECTION = "capability"
 _RULES = (SECTION, "plan")
+_MEND = "Write for example set: {arms.arm.model.rows.1.d_mm: 10}; entries of a list count from 0."
 
 
 class ToolDirectionSettings(Settings):
@@ -166,36 +166,14 @@ def load_task(path: Path, rules: Path | None, overrides: Sequence[str], registry
             hint="Write extends: ARM.yaml in it, with the arm that the designs are of.",
         )
     designs = {}
-    for name, source in load_designs(config.path, overrides).items():
+    for name, source in load_variants(config.path, overrides, listed=(SECTION, "designs")).variants.items():
         try:
+            for key in set(source.data) - set(config.data):
+                source.refuse((key,), f"found {key!r}, expected the dotted name of a value of the arm.", _MEND)
             designs[name] = _design(_with_rules(source, config), registry, path, corrections)
         except ConfigError as fault:
             raise ConfigError(f"design {name!r}: {fault.message}", where=fault.where, hint=fault.hint) from fault
     return Task(settings, designs, files)
-
-
-def load_designs(path: Path, overrides: Sequence[str] = ()) -> dict[str, ConfigSource]:
-    """The designs of a configuration, each a whole configuration: with names and values as after ``--set``."""
-    reader = Reader(root_of(path, None))
-    tree = reader.tree(path, ())
-    for text in overrides:
-        tree = override(tree, text)
-    section = entries_of(tree).get(SECTION)
-    listed = entries_of(section).get("designs") if section else None
-    designs = {}
-    for name, node in entries_of(listed).items() if listed else ():
-        design = tree
-        for key, value in entries_of(node).items():
-            steps = steps_of(str(key))
-            if steps is None or steps[0] == SECTION or steps[0] not in entries_of(tree):
-                raise ConfigError(
-                    f"found {str(key)!r}, expected the dotted name of a value of the arm.",
-                    where=value.origin.at(value.line, (SECTION, "designs", str(name))),
-                    hint="Write for example arms.arm.model.rows.1.d_mm: 10; entries of a list count from 0.",
-                )
-            design = set_at(design, steps, replace(value, origin=replace(value.origin, prefix=steps)))
-        designs[str(name)] = as_source(design, path, reader)
-    return designs
 
 
 def examined_arm(system: System, path: Path) -> Arm:

@@ -27,7 +27,6 @@ from armcal_capability.designs import (
     LoadSettings,
     Task,
     ToolDirectionSettings,
-    load_designs,
     load_task,
 )
 from armcal_capability.search import (
@@ -45,7 +44,7 @@ from click.testing import CliRunner, Result
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 QUICK = ("--set", "capability.samples=80", "--set", "capability.voxel_mm=120")
-TWO = ("--set", 'capability.designs={"60 deg, as built": {}, 45 deg: {arms.arm.model.base.4.ry_deg: 45}}')
+TWO = ("--set", 'capability.designs={"60 deg, as built": {}, 45 deg: {set: {arms.arm.model.base.4.ry_deg: 45}}}')
 LINKS = (0.3, 0.25)
 PLANAR = """
 arms:
@@ -334,13 +333,16 @@ def test_designs_are_compared_where_all_of_them_reach(tmp_path: Path) -> None:
 
 def test_a_design_that_sets_nothing_of_the_arm_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "d.yaml"
-    text = PLANAR.format(x=0, z=0) + "capability: {designs: {a: {arm.model.rows.0.a_mm: 5}}}\n"
+    text = PLANAR.format(x=0, z=0) + AREAS.replace("}}}\n", "}}, designs: {a: {set: {arm.model.rows.0.a_mm: 5}}}}\n")
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"dotted name of a value of the arm"):
-        load_designs(path)
+    with pytest.raises(ConfigError, match="design 'a': found 'arm', expected the dotted name of a value of the arm"):
+        task_of(path)
     path.write_text(text.replace("arm.model.rows.0", "arms.arm.model.rows.7"), encoding="utf-8")
     with pytest.raises(ConfigError, match="index '7'"):
-        load_designs(path)
+        task_of(path)
+    path.write_text(text.replace("set: {arm.model.rows.0.a_mm: 5}", "arms.arm.model.rows.0.a_mm: 5"), encoding="utf-8")
+    with pytest.raises(ConfigError, match="expected extends, set or add"):
+        task_of(path)
 
 
 def test_a_load_that_nothing_holds_leaves_no_posture(tmp_path: Path) -> None:
@@ -454,7 +456,7 @@ def refused(folder: Path, source: object, *arguments: object, says: tuple[str, .
 @pytest.mark.quick(
     "capability.basket=1-says12",
     "capability.designs={a: 3}-says16",
-    "capability.designs={a: {arms.arm.model.base.4.ry_degree: 45}}-says15",
+    "capability.designs={a: {set: {arms.arm.model.base.4.ry_degree: 45}}}-says15",
     "capability.voxel=5-says8",
     "capability.samples=many-says3",
 )
@@ -476,7 +478,7 @@ def refused(folder: Path, source: object, *arguments: object, says: tuple[str, .
         ("capability.basket=1", ("unknown key 'basket'",)),
         ("capability.values=nowhere.yaml", ("there is no such file",)),
         ("plan.limits={q9: [0 deg, 1 deg]}", ("no turning joint is called 'q9'",)),
-        ("capability.designs={a: {arms.arm.model.base.4.ry_degree: 45}}", ("design 'a'", "ry_degree")),
+        ("capability.designs={a: {set: {arms.arm.model.base.4.ry_degree: 45}}}", ("design 'a'", "ry_degree")),
         ("capability.designs={a: 3}", ("capability.designs.a", "expected keys and values")),
         ("capability.areas=null", ("found no areas", "low_mm")),
     ],

@@ -252,8 +252,8 @@ def _scalar(node: Node, path: tuple[Step, ...]) -> Any:
     return node.value
 
 
-SECTION = "study"
-"""Says which variants there are, and is no part of any."""
+VARIANTS = ("study", "variants")
+"""Where a study lists its variants; the section is no part of any."""
 _KEYS = ("extends", "set", "add")
 
 
@@ -265,8 +265,10 @@ class Variants:
     variants: dict[str, ConfigSource]
 
 
-def load_variants(path: str | Path, overrides: Sequence[str] = (), root: Path | None = None) -> Variants:
-    """Read ``study.variants`` of a YAML config; without any, the config itself is the only one, called as the file.
+def load_variants(
+    path: str | Path, overrides: Sequence[str] = (), root: Path | None = None, listed: tuple[str, str] = VARIANTS
+) -> Variants:
+    """Read the variants that a YAML config lists; without any, the config itself is the only one, called as the file.
 
     A variant is the rest of the config, then what it ``extends`` (an earlier variant by its name, files), then the
     overrides, then the values that it sets (``set: {a.b: value}``) and the entries that it adds to lists
@@ -280,35 +282,39 @@ def load_variants(path: str | Path, overrides: Sequence[str] = (), root: Path | 
     tree = reader.tree(path, ())
     for text in overrides:
         tree = override(tree, text)
-    outside = [text for text in overrides if text.strip().partition("=")[0].partition(".")[0].strip() != SECTION]
-    section = entries_of(tree).get(SECTION)
-    listed = entries_of(section).get("variants") if section else None
+    outside = [text for text in overrides if text.strip().partition("=")[0].partition(".")[0].strip() != listed[0]]
+    section = entries_of(tree).get(listed[0])
+    variants = entries_of(section).get(listed[1]) if section else None
     made: dict[str, Node] = {}
-    for name, node in entries_of(listed).items() if listed else ():
-        made[str(name)] = _variant(name, node, _without_section(tree), made, reader, outside)
-    made = made or {path.stem: _without_section(tree)}
+    for name, node in entries_of(variants).items() if variants else ():
+        made[str(name)] = _variant((*listed, str(name)), node, _without(tree, listed[0]), made, reader, outside)
+    made = made or {path.stem: _without(tree, listed[0])}
     sources = {name: as_source(made[name], path, reader) for name in made}
     return Variants(as_source(tree, path, reader), sources)
 
 
 def _variant(
-    name: str, node: Node, base: Node, earlier: dict[str, Node], reader: Reader, overrides: Sequence[str]
+    at: tuple[str, str, str],
+    node: Node,
+    base: Node,
+    earlier: dict[str, Node],
+    reader: Reader,
+    overrides: Sequence[str],
 ) -> Node:
-    at = (SECTION, "variants", name)
     entries = entries_of(node)
     unknown = sorted(set(entries) - set(_KEYS))
     if unknown or not (isinstance(node.value, dict) or node.value is None):
         raise ConfigError(
             f"found {', '.join(unknown) or str(node.value)[:60]!r} in a variant, expected extends, set or add.",
             where=node.origin.at(node.line, at),
-            hint=f"Write for example {name}: {{extends: FILE, set: {{parameters.bounds: none}}}}.",
+            hint=f"Write for example {at[2]}: {{extends: FILE, set: {{parameters.bounds: none}}}}.",
         )
     tree, files = base, False
     for place, parent in enumerate(parents_of(node)):
         if str(parent) in earlier:
             tree = merge(tree, earlier[str(parent)]) if place else earlier[str(parent)]
             continue
-        tree, files = merge(tree, _without_section(reader.parent(parent, ()))), True
+        tree, files = merge(tree, _without(reader.parent(parent, ()), at[0])), True
     for text in overrides if files else ():
         tree = override(tree, text)
     for steps, value in _by_path(entries.get("set"), (*at, "set")):
@@ -324,8 +330,8 @@ def _variant(
     return tree
 
 
-def _without_section(tree: Node) -> Node:
-    return replace(tree, value={key: node for key, node in entries_of(tree).items() if key != SECTION})
+def _without(tree: Node, section: str) -> Node:
+    return replace(tree, value={key: node for key, node in entries_of(tree).items() if key != section})
 
 
 def _by_path(node: Node | None, at: tuple[str, ...]) -> list[tuple[tuple[str, ...], Node]]:
@@ -335,7 +341,7 @@ def _by_path(node: Node | None, at: tuple[str, ...]) -> list[tuple[tuple[str, ..
     variants = []
     for name, value in entries_of(node).items():
         steps = steps_of(str(name))
-        if steps is None or steps[0] in ("extends", SECTION):
+        if steps is None or steps[0] in ("extends", at[0]):
             raise ConfigError(
                 f"found {str(name)!r}, expected the dotted name of a value.",
                 where=value.origin.at(value.line, at),

@@ -8,7 +8,7 @@ from armcal.base.arrays import Array
 from armcal.base.config_text import as_json
 from armcal.base.dataset import Dataset
 from armcal.calibration.calibration_file import dump
-from armcal.config.yaml_source import SECTION, ConfigSource
+from armcal.config.yaml_source import VARIANTS, ConfigSource
 from armcal.estimate.validation import ErrorSummary, in_unit
 from armcal.io.cells import csv_text
 
@@ -197,12 +197,12 @@ def _self_contained(study: ConfigSource, variants: Mapping[str, ConfigSource]) -
     """The configuration with each variant as the sections in which it differs: no other file is needed."""
     read = next((own.data["data"] for own in variants.values() if "data" in own.data), None)
     data = study.data if read is None else {**study.data, "data": read}
-    base = {key: section for key, section in data.items() if key != SECTION}
+    base = {key: section for key, section in data.items() if key != VARIANTS[0]}
     listed = {}
     for name, own in variants.items():
         differing = {key: section for key, section in own.data.items() if base.get(key) != section}
         listed[name] = {"set": differing | {key: None for key in base if key not in own.data}}
-    return {**data, SECTION: {**data[SECTION], "variants": listed}}
+    return {**data, VARIANTS[0]: {**data[VARIANTS[0]], "variants": listed}}
 
 
 def _csv_text(result: StudyResult) -> str:
