@@ -22,7 +22,7 @@ COMMANDS = {
     "compensate": ("compensate", "{0}", "--targets", CONFIGS / "targets.csv", "--out", "{1}"),
     "export": ("export", "{0}", "--format", "yaml", "--out", "{1}"),
     "serve": ("serve", "{0}", "--evaluator", "interpreted"),
-    "capability": ("capability", "{0}", "--out", "{1}"),
+    "capability": ("capability", "{0}", "--settings", CONFIGS / "capability.yaml", "--out", "{1}"),
     "recalibrate": ("recalibrate", "{0}", "--from", CONFIGS / "demo.csv", "--out", "{1}"),
 }
 

@@ -112,9 +112,9 @@ def test_a_study_states_them_by_variant(folder: Path) -> None:
     variants = json.loads((folder / "study" / "study.json").read_text())["variants"]
     means = {v["name"]: v["orientation_error_deg"]["cross_validated"]["mean"] for v in variants}
     assert means["lengths"] > 0.4 > 0.12 > means["all"]
-    assert "cv, deg" in done.stdout and f"{means['all']:.3f}" in done.stdout
+    assert "Turn, deg" in done.stdout and f"{means['all']:.3f}" in done.stdout
     page = (folder / "study" / "study.html").read_text()
-    assert "Turn mean, deg" in page and f"{means['all']:.3f}" in page
+    assert "Turn, deg" in page and f"{means['all']:.3f}" in page
 
 
 def test_positions_alone_have_none(folder: Path) -> None:

@@ -256,7 +256,7 @@ def test_a_plan_counts_what_measured_orientations_would_tell(tmp_path):
     q = np.random.default_rng(5).uniform(-1.5, 1.5, (20, 5))
     poses = Dataset(tuple(map(str, range(20))), {f"arm.q{i + 1}": q[:, i] for i in range(5)})
     setup = plan_context(experiment, PlanSettings(), JointSpace.of(experiment), experiment.parameters, None)
-    step, found = 1e-6, setup.rows(poses)[0]
+    step, found = 1e-6, setup.rows(poses)
     scales = experiment.parameters.scales()
     for n, angles in enumerate(q):
         turn, place = turned_and_placed(angles, np.zeros(5), Rotation.identity())

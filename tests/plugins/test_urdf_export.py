@@ -21,7 +21,7 @@ from armcal.cli.main import cli
 from armcal.errors import ConfigError, ProblemError
 from armcal.plugins import discover
 from armcal.testing.planar import planar_arms
-from armcal_urdf import edit, export
+from armcal_urdf import export
 from armcal_urdf.export import UrdfExporter, UrdfExportSettings
 from armcal_urdf.model import UrdfModel, UrdfSettings
 from armcal_urdf.robot import decode
@@ -172,7 +172,7 @@ def test_numbers_of_any_size_read_back(seed):
 
 
 def test_what_reads_back_differently_is_not_written(monkeypatch):
-    monkeypatch.setattr(edit, "repr", lambda number: f"{number:.6f}", raising=False)
+    monkeypatch.setattr(export, "repr", lambda number: f"{number:.6f}", raising=False)
     with pytest.raises(ProblemError, match="off the calibrated arm"):
         exported(STRANGE.encode(), random_change(3))
 

@@ -13,7 +13,7 @@ from armcal.report.tables import TextTable, provenance_facts
 from armcal.run.study_result import Cell, StudyResult, VariantResult
 from armcal.version import __version__
 
-PAGE_ONLY = ("Train 95 %", "RMS", "Max", "Fit")
+PAGE_ONLY = ("Train 95 %", "RMS", "Max", "Fit", "Turn 95 %")
 """Columns of ``study_tables`` for which a terminal has no room."""
 _SAME_MM = 1e-6
 _FEW_GROUPS = 3

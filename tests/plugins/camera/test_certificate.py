@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 from armcal.base.arrays import Array
-from armcal_camera import certificate as of
+from armcal_camera import hand_eye as of
 from armcal_camera.hand_eye import HandEye, certificate, hand_eye, sentence
 from scipy.spatial.transform import Rotation
 
