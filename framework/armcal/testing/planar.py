@@ -1,9 +1,8 @@
 """The arm, springs and instrument of the contract's own checks: two links in a vertical plane, and their tip."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 
 from armcal.arm.assembly import Arm, ArmState
@@ -15,14 +14,13 @@ from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
 from armcal.base.poses import quaternion_expression
 from armcal.base.se3 import Expression
-from armcal.measure.instrument import Contact
+from armcal.measure.instrument import Contact, Instrument
 from armcal.measure.measurement import Channel
 
 ARM, TRACKER, WALLS = "arm", "tracker", "walls"
 GRAVITY = Environment((0.0, 0.0, -9.81))
 NOISE_M = 1e-3
 _Y_AXIS = (0.0, 1.0, 0.0)
-_TIP = "xyz"
 QUATERNION = ("qw", "qx", "qy", "qz")
 
 
@@ -85,49 +83,31 @@ class Walls(Contact):
         return (NOISE_M,)
 
 
-@dataclass(frozen=True)
-class Tip:
+class Tip(Instrument):
     """The tool's position, without parameters of its own."""
 
-    arm: str = ARM
-
-    @property
-    def arms(self) -> tuple[str, ...]:
-        return (self.arm,)
-
-    def parameters(self) -> tuple[ParameterBlock, ...]:
-        return ()
+    def __init__(self, arm: str = ARM) -> None:
+        self.arms = (arm,)
 
     def channels(self) -> tuple[Channel, ...]:
-        return tuple(Channel(axis, "length") for axis in _TIP)
+        return tuple(Channel(axis, "length") for axis in "xyz")
 
     def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> dict[str, Expression]:
-        return {axis: arms[self.arm].base_T_tool.translation[i] for i, axis in enumerate(_TIP)}
-
-    def residual(
-        self,
-        arms: Mapping[str, ArmState],
-        measured: Mapping[str, Expression],
-        values: Mapping[str, Expression],
-    ) -> Expression:
-        predicted = self.outputs(arms, values)
-        return ca.vertcat(*[measured[axis] - predicted[axis] for axis in _TIP])
+        return {axis: self.base_T_tool(arms).translation[i] for i, axis in enumerate("xyz")}
 
     def noise(self) -> tuple[float, ...]:
         return (NOISE_M,) * 3
 
 
-@dataclass(frozen=True)
 class Body(Tip):
-    """The tool's position and orientation, without parameters of its own."""
+    """The tool's position and orientation, as a reader is asked for them."""
 
     def channels(self) -> tuple[Channel, ...]:
         return (*super().channels(), *(Channel(name, "dimensionless") for name in QUATERNION))
 
     def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> dict[str, Expression]:
-        turned = quaternion_expression(arms[self.arm].base_T_tool.rotation)
-        named = {name: turned[i] for i, name in enumerate(QUATERNION)}
-        return {**super().outputs(arms, values), **named}
+        turned = quaternion_expression(self.base_T_tool(arms).rotation)
+        return {**super().outputs(arms, values), **{name: turned[i] for i, name in enumerate(QUATERNION)}}
 
 
 def planar_arms(names: Sequence[str]) -> dict[str, Arm]:
