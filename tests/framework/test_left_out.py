@@ -45,6 +45,7 @@ def test_it_is_the_posterior_without_the_record() -> None:
     assert (spread.deviations > own.deviations).all()
 
 
+@pytest.mark.slow
 def test_a_record_that_weighed_less_is_missed_less() -> None:
     problem, fitted, *_ = without_priors()
     by = predictor(problem, fitted)

@@ -218,6 +218,7 @@ def test_measured_records_must_say_their_payload(plain: Path) -> None:
     assert done.exit_code == 2 and "66.3 g (12)" in done.output
 
 
+@pytest.mark.slow
 def test_the_files_agree_with_the_terminal(place: Path) -> None:
     out = place / "out"
     done = armcal("study", str(place / "study.yaml"), "--out", str(out), "--json")

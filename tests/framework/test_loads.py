@@ -30,6 +30,7 @@ def test_what_hangs_or_pulls_loads_them(loaded: str) -> None:
     assemble(Experiment.load(DEMO, [*WEIGHTLESS, loaded, "evaluator=interpreted"]), Stopwatch())
 
 
+@pytest.mark.slow
 def test_grams_read_as_kilograms_are_said_before_the_fit_and_in_the_verdict() -> None:
     experiment = Experiment.load(DEMO, ["arms.arm.links.link2.mass_g=177000", "evaluator=interpreted"])
     (finding,) = mass_findings(experiment.system)

@@ -409,6 +409,7 @@ def test_units_mean_nothing(run, tmp_path):
 # ---------------------------------------------------------------- the matrix of training positions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param("kuka"), pytest.param("kinova", marks=SLOW), pytest.param("panda", marks=SLOW)]
 )

@@ -59,7 +59,7 @@ def tilted(arm: Loaded) -> None:
 CAUSES = {"link_bent": bent, "payload_changed": loaded, "gravity_tilted": tilted}
 
 
-@pytest.mark.quick("link_bent", "payload_changed")
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", CAUSES)
 def test_a_cause_is_named_with_its_size_and_no_joint_is(kind: str) -> None:
     arm, session = Loaded.drawn(2), begun()

@@ -173,6 +173,7 @@ def some_of(halves: Halves, missing: float, seed: int, joint: str = "q2", step_d
     return [event for event in events if event["event"] == "decision"]
 
 
+@pytest.mark.slow
 def test_what_a_coarse_model_makes_look_like_a_slip_is_named_beside_the_models_own_error(coarse: Halves) -> None:
     (decision,) = some_of(coarse, 0.3, 0)
     assert decision["kind"] == "joint_slipped" and OWN_ERROR in decision["sentence"]

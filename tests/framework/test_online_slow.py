@@ -105,6 +105,7 @@ def largest_z(session, arm: World) -> float:
     return float(np.max(np.abs(off[at]) / np.sqrt(belief.gaussian.covariance[at, at])))
 
 
+@pytest.mark.slow
 def test_a_joint_that_wears_without_process_noise_is_named_and_followed() -> None:
     """0.2 deg a day, a record every 15 min; without the decision its zero is known to a tenth of its error."""
     arm, session, decisions = World.drawn(1, wanders=False), begun(settings(process_noise={})), []

@@ -232,6 +232,7 @@ class TestUncheckedWiring:
 
 
 class TestFirstAndLastMotion:
+    @pytest.mark.slow
     def test_jump_and_fall_are_foretold_as_the_simulated_arm_then_bears_them(self, either: OwnArm) -> None:
         plan = either.plan((0,) * len(either.kind["joints"]))
         forecast = {each["kind"]: each for each in dangers(either, plan)["hazards"]}

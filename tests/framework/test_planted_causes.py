@@ -72,6 +72,7 @@ def test_no_drift_is_advised_for_functions_of_poses_in_any_order(tmp_path: Path,
             assert "parameters.drift" not in said(left(base, cause, recording(base, cause, seed, poses)))
 
 
+@pytest.mark.slow
 def test_a_base_that_drifts_while_poses_come_at_random_is_let_drift(tmp_path: Path) -> None:
     drifting = Cause(read=lambda q, p: p + 0.002 * when(q)[:, None] ** 2 * [1, 0.5, 0.2])
     base = experiment(tmp_path)
@@ -83,6 +84,7 @@ def sagging(q: np.ndarray) -> np.ndarray:
     return joint(2, lambda q: 0.5 * DEG * np.cos(q[:, 1]))(sagged)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sags", [True, False])
 def test_repeats_in_each_rest_say_what_is_no_noise(tmp_path: Path, sags: bool) -> None:
     random, cause = np.random.default_rng(1), Cause(stands=sagging if sags else None)

@@ -216,6 +216,7 @@ def test_only_free_numbers_have_one() -> None:
         profiled(made.problem, ["arm.nothing*"])
 
 
+@pytest.mark.slow
 def test_a_run_leaves_profiles_behind(tmp_path: Path) -> None:
     out = tmp_path / "run"
     arguments = ["run", DEMO, "--out", str(out), "--set", "evaluator=interpreted", "--set", "validation.folds=0"]

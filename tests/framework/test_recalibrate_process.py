@@ -44,6 +44,7 @@ def wait_for(folder: Path, what: str, timeout_s: float = 20.0) -> None:
     raise AssertionError(f"{what} did not come")
 
 
+@pytest.mark.slow
 def test_a_closed_standard_output_does_not_stop_it(tmp_path: Path) -> None:
     (tmp_path / "poses.csv").write_text(table(300))
     going = process(tmp_path / "out", str(tmp_path / "poses.csv"), stdout=subprocess.PIPE)

@@ -97,6 +97,7 @@ def test_right_postures_are_never_in_doubt_whatever_their_order() -> None:
     assert judged({}, 45, order)[1] == set()
 
 
+@pytest.mark.slow
 def test_a_first_posture_that_was_wrong_is_found_out_by_the_others() -> None:
     assert judged({0: 0.4}, 20)[1] == {0}
 

@@ -156,6 +156,7 @@ def test_joints_that_moved_and_are_not_late_are_not_said_to_be(lrm, seeds):
     assert "delay" not in kinds
 
 
+@pytest.mark.slow
 def test_a_delay_is_not_tested_where_no_joint_moved_or_a_rate_is_missing(lrm):
     """The family of tests is then what it is without rates."""
     plain, at_rest = (looked_at(*made) for made in (recording(lrm, 100, 7), moving(lrm, 0.1, 7, deg_s=0.0)))
@@ -166,6 +167,7 @@ def test_a_delay_is_not_tested_where_no_joint_moved_or_a_rate_is_missing(lrm):
     assert looked_at(problem, records, start, dataset).tested == plain.tested + 2, "a delay, and play of all joints"
 
 
+@pytest.mark.slow
 def test_play_of_joints_that_move_is_not_called_a_delay(lrm):
     """Equal play of all joints, and of one, whose rates have the sign of their approach."""
     came = poses(150, 2)[1]

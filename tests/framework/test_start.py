@@ -159,7 +159,9 @@ def test_mistakes_are_named_in_any_frame(anywhere: Prepared, change, words: str)
     assert found.as_given_mm > 3 * found.left_mm
 
 
-@pytest.mark.parametrize("since", [40, 100, 170])
+@pytest.mark.parametrize(
+    "since", [pytest.param(40, marks=pytest.mark.slow), 100, pytest.param(170, marks=pytest.mark.slow)]
+)
 def test_a_tracker_that_was_moved_in_the_middle_is_named_with_the_record(anywhere: Prepared, since: int) -> None:
     """Half of the record's positions in one frame, half in another: no single one fits."""
     dataset = seen_from(anywhere.dataset, Rotation.random(random_state=4).as_matrix(), np.array([1.0, -2.0, 0.5]))

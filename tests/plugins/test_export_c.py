@@ -150,6 +150,7 @@ def test_efforts_are_what_force_and_torque_do_along_the_joints(arms):
         np.testing.assert_allclose(efforts, compiled.jacobian(record)[2].T @ wrench, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_efforts_bend_the_springs_as_far_as_these_give(arms):
     calibration, compiled = arms("elastic")
     compliances = [calibration.parameters[f"arm.spring.k{joint}"].nominal[0] for joint in range(1, 7)]

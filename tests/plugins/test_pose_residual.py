@@ -93,6 +93,7 @@ def test_unseen_errors_fall_to_near_the_noise_and_the_run_says_so():
     assert "The pose residual of arm takes unseen errors from" in log
 
 
+@pytest.mark.slow
 def test_what_is_learned_leaves_the_parameters_where_the_fit_has_them(tmp_path):
     """The length of the last link and the target trade: the shift that is learned would choose between them."""
     run = learned_run()
@@ -335,6 +336,7 @@ def sag_mm(beside_mm, load_kg):
     return 1.2 * load_kg * np.sum(beside_mm**2) / 450**2
 
 
+@pytest.mark.slow
 def test_errors_that_depend_on_the_load_are_learned_and_hold_on_unseen_records():
     run = loaded_run()
     metrics = json.loads((run.folder / "run/metrics.json").read_text())

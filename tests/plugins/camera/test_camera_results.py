@@ -258,6 +258,7 @@ def armcal_says(*arguments: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_what_a_record_lacks_is_empty_in_the_residuals(tmp_path: Path) -> None:
     rows = list(csv.reader(DEMO.with_suffix(".csv").read_text().splitlines()))
     place = rows[0].index("u_7_px")

@@ -67,6 +67,7 @@ def test_joints_that_are_late_are_late_by_so_much(recorded: Path) -> None:
     assert own < 1e-3
 
 
+@pytest.mark.slow
 def test_late_joints_are_named_without_the_effect(recorded: Path) -> None:
     """From the times of the joint table alone; of a table without times nothing is said of rates."""
     content = yaml.safe_load((recorded / "late.yaml").read_text())

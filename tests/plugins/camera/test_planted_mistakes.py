@@ -144,6 +144,7 @@ def scale_held(*changes: str) -> tuple[str, str]:
     return said
 
 
+@pytest.mark.slow
 def test_a_square_of_another_size_contradicts_the_priors_of_lengths() -> None:
     grade, text = scale_held("measurements.camera.board.square_mm=25.5")
     assert grade == "warning" and "although records and priors put it -2 +- 0.81 %" in text

@@ -58,6 +58,7 @@ def test_a_pose_out_of_reach_has_no_joints(arm: Arm, path: Array) -> None:
     assert np.abs(np.delete(commands - path, 3, axis=1)).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_images_with_poses_of_an_arm_with_joints(arm: Arm, path: Array, tmp_path: Path) -> None:
     tools = tools_at(arm, path)
     (tmp_path / "poses.txt").write_text("\n".join(" ".join(f"{x:.12f}" for x in tool[:3].ravel()) for tool in tools))

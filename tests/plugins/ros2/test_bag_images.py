@@ -21,6 +21,7 @@ LENS = Lens((600.0, 600.0), (320.0, 240.0))
 BOARD = {"type": "chessboard", "columns": 9, "rows": 6, "square_mm": 25}
 
 
+@pytest.mark.slow
 def test_images_of_a_recording_become_records_of_corners(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ARMCAL_CACHE_DIR", str(tmp_path / "cache"))
     tour = bags.made_tour(tmp_path, rests=4)
