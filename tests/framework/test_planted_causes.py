@@ -67,8 +67,8 @@ def test_no_drift_is_advised_for_functions_of_poses_in_any_order(tmp_path: Path,
     base, cause = experiment(tmp_path), CAUSES[name]
     for seed in range(3):
         q = np.random.default_rng(seed).uniform(-1, 1, (COUNT, 6)) * LIMITS
-        sorted_by = (q[:, 0], q[:, 2], np.lexsort((q[:, 0], np.round(3 * q[:, 1]))))
-        for poses in (along_a_path(seed), *(q[np.argsort(key)] for key in sorted_by)):
+        orders = (np.argsort(q[:, 0]), np.argsort(q[:, 2]), np.lexsort((q[:, 0], np.round(3 * q[:, 1]))))
+        for poses in (along_a_path(seed), *(q[order] for order in orders)):
             assert "parameters.drift" not in said(left(base, cause, recording(base, cause, seed, poses)))
 
 

@@ -207,10 +207,8 @@ def _predictable_finding(structure: ResidualStructure) -> Finding:
     listed = ", ".join(f"{carrier.words} ({percent(carrier.share)})" for carrier in predicted.carriers)
     text = f"{predicted_in_short(predicted)} Of it: {listed}."
     if predicted.is_in_order:
-        text += (
-            f" The poses were visited in an order, and time alone predicts {percent(predicted.by_time)}: these data "
-        )
-        text += "do not show which of them is the cause."
+        text += f" The poses were visited in an order, and time alone predicts {percent(predicted.by_time)}: these data"
+        text += " do not show which of them is the cause."
     named = sum(s.falls_mm for s in structure.worthwhile) / max(structure.mean_mm, 1e-12)
     first = "Model what is named beside this, then look again. " if named > predicted.falls / 2 else ""
     return Finding(grade, text, test, first + " ".join(_remedies(predicted)))

@@ -153,7 +153,7 @@ class TimeOrPose:
     Attributes:
         time, pose: logarithms of the odds of a function of time, and of the pose, against noise alone.
         time_mm, pose_mm: mean residual of a record that the others predict by either.
-        time_imitated, pose_imitated: which share of the one's function the other predicts.
+        time_imitated, pose_imitated: which share of the one's function the other predicts, or of the records' order.
     """
 
     time: float

@@ -175,6 +175,7 @@ _FOLDS = 5
 _MM = 1000.0
 _SAME = 0.999
 """Cosine from which on two causes are one."""
+_IN_ORDER = 0.5  # share of the order of records from which on poses tell the time
 _LIKELIER = 0.5
 """Where chance has more of the odds, a cause is none."""
 
@@ -317,14 +318,11 @@ def _alike(residual: Array, basis: Array, rows: FitRows, contest: Contest) -> Ti
     time, pose = (smooth(residual, basis, rows.by_record, k) for k in (contest.time, contest.pose))
     left = (left_out(one, residual, basis, rows.by_record) for one in (time, pose))
     time_mm, pose_mm = (rows.mean_error(one) * _MM for one in left)
-    return TimeOrPose(
-        time.evidence,
-        pose.evidence,
-        time_mm,
-        pose_mm,
-        contest.pose.imitate(time.function[rows.by_record]),
-        contest.time.imitate(pose.function[rows.by_record]),
-    )
+    by_time, by_pose = (one.function[rows.by_record] for one in (time, pose))
+    imitated, order = contest.pose.imitate(by_time), np.arange(len(by_time), dtype=float)[:, None]
+    if imitated < IMITATED and (of_order := contest.pose.imitate(order)) > _IN_ORDER:
+        imitated = of_order
+    return TimeOrPose(time.evidence, pose.evidence, time_mm, pose_mm, imitated, contest.time.imitate(by_pose))
 
 
 def _looked_at(candidates: Indices, position: Indices) -> Indices:
