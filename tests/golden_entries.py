@@ -726,7 +726,7 @@ ENTRIES: tuple[Entry, ...] = (
         "plan configs/lrm_arm/plan.yaml --iso-cube auto --cycles 4 --out {out}/iso.csv --json",
         "simulate configs/lrm_arm/demo.yaml --poses {out}/iso.csv --out {out}/measured.csv --json",
         "acceptance runs/lrm-demo/calibration.yaml {out}/measured.csv --out {out}/acceptance --json",
-        reads=["0.out", "2.out", "iso.csv", "measured.csv"],
+        reads=["0.out", "iso.csv", "measured.csv", "acceptance/acceptance.json", "acceptance/acceptance.csv"],
         needs=["lrm-demo"],
     ),
     entry(
