@@ -1,87 +1,34 @@
-"""Nominal arms as their makers publish them [UrDh, XarmKinematics]: a fixed transform before each joint, which turns
-about its frame's z axis."""
+"""Arms as their makers publish them, and as their calibration files have them: a fixed transform before each joint,
+which turns about its frame's z axis. Files are the kinematics YAML of ur_calibration and of xarm_ros2."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
+from functools import cache
+from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
+import yaml
 from armcal.base.arrays import Array
 from armcal.base.quaternions import rpy_of
+from armcal.config.yaml_nodes import Node, Origin, entries_of, read_nodes
 from armcal.errors import DataError, Location
+from armcal.io.plain_files import refuse
 from scipy.spatial.transform import Rotation
 
+HASH = re.compile(r"calib_\d+")
 KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 FARTHEST_M, FARTHEST_RAD = 0.03, math.radians(5)
 """Frames of a calibrated arm further off the nominal ones are of another arm, or in other units."""
-_FARTHEST = FARTHEST_M, FARTHEST_RAD
+_LONGEST_M, _WIDEST = 3.0, 2 * math.pi + 1e-6
+_AGAIN = "Extract the file from the robot again."
 _UNKNOWN = "Check units (m, rad), or use a URDF of the arm itself."
 _NEAR_M, _NEAR_RAD = 0.02, 0.1
 """A frame as near to its nominal one stays where it is; another is shifted along its axis, and turned about it."""
 _ALONG = 0.9
 """Cosine to an axis beyond which a direction says too little of what is across it."""
-_R = math.pi / 2
-_UR_ALPHA = np.array([_R, 0, 0, _R, -_R, 0])
-_UR_M: Mapping[str, tuple[float, ...]] = MappingProxyType(
-    {
-        "ur3": (0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819),
-        "ur5": (0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823),
-        "ur10": (0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922),
-        "ur3e": (0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921),
-        "ur5e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996),
-        "ur10e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655),
-        "ur16e": (0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655),
-        "ur20": (0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543),
-        "ur30": (0.2363, -0.637, -0.5037, 0.201, 0.1593, 0.1543),
-    }
-)
-"""d1, a2, a3, d4, d5, d6 (m)."""
-_XARM: Mapping[str, tuple[tuple[float, ...], ...]] = MappingProxyType(
-    {
-        "xarm5": (
-            (0, 0, 0.267, 0, 0, 0),
-            (0, 0, 0, -_R, 0, 0),
-            (0.0535, -0.2845, 0, 0, 0, 0),
-            (0.0775, 0.3425, 0, 0, 0, 0),
-            (0.076, 0.097, 0, -_R, 0, 0),
-        ),
-        "xarm6": (
-            (0, 0, 0.267, 0, 0, 0),
-            (0, 0, 0, -_R, 0, 0),
-            (0.0535, -0.2845, 0, 0, 0, 0),
-            (0.0775, 0.3425, 0, -_R, 0, 0),
-            (0, 0, 0, _R, 0, 0),
-            (0.076, 0.097, 0, -_R, 0, 0),
-        ),
-        "xarm7": (
-            (0, 0, 0.267, 0, 0, 0),
-            (0, 0, 0, -_R, 0, 0),
-            (0, -0.293, 0, _R, 0, 0),
-            (0.0525, 0, 0, _R, 0, 0),
-            (0.0775, -0.3425, 0, _R, 0, 0),
-            (0, 0, 0, _R, 0, 0),
-            (0.076, 0.097, 0, -_R, 0, 0),
-        ),
-        "lite6": (
-            (0, 0, 0.2435, 0, 0, 0),
-            (0, 0, 0, _R, -_R, math.pi),
-            (0.2002, 0, 0, -math.pi, 0, _R),
-            (0.087, -0.22761, 0, _R, 0, 0),
-            (0, 0, 0, _R, 0, 0),
-            (0, 0.0625, 0, -_R, 0, 0),
-        ),
-        "uf850": (
-            (0, 0, 0.364, 0, 0, 0),
-            (0, 0, 0, _R, -_R, 0),
-            (0.39, 0, 0, -math.pi, 0, -_R),
-            (0.15, 0.426, 0, -_R, 0, 0),
-            (0, 0, 0, -_R, 0, 0),
-            (0, -0.09, 0, _R, 0, 0),
-        ),
-    }
-)
-"""KEYS of each joint (m, rad)."""
 _UR_JOINTS = ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", *(f"wrist_{i}_joint" for i in (1, 2, 3)))
 _UR_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 
@@ -111,18 +58,19 @@ class Nominal:
     frames: Array  # parent_T_joint (n x 4 x 4)
 
 
-def nominal_arms() -> dict[str, Nominal]:
-    arms = [Nominal(name, UR, _UR_JOINTS, _UR_LINKS, _dh_frames(*ur_rows(name))) for name in _UR_M]
-    for name, rows in _XARM.items():
+@cache
+def nominal_arms() -> Mapping[str, Nominal]:
+    tables = yaml.safe_load((Path(__file__).parent / "arms.yaml").read_text(encoding="utf-8"))
+    arms = []
+    for name, (d1, a2, a3, d4, d5, d6) in tables["ur"].items():
+        rows = ((0, 0, d1, 0), (0, 0, 0, 90), (a2, 0, 0, 0), (a3, 0, d4, 0), (0, -d5, 0, 90), (0, d6, 0, -90))
+        frames = np.array([pose((x, y, z, math.radians(roll), 0, 0)) for x, y, z, roll in rows])
+        arms.append(Nominal(name, UR, _UR_JOINTS, _UR_LINKS, frames))
+    for name, rows in tables["xarm"].items():
         joints = tuple(f"joint{i}" for i in range(1, len(rows) + 1))
-        arms.append(Nominal(name, XARM, joints, joints, np.array([pose(row) for row in rows])))
+        frames = np.array([pose((*row[:3], *np.radians(row[3:]))) for row in rows])
+        arms.append(Nominal(name, XARM, joints, joints, frames))
     return {arm.name: arm for arm in arms}
-
-
-def ur_rows(name: str) -> tuple[Array, Array, Array, Array]:
-    """theta, a, d, alpha (6 each; rad, m) of a UR arm."""
-    d1, a2, a3, d4, d5, d6 = _UR_M[name]
-    return np.zeros(6), np.array([0, a2, a3, 0, 0, 0]), np.array([d1, 0, 0, d4, d5, d6]), _UR_ALPHA
 
 
 def nearest(candidates: Mapping[str, Array], where: Location | None = None) -> Nominal:
@@ -141,7 +89,9 @@ def nearest(candidates: Mapping[str, Array], where: Location | None = None) -> N
     shift, turn = off[best]
     if shift <= FARTHEST_M and turn <= FARTHEST_RAD:
         return arms[best]
-    apart, limits = (f"{1000 * m:.3g} mm and {math.degrees(r):.2g} deg" for m, r in (off[best], _FARTHEST))
+    apart, limits = (
+        f"{1000 * m:.3g} mm and {math.degrees(r):.2g} deg" for m, r in ((shift, turn), (FARTHEST_M, FARTHEST_RAD))
+    )
     text = f"it is not a calibration of {best}, the nearest arm: {apart} off, expected {limits} at most."
     raise DataError(text, where=where, hint=_UNKNOWN)
 
@@ -156,17 +106,6 @@ def pose(six: Sequence[float]) -> Array:
 def six_of(matrix: Array) -> list[float]:
     """x, y, z (m), roll, pitch, yaw (rad) of a 4x4 matrix, as a URDF has them."""
     return [round(float(value), 15) + 0.0 for value in (*matrix[:3, 3], *rpy_of(matrix[:3, :3]))]
-
-
-def _dh_frames(theta: Array, a: Array, d: Array, alpha: Array) -> Array:
-    """Standard Denavit-Hartenberg rows (n each; rad, m) as parent_T_joint (n x 4 x 4) [Denavit1955].
-
-    Each joint's theta and d come before its turn: all are about and along the same axis. The last a and alpha, behind
-    the last joint, are not in them.
-    """
-    along = [pose((0, 0, length, 0, 0, angle)) for length, angle in zip(d, theta, strict=True)]
-    across = [pose((length, 0, 0, angle, 0, 0)) for length, angle in zip(a, alpha, strict=True)]
-    return np.array([before @ here for before, here in zip([np.eye(4), *across[:-1]], along, strict=True)])
 
 
 def at_zero(frames: Array) -> Array:
@@ -215,3 +154,78 @@ def differences(frames: Array, others: Array) -> tuple[Array, Array]:
     """Distances (n; m) and angles (n; rad) between frames."""
     turns = Rotation.from_matrix(others[:, :3, :3].transpose(0, 2, 1) @ frames[:, :3, :3]).magnitude()
     return np.linalg.norm(frames[:, :3, 3] - others[:, :3, 3], axis=1), np.asarray(turns)
+
+
+@dataclass(frozen=True)
+class MakersArm:
+    """An arm as its maker measured it."""
+
+    nominal: Nominal
+    frames: Array  # parent_T_joint (n x 4 x 4)
+    hash: str = ""  # by which the maker's driver knows the calibration (calib_...); empty where the file has none
+
+
+def read_kinematics(text: str, path: Path) -> MakersArm:
+    """An arm from the text of a maker's file; ``path`` names it in messages.
+
+    Raises:
+        DataError: what was found, what was expected, the line, and what to do.
+    """
+    if text.lstrip().startswith("[") or "\n[mounting]" in text:
+        hint = "Extract it from the robot with ur_calibration."
+        refuse(path, "found a controller's calibration.conf, expected the kinematics YAML of the robot.", hint)
+    arms = nominal_arms()
+    root = read_nodes(text, Origin(str(path), path.parent), plain=str)
+    if root is None or not (entries := entries_of(root)):
+        hint = "Give the kinematics YAML of ur_calibration or xarm_ros2."
+        refuse(path, "it holds no keys, expected a maker's calibration.", hint)
+    section = entries.get("kinematics")
+    if section is None or not (joints := entries_of(section)):
+        listed = ", ".join(list(entries)[:12])
+        _refuse(root, (), f"found {listed}, expected kinematics: and numbers under it.", "Check which file this is.")
+    keys = [key for key, node in joints.items() if entries_of(node)]
+    known = [arm for arm in arms.values() if set(arm.keys) == set(keys)]
+    if not known:
+        expected = f"{', '.join(arms['ur5e'].keys)} (UR), or joint1 to joint5, joint6 or joint7 (xArm)"
+        text = f"found the joints {', '.join(keys)[:200] or 'none'}, expected {expected}."
+        _refuse(section, ("kinematics",), text)
+    rows = [_six(joints[key], ("kinematics", key)) for key in known[0].keys]
+    frames = np.array([pose(row) for row in rows])
+    nominal = nearest({arm.name: frames for arm in known}, Location(str(path)))
+    if nominal.family is not UR:
+        return MakersArm(nominal, frames)
+    value = joints["hash"].value if "hash" in joints else ""
+    if not (isinstance(value, str) and HASH.fullmatch(value)):
+        hint = "Without it the driver cannot tell whose calibration it is. Extract the file from the robot again."
+        shown = repr(str(value)[:40]) if value else "no hash"
+        _refuse(section, ("kinematics",), f"found {shown}, expected hash: calib_ and a number.", hint)
+    return MakersArm(nominal, frames, value)
+
+
+def _six(section: Node, keys: tuple[str, ...]) -> list[float]:
+    """The six numbers of a joint; makers' tools write exponents that configurations refuse."""
+    entries, numbers = entries_of(section), []
+    if set(entries) != set(KEYS):
+        _refuse(section, keys, f"found {', '.join(entries) or 'nothing'}, expected {', '.join(KEYS)}.")
+    for key in KEYS:
+        node, value = entries[key], math.nan
+        if isinstance(node.value, str):
+            try:
+                value = float(node.value)
+            except ValueError:
+                value = math.nan
+        if not math.isfinite(value):
+            shown = repr(node.value[:40]) if isinstance(node.value, str) else "a list or keys"
+            _refuse(node, (*keys, key), f"found {shown}, expected a number.")
+        if key in "xyz" and abs(value) > _LONGEST_M:
+            text = f"found {key} {value:g}, expected metres of a link."
+            _refuse(section, keys, text, "Divide millimetres by 1000.")
+        if abs(value) > _WIDEST:
+            text = f"found {key} {value:g}, expected radians: it looks like degrees."
+            _refuse(section, keys, text, "Convert it to radians.")
+        numbers.append(value)
+    return numbers
+
+
+def _refuse(node: Node, keys: tuple[str, ...], message: str, hint: str = _AGAIN) -> NoReturn:
+    raise DataError(message, where=node.origin.at(node.line, keys), hint=hint)

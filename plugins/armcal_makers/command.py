@@ -12,8 +12,7 @@ from armcal.errors import InputError
 from armcal.io.file_set import write_new, write_over
 from armcal.io.plain_files import check_output, input_bytes, text_of
 
-from armcal_makers.arms import at_zero, differences, tips
-from armcal_makers.kinematics import MakersArm, read_kinematics
+from armcal_makers.arms import MakersArm, at_zero, differences, read_kinematics, tips
 
 _MAX_BYTES, _SEED = 1 << 18, 1
 

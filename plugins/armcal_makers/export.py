@@ -22,6 +22,7 @@ from armcal.errors import ConfigError, ProblemError
 from armcal_makers.arms import (
     FARTHEST_M,
     FARTHEST_RAD,
+    HASH,
     KEYS,
     UR,
     XARM,
@@ -33,10 +34,10 @@ from armcal_makers.arms import (
     nearest,
     nominal_arms,
     placed,
+    read_kinematics,
     six_of,
     tips,
 )
-from armcal_makers.kinematics import HASH, read_kinematics
 
 TOLERANCE = 1e-9
 """m and rad."""

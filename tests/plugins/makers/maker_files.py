@@ -7,7 +7,11 @@ those of three UR10 in the tests of ur_calibration.
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import armcal_makers
 import numpy as np
+import yaml
 from armcal_makers.arms import nominal_arms, six_of
 
 UR5_DELTAS = (
@@ -234,6 +238,17 @@ def shift(x, y, z):
     matrix = np.eye(4)
     matrix[:3, 3] = x, y, z
     return matrix
+
+
+def ur_rows(name):
+    """theta, a, d, alpha (6 each; rad, m) of a nominal UR arm, from the numbers that its maker publishes."""
+    tables = yaml.safe_load((Path(armcal_makers.__file__).parent / "arms.yaml").read_text())
+    d1, a2, a3, d4, d5, d6 = tables["ur"][name]
+    right = np.pi / 2
+    return tuple(
+        np.array(row, dtype=float)
+        for row in ((0,) * 6, (0, a2, a3, 0, 0, 0), (d1, 0, 0, d4, d5, d6), (right, 0, 0, right, -right, 0))
+    )
 
 
 def dh_tip(rows, q):

@@ -13,7 +13,6 @@ from armcal.base.settings import Settings
 from armcal.calibration.exporter import request_of
 from armcal.cli.main import cli
 from armcal.errors import ConfigError, InputError
-from armcal_makers.arms import ur_rows
 from armcal_makers.export import UrExporter, UrSettings, XarmExporter
 from click.testing import CliRunner
 
@@ -26,6 +25,7 @@ from tests.plugins.makers.maker_files import (
     dh_tip,
     full_urdf,
     poses,
+    ur_rows,
     yaml_tip,
 )
 

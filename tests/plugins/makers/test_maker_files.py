@@ -14,8 +14,7 @@ from armcal.calibration.rigid_chain import tool_poses
 from armcal.cli.main import cli
 from armcal.errors import InputError
 from armcal.plugins import discover
-from armcal_makers.arms import at_zero, nominal_arms, tips, ur_rows
-from armcal_makers.kinematics import read_kinematics
+from armcal_makers.arms import at_zero, nominal_arms, read_kinematics, tips
 from click.testing import CliRunner
 
 from tests.plugins.makers.maker_files import (
@@ -27,6 +26,7 @@ from tests.plugins.makers.maker_files import (
     XARM6_YAML,
     dh_tip,
     poses,
+    ur_rows,
     yaml_of,
     yaml_tip,
 )
