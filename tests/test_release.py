@@ -247,7 +247,7 @@ WITH = {
     "all": "import cvxpy, filterpy, matplotlib, cv2, pyarrow, rosbags",
     "online": "from armcal_kalman.filters import ExtendedFilter",
     "convex": "from armcal_cvxpy.estimator import CvxpyEstimator",
-    "figures": "from armcal_capability.page import empty_figure; empty_figure((1, 1))",
+    "figures": "from matplotlib.backends.backend_agg import FigureCanvasAgg",
     "lerobot": "import pyarrow.parquet",
     "i2c": "import smbus2; smbus2.i2c_msg.write(64, [0]); import armcal_pca9685.linux_i2c",
     "mujoco": "import mujoco; mujoco.MjModel.from_xml_string('<mujoco><worldbody/></mujoco>')",

@@ -58,7 +58,7 @@ class AreaSettings(Settings):
 
 
 class LoadSettings(Settings):
-    """What the arm carries, where it differs from the configured ``statics``: payload and force at the tool."""
+    """What the arm carries at its tool, where it differs from the configured ``statics``."""
 
     payload: Annotated[Mass, Field(ge=0)] | None = None
     payload_com: Length3 | None = None
@@ -66,7 +66,7 @@ class LoadSettings(Settings):
 
 
 class CapabilitySettings(Settings):
-    """How an arm and its designs are surveyed: the section ``capability`` of a configuration."""
+    """The section ``capability`` of a configuration."""
 
     areas: Annotated[dict[str, AreaSettings], Field(min_length=1)]
     voxel: Annotated[Length, Field(gt=0)] = 0.02  # side of an area's cells
@@ -96,7 +96,6 @@ class Task:
 
     settings: CapabilitySettings
     designs: Mapping[str, Design]
-    files: tuple[Path, ...]
 
 
 @dataclass(frozen=True)
@@ -155,10 +154,13 @@ def load_task(path: Path, rules: Path | None, overrides: Sequence[str], registry
     elif settings.values is not None:
         described = base if settings.values_of is None else load_config(settings.values_of)
         corrections = Corrections.read(settings.values, described, registry)
-    files = (path, *given.files, *config.files)
+    if not settings.designs and is_calibration:
+        calibration = Calibration.load(path, registry)
+        arm = examined_arm(calibration.system, path)
+        alone = Design(calibration.expression(), *_limits(arm, calibration.system, config, path))
+        return Task(settings, {path.name: alone})
     if not settings.designs:
-        alone = _calibrated(path, config, registry) if is_calibration else _design(base, registry, path, corrections)
-        return Task(settings, {path.name: alone}, files)
+        return Task(settings, {path.name: _design(base, registry, path, corrections)})
     if "arms" not in config.data:
         raise ConfigError(
             "it lists designs and describes no arm.",
@@ -173,20 +175,12 @@ def load_task(path: Path, rules: Path | None, overrides: Sequence[str], registry
             designs[name] = _design(_with_rules(source, config), registry, path, corrections)
         except ConfigError as fault:
             raise ConfigError(f"design {name!r}: {fault.message}", where=fault.where, hint=fault.hint) from fault
-    return Task(settings, designs, files)
+    return Task(settings, designs)
 
 
 def examined_arm(system: System, path: Path) -> Arm:
-    """The arm of a system that has one."""
-    return only_arm(
-        system.arms, "a single arm is examined", "Describe the arm to be examined alone.", Location(str(path))
-    )
-
-
-def _calibrated(path: Path, rules: ConfigSource, registry: PluginRegistry) -> Design:
-    calibration = Calibration.load(path, registry)
-    arm = examined_arm(calibration.system, path)
-    return Design(calibration.expression(), *_limits(arm, calibration.system, rules, path))
+    hint = "Describe the arm to be examined alone."
+    return only_arm(system.arms, "a single arm is examined", hint, Location(str(path)))
 
 
 def _design(source: ConfigSource, registry: PluginRegistry, path: Path, corrections: Corrections | None) -> Design:

@@ -19,7 +19,6 @@ from armcal.base.arrays import Array, Indices, Mask
 from armcal.calibration.compensation.step import slopes, twists
 from armcal.calibration.tool_expression import Equilibrium, ToolExpression
 from armcal.errors import ConfigError, ProblemError
-from armcal.estimate.estimator import Progress, no_progress
 from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 from numpy.typing import NDArray
 
@@ -96,15 +95,8 @@ class MechanicsFunction:
         standing = self._equilibrium(self._records(commands))
         return standing.base_T_tool, np.asarray(standing.settled, dtype=bool)
 
-    def without_load(self, commands: Array, states: Array) -> Array:
-        """Where the tool is under the arm's own weight alone (3 x N; m), from states near it."""
-        return self._place(commands, states, ("payload", _FORCE, "force_y", "force_z"))
-
-    def weightless(self, commands: Array) -> Array:
-        """Where the tool would be if nothing pulled at the arm (3 x N; m)."""
-        return self._place(commands, None, LOAD_CHANNELS)
-
-    def _place(self, commands: Array, states: Array | None, idle: tuple[str, ...]) -> Array:
+    def place(self, commands: Array, idle: tuple[str, ...], states: Array | None = None) -> Array:
+        """Where the tool is if nothing acts through some channels of the load (3 x N; m)."""
         record = self._records(commands)
         record[[self._channels.index(channel) for channel in idle]] = 0.0
         return np.asarray(self._equilibrium(record, states).base_T_tool[:, :3, 3].T)
@@ -157,12 +149,10 @@ class Survey:
     drawn: int  # postures
     clear: int  # of which keep their clearance
     settled: int  # of which have an elastic equilibrium
-    positions: Array  # of their tools (N x 3; m)
-    outline: Array  # mount, joints and tool at half of the travel, unloaded (points x 3; m)
     areas: Mapping[str, AreaMap]
 
 
-def survey(design: Design, settings: CapabilitySettings, progress: Progress = no_progress) -> Survey:
+def survey(design: Design, settings: CapabilitySettings) -> Survey:
     """Survey an arm.
 
     Raises:
@@ -177,15 +167,8 @@ def survey(design: Design, settings: CapabilitySettings, progress: Progress = no
             "Make capability.voxel_mm larger, or the area smaller; check their units.",
         )
     search = AreaSearch(design, settings, "compiled" if settings.samples >= _WORTH_COMPILING else "interpreted")
-    areas = {}
-    for i, (name, area) in enumerate(settings.areas.items()):
-        progress("areas", i / len(settings.areas))
-        areas[name] = search(area)
-    expression, middle = design.expression, design.limits.mean(axis=1)
-    points = ca.horzcat(*expression.origins, expression.base_T_tool.translation)
-    function = ca.Function("outline", [expression.record, expression.state], [ca.densify(points)])
-    outline = function(expression.records(middle[:, None]), np.zeros(expression.state.numel())).full().T
-    return Survey(settings.samples, search.clear, len(search.positions), search.positions, outline, areas)
+    areas = {name: search(area) for name, area in settings.areas.items()}
+    return Survey(settings.samples, search.clear, len(search.positions), areas)
 
 
 def cells_of(area: AreaSettings, size: float) -> Array:
@@ -209,9 +192,9 @@ def spread(limits: Array, count: int, seed: int) -> Array:
 
 def quantities(function: MechanicsFunction, commands: Array, mechanics: Mechanics, holding: Array) -> dict[str, Array]:
     """Sag by the arm's own weight, how much further the load moves the tool, and the largest share of ``holding``."""
-    unloaded = function.without_load(commands, mechanics.states)
+    unloaded = function.place(commands, ("payload", _FORCE, "force_y", "force_z"), mechanics.states)
     values = {
-        "sag_mm": np.linalg.norm(unloaded - function.weightless(commands), axis=0) * _MM,
+        "sag_mm": np.linalg.norm(unloaded - function.place(commands, LOAD_CHANNELS), axis=0) * _MM,
         "deflection_mm": np.linalg.norm(mechanics.positions - unloaded, axis=0) * _MM,
     }
     if np.isfinite(holding).any():
@@ -320,7 +303,15 @@ def reach_for(
         remaining, error, slope, states = remaining[going], error[going], slope[going], mechanics.states[:, going]
         if not len(remaining):
             break
-        commands[:, remaining] = _moved(commands[:, remaining], error, slope, limits)
+        here = commands[:, remaining]
+        pull = np.einsum("nmj,nm->jn", slope, error)
+        stuck = ((here <= limits[:, :1]) & (pull < 0)) | ((here >= limits[:, 1:]) & (pull > 0))
+        free = slope * ~stuck.T[:, None, :]
+        damping = np.sum(error**2, axis=1) + _DAMPING
+        square = free @ np.swapaxes(free, 1, 2) + damping[:, None, None] * np.eye(error.shape[1])
+        step = np.einsum("nmj,nm->jn", free, np.linalg.solve(square, error[..., None])[..., 0])
+        step *= _LONGEST / np.maximum(np.abs(step).max(axis=0, initial=0.0), _LONGEST)
+        commands[:, remaining] = np.clip(here + step, limits[:, :1], limits[:, 1:])
     return commands, arrived
 
 
@@ -337,18 +328,6 @@ def _equations(mechanics: Mechanics, targets: Array, pointing: Pointing | None) 
     weight = (away > 0).astype(float) * _LENGTH
     turn = np.einsum("ni,nij->nj", about, mechanics.slopes[:, 3:]) * weight[:, None]
     return np.column_stack([error, away * weight]), np.concatenate([slope, turn[:, None]], axis=1)
-
-
-def _moved(commands: Array, error: Array, slope: Array, limits: Array) -> Array:
-    pull = np.einsum("nmj,nm->jn", slope, error)
-    stuck = ((commands <= limits[:, :1]) & (pull < 0)) | ((commands >= limits[:, 1:]) & (pull > 0))
-    free = slope * ~stuck.T[:, None, :]
-    damping = np.sum(error**2, axis=1) + _DAMPING
-    square = free @ np.swapaxes(free, 1, 2) + damping[:, None, None] * np.eye(error.shape[1])
-    step = np.einsum("nmj,nm->jn", free, np.linalg.solve(square, error[..., None])[..., 0])
-    size = np.abs(step).max(axis=0, initial=0.0)
-    step *= _LONGEST / np.maximum(size, _LONGEST)
-    return np.asarray(np.clip(commands + step, limits[:, :1], limits[:, 1:]))
 
 
 def _require(holds: bool, message: str, hint: str) -> None:

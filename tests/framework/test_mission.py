@@ -326,3 +326,22 @@ def test_records_of_the_mission_are_what_was_simulated(one_day: tuple[Path, dict
     assert [row["pose_id"] for row in rows] == list(records.ids)
     read = np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in rows]) / 1000
     assert np.allclose(read.T, records.stacked([f"tracker.{axis}" for axis in "xyz"]), atol=1e-12)
+
+
+@pytest.mark.parametrize("fault", [ModuleNotFoundError("No module", name="matplotlib"), ImportError("libfreetype")])
+def test_a_missing_or_broken_library_is_told_before_the_mission(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: ImportError
+) -> None:
+    def failing(name: str) -> None:
+        assert name == "matplotlib"
+        raise fault
+
+    monkeypatch.setattr("armcal_online.commands.mission.import_module", failing)
+    monkeypatch.setattr("armcal_online.commands.mission.run_mission", lambda *_: pytest.fail("it began first"))
+    done = CliRunner().invoke(cli, ["mission", str(CONFIG), "--out", str(tmp_path / "out")])
+    assert done.exit_code in (1, 2) and isinstance(done.exception, SystemExit)
+    assert "Traceback" not in done.output
+    if isinstance(fault, ModuleNotFoundError):
+        assert "armcal mission needs the library matplotlib" in done.output and "'armcal[figures]'" in done.output
+    else:
+        assert "cannot be loaded (libfreetype)" in done.output and "armcal doctor" in done.output

@@ -22,7 +22,7 @@ from armcal.version import JSON_SCHEMA, SOURCES, __version__
 EXTRAS = {
     "online": "armcal recalibrate and mission",
     "convex": "the estimator cvxpy, cones in armcal recalibrate",
-    "figures": "the figures of armcal mission and capability",
+    "figures": "the figure of armcal mission",
     "lerobot": "LeRobot's data sets",
     "camera": "boards found in images, boards to print (armcal board)",
     "i2c": "servo boards on this computer's own I2C bus (link linux_i2c)",
