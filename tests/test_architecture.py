@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import graphlib
 import inspect
+import re
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -137,6 +138,17 @@ def test_plugins_import_armcal_and_never_each_other(plugin: str) -> None:
         assert not packages & others, path
         if path.name == "plugin.py":
             assert packages <= {"armcal", "__future__", ""}, f"{path} is imported to list plugins and must stay light"
+
+
+def test_plugins_import_the_documented_modules_alone() -> None:
+    """The table of docs/plugins.md is the one list: what is not on it is private, what nothing imports leaves it."""
+    table = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8").split("## What a plugin may import")[1]
+    documented = set()
+    for room, modules in re.findall(r"^\| `(armcal[.\w]*)` \| (.+) \|$", table, re.MULTILINE):
+        documented |= {f"{room}.{module}" for module in re.findall(r"`([.\w]+)`", modules)}
+    there = {_module(path) for path in FRAMEWORK.rglob("*.py")} - {"armcal"}
+    imported = {name for path in PLUGINS.rglob("*.py") for name in _source(path).imports if name.startswith("armcal.")}
+    assert {name if name in there else name.rpartition(".")[0] for name in imported} - {"armcal"} == documented
 
 
 def test_applications_are_announced_by_their_commands_alone() -> None:
