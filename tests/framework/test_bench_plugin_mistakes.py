@@ -293,6 +293,8 @@ def ended(folder: Path, plugin: str, command: str, *more: str, measurement: str 
     [
         ("acquire", '("a", "b")', "None", "D returned None as joint_names, expected .'a', 'b'., as it was given them"),
         ("acquire", '("a", "b")', '("a",)', "D returned .'a',. as joint_names, expected .'a', 'b'., as it was given"),
+        ("acquire", "refused = {}", "refused = None", "T returned None, expected refused as a mapping from reasons"),
+        ("acquire", "refused = {}", "refused = []", "T returned .., expected refused as a mapping from reasons"),
         ("record", '"touch"', '"board"', "C returned 'board' as measurement, expected one of touch"),
     ],
 )

@@ -197,6 +197,15 @@ def samples_of(stream: JointStream, which: Literal["samples", "lasting"] = "samp
     return samples
 
 
+def refused_by(source: Tracker | JointStream) -> Mapping[str, int]:
+    """How much a live source has passed over, by reason."""
+    refused, own = source.refused, getattr(type(source), "refused", None)
+    method = own if isinstance(own, property) else type(source)
+    with expecting(method, refused, "refused as a mapping from reasons, texts, to counts"):
+        _ = sum(refused.values()), "".join(refused.keys())
+    return refused
+
+
 def shots_of(camera: LiveCamera) -> list[Shot]:
     """All images that came by themselves since the last call."""
     return [_checked(camera.shots, shot) for shot in camera.shots()]

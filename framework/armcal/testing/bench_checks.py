@@ -7,7 +7,10 @@ import math
 import socket
 import threading
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, wait
 from contextlib import closing, suppress
+from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -25,7 +28,7 @@ from armcal.devices.device import (
     state_of,
 )
 from armcal.devices.link import GuardedLink, LinkIdentity
-from armcal.devices.live import JointSample, TrackerFrame, frames_of, samples_of
+from armcal.devices.live import frames_of, refused_by, samples_of
 from armcal.errors import InputError
 from armcal.testing.checking import ContractError, NotRun, Subject, check, expect, raises_only
 
@@ -135,10 +138,10 @@ def on_a_bus_of_registers_it_sets_the_angles_that_it_says(s: Subject) -> None:
 
 @check("device")
 def its_state_is_read_from_the_board_and_a_released_joint_has_no_angle(s: Subject) -> None:
-    before, there = s.link.snapshot(), state_of(s.device).angles
+    before, there = deepcopy(s.link.registers), state_of(s.device).angles
     s.device.command(dict.fromkeys(JOINTS, 0.15))
-    expect(s.link.snapshot() != before, "found nothing written to the board by command()")
-    s.link.restore(before)
+    expect(s.link.registers != before, "found nothing written to the board by command()")
+    s.link.registers = before
     angles = state_of(s.device).angles
     same = all(abs(angles[joint] - there[joint]) <= _SAME_RAD for joint in JOINTS)
     advice = "it is read from the board: read its pulses, do not remember them"
@@ -152,11 +155,15 @@ def its_state_is_read_from_the_board_and_a_released_joint_has_no_angle(s: Subjec
 @check("device")
 def it_passes_on_that_the_link_was_lost(s: Subject) -> None:
     device, s.link.lost = s.device, "the link was cut."
-    _expect_lost("state()", device.state)
-    _expect_lost("command()", lambda: device.command({JOINTS[1]: -0.2}))
-    _expect_lost("energise()", lambda: device.energise(JOINTS[0], 0.1))
-    _expect_lost("keep_alive()", device.keep_alive)
-    _expect_lost("release()", lambda: device.release(JOINTS[0]))
+    calls = {
+        "state": (),
+        "command": ({JOINTS[1]: -0.2},),
+        "energise": (JOINTS[0], 0.1),
+        "keep_alive": (),
+        "release": (JOINTS[0],),
+    }
+    for name, given in calls.items():
+        _expect_lost(f"{name}()", partial(getattr(device, name), *given))
 
 
 def _expect_at(device: Any, commands: Mapping[str, float], after: str) -> None:
@@ -175,35 +182,26 @@ class _MemoryLink:
 
     def __init__(self, lost: str = "") -> None:
         self.lost = lost
-        self._registers: dict[int, bytearray] = {}
+        self.registers: dict[int, bytearray] = {}
 
     def open(self, clock: Clock) -> LinkIdentity:
-        """An adapter without an id."""
         self._of(0)
         return LinkIdentity("", "registers of the contract's checks")
 
     def write(self, address: int, data: bytes) -> None:
-        memory = self._of(address)
         for place, value in enumerate(data[1:], start=data[0]):
-            memory[place % _REGISTERS] = value
+            self._of(address)[place % _REGISTERS] = value
 
     def read(self, address: int, register: int, count: int) -> bytes:
-        memory = self._of(address)
-        return bytes(memory[(register + i) % _REGISTERS] for i in range(count))
+        return bytes(self._of(address)[(register + i) % _REGISTERS] for i in range(count))
 
     def close(self) -> None:
-        """Nothing: what is kept stays."""
-
-    def snapshot(self) -> Mapping[int, bytes]:
-        return {address: bytes(memory) for address, memory in self._registers.items()}
-
-    def restore(self, snapshot: Mapping[int, bytes]) -> None:
-        self._registers = {address: bytearray(memory) for address, memory in snapshot.items()}
+        pass
 
     def _of(self, address: int) -> bytearray:
         if self.lost:
             raise DeviceLostError(self.lost)
-        return self._registers.setdefault(address, bytearray(_REGISTERS))
+        return self.registers.setdefault(address, bytearray(_REGISTERS))
 
 
 # --- live sources ---------------------------------------------------------------------------------------------------
@@ -227,7 +225,7 @@ def the_camera_refuses_without_a_measurement_and_may_be_closed_at_any_time(s: Su
 def it_opens_or_refuses_by_an_armcal_error(s: Subject) -> None:
     is_tracker = s.kind == "tracker"
     s.opening = () if is_tracker else (CHANNELS,)
-    s.take, s.item = (frames_of, TrackerFrame) if is_tracker else (samples_of, JointSample)
+    s.take = frames_of if is_tracker else samples_of
     s.built.close()
     with suppress(InputError), raises_only(InputError):
         _within(lambda: s.built.open(RealClock(), *s.opening))
@@ -235,11 +233,10 @@ def it_opens_or_refuses_by_an_armcal_error(s: Subject) -> None:
 
 @check("tracker", "joints")
 def it_gives_what_has_come_without_waiting_and_nothing_once_closed(s: Subject) -> None:
-    for item in _within(lambda: s.take(s.built)):
-        expect(isinstance(item, s.item), f"found {type(item).__name__}, expected {s.item.__name__}")
+    _within(lambda: s.take(s.built))
     if s.kind == "joints":
         expect(isinstance(s.built.ended, bool), f"found ended = {s.built.ended!r}, expected true or false")
-    _counted(s.built.refused)
+    refused_by(s.built)
     s.built.close()
     s.built.close()
     expect(_within(lambda: s.take(s.built)) == [], "found something that came after close(), expected nothing")
@@ -250,25 +247,23 @@ def damaged_bytes_are_passed_over_and_counted(s: Subject) -> None:
     """By UDP or in a file: each is passed over, and some of them are counted."""
     with TemporaryDirectory() as folder:
         path = Path(folder, "live")
-        path.write_bytes(b"")
+        path.touch()
         source = s.made(s.made.Settings.model_validate(_settings_to_feed(s, path)))
         try:
             source.open(RealClock(), *s.opening)
         except InputError as refusal:
             raise NotRun(f"it does not open: {refusal}") from refusal
-        with closing(source):
+        with closing(source), path.open("ab", 0) as file, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             address = getattr(source, "address", None)
             for data in _DAMAGED:
                 if address is None:
-                    with path.open("ab") as file:
-                        file.write(data)
+                    file.write(data)
                 else:
-                    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-                        sender.sendto(data, tuple(address))
+                    sender.sendto(data, tuple(address))
                 with raises_only(expected="them counted in refused", when=f" for the bytes {data[:20]!r}"):
                     _within(lambda: s.take(source))
             for _ in range(_TRIES):
-                if _counted(source.refused):
+                if sum(refused_by(source).values()):
                     return
                 _within(lambda: s.take(source))
     raise ContractError("found nothing in refused after damaged bytes, expected each to be counted by its reason")
@@ -276,30 +271,19 @@ def damaged_bytes_are_passed_over_and_counted(s: Subject) -> None:
 
 def _within(call: Callable[[], T]) -> T:
     """What a call gives, if it does not wait."""
-    items: list[T] = []
-    raised: list[BaseException] = []
+    future = Future[T]()
 
     def run() -> None:
         try:
-            items.append(call())
+            future.set_result(call())
         except BaseException as fault:
-            raised.append(fault)
+            future.set_exception(fault)
 
-    worker = threading.Thread(target=run, daemon=True)
-    worker.start()
-    worker.join(_PATIENCE_S)
-    if worker.is_alive():
-        raise ContractError(f"found it still waiting after {_PATIENCE_S:g} s, expected what has come by now, at once")
-    if raised:
-        raise raised[0]
-    return items[0]
-
-
-def _counted(refused: Any) -> int:
-    expect(isinstance(refused, Mapping), f"found {type(refused).__name__}, expected a mapping from reason to count")
-    for reason, count in refused.items():
-        expect(isinstance(reason, str) and isinstance(count, int), f"found {reason!r}: {count!r} in refused")
-    return sum(refused.values())
+    threading.Thread(target=run, daemon=True).start()
+    wait([future], _PATIENCE_S)
+    waits = f"found it still waiting after {_PATIENCE_S:g} s, expected what has come by now, at once"
+    expect(future.done(), waits)
+    return future.result()
 
 
 def _settings_to_feed(s: Subject, path: Path) -> Mapping[str, Any]:

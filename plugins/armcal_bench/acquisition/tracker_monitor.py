@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceRefusedError
-from armcal.devices.live import REPEATED, TrackerFrame, frames_of
+from armcal.devices.live import REPEATED, TrackerFrame, frames_of, refused_by
 
 from armcal_bench.acquisition.settings import LostSettings
 from armcal_bench.bench import Bench, BodySettings, base_fault, repeats, tool_fault
@@ -129,7 +129,7 @@ class TrackerMonitor:
             )
 
     def look(self) -> None:
-        frames, refused = frames_of(self._tracker), self._tracker.refused
+        frames, refused = frames_of(self._tracker), refused_by(self._tracker)
         for health in (self._health, self._with_base):
             health.feed(frames, refused)
         self._settling.feed(frames)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from armcal.devices.clock import Clock
 from armcal.devices.line_source import refused_lines_text
-from armcal.devices.live import JointSample, JointStream, LiveCamera, Shot, shot_of, shots_of
+from armcal.devices.live import JointSample, JointStream, LiveCamera, Shot, refused_by, shot_of, shots_of
 from armcal.errors import InputError
 from armcal.io.file_set import write_over
 from armcal.measure.environment import warn_beyond_limits
@@ -305,7 +305,7 @@ class Recorder:
         lines += [f"posture {name} disagrees by {offset}." for name, offset in doubts.items()]
         lines += [f"the next one touches {self.labels.shown}."] if self.labels.columns else []
         lines += [f"digits: {self.labels.known_labels_text()}."] if self.labels.known else []
-        refused = refused_lines_text(self._stream.refused)
+        refused = refused_lines_text(refused_by(self._stream))
         lines += [f"{refused}."] if refused else []
         missing = self._assessor.explained(postures)
         content = {"postures": len(postures), "groups": by_place, "name": self.labels.shown}
@@ -351,7 +351,7 @@ class Recorder:
     def _silent(self) -> str:
         if self._fault and self._clock.now() - self._fault_at <= self._settings.stale:
             return self._fault
-        refused = refused_lines_text(self._stream.refused)
+        refused = refused_lines_text(refused_by(self._stream))
         reason = f" ({refused})" if refused else ": is the sender running?"
         return f"no joint readings came for {self._silence():.1f} s{reason}"
 
