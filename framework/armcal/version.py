@@ -7,5 +7,4 @@ from pathlib import Path
 __version__ = "0.1.0"
 JSON_SCHEMA = {"schema_version": 1}
 """Stands first in what ``--json`` prints; the number grows when a key goes or changes its meaning."""
-SOURCES = Path(__file__).parent
-"""Where the core is installed."""
+SOURCES = Path(__file__).parent  # Where the core is installed

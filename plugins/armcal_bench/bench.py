@@ -29,8 +29,7 @@ _LEAST_OUTLIER_M = 2e-4
 _NAMES_SHOWN = 8
 
 
-NONE = "none"
-"""In the place of the base body's name: the tracker's world itself stands still with the arm's base."""
+NONE = "none"  # In the place of the base body's name: the tracker's world itself stands still with the arm's base
 
 Name = Annotated[str, Field(min_length=1, max_length=100)]
 
@@ -39,16 +38,15 @@ class BodySettings(Settings):
     """The bodies by the tracker's own names, and what is known about where they sit.
 
     Attributes:
-        tool: the body on the tool.
-        base: the body that stands still with the arm's base; ``none`` where the tracker's world does.
         base_motion: ``moving``: each frame is taken in the base body's own pose of that frame. ``still``: the base body's
             poses of all frames of a capture are averaged first.
         base_T_reference: where the base body (or the tracker's world, without one) is in the arm's base frame.
         tool_body_T_target: where the measured target is on the tool body.
+
     """  # noqa: E501
 
-    tool: Name = "tool"
-    base: Name = NONE
+    tool: Name = "tool"  # the body on the tool
+    base: Name = NONE  # the body that stands still with the arm's base; ``none`` where the tracker's world does
     base_motion: Literal["moving", "still"] = "moving"
     base_T_reference: PoseSettings = Field(default_factory=PoseSettings)
     tool_body_T_target: PoseSettings = Field(default_factory=PoseSettings)
@@ -73,11 +71,10 @@ class Capture:
     Attributes:
         poses: ``base_T_target`` (N x 4 x 4, m), NaN where a frame does not show it; the rotation alone is NaN where
             the tracker gives only positions.
-        faults: why a frame does not show it, a sentence; empty where it does (N).
     """
 
     poses: Array
-    faults: tuple[str, ...]
+    faults: tuple[str, ...]  # why a frame does not show it, a sentence; empty where it does (N)
 
 
 def in_base(frames: Sequence[TrackerFrame], settings: BodySettings) -> Capture:

@@ -11,30 +11,20 @@ from armcal.base.arrays import Array
 
 from armcal_bench.acquisition.heat import Torques
 
-_GEARS_HOLD = 0.05
-"""N m: under less than this the gears of a small servo stand without pulses; more turns them."""
+_GEARS_HOLD = 0.05  # N m: under less than this the gears of a small servo stand without pulses; more turns them
 _FALL_STEP = math.radians(2.0)
-_LONGEST_FALL = 400
-"""Steps: more than two turns of a joint."""
-_BEYOND = math.radians(0.5)
-"""A board's counts lie half a degree apart."""
+_LONGEST_FALL = 400  # Steps: more than two turns of a joint
+_BEYOND = math.radians(0.5)  # A board's counts lie half a degree apart
 
 
 @dataclass(frozen=True)
 class Hazard:
-    """The worst of its kind.
+    """The worst of its kind."""
 
-    Attributes:
-        kind: ``first_pulse``, ``limits`` or ``drop``.
-        joint: that turns.
-        amount: how far (rad).
-        sentence: the same for people.
-    """
-
-    kind: str
-    joint: str
-    amount: float
-    sentence: str
+    kind: str  # ``first_pulse``, ``limits`` or ``drop``
+    joint: str  # that turns
+    amount: float  # how far (rad)
+    sentence: str  # the same for people
 
     @property
     def content(self) -> dict[str, Any]:
@@ -43,19 +33,12 @@ class Hazard:
 
 @dataclass(frozen=True)
 class FirstMotion:
-    """What is about to move.
+    """What is about to move."""
 
-    Attributes:
-        free: joints that hang free and get their first pulses.
-        powered: joints that have pulses.
-        measured: joints that hang free too, and whose servos know where: they do not jump.
-        hazards: of the motion, the worst of each kind.
-    """
-
-    free: tuple[str, ...]
-    powered: tuple[str, ...]
-    hazards: tuple[Hazard, ...]
-    measured: tuple[str, ...] = ()
+    free: tuple[str, ...]  # joints that hang free and get their first pulses
+    powered: tuple[str, ...]  # joints that have pulses
+    hazards: tuple[Hazard, ...]  # of the motion, the worst of each kind
+    measured: tuple[str, ...] = ()  # joints that hang free too, and whose servos know where: they do not jump
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,18 +46,14 @@ class HazardJudge:
     """Judges an arm's motions before they begin.
 
     Attributes:
-        joints: in the arm's order.
-        moved: those that have servos.
-        limits: of the joints (joints x 2, rad).
         torques: of the load on each joint at joint angles (joints, N m); it turns a limp joint the way of its sign.
-        rest: where the arm parks, or its base pose (joints, rad).
     """
 
-    joints: tuple[str, ...]
-    moved: tuple[str, ...]
-    limits: Array
+    joints: tuple[str, ...]  # in the arm's order
+    moved: tuple[str, ...]  # those that have servos
+    limits: Array  # of the joints (joints x 2, rad)
     torques: Torques
-    rest: Array
+    rest: Array  # where the arm parks, or its base pose (joints, rad)
 
     def first_motion(
         self,

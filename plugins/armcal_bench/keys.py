@@ -82,8 +82,7 @@ class Typed:
 class Keys(Protocol):
     """Commands as ``Recorder.command`` takes them."""
 
-    ended: bool
-    """Whether there will never be another one."""
+    ended: bool  # Whether there will never be another one
 
     def commands(self) -> list[str]:
         """All that came since the last call; it never waits."""

@@ -16,8 +16,7 @@ from armcal.base.units import length_mistake
 from armcal.diagnose.permuted_axes import FITS, MISSES, MUCH_BETTER
 from armcal.problem.rigid_alignment import rigid_fit, spread_of
 
-FEWEST = 3
-"""Poses: fewer show neither a gain nor a reflection."""
+FEWEST = 3  # Poses: fewer show neither a gain nor a reflection
 _MOST = 30
 _FEWEST_FOR_TARGET = 5
 _ROUNDS = 12
@@ -26,8 +25,7 @@ _TARGET_WEIGHT = 0.2
 _MOST_TARGET_M = 0.3
 _LEVER_M = 0.1
 _GAIN_OFF, _LEAST_GAIN = 2.0, 1e-6
-_ROUGHLY = 3.0
-"""A gain shows in each distance, a reflection in all of them together."""
+_ROUGHLY = 3.0  # A gain shows in each distance, a reflection in all of them together
 _LEAST_MOTION, _FAR_MOTION = 0.05, 0.5
 """Of the reach: sag, play, the target's place and axes that are not as drawn are no gain where the model moves the tool
 by less, and the target moves by less."""
@@ -39,38 +37,26 @@ class MeasuredFrame:
     """How measured poses lie to the model's: ``p = gain turn mirror (e + R_e target) + shift``.
 
     Attributes:
-        gain: measured lengths, in lengths of the model.
-        is_mirrored: whether the frame is left-handed; ``mirror`` is -1 then, else 1.
-        with_rotations: whether the measured rotations agree with the model's in this frame; False where none are.
-        turn: ``frame_R_base`` (3 x 3, proper).
-        shift: of the base's origin (3, m, measured lengths).
-        target: where the target is on the model's tool (3, m).
         left: what is not explained, root mean square with the numbers that were fitted taken into account (m, by the
             model's lengths).
     """
 
-    gain: float
-    is_mirrored: bool
-    with_rotations: bool
-    turn: Array
-    shift: Array
-    target: Array
+    gain: float  # measured lengths, in lengths of the model
+    is_mirrored: bool  # whether the frame is left-handed; ``mirror`` is -1 then, else 1
+    with_rotations: bool  # whether the measured rotations agree with the model's in this frame; False where none are
+    turn: Array  # ``frame_R_base`` (3 x 3, proper)
+    shift: Array  # of the base's origin (3, m, measured lengths)
+    target: Array  # where the target is on the model's tool (3, m)
     left: float
 
 
 @dataclass(frozen=True)
 class FrameMistake:
-    """A frame that is not what was configured.
+    """A frame that is not what was configured."""
 
-    Attributes:
-        sentence: what is off, by how much, and by how many poses, without its full stop.
-        mend: what to do, a full sentence.
-        frame: that explains the poses.
-    """
-
-    sentence: str
-    mend: str
-    frame: MeasuredFrame
+    sentence: str  # what is off, by how much, and by how many poses, without its full stop
+    mend: str  # what to do, a full sentence
+    frame: MeasuredFrame  # that explains the poses
 
 
 def frame_mistake(expected: Array, seen: Array) -> FrameMistake | None:

@@ -16,12 +16,10 @@ from armcal_bench.bench import BodySettings, in_base, repeats
 
 FROZEN = "the tracker is frozen: it gives the same frame again"
 _MOST_FRAMES = 20_000
-_GAP = 0.25
-"""A part of the window that may pass without a usable frame."""
+_GAP = 0.25  # A part of the window that may pass without a usable frame
 _SLACK_S = 1e-9
 _LONGEST_STAND_S, _FEWEST = 30.0, 4
-_LEAST_RATE = 1e-7
-"""m/s and rad/s: what is rounded more coarsely than its noise has no deviation."""
+_LEAST_RATE = 1e-7  # m/s and rad/s: what is rounded more coarsely than its noise has no deviation
 
 
 @dataclass(frozen=True)
@@ -29,18 +27,15 @@ class Settled:
     """Where the arm stands.
 
     Attributes:
-        base_T_target: the mean (4 x 4, m); the rotation is NaN where the tracker gives only positions.
         deviations: standard deviations of the mean (6): x, y, z in the base frame (m), and the turn about each axis of
             the target (rad). A coordinate that the tracker rounds more coarsely than its noise may have none.
-        frames: how many frames it is the mean of.
-        rejected: how many more were set aside, lying far from the others.
         begun, ended: when the first and the last of them came, by the bench's clock (s).
     """
 
-    base_T_target: Array
+    base_T_target: Array  # the mean (4 x 4, m); the rotation is NaN where the tracker gives only positions
     deviations: Array
-    frames: int
-    rejected: int
+    frames: int  # how many frames it is the mean of
+    rejected: int  # how many more were set aside, lying far from the others
     begun: float
     ended: float
 
@@ -53,19 +48,12 @@ class Settled:
 
 @dataclass(frozen=True)
 class Stand:
-    """How the target moved while the arm was commanded to stand.
+    """How the target moved while the arm was commanded to stand."""
 
-    Attributes:
-        base_T_target: in the middle of that time (4 x 4, m); the rotation is NaN where it is not known.
-        rates: along x, y, z (m/s) and about x, y, z (rad/s) of the base frame; NaN where the rotation is not known.
-        sds: standard deviations of these.
-        seconds: how long it was seen.
-    """
-
-    base_T_target: Array
-    rates: Array
-    sds: Array
-    seconds: float
+    base_T_target: Array  # in the middle of that time (4 x 4, m); the rotation is NaN where it is not known
+    rates: Array  # along x, y, z (m/s) and about x, y, z (rad/s) of the base frame; NaN where the rotation is not known
+    sds: Array  # standard deviations of these
+    seconds: float  # how long it was seen
 
 
 def pose_of(record: Mapping[str, Any]) -> Array:

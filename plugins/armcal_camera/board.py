@@ -50,30 +50,20 @@ def tags_in(family: str) -> int:
 
 @dataclass(frozen=True)
 class Layout:
-    """What is printed of a board.
+    """What is printed of a board."""
 
-    Attributes:
-        points: where its points are (P x 3, m, in the board's frame; z = 0).
-        extent: width and height of what is printed, without a margin (m).
-        step: the distance of neighbouring points (m).
-        reach: how far around a point nothing is printed but the edges that cross there (m).
-        tag_family: the family of its tags; empty if it has none.
-        tag_ids: the ids of its tags, in their order on the board.
-    """
-
-    points: Array
-    extent: tuple[float, float]
-    step: float
-    reach: float
-    tag_family: str = ""
-    tag_ids: range = range(0)
+    points: Array  # where its points are (P x 3, m, in the board's frame; z = 0)
+    extent: tuple[float, float]  # width and height of what is printed, without a margin (m)
+    step: float  # the distance of neighbouring points (m)
+    reach: float  # how far around a point nothing is printed but the edges that cross there (m)
+    tag_family: str = ""  # the family of its tags; empty if it has none
+    tag_ids: range = range(0)  # the ids of its tags, in their order on the board
 
 
 class Board(Settings):
     """What all boards have; the kinds derive from it, and say how they are printed."""
 
-    kind: ClassVar[str]
-    """What one of them is called."""
+    kind: ClassVar[str]  # What one of them is called
 
     @property
     def layout(self) -> Layout:

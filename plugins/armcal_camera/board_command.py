@@ -138,16 +138,13 @@ class Sheet:
 
     Attributes:
         width, height: of the paper.
-        dark: rectangles of the board (N x 4: left, top, width, height).
-        ruler: the same of the ruler's lines.
-        texts: left, baseline and words of each line.
     """
 
     width: float
     height: float
-    dark: Array
-    ruler: Array
-    texts: Sequence[tuple[float, float, str]]
+    dark: Array  # rectangles of the board (N x 4: left, top, width, height)
+    ruler: Array  # the same of the ruler's lines
+    texts: Sequence[tuple[float, float, str]]  # left, baseline and words of each line
 
 
 def sheet_of(board: Board, paper: str) -> Sheet:

@@ -33,21 +33,13 @@ _FEWEST_VIEWS = 3
 
 @dataclass(frozen=True)
 class Setup:
-    """What of a camera's settings a start depends on.
+    """What of a camera's settings a start depends on."""
 
-    Attributes:
-        names: the first part of the names of each board's parameters.
-        points: of each board those that are used (P x 3, m).
-        lens: ``pinhole`` or ``fisheye``.
-        is_stated: whether its intrinsics are.
-        frames: which carry the camera and the boards.
-    """
-
-    names: tuple[str, ...]
-    points: tuple[Array, ...]
-    lens: str
-    is_stated: bool
-    frames: tuple[str, str]
+    names: tuple[str, ...]  # the first part of the names of each board's parameters
+    points: tuple[Array, ...]  # of each board those that are used (P x 3, m)
+    lens: str  # ``pinhole`` or ``fisheye``
+    is_stated: bool  # whether its intrinsics are
+    frames: tuple[str, str]  # which carry the camera and the boards
 
 
 @dataclass(frozen=True)

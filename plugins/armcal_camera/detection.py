@@ -37,17 +37,11 @@ _NEAR = 1e-9
 
 @dataclass(frozen=True)
 class Refined:
-    """Corners after the fit.
+    """Corners after the fit."""
 
-    Attributes:
-        corners: (N x 2, px); NaN where the surroundings are not those of a corner.
-        blur: standard deviation of the blur across the edges (N, px).
-        crossing: q3, whose sign says which quadrants are dark (N, grey values); NaN as well.
-    """
-
-    corners: Array
-    blur: Array
-    crossing: Array
+    corners: Array  # (N x 2, px); NaN where the surroundings are not those of a corner
+    blur: Array  # standard deviation of the blur across the edges (N, px)
+    crossing: Array  # q3, whose sign says which quadrants are dark (N, grey values); NaN as well
 
 
 _FIELDS = ("corners", "blur", "crossing")
@@ -255,10 +249,8 @@ def grown(image: Array | Grey, grid: Array, crossing: Array) -> tuple[int, int]:
     return grid.shape[1], grid.shape[0]
 
 
-VERSION = 2
-"""Of the detection; it changes with the corners."""
-_SIDES_PX = (1200, 2400)
-"""Largest sides of the reduced images on which boards are looked for, one after the other."""
+VERSION = 2  # Of the detection; it changes with the corners
+_SIDES_PX = (1200, 2400)  # Largest sides of the reduced images on which boards are looked for, one after the other
 _FEWEST = 4
 _STEEPEST = math.radians(78)
 _DULLEST = 0.12
@@ -268,23 +260,14 @@ _ASTRAY = 0.25
 
 @dataclass(frozen=True)
 class Detection:
-    """A board in an image.
+    """A board in an image."""
 
-    Attributes:
-        corners: of each of the board's points (P x 2, px); NaN where it was not seen.
-        fault: why the image says nothing of this board; empty if it does.
-        found_size: columns and rows of a chessboard of another size that is there instead.
-        blur: standard deviation of the blur across edges (px).
-        step: the mean distance of neighbouring points (px).
-        oblique: the angle between the line of sight and the board's normal at its middle (rad).
-    """
-
-    corners: Array
-    fault: str = ""
-    found_size: tuple[int, int] | None = None
-    blur: float = math.nan
-    step: float = math.nan
-    oblique: float = math.nan
+    corners: Array  # of each of the board's points (P x 2, px); NaN where it was not seen
+    fault: str = ""  # why the image says nothing of this board; empty if it does
+    found_size: tuple[int, int] | None = None  # columns and rows of a chessboard of another size that is there instead
+    blur: float = math.nan  # standard deviation of the blur across edges (px)
+    step: float = math.nan  # the mean distance of neighbouring points (px)
+    oblique: float = math.nan  # the angle between the line of sight and the board's normal at its middle (rad)
 
 
 def detect(image: Grey, board: Board) -> Detection:

@@ -139,16 +139,13 @@ class HandEye:
 
     Attributes:
         x, y: 4 x 4 (m).
-        method: whose closed form it is.
-        left_m: typical distance (median, m) between A X and Y B.
-        kept: which poses decided.
     """
 
     x: Array
     y: Array
-    method: str
-    left_m: float
-    kept: Mask
+    method: str  # whose closed form it is
+    left_m: float  # typical distance (median, m) between A X and Y B
+    kept: Mask  # which poses decided
 
 
 def hand_eye(a: Array, b: Array) -> HandEye | None:
@@ -279,8 +276,7 @@ def _with_translations(a: Array, b: Array, method: str, turn_x: Array, turn_y: A
 
 
 _ENTRIES, _SQUARED_LENGTH = 19, 7.0  # two rotation matrices and 1; each rotation's squares sum to 3
-_LEAST = 1e-3
-"""Turns (rad) and places (m) are not weighed as better than this."""
+_LEAST = 1e-3  # Turns (rad) and places (m) are not weighed as better than this
 _ENOUGH, _ELSEWHERE = 0.01, 25.0
 
 
@@ -290,14 +286,12 @@ class Certificate:
 
     Attributes:
         x, y: 4 x 4 (m).
-        gap: share by which the sum of squares of another answer may be lower at most; 0 for a best one.
-        ratio: the sum of squares of another answer that is compared, over the best one's.
     """
 
     x: Array
     y: Array
-    gap: float
-    ratio: float
+    gap: float  # share by which the sum of squares of another answer may be lower at most; 0 for a best one
+    ratio: float  # the sum of squares of another answer that is compared, over the best one's
 
 
 def sentence(a: Array, b: Array, start: HandEye, other: tuple[Array, Array]) -> str:

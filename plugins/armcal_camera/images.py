@@ -10,15 +10,13 @@ from armcal.errors import DataError, Location, PluginError
 from armcal.plugins import library
 from numpy.typing import NDArray
 
-Grey = NDArray[np.uint8]
-"""An image (H x W); the centre of the pixel in column u and row v is at (u, v)."""
+Grey = NDArray[np.uint8]  # An image (H x W); the centre of the pixel in column u and row v is at (u, v)
 
 SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".pnm"))
 _ENDS = ((b"\x89PNG", b"IEND", 64), (b"\xff\xd8", b"\xff\xd9", 4096))
 _KINDS = ("PNG", "JPEG", "TIFF", "BMP", "DIB", "WEBP", "PPM")
 _FEWEST_PIXELS, MOST_PIXELS = 1024, 100_000_000
-MOST_BYTES = 512 * 1024**2
-"""Of an image file."""
+MOST_BYTES = 512 * 1024**2  # Of an image file
 
 
 def is_image(path: Path) -> bool:

@@ -20,8 +20,7 @@ from typing_extensions import override
 from armcal_camera.images import MOST_BYTES, is_image, opencv
 from armcal_camera.images_reader import View, as_the_others, corner_channels, look_at, sees_boards
 
-_WAITING = 5
-"""So many images a driver may hold back: they are older than the moment of asking."""
+_WAITING = 5  # So many images a driver may hold back: they are older than the moment of asking
 _PERIOD_S, _PATIENCE_S = 0.2, 2.0
 """A folder is looked through so often; a file that cannot be read is waited for so long."""
 _KINDS = "the number of a camera (0), its device (/dev/video0), an address (rtsp://...), a video, or a folder"

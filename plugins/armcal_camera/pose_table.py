@@ -43,8 +43,7 @@ _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _STARTS, _STEPS, _SEED = 96, 40, 1
 _REACHED, _STEP, _LONGEST = 1e-7, 1e-6, 0.5
 _SAME = 1e-3
-_LENGTH_M = 0.3
-"""A turn of 1 rad counts as much as this distance."""
+_LENGTH_M = 0.3  # A turn of 1 rad counts as much as this distance
 _AT_ONCE = 40
 
 

@@ -28,16 +28,13 @@ class Lens:
     """How rays become pixels.
 
     Attributes:
-        focal: fx, fy (px).
-        centre: cx, cy (px; the first pixel's centre is at 0, 0).
         distortion: k1, k2, p1, p2, k3 by Brown and Conrady, or k1 to k4 of a fisheye by Kannala and Brandt.
-        is_fisheye: which of the two.
     """
 
-    focal: tuple[float, float]
-    centre: tuple[float, float]
+    focal: tuple[float, float]  # fx, fy (px)
+    centre: tuple[float, float]  # cx, cy (px; the first pixel's centre is at 0, 0)
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    is_fisheye: bool = False
+    is_fisheye: bool = False  # which of the two
 
     def project(self, points: Array) -> Array:
         """Pixels (N x 2) of points in the camera's frame (N x 3, m; z along the line of sight)."""
@@ -82,20 +79,16 @@ class Exposure:
     """What makes an image imperfect, and its grey values.
 
     Attributes:
-        blur: standard deviation (px), beyond that of the pixels' own size.
-        noise: standard deviation (grey values).
-        light: how much brighter the right edge is than the left one, as a share of the mean.
         dark, white, background: grey values.
-        seed: of the noise.
     """
 
-    blur: float = 0.5
-    noise: float = 0.0
-    light: float = 0.0
+    blur: float = 0.5  # standard deviation (px), beyond that of the pixels' own size
+    noise: float = 0.0  # standard deviation (grey values)
+    light: float = 0.0  # how much brighter the right edge is than the left one, as a share of the mean
     dark: float = 30.0
     white: float = 215.0
     background: float = 110.0
-    seed: int = 0
+    seed: int = 0  # of the noise
 
 
 def render(placed: Sequence[tuple[Board, Array]], lens: Lens, size: tuple[int, int], exposure: Exposure) -> Grey:

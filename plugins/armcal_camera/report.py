@@ -26,8 +26,7 @@ if TYPE_CHECKING:  # importing it takes 0.1 s, which a run without a camera must
 _PX = 1000.0
 _MOST_VECTORS, _WORST, _MOST_BYTES = 4000, 8, 200_000
 _DRAWN, _ENLARGED = 3, 20.0
-_SHORTEST, _LONGEST = 0.004, 0.06
-"""Of the width of an image: arrows of typical length that can be seen, and told apart."""
+_SHORTEST, _LONGEST = 0.004, 0.06  # Of the width of an image: arrows of typical length that can be seen, and told apart
 _WIDTH_PX, _QUALITIES = 480, (70, 45, 25, 10)
 _COLOURS = {"seen": "#ffd400", "predicted": "#00c2ff", "arrow": "#ff4fa3"}
 _CROSS = "m-3 0h6m-3-3v6"
@@ -91,23 +90,14 @@ def _over_the_sensor(residuals: CameraResiduals) -> Figure:
 
 @dataclass(frozen=True)
 class CameraResiduals:
-    """Of one camera what it saw, and how far that is from what was predicted.
+    """Of one camera what it saw, and how far that is from what was predicted."""
 
-    Attributes:
-        name: of the measurement.
-        images: what each record is called.
-        seen: where corners were seen (2 x P x N, px).
-        off: measured minus predicted (2 x P x N, px; NaN if unseen).
-        size: width and height of an image (px), where they are stated.
-        files: the path of each image; none where corners were read without images.
-    """
-
-    name: str
-    images: tuple[str, ...]
-    seen: Array
-    off: Array
-    size: tuple[float, float] | None = None
-    files: tuple[str, ...] = ()
+    name: str  # of the measurement
+    images: tuple[str, ...]  # what each record is called
+    seen: Array  # where corners were seen (2 x P x N, px)
+    off: Array  # measured minus predicted (2 x P x N, px; NaN if unseen)
+    size: tuple[float, float] | None = None  # width and height of an image (px), where they are stated
+    files: tuple[str, ...] = ()  # the path of each image; none where corners were read without images
 
     @property
     def by_image(self) -> Array:

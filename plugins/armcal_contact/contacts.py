@@ -179,8 +179,7 @@ class ClampedTool(OneArmContact):
         return ("length",) * 3 + ("angle",) * 3
 
 
-_MEAN_WEIGHT = 1e6
-"""The mean of a socket's postures then lies in the socket to a thousandth of one posture's error."""
+_MEAN_WEIGHT = 1e6  # The mean of a socket's postures then lies in the socket to a thousandth of one posture's error
 
 
 class KnownDistance(Settings):

@@ -200,20 +200,15 @@ class JsonLinesJointSettings(Settings):
     """Where lines come from, and what their numbers are called.
 
     Attributes:
-        source: ``-`` (standard input), ``udp:PORT``, ``udp:HOST:PORT``, or a file that another program writes.
-        begin: from where a file is read.
         joints: the source's own names by joint (``{j1: shoulder}``); joints that are not named have their own.
-        values: the key of a list of all joints in order, where they have no names.
-        unit: of numbers whose names do not end in one.
-        time: the key of the source's own time, with its unit.
     """
 
-    source: SourceName
-    begin: Begin = "end"
+    source: SourceName  # ``-`` (standard input), ``udp:PORT``, ``udp:HOST:PORT``, or a file that another program writes
+    begin: Begin = "end"  # from where a file is read
     joints: dict[str, str] = Field(default_factory=dict)
-    values: str | None = None
-    unit: Literal["rad", "deg", "mrad"] | None = None
-    time: str = "time_s"
+    values: str | None = None  # the key of a list of all joints in order, where they have no names
+    unit: Literal["rad", "deg", "mrad"] | None = None  # of numbers whose names do not end in one
+    time: str = "time_s"  # the key of the source's own time, with its unit
 
     @field_validator("time")
     @classmethod

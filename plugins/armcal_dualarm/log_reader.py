@@ -27,31 +27,21 @@ from pydantic import Field, model_validator
 
 MAX_BYTES = 2 * 1024**3
 _ROWS_AT_ONCE = 256
-_DELIMITERS = "\t;|,"
-"""The likeliest first: where columns are parted by semicolons, commas are decimal ones."""
+_DELIMITERS = "\t;|,"  # The likeliest first: where columns are parted by semicolons, commas are decimal ones
 _SAVE_AS_TEXT = "Save the log as text in UTF-8."
 
-Column = str | int
-"""A column's name in the header, or its number from 1."""
+Column = str | int  # A column's name in the header, or its number from 1
 
 
 @dataclass(frozen=True)
 class LogTable:
-    """The requested columns.
+    """The requested columns."""
 
-    Attributes:
-        lines: of each row (from 1).
-        numbers: of each number column (columns x rows); NaN where a cell is empty.
-        texts: of each text column.
-        names: what each number column is called in the file.
-        sha256: of the file.
-    """
-
-    lines: tuple[int, ...]
-    numbers: Array
-    texts: tuple[tuple[str, ...], ...]
-    names: tuple[str, ...]
-    sha256: str
+    lines: tuple[int, ...]  # of each row (from 1)
+    numbers: Array  # of each number column (columns x rows); NaN where a cell is empty
+    texts: tuple[tuple[str, ...], ...]  # of each text column
+    names: tuple[str, ...]  # what each number column is called in the file
+    sha256: str  # of the file
 
 
 def read_table(path: Path, delimiter: str, numbers: Sequence[Column], texts: Sequence[Column]) -> LogTable:

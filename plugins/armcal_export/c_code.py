@@ -37,8 +37,7 @@ FLAGS = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Werror", "-pedantic")
 MOST_WHOLE = 12000
 """Operations: slopes of more are evaluated column by column, so that they compile in seconds and fit small memories."""
 _FEW_PASSES, _MANY_PASSES = 2, 30
-_TOLERANCE = 1e-12
-"""m, and entries of rotation matrices."""
+_TOLERANCE = 1e-12  # m, and entries of rotation matrices
 _PAYLOAD_KG, _FORCE_N = 0.05, 0.5
 _TOLD = 9
 _LIMIT_S = 300
@@ -59,11 +58,10 @@ class CExportSettings(Settings):
     """How the C code names things, and what it is told.
 
     Attributes:
-        prefix: of every name in the code; the arm's name unless given.
         conditions: of the surroundings that the code is told (``temperature``; C); others are as in the calibration.
     """
 
-    prefix: str = ""
+    prefix: str = ""  # of every name in the code; the arm's name unless given
     conditions: tuple[str, ...] = ()
 
     @field_validator("prefix")

@@ -18,11 +18,9 @@ from scipy.spatial.transform import Rotation
 
 REPORT = "Nothing was written. Please report this with the calibration."
 _LOADS = (-3.0, -0.5, 0.1, 2.0)
-_COMMANDS = ((0.0, 0.0), (0.7, 1.0), (-1.1, -1.0))
-"""Commanded displacements (rad or m) and approaches."""
+_COMMANDS = ((0.0, 0.0), (0.7, 1.0), (-1.1, -1.0))  # Commanded displacements (rad or m) and approaches
 _LINEAR = 1e-12
-_TOLERANCE = 1e-12
-"""m, and entries of rotation matrices, for each metre and radian that a pose is made of."""
+_TOLERANCE = 1e-12  # m, and entries of rotation matrices, for each metre and radian that a pose is made of
 
 
 @dataclass(frozen=True)

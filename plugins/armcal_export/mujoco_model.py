@@ -33,32 +33,22 @@ from pydantic import Field
 
 from armcal_export.content import REPORT, ArmContent, ArmMass, ArmSpring, content_of, in_equilibrium
 
-TOLERANCE = 1e-9
-"""m, and entries of rotation matrices, of the rigid arm."""
-NO_MASS_KG = 1e-9
-"""What MuJoCo is told of a body without a mass: it refuses none, and this bends nothing."""
-_DAMPING = 0.1
-"""Of a spring, for the root of its stiffness: so that models come to rest in a few seconds."""
+TOLERANCE = 1e-9  # m, and entries of rotation matrices, of the rigid arm
+NO_MASS_KG = 1e-9  # What MuJoCo is told of a body without a mass: it refuses none, and this bends nothing
+_DAMPING = 0.1  # Of a spring, for the root of its stiffness: so that models come to rest in a few seconds
 _RADIUS_M = 0.03
 """Masses are told as small balls: armcal knows their weight and centre, and not how they resist turning."""
 _COMMANDS = (-0.31, 0.42)
-_NO_SPRING = 1e-12
-"""rad/(N m) or m/N: what gives less than this is no spring."""
+_NO_SPRING = 1e-12  # rad/(N m) or m/N: what gives less than this is no spring
 _TURNS, _AT_REST, _FARTHEST, _DIFFERENCE = 60, 1e-12, 1.5, 1e-6
 
 
 class MujocoSettings(Settings):
-    """The drives: what the calibration cannot know.
+    """The drives: what the calibration cannot know."""
 
-    Attributes:
-        gain: of each position actuator (N m/rad, or N/m).
-        damping: of each position actuator (N m s/rad, or N s/m).
-        armature: inertia of each rotor, seen at the joint (kg m^2, or kg).
-    """
-
-    gain: Annotated[float, Field(gt=0)] = 1000.0
-    damping: Annotated[float, Field(ge=0)] = 20.0
-    armature: Annotated[float, Field(gt=0)] = 0.01
+    gain: Annotated[float, Field(gt=0)] = 1000.0  # of each position actuator (N m/rad, or N/m)
+    damping: Annotated[float, Field(ge=0)] = 20.0  # of each position actuator (N m s/rad, or N s/m)
+    armature: Annotated[float, Field(gt=0)] = 0.01  # inertia of each rotor, seen at the joint (kg m^2, or kg)
 
 
 class MujocoExporter:

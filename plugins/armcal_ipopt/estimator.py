@@ -36,14 +36,11 @@ from armcal.problem.problem import FactorRecords, NormalEquations, Problem
 from pydantic import Field
 from typing_extensions import override
 
-_LEAST_START = 2e-2
-"""Of a semidefinite matrix's typical scale: its smallest eigenvalue at the start."""
-_LEAST_AGAIN = 1e-5
-"""The same where a model is searched from where the last one ended."""
+_LEAST_START = 2e-2  # Of a semidefinite matrix's typical scale: its smallest eigenvalue at the start
+_LEAST_AGAIN = 1e-5  # The same where a model is searched from where the last one ended
 _MOST_STEPS = 30
 _FIRST_DAMPING, _MOST_DAMPING = 1e-6, 1e4
-_ENOUGH = 1e-11
-"""Of the cost: with steps that save less, the fit itself goes on."""
+_ENOUGH = 1e-11  # Of the cost: with steps that save less, the fit itself goes on
 _SUFFICIENT, _TRUSTED = 1e-4, 0.75
 """Of what a step was to save: what it must save to be taken, and for its damping to fall."""
 

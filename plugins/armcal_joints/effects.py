@@ -271,13 +271,9 @@ _AXES = dict(zip("xyz", XYZ, strict=True))
 
 
 class SiteSprings(JointEffect):
-    """Springs of one law: at joints, and at the base where the settings say so.
+    """Springs of one law: at joints, and at the base where the settings say so."""
 
-    Attributes:
-        letter: of the sites' parameters, before the number: 0 for the base, i for joint i.
-    """
-
-    letter: ClassVar[str]
+    letter: ClassVar[str]  # of the sites' parameters, before the number: 0 for the base, i for joint i
 
     @property
     def sites(self) -> tuple[int, ...]:

@@ -451,8 +451,7 @@ LIMITS_OF_DATA = (
     "run)."
 )
 _FIGURES = ("delay_s", "gain", "offset", "backlash", "load")
-Table = tuple[str, tuple[str, ...], list[list[str]]]
-"""Caption, headings and rows."""
+Table = tuple[str, tuple[str, ...], list[list[str]]]  # Caption, headings and rows
 
 
 def compare_content(motions: Sequence[Motion], gripper: Gripper | None) -> dict[str, Any]:

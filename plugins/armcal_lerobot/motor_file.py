@@ -21,18 +21,15 @@ from armcal.io.plain_files import input_bytes, text_of
 
 _WITHIN_DEG = 2.0
 _FULL_TURN = ("wrist_roll", "forearm_roll", "wrist_rotate", "wheel")
-_AT_END = 34
-"""Counts, 3 deg: a range that comes so near to the encoder's end does not end there by chance."""
-_FARTHEST_DEG = 300.0
-"""No joint of an arm that LeRobot drives by these servos goes so far, but those that turn freely."""
+_AT_END = 34  # Counts, 3 deg: a range that comes so near to the encoder's end does not end there by chance
+_FARTHEST_DEG = 300.0  # No joint of an arm that LeRobot drives by these servos goes so far, but those that turn freely
 _LONGER_DEG, _SAME_DEG = 60.0, 6.0
 Units = Literal["degrees", "percent"]
 
 LAST_COUNT = 4095
 COUNTS_A_TURN = 4096
 LARGEST_OFFSET = 2047
-DEGREES_A_COUNT = 360 / LAST_COUNT
-"""As LeRobot has it; a count of the encoder itself is 360 / 4096 deg."""
+DEGREES_A_COUNT = 360 / LAST_COUNT  # As LeRobot has it; a count of the encoder itself is 360 / 4096 deg
 
 
 @dataclass(frozen=True)

@@ -51,25 +51,15 @@ class Frames:
 
 @dataclass(frozen=True)
 class Recording:
-    """A data set on disk.
+    """A data set on disk."""
 
-    Attributes:
-        folder: with ``meta`` and ``data``.
-        version: as stated, such as v2.1.
-        fps: frames a second.
-        frames: how many ``meta/info.json`` states.
-        names: of the numbers of each vector feature, such as the motors.
-        files: parquet files in their order.
-        lengths: frames by episode, as far as the meta data state them.
-    """
-
-    folder: Path
-    version: str
-    fps: float
-    frames: int
-    names: Mapping[str, tuple[str, ...]]
-    files: tuple[Path, ...]
-    lengths: Mapping[int, int] = field(default_factory=dict)
+    folder: Path  # with ``meta`` and ``data``
+    version: str  # as stated, such as v2.1
+    fps: float  # frames a second
+    frames: int  # how many ``meta/info.json`` states
+    names: Mapping[str, tuple[str, ...]]  # of the numbers of each vector feature, such as the motors
+    files: tuple[Path, ...]  # parquet files in their order
+    lengths: Mapping[int, int] = field(default_factory=dict)  # frames by episode, as far as the meta data state them
 
     @cached_property
     def motors(self) -> tuple[str, ...]:

@@ -23,8 +23,7 @@ from scipy.stats import t as student
 from armcal_lerobot.motor_file import MotorFile, Units, is_gripper
 from armcal_lerobot.recordings import ACTION, STATE, Frames, Recording
 
-MOST_FRAMES = 100_000
-"""Of a larger data set every second, third, ... episode is taken, so that memory stays bounded."""
+MOST_FRAMES = 100_000  # Of a larger data set every second, third, ... episode is taken, so that memory stays bounded.
 _START_FRAMES = 5
 _FEWEST = 10
 _MOST_PERCENT = 105.0
@@ -43,23 +42,14 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Motion:
-    """A data set's motion.
+    """A data set's motion."""
 
-    Attributes:
-        motors: in the order of the columns.
-        units: of each motor's numbers: deg or %.
-        fps: frames a second.
-        stretches: without gaps.
-        frames: how many were taken.
-        of: how many there are.
-    """
-
-    motors: tuple[str, ...]
-    units: tuple[str, ...]
-    fps: float
-    stretches: tuple[Stretch, ...]
-    frames: int
-    of: int
+    motors: tuple[str, ...]  # in the order of the columns
+    units: tuple[str, ...]  # of each motor's numbers: deg or %
+    fps: float  # frames a second
+    stretches: tuple[Stretch, ...]  # without gaps
+    frames: int  # how many were taken
+    of: int  # how many there are
 
     @property
     def starts(self) -> Array:
@@ -157,10 +147,8 @@ def unit_of(name: str, units: Units, file: MotorFile | None) -> tuple[float, str
 
 Torque = Callable[[Array], Array]
 """Gravity about the joints of the motors (N x motors; N m) for commands (N x motors); NaN for a motor without joint."""
-REVERSAL = 0.35
-"""deg or %: a command that comes back by less has not reversed; a servo's count is 0.09 deg."""
-SETTLED = 3.0
-"""deg or %: after so much travel from a reversal any play is taken up."""
+REVERSAL = 0.35  # deg or %: a command that comes back by less has not reversed; a servo's count is 0.09 deg
+SETTLED = 3.0  # deg or %: after so much travel from a reversal any play is taken up
 SLOW_A_SECOND, FAST_A_SECOND = 8.0, 10.0
 _CLUSTER_S = 3.0
 _EARLIEST_S, _LATEST_S, _FINEST = -0.4, 0.6, 0.25
@@ -169,12 +157,10 @@ _LEAST_SPAN = 3.0
 _LEAST_TORQUE = 0.02
 _LEAST_GAIN = 0.1
 _L1_STEPS, _L1_FLOOR = 10, 1e-3
-_OBSTRUCTED, _FAR = 0.5, 9.0
-"""deg or %, and medians: a joint that is further off did not get where it was sent."""
+_OBSTRUCTED, _FAR = 0.5, 9.0  # deg or %, and medians: a joint that is further off did not get where it was sent
 _MOST_FREE = 0.98
 _STEPS = 3
-_SETTLES_S = 0.5
-"""After a fast motion, until a servo that lags has arrived."""
+_SETTLES_S = 0.5  # After a fast motion, until a servo that lags has arrived
 _THIRD_OF_A_COUNT, _FINEST_GAIN = 0.03, 0.0005
 _CONFIDENCE = 0.975
 
@@ -205,31 +191,18 @@ class Figure:
 
 @dataclass(frozen=True)
 class Tracking:
-    """How one motor's state follows its command; None where the data cannot say, and ``doubts`` say why.
+    """How one motor's state follows its command; None where the data cannot say, and ``doubts`` say why."""
 
-    Attributes:
-        motor: its name.
-        unit: deg, or % where degrees are not known.
-        span: of the command, without its outermost hundredths.
-        delay_s: state behind command; below zero the command follows the state.
-        gain: state over command, at rest.
-        offset: of the state at rest, in the middle of the motion.
-        backlash: by how much the command has to come back before the state does.
-        load: per N m of gravity about the joint.
-        load_most: the largest error by gravity in these poses.
-        doubts: sentences.
-    """
-
-    motor: str
-    unit: str
-    span: float
-    delay_s: Figure | None = None
-    gain: Figure | None = None
-    offset: Figure | None = None
-    backlash: Figure | None = None
-    load: Figure | None = None
-    load_most: float | None = None
-    doubts: tuple[str, ...] = ()
+    motor: str  # its name
+    unit: str  # deg, or % where degrees are not known
+    span: float  # of the command, without its outermost hundredths
+    delay_s: Figure | None = None  # state behind command; below zero the command follows the state
+    gain: Figure | None = None  # state over command, at rest
+    offset: Figure | None = None  # of the state at rest, in the middle of the motion
+    backlash: Figure | None = None  # by how much the command has to come back before the state does
+    load: Figure | None = None  # per N m of gravity about the joint
+    load_most: float | None = None  # the largest error by gravity in these poses
+    doubts: tuple[str, ...] = ()  # sentences
 
 
 def trackings(motion: Motion, torque: Torque | None = None) -> tuple[Tracking, ...]:

@@ -75,15 +75,13 @@ class PoeSettings(Settings):
     """An arm in screws, all given in the base frame at zero angles.
 
     Attributes:
-        joints: from the base to the tip.
-        tool: the pose of the tool at zero angles.
         mount: where the arm stands, for springs at the base and masses on it; it moves nothing.
         parametrisation: ``minimal`` keeps axes axes: four numbers for a joint that turns, two for one that slides.
             ``full`` gives every joint six free numbers.
     """
 
-    joints: Annotated[tuple[JointSettings, ...], Field(min_length=1)]
-    tool: PoseSettings
+    joints: Annotated[tuple[JointSettings, ...], Field(min_length=1)]  # from the base to the tip
+    tool: PoseSettings  # the pose of the tool at zero angles
     mount: PoseSettings = PoseSettings.si()
     parametrisation: Literal["minimal", "full"] = "minimal"
 
@@ -101,8 +99,7 @@ class PoeSettings(Settings):
         return self
 
 
-AXIS_SCALE = 0.02
-"""rad and m: an increment of an axis has both."""
+AXIS_SCALE = 0.02  # rad and m: an increment of an axis has both
 LENGTH_SCALE_M = 0.01
 ANGLE_SCALE_RAD = 0.05
 TWIST = ("wx", "wy", "wz", "vx", "vy", "vz")

@@ -27,8 +27,7 @@ Positive = Annotated[float, Field(gt=0)]
 _ROUNDS = 40
 _SETTLED = 1e-2
 _LEAST_TAKEN = 1e-3
-_LEAST_KNOWN = 0.5
-"""Weights that records determine: a function of fewer is none."""
+_LEAST_KNOWN = 0.5  # Weights that records determine: a function of fewer is none
 Kind = Literal["angle", "length", "approach", "payload", "temperature"]
 _JITTER = 1e-8
 
@@ -126,23 +125,14 @@ def share_between(features: Array) -> float:
 
 @dataclass(frozen=True)
 class Regression:
-    """Weights of blocks of features, each block with a variance of its own. [MacKay1992]
+    """Weights of blocks of features, each block with a variance of its own. [MacKay1992]"""
 
-    Attributes:
-        weights: of each block.
-        variances: prior ones, by block.
-        left: covariance of all weights where what else explains the rows is known, in units of prior deviations.
-        known: how many weights of each block the rows determine.
-        evidence: logarithm of the marginal likelihood.
-        noise: variance.
-    """
-
-    weights: tuple[Array, ...]
-    variances: Array
-    left: Array
-    known: Array
-    evidence: float
-    noise: float
+    weights: tuple[Array, ...]  # of each block
+    variances: Array  # prior ones, by block
+    left: Array  # covariance of all weights where what else explains the rows is known, in units of prior deviations
+    known: Array  # how many weights of each block the rows determine
+    evidence: float  # logarithm of the marginal likelihood
+    noise: float  # variance
 
     def left_of(self, blocks: Sequence[int]) -> Array:
         edges = np.cumsum([0, *map(len, self.weights)])

@@ -32,27 +32,21 @@ from armcal_residual.features import (
     taken_root,
 )
 
-_JOINT_LENGTHS = (1.0, 0.5, 0.25, 0.12, 0.06)
-"""Chords, about rad. The first stands beside each of the others."""
+_JOINT_LENGTHS = (1.0, 0.5, 0.25, 0.12, 0.06)  # Chords, about rad. The first stands beside each of the others.
 _ROWS_PER_FEATURE = 2
-_Key = tuple[int, int]
-"""A joint (from 0), and a place in ``_JOINT_LENGTHS``."""
+_Key = tuple[int, int]  # A joint (from 0), and a place in ``_JOINT_LENGTHS``
 _Places = tuple[int, ...]
 _UNSEEN = 1e-6
-_FEWEST = 12
-"""Records an input of the process."""
+_FEWEST = 12  # Records an input of the process
 _STARTS = (0.4, 2.0)
 _FIRST_NOISE = 0.7
 _FIRST, _SECOND = 250, 500
 """Records by which its length scales are found, first from each start, then from the best of them."""
 _STEPS = 20
-_LENGTHS = (-2.3, 4.0)
-"""Bounds of the logarithm: a chord of 2 is half a turn."""
+_LENGTHS = (-2.3, 4.0)  # Bounds of the logarithm: a chord of 2 is half a turn
 _NOISE = (-3.0, 3.0)
-_GAIN = 3.0
-"""Logarithm of the odds, for each of its numbers, from which on a process is there."""
-_LEFT = 0.01
-"""Of the noise's variance: so little of the process may be left between its poses."""
+_GAIN = 3.0  # Logarithm of the odds, for each of its numbers, from which on a process is there
+_LEFT = 0.01  # Of the noise's variance: so little of the process may be left between its poses
 
 
 @dataclass(frozen=True)

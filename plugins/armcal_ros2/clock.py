@@ -16,8 +16,7 @@ from scipy.special import stdtrit
 
 from armcal_ros2.samples import JointRest
 
-_BESIDE_S = 0.3
-"""So much of the rests before and after a motion belongs to it."""
+_BESIDE_S = 0.3  # So much of the rests before and after a motion belongs to it
 _SEARCHED_S, _COARSE_S, _FINE_S = 1.0, 0.02, 0.004
 _FINE_STEPS = 15
 _LEAST_MOTION_M = 0.02
@@ -25,27 +24,19 @@ _MOST_MOTIONS, _FEWEST_MOTIONS, _FEWEST_SAMPLES = 80, 5, 12
 _LONGEST_MOTION_S = 20.0
 _PLAY = np.deg2rad(3.0)
 """More than joints have play: until each has turned by so much, the tool comes late, whatever the clocks say."""
-_WORST_MISFIT = 0.02
-"""Of the variance of the measured path."""
+_WORST_MISFIT = 0.02  # Of the variance of the measured path
 _WIDEST_S = 0.02
 _FAR, _SURE = 4.0, 4.0
 
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """How far a clock is ahead.
+    """How far a clock is ahead."""
 
-    Attributes:
-        seconds: the mean (s).
-        half_width: of its 95 % interval (s).
-        motions: from how many it is known.
-        drift: by how much it grew during the recording (s); 0 if that is not sure.
-    """
-
-    seconds: float
-    half_width: float
-    motions: int
-    drift: float
+    seconds: float  # the mean (s)
+    half_width: float  # of its 95 % interval (s)
+    motions: int  # from how many it is known
+    drift: float  # by how much it grew during the recording (s); 0 if that is not sure
 
 
 @dataclass(frozen=True)

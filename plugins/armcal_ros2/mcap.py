@@ -15,8 +15,7 @@ from armcal_ros2.message import MAX_BYTES, RawMessage, Topic, decompressed
 
 MAGIC = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
-_MAX_CHUNK_BYTES = 64 * 1024**2
-"""Larger compressed chunks would take too much memory; recorders write 1 to 4 MiB."""
+_MAX_CHUNK_BYTES = 64 * 1024**2  # Larger compressed chunks would take too much memory; recorders write 1 to 4 MiB
 _LONGEST_TEXT_BYTES = 1 << 20
 _HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQI")

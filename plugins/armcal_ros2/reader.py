@@ -34,12 +34,9 @@ from armcal_ros2.samples import (
     channels_of,
 )
 
-NO_NOISE_M = 1e-5
-"""Smaller than what any arm errs by."""
-_FEWEST = 26
-"""Twice the numbers of an affine map of the tool's pose."""
-_MUCH_BETTER = 10.0
-"""So many times less is left of inverted poses."""
+NO_NOISE_M = 1e-5  # Smaller than what any arm errs by
+_FEWEST = 26  # Twice the numbers of an affine map of the tool's pose
+_MUCH_BETTER = 10.0  # So many times less is left of inverted poses
 
 
 def joint_channels(request: ReadRequest) -> list[str]:

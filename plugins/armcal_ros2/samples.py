@@ -22,14 +22,11 @@ from scipy.spatial.transform import Rotation
 from armcal_ros2.bag import Stamps, TopicSettings, nanoseconds
 from armcal_ros2.message import Topic
 
-GUARD_S = 0.1
-"""At the end of a rest, before joints are seen to move."""
+GUARD_S = 0.1  # At the end of a rest, before joints are seen to move
 _BLOCK = 1000
-_LARGEST = 1e6
-"""No joint stands so far away, in any unit."""
+_LARGEST = 1e6  # No joint stands so far away, in any unit
 THINNED_S = 0.01
-MOST_THINNED = 400_000
-"""So many moments of the motion are kept, enough for an hour."""
+MOST_THINNED = 400_000  # So many moments of the motion are kept, enough for an hour
 
 
 class JointsSettings(TopicSettings):
@@ -47,16 +44,14 @@ class RestSettings(Settings):
     """What a rest is.
 
     Attributes:
-        window: how long it lasts at least.
         spread: by how much no turning joint moves in it; ``sliding_spread``: no sliding one.
-        settle: what passes after joints stopped before measurements count.
         drift: by how much the mean of the measured positions may differ between a rest's halves.
     """
 
-    window: Annotated[Duration, Field(gt=0)] = 0.5
+    window: Annotated[Duration, Field(gt=0)] = 0.5  # how long it lasts at least
     spread: Annotated[Angle, Field(gt=0)] = math.radians(0.1)
     sliding_spread: Annotated[Length, Field(gt=0)] = 0.0002
-    settle: Annotated[Duration, Field(ge=0)] = 0.2
+    settle: Annotated[Duration, Field(ge=0)] = 0.2  # what passes after joints stopped before measurements count
     drift: Annotated[Length, Field(gt=0)] = 0.001
 
 
@@ -237,8 +232,7 @@ _FIELDS: Mapping[str, tuple[str, str, str]] = MappingProxyType(
         "geometry_msgs/msg/TransformStamped": ("transform", "translation", "rotation"),
     }
 )
-MEASURED = (*_FIELDS, TRANSFORMS)
-"""The types of messages that measure."""
+MEASURED = (*_FIELDS, TRANSFORMS)  # The types of messages that measure
 _NORM_TOLERANCE = 1e-3
 _STATIC = "/tf_static"
 _MOST_SAMPLES = 1000

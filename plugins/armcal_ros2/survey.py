@@ -20,8 +20,7 @@ from armcal_ros2.message import CAMERA_INFO, IMAGES, JOINT_STATE
 from armcal_ros2.samples import GUARD_S, MEASURED, TRANSFORMS, JointLog, JointRest, JointsSettings, RestSettings
 
 _MOST_FRAMES = 200
-_LATEST = 20
-"""So many stamps of joint states are kept: transforms that are computed from them come at once."""
+_LATEST = 20  # So many stamps of joint states are kept: transforms that are computed from them come at once
 
 
 @dataclass

@@ -37,17 +37,11 @@ from armcal_serve.served_arm import TEMPERATURE, TEMPERATURE_KEY, ServedArm
 
 @dataclass(frozen=True)
 class Answerer:
-    """Answers by one calibration.
+    """Answers by one calibration."""
 
-    Attributes:
-        arms: by name.
-        tag: identifies the calibration in every answer.
-        fault: the answer to every request; None where the calibration may be used.
-    """
-
-    arms: Mapping[str, ServedArm]
-    tag: CalibrationTag
-    fault: ArmcalError | None = None
+    arms: Mapping[str, ServedArm]  # by name
+    tag: CalibrationTag  # identifies the calibration in every answer
+    fault: ArmcalError | None = None  # the answer to every request; None where the calibration may be used
 
     def answer(self, line: bytes, arrived: float) -> bytes:
         """The answer to a line that arrived then (monotonic seconds)."""

@@ -25,8 +25,7 @@ from armcal_serve.transports.datagrams import Datagrams
 from armcal_serve.transports.stream import StandardStreams
 from armcal_serve.transports.unix import UnixSocket
 
-_ALWAYS = ("refused", "worker_lost", "missing", "status", "notice")
-"""Events that are written with --quiet too."""
+_ALWAYS = ("refused", "worker_lost", "missing", "status", "notice")  # Events that are written with --quiet too
 
 
 @click.command()

@@ -7,8 +7,7 @@ from armcal.errors import ArmcalError
 
 from armcal_serve.protocol import as_bytes, id_of, refusal
 
-MOST_WAITING = 64
-"""So many of a client's requests are taken before the first is answered."""
+MOST_WAITING = 64  # So many of a client's requests are taken before the first is answered
 
 
 class Ticket:

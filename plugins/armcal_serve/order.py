@@ -16,26 +16,17 @@ class Order:
     """Which calibration to make ready.
 
     Attributes:
-        shown: the file, as it is called in messages.
-        sequence: its number on this server.
-        sha256: of its bytes.
-        arm: the identity that its arm must have; empty: any.
-        redundancy: which of many commands.
-        within: a configuration whose plan has limits and clearance; empty: none.
-        point: what forward and compensate are about: the tool's frame, or the target that was measured.
-        evaluator: ``compiled`` where a compiler is found, or ``interpreted``.
         accept: whether one whose level is lost answers as any other; else the first is refused, and a later one
             answers every request with that error, since those before it are no longer valid either.
-        gently: whether it is made ready at low priority.
     """
 
-    shown: str
-    sequence: int = 1
-    sha256: str = ""
-    arm: str = ""
-    redundancy: Redundancy = "nearest"
-    within: str = ""
-    point: Point = "tool"
-    evaluator: EvaluatorChoice = "compiled"
+    shown: str  # the file, as it is called in messages
+    sequence: int = 1  # its number on this server
+    sha256: str = ""  # of its bytes
+    arm: str = ""  # the identity that its arm must have; empty: any
+    redundancy: Redundancy = "nearest"  # which of many commands
+    within: str = ""  # a configuration whose plan has limits and clearance; empty: none
+    point: Point = "tool"  # what forward and compensate are about: the tool's frame, or the target that was measured
+    evaluator: EvaluatorChoice = "compiled"  # ``compiled`` where a compiler is found, or ``interpreted``
     accept: bool = False
-    gently: bool = False
+    gently: bool = False  # whether it is made ready at low priority

@@ -12,16 +12,13 @@ from pydantic import Field, field_validator
 from typing_extensions import TypedDict  # pydantic checks no other before Python 3.12
 
 VERSION = 1
-MAX_LINE_BYTES = 256 * 1024
-"""A longer request is refused, and thrown away while it comes."""
-MAX_ROWS = 1000
-"""So many targets or postures may stand in one request."""
+MAX_LINE_BYTES = 256 * 1024  # A longer request is refused, and thrown away while it comes
+MAX_ROWS = 1000  # So many targets or postures may stand in one request
 _MAX_ID = 200
 _ABSOLUTE_ZERO_C = -273.15
 
 Approach = Annotated[int, Field(ge=-1, le=1)]
-Joints = tuple[Angle, ...] | dict[str, Angle]
-"""Of one posture: in the arm's order, or by name."""
+Joints = tuple[Angle, ...] | dict[str, Angle]  # Of one posture: in the arm's order, or by name
 Units = Literal["rad", "deg", "pulse_us", "counts"]
 Word = Literal["forward", "compensate", "status"]
 
@@ -43,17 +40,14 @@ class Acting(Settings):
     """What acts on the arm; the calibration states what is left out.
 
     Attributes:
-        payload: at the tool (kg).
-        payload_com: its centre of mass, in the tool's frame (m).
-        gravity: in the base frame (m/s^2).
         force, torque: on the tool, in the base frame (N, N m).
         temperature: of the arm (C), where it changes with that.
         approach: from where joints come, by name or in the arm's order: -1, 0 (not known), 1.
     """
 
-    payload: Annotated[Mass, Field(ge=0)] | None = None
-    payload_com: Length3 | None = None
-    gravity: Acceleration3 | None = None
+    payload: Annotated[Mass, Field(ge=0)] | None = None  # at the tool (kg)
+    payload_com: Length3 | None = None  # its centre of mass, in the tool's frame (m)
+    gravity: Acceleration3 | None = None  # in the base frame (m/s^2)
     force: Force3 | None = None
     torque: Torque3 | None = None
     temperature: Annotated[Temperature, Field(ge=_ABSOLUTE_ZERO_C)] | None = None
@@ -61,17 +55,11 @@ class Acting(Settings):
 
 
 class Request(Settings):
-    """The fields of every request.
+    """The fields of every request."""
 
-    Attributes:
-        armcal_serve: the version of this protocol that the client speaks.
-        id: handed back with the answer.
-        do: the kind of request.
-    """
-
-    armcal_serve: Literal[1] = 1
-    id: Annotated[str, Field(max_length=_MAX_ID)] | int | float | None = None
-    do: Word
+    armcal_serve: Literal[1] = 1  # the version of this protocol that the client speaks
+    id: Annotated[str, Field(max_length=_MAX_ID)] | int | float | None = None  # handed back with the answer
+    do: Word  # the kind of request
 
 
 class StatusRequest(Request):
@@ -84,14 +72,12 @@ class ForwardRequest(Request, Acting):
     """Where the tool is at commands.
 
     Attributes:
-        arm: which, where the calibration has several.
-        joint_angles: of one posture or several (rad), for an arm without sliding joints.
         joints: of one posture or several, by name with the unit: ``{"q1_deg": 10, "slide_mm": 5}``.
     """
 
     do: Literal["forward"]
-    arm: str | None = None
-    joint_angles: tuple[Joints, ...] | None = None
+    arm: str | None = None  # which, where the calibration has several
+    joint_angles: tuple[Joints, ...] | None = None  # of one posture or several (rad), for an arm without sliding joints
     joints: tuple[dict[str, float], ...] | None = None
 
     _one_posture = field_validator("joint_angles", "joints", mode="before")(_rows)
@@ -101,12 +87,11 @@ class TargetRequest(Acting):
     """Where the tool shall be.
 
     Attributes:
-        position: of the tool's origin in the base frame (m).
         rpy: its rotation as roll, pitch, yaw about the fixed axes x, y, z (rad): Rz(yaw) Ry(pitch) Rx(roll).
         quaternion_wxyz: its rotation as a unit quaternion, in place of ``rpy``; without either, any rotation will do.
     """
 
-    position: Length3
+    position: Length3  # of the tool's origin in the base frame (m)
     rpy: Angle3 | None = None
     quaternion_wxyz: tuple[float, float, float, float] | None = None
 
@@ -115,21 +100,16 @@ class CompensateRequest(Request, Acting):
     """Commands that bring the tool to targets; what acts is stated here for all targets, or in a target for itself.
 
     Attributes:
-        arm: which, where the calibration has several.
-        targets: one or several.
-        start: where the arm comes from (rad), for an arm without sliding joints.
-        start_joints: the same by name with the unit.
         path: whether the targets are a path, to be followed in order; otherwise each is reached from ``start``.
-        units: of the commands in the answer.
     """
 
     do: Literal["compensate"]
-    arm: str | None = None
-    targets: tuple[TargetRequest, ...]
-    start: Joints | None = None
-    start_joints: dict[str, float] | None = None
+    arm: str | None = None  # which, where the calibration has several
+    targets: tuple[TargetRequest, ...]  # one or several
+    start: Joints | None = None  # where the arm comes from (rad), for an arm without sliding joints
+    start_joints: dict[str, float] | None = None  # the same by name with the unit
     path: bool = False
-    units: Units = "rad"
+    units: Units = "rad"  # of the commands in the answer
 
     _one_target = field_validator("targets", mode="before")(_rows)
 
@@ -140,23 +120,14 @@ REQUESTS: Mapping[str, type[Request]] = MappingProxyType(
 
 
 class CalibrationTag(TypedDict):
-    """Which calibration an answer came from.
+    """Which calibration an answer came from."""
 
-    Attributes:
-        sequence: 1 for the one that the server began with, one more for each later one.
-        created: when it was made.
-        sha256: of its file.
-        arm: the identity of the arm's description, the same as long as it is the same arm.
-        recalibrated: the recalibration's last record in it; null where there was none.
-        level: the recalibration's: nominal, watch, suspect or lost; null where there was none.
-    """
-
-    sequence: int
-    created: str
-    sha256: str
-    arm: str
-    recalibrated: int | None
-    level: str | None
+    sequence: int  # 1 for the one that the server began with, one more for each later one
+    created: str  # when it was made
+    sha256: str  # of its file
+    arm: str  # the identity of the arm's description, the same as long as it is the same arm
+    recalibrated: int | None  # the recalibration's last record in it; null where there was none
+    level: str | None  # the recalibration's: nominal, watch, suspect or lost; null where there was none
 
 
 class Tool(TypedDict):
@@ -170,16 +141,13 @@ class Answer(TypedDict):
     """The fields of every answer.
 
     Attributes:
-        id: the request's; null where it could not be read.
-        ok: whether it was answered; if not, ``error`` says why not and ``hint`` what to do.
-        calibration: that it was answered from.
         waited_ms, took_ms: from the request's arrival until it was begun, and until it was answered.
     """
 
     armcal_serve: int
-    id: str | int | float | None
-    ok: bool
-    calibration: NotRequired[CalibrationTag]
+    id: str | int | float | None  # the request's; null where it could not be read
+    ok: bool  # whether it was answered; if not, ``error`` says why not and ``hint`` what to do
+    calibration: NotRequired[CalibrationTag]  # that it was answered from
     waited_ms: NotRequired[float]
     took_ms: NotRequired[float]
 
@@ -196,15 +164,13 @@ class PoseAnswer(Answer):
     """The fields of answers with poses, which may lie where nothing tested how far off predictions are.
 
     Attributes:
-        arm: which one.
         beyond_records: places (from 0) of the tools or commands that lie beyond the calibration's records; null where
             the calibration keeps no ranges of them.
-        warning: a sentence about those, with joint or payload, the farthest value and the recorded ones; else empty.
     """
 
-    arm: str
+    arm: str  # which one
     beyond_records: list[int] | None
-    warning: str
+    warning: str  # a sentence about those, with joint or payload, the farthest value and the recorded ones; else empty
 
 
 class ForwardAnswer(PoseAnswer):
@@ -222,9 +188,6 @@ class Command(TypedDict):
         counts, pulse_us: for the servo board; null for a joint without a pulse table.
         reached: whether the target is reached; ``why_not`` says why not, and the command is the nearest that was found.
         error_mm, error_deg: what remains.
-        nearest_mm: no command comes nearer than this, as far as is known.
-        approach: the assumed side from which each joint comes: -1, 0 (not known), 1.
-        tool: its predicted pose.
     """
 
     joint_angles_rad: NotRequired[list[float]]
@@ -236,9 +199,9 @@ class Command(TypedDict):
     why_not: str
     error_mm: float
     error_deg: float
-    nearest_mm: float
-    approach: list[int]
-    tool: Tool
+    nearest_mm: float  # no command comes nearer than this, as far as is known
+    approach: list[int]  # the assumed side from which each joint comes: -1, 0 (not known), 1
+    tool: Tool  # its predicted pose
 
 
 class CompensateAnswer(PoseAnswer):

@@ -28,21 +28,16 @@ class ServedArm:
     """One arm.
 
     Attributes:
-        name: the arm's instance name.
-        dimensions: ``angle`` or ``length`` by commanded joint, in order.
-        compensator: of the calibration as it was loaded.
-        needs_payload: whether what hangs on it moves it and the calibration does not state that.
         heated: the compensator of requests that state the temperature; None where the arm does not change with it.
-        point: what requests and answers are about: the tool's frame, or the target that was measured.
         recorded: the joints' ranges in the calibration's records, then the payload's; None where it keeps none.
     """
 
-    name: str
-    dimensions: Mapping[str, str]
-    compensator: Compensator
-    needs_payload: bool
+    name: str  # the arm's instance name
+    dimensions: Mapping[str, str]  # ``angle`` or ``length`` by commanded joint, in order
+    compensator: Compensator  # of the calibration as it was loaded
+    needs_payload: bool  # whether what hangs on it moves it and the calibration does not state that
     heated: Compensator | None = None
-    point: Point = "tool"
+    point: Point = "tool"  # what requests and answers are about: the tool's frame, or the target that was measured
     recorded: RecordedRange | None = None
 
     @property

@@ -23,12 +23,9 @@ from armcal_serve.protocol import VERSION, CalibrationTag, Notify
 from armcal_serve.transports.transport import Transport
 from armcal_serve.worker_process import WorkerProcess
 
-LOOK_S = 0.2
-"""How often the file is looked at; a new one must look the same twice."""
-QUIET_S = 5.0
-"""A file that grows or is changed in place is read when it has not changed for so long."""
-AGAIN_S = 10.0
-"""A file that could not be tried for no fault of its own is tried again after so long."""
+LOOK_S = 0.2  # How often the file is looked at; a new one must look the same twice
+QUIET_S = 5.0  # A file that grows or is changed in place is read when it has not changed for so long
+AGAIN_S = 10.0  # A file that could not be tried for no fault of its own is tried again after so long
 
 _LAST_LINE = re.compile(rb"^# sha256 of the lines above: [0-9a-f]{64}\r?\n\Z", re.MULTILINE)
 """What a calibration ends in."""
@@ -196,13 +193,11 @@ def _key(status: os.stat_result) -> _Stat:
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
-LONGEST_S = 20.0
-"""A request that takes longer costs its worker, and is answered with an error."""
+LONGEST_S = 20.0  # A request that takes longer costs its worker, and is answered with an error
 _LONGEST_LOADING_S = 300.0
 _GENTLY_S = 15.0
 """On a computer that others keep busy a worker of low priority may never be ready; after so long one of ours is."""
-_PAUSE_S = 1.0
-"""Before a worker is started again that did not come."""
+_PAUSE_S = 1.0  # Before a worker is started again that did not come
 
 
 class WorkerPool:
@@ -398,8 +393,7 @@ class WorkerPool:
 
 _STEP_S = 0.1
 """How long it may take until a signal, a client that left or a new file is noticed, when nothing else happens."""
-_GRACE_S = 10.0
-"""How long answers may take after the end was asked for."""
+_GRACE_S = 10.0  # How long answers may take after the end was asked for
 
 Opening = Callable[[Poller, Dispatcher], Transport]
 

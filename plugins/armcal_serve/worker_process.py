@@ -26,27 +26,19 @@ from armcal_serve.poller import Poller
 if TYPE_CHECKING:
     from armcal_serve.answering import Answerer
 
-ABOUT_ITSELF = 0
-"""The number of messages that are no request: orders to a worker, and its state."""
+ABOUT_ITSELF = 0  # The number of messages that are no request: orders to a worker, and its state
 _HEAD = struct.Struct("!IQd")
-_NICENESS = 19
-"""Requests come first."""
+_NICENESS = 19  # Requests come first
 CHUNK = 256 * 1024
 
 
 @dataclass(frozen=True)
 class Message:
-    """One message: a head of fixed size, and bytes.
+    """One message: a head of fixed size, and bytes."""
 
-    Attributes:
-        number: of the request that it belongs to, or ``ABOUT_ITSELF``.
-        content: the request, or its answer.
-        arrived: when the request came (monotonic seconds).
-    """
-
-    number: int
-    content: bytes
-    arrived: float = 0.0
+    number: int  # of the request that it belongs to, or ``ABOUT_ITSELF``
+    content: bytes  # the request, or its answer
+    arrived: float = 0.0  # when the request came (monotonic seconds)
 
     def packed(self) -> bytes:
         return _HEAD.pack(len(self.content), self.number, self.arrived) + self.content

@@ -40,44 +40,27 @@ class Instruction(IntEnum):
 
 @dataclass(frozen=True)
 class Status:
-    """A servo's answer.
+    """A servo's answer."""
 
-    Attributes:
-        id: of the servo.
-        alarm: the bits by which it says that it is unwell; of protocol 2 only that it is.
-        refusal: why it did not do what it was asked, in words; empty if it did.
-        data: what was read.
-    """
-
-    id: int
-    alarm: int
-    refusal: str
-    data: bytes
+    id: int  # of the servo
+    alarm: int  # the bits by which it says that it is unwell; of protocol 2 only that it is
+    refusal: str  # why it did not do what it was asked, in words; empty if it did
+    data: bytes  # what was read
 
 
 @dataclass(frozen=True)
 class Received:
-    """What a stretch of bytes holds.
+    """What a stretch of bytes holds."""
 
-    Attributes:
-        answers: those that are whole and right, in order.
-        damaged: how many were damaged.
-        rest: the bytes of one that may go on.
-    """
-
-    answers: tuple[Status, ...]
-    damaged: int
-    rest: bytes
+    answers: tuple[Status, ...]  # those that are whole and right, in order
+    damaged: int  # how many were damaged
+    rest: bytes  # the bytes of one that may go on
 
 
 class Framing(Protocol):
-    """The packets of a protocol.
+    """The packets of a protocol."""
 
-    Attributes:
-        overhead: bytes of an answer beside its data.
-    """
-
-    overhead: int
+    overhead: int  # bytes of an answer beside its data
 
     def encoded(self, servo: int, instruction: Instruction, parameters: bytes = b"") -> bytes:
         """A whole instruction."""
@@ -231,13 +214,10 @@ FRAMINGS: Mapping[ProtocolName, Framing] = MappingProxyType(
 )
 
 
-_BITS = 10
-"""On the line, of a byte."""
-_ECHO_ID = 0xFD
-"""Nobody's: what comes back when it is asked is an echo."""
+_BITS = 10  # On the line, of a byte
+_ECHO_ID = 0xFD  # Nobody's: what comes back when it is asked is an echo
 _NOBODY = frozenset((-1,))
-_NOISE = 4
-"""So many bytes that mean nothing are more than an adapter makes that turns its direction."""
+_NOISE = 4  # So many bytes that mean nothing are more than an adapter makes that turns its direction
 SILENT_MEND = "Look at its plug and its power; armcal bus find shows who answers, and at which baud rate."
 
 

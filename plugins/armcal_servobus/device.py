@@ -29,29 +29,19 @@ from armcal_servobus.joints import ServoJoint, ServoJointsSettings, ServoReading
 from armcal_servobus.models import ANY
 
 _READINGS = 2
-SEVERAL_TURNS = 0x10
-"""Of a Feetech servo's phase: it reports angles of several turns."""
-_ROUNDED = 2
-"""Counts: limits in a servo may be so much narrower than a range that was rounded."""
+SEVERAL_TURNS = 0x10  # Of a Feetech servo's phase: it reports angles of several turns
+_ROUNDED = 2  # Counts: limits in a servo may be so much narrower than a range that was rounded
 
 
 @dataclass(frozen=True)
 class Eeprom:
-    """What a servo keeps without power; where a model lacks a register, what does no harm.
+    """What a servo keeps without power; where a model lacks a register, what does no harm."""
 
-    Attributes:
-        offset: its homing offset (counts).
-        limits: the counts between which it lets itself be driven.
-        max_temperature: deg C.
-        voltage_range: V.
-        phase: of a Feetech servo: directions and units, as bits.
-    """
-
-    offset: int = 0
-    limits: tuple[int, int] = (0, 1 << 20)
-    max_temperature: float = 100.0
-    voltage_range: tuple[float, float] = (0.0, 60.0)
-    phase: int = 0
+    offset: int = 0  # its homing offset (counts)
+    limits: tuple[int, int] = (0, 1 << 20)  # the counts between which it lets itself be driven
+    max_temperature: float = 100.0  # deg C
+    voltage_range: tuple[float, float] = (0.0, 60.0)  # V
+    phase: int = 0  # of a Feetech servo: directions and units, as bits
     mode: int | None = None
 
 
@@ -89,19 +79,12 @@ def read_eeprom(bus: Bus, joint: ServoJoint) -> Eeprom:
 
 @dataclass(frozen=True)
 class Examination:
-    """A bus beside its configuration.
+    """A bus beside its configuration."""
 
-    Attributes:
-        eeproms: by joint, of servos that are the configured ones.
-        mistakes: all that is not as configured.
-        silent: joints whose servos do not answer.
-        strangers: ids that answer and that no joint has; looked for only where somebody is silent.
-    """
-
-    eeproms: Mapping[str, Eeprom]
-    mistakes: tuple[Mistake, ...]
-    silent: tuple[str, ...]
-    strangers: tuple[int, ...]
+    eeproms: Mapping[str, Eeprom]  # by joint, of servos that are the configured ones
+    mistakes: tuple[Mistake, ...]  # all that is not as configured
+    silent: tuple[str, ...]  # joints whose servos do not answer
+    strangers: tuple[int, ...]  # ids that answer and that no joint has; looked for only where somebody is silent
 
 
 def checked(bus: Bus, joints: Mapping[str, ServoJoint], *, moves: bool = True) -> Mapping[str, Eeprom]:

@@ -16,34 +16,23 @@ _FIRST_IDS = range(31)
 """Asked one by one at each baud rate, where nothing else is said; beyond that only those that answer to all."""
 _BROADCAST_S = 0.25
 _ONE_S = 0.03
-_AGAIN = 4
-"""So often a servo is read: two with one id do not always collide. So many damaged answers are no chance."""
+_AGAIN = 4  # So often a servo is read: two with one id do not always collide. So many damaged answers are no chance.
 
 
 @dataclass(frozen=True)
 class FoundServo:
-    """A servo that answers, as it was read without writing anything to it.
-
-    Attributes:
-        model: None: its number is not known.
-        number: of its model.
-        position: as it reports it (counts).
-        voltage: V.
-        temperature: deg C.
-        alarms: in words.
-        damaged: so many of its answers were damaged, or followed by another one.
-    """
+    """A servo that answers, as it was read without writing anything to it."""
 
     baud: int
     id: int
-    number: int
-    model: ServoModel | None
+    number: int  # of its model
+    model: ServoModel | None  # None: its number is not known
     firmware: str = ""
-    position: int | None = None
-    voltage: float | None = None
-    temperature: int | None = None
-    alarms: tuple[str, ...] = ()
-    damaged: int = 0
+    position: int | None = None  # as it reports it (counts)
+    voltage: float | None = None  # V
+    temperature: int | None = None  # deg C
+    alarms: tuple[str, ...] = ()  # in words
+    damaged: int = 0  # so many of its answers were damaged, or followed by another one
 
     @property
     def is_doubled(self) -> bool:

@@ -22,8 +22,7 @@ from armcal_servobus.device import SEVERAL_TURNS, read_eeprom
 from armcal_servobus.finding import read_number
 from armcal_servobus.joints import ServoJoint, Servos, check_offset
 
-_TOOTH_SHARE = 0.15
-"""A difference so near to whole teeth (of one) is taken for them."""
+_TOOTH_SHARE = 0.15  # A difference so near to whole teeth (of one) is taken for them
 _EEPROM_S = 0.02
 _LEAST_DEG = 8.0
 _SAME_COUNTS = 4
@@ -35,17 +34,14 @@ class Homing:
     """What is to become of a joint's homing offset.
 
     Attributes:
-        joint: whose.
-        position: what it reports now (counts).
         before, after: the offset (counts).
-        target: what it will report.
     """
 
-    joint: ServoJoint
-    position: int
+    joint: ServoJoint  # whose
+    position: int  # what it reports now (counts)
     before: int
     after: int
-    target: int
+    target: int  # what it will report
 
     @property
     def change(self) -> float:

@@ -196,8 +196,7 @@ def named(joints: Mapping[str, ServoJoint]) -> dict[int, str]:
     return {joint.id: name for name, joint in joints.items()}
 
 
-_TIME_BYTES = 2
-"""Between goal and speed some have a time to be taken, which is zero here: the speed holds."""
+_TIME_BYTES = 2  # Between goal and speed some have a time to be taken, which is zero here: the speed holds
 
 
 @dataclass(frozen=True)
@@ -206,20 +205,15 @@ class ServoReading:
 
     Attributes:
         position, goal: counts, as its registers have them.
-        has_torque: whether it holds.
-        load: share of full torque (-1 to 1), or its current (A) where the model says that.
-        voltage: V.
-        temperature: deg C.
-        alarms: in words.
     """
 
     position: int
     goal: int
-    has_torque: bool
-    load: float
-    voltage: float
-    temperature: float
-    alarms: tuple[str, ...] = ()
+    has_torque: bool  # whether it holds
+    load: float  # share of full torque (-1 to 1), or its current (A) where the model says that
+    voltage: float  # V
+    temperature: float  # deg C
+    alarms: tuple[str, ...] = ()  # in words
 
 
 class Servos:

@@ -20,16 +20,13 @@ class Register:
 
     Attributes:
         address, size: of its first byte, and bytes.
-        sign_bit: its sign stands apart, in this bit; None: there is none, or it is a two's complement.
-        is_signed: it is a two's complement.
-        unit: what one count is, in SI (V, rad/s, deg C).
     """
 
     address: int
     size: int = 1
-    sign_bit: int | None = None
-    is_signed: bool = False
-    unit: float = 1.0
+    sign_bit: int | None = None  # its sign stands apart, in this bit; None: there is none, or it is a two's complement
+    is_signed: bool = False  # it is a two's complement
+    unit: float = 1.0  # what one count is, in SI (V, rad/s, deg C)
 
     def pack(self, value: int, order: Literal["little", "big"]) -> bytes:
         """As it is written.
@@ -59,38 +56,24 @@ class ServoModel:
     """A kind of servo.
 
     Attributes:
-        name: as configurations have it.
-        number: as its register has it; ``ANY``: of all that are alike.
-        protocol: that it speaks.
-        registers: by armcal's name of what they hold; those that it lacks are not there.
-        polled: the stretches (address, bytes) that hold what changes while it works.
-        alarms: words, by the bit of its alarm.
-        counts: so many are ``turn`` (rad).
-        wraps: whether its encoder goes on over the end of the turn, from the last count to zero.
-        position_mode: what the register of its operating mode holds while it goes to positions.
-        offset_limit: the largest magnitude of its homing offset; 0: it has none.
-        offset_sign: of the offset in the position that it reports: -1 if that is the encoder's less the offset.
-        teeth: of the spline on which its horn sits; 0: not known.
-        order: of the bytes of a number.
-        reads_together: whether it takes part when several are read at once.
         load: what its register of load counts: a share of its full torque, or a current (A).
     """
 
-    name: str
-    number: int
-    protocol: ProtocolName
-    registers: Mapping[str, Register]
-    polled: tuple[tuple[int, int], ...]
-    alarms: Mapping[int, str]
-    counts: int = 4096
+    name: str  # as configurations have it
+    number: int  # as its register has it; ``ANY``: of all that are alike
+    protocol: ProtocolName  # that it speaks
+    registers: Mapping[str, Register]  # by armcal's name of what they hold; those that it lacks are not there
+    polled: tuple[tuple[int, int], ...]  # the stretches (address, bytes) that hold what changes while it works
+    alarms: Mapping[int, str]  # words, by the bit of its alarm
+    counts: int = 4096  # so many are ``turn`` (rad)
     turn: float = 2 * math.pi
-    wraps: bool = True
-    position_mode: int = 0
-    offset_limit: int = 0
-    offset_sign: int = -1
-    teeth: int = 0
-    order: Literal["little", "big"] = "little"
-    reads_together: bool = True
+    wraps: bool = True  # whether its encoder goes on over the end of the turn, from the last count to zero
+    position_mode: int = 0  # what the register of its operating mode holds while it goes to positions
+    offset_limit: int = 0  # the largest magnitude of its homing offset; 0: it has none
+    offset_sign: int = -1  # of the offset in the position that it reports: -1 if that is the encoder's less the offset
+    teeth: int = 0  # of the spline on which its horn sits; 0: not known
+    order: Literal["little", "big"] = "little"  # of the bytes of a number
+    reads_together: bool = True  # whether it takes part when several are read at once
     load: Literal["share", "current"] = "share"
 
     @property

@@ -230,8 +230,7 @@ class Orientation(Settings):
     Values are numbers of all records, one row each, in the order of ``mapped``.
     """
 
-    kind: ClassVar[str]
-    """What one of them is called."""
+    kind: ClassVar[str]  # What one of them is called
 
     @property
     def declared(self) -> str:
@@ -431,8 +430,7 @@ def reflections(values: Array) -> Array:
     return np.flatnonzero(np.linalg.det(values.reshape(-1, 3, 3)) < 0)
 
 
-TOLERANCE = 1e-3
-"""How far a quaternion's length may be from one, or an entry of R^T R from the identity's."""
+TOLERANCE = 1e-3  # How far a quaternion's length may be from one, or an entry of R^T R from the identity's
 MOST_FAULTY = 0.05
 WORST = ((5.0, 3.0), (0.5, 10.0))
 """The declared meaning of the columns is refused if it fits the arm worse than this (deg), and so many times worse than
@@ -441,8 +439,7 @@ _ZERO = 1e-6
 FEWEST = 6
 _STRIDES = (1, 2, 3, 5, 7, 11, 17)
 _MOST_PAIRS = 4000
-_LARGEST_TURN_RAD = 2.6
-"""Beyond it a rotation vector may jump to the other end of its axis."""
+_LARGEST_TURN_RAD = 2.6  # Beyond it a rotation vector may jump to the other end of its axis
 
 
 class PoseCsvSettings(CsvSettings):

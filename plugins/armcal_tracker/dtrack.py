@@ -31,8 +31,7 @@ from typing_extensions import override
 
 from armcal_tracker.frames import FARTHEST_M, TOO_FAR, CountingTracker, Frame, FrameCounter, UnreadableError
 
-NOT_A_ROTATION = 1e-3
-"""A matrix may be so far from a rotation, in any entry of R^T R: six decimals are printed."""
+NOT_A_ROTATION = 1e-3  # A matrix may be so far from a rotation, in any entry of R^T R: six decimals are printed
 MOST_BODIES = 1000
 
 _OPTICAL, _BOTH = 2, 3
@@ -140,8 +139,7 @@ def _numbers(text: str, count: int, name: str) -> list[float]:
 
 DAY_S = 86400.0
 _MOST_BYTES = 65536
-_MOST_AT_ONCE = 10_000
-"""Datagrams; the rest waits in the system's queue, which holds some 0.2 MB or more."""
+_MOST_AT_ONCE = 10_000  # Datagrams; the rest waits in the system's queue, which holds some 0.2 MB or more
 _BUFFER_BYTES = 4 * 1024**2
 
 

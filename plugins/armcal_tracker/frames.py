@@ -12,14 +12,11 @@ from armcal.devices.clock import Clock
 from armcal.devices.live import REPEATED, Tracker
 from typing_extensions import override
 
-OFF_UNIT = 1e-3
-"""A quaternion's length may be so far from one."""
+OFF_UNIT = 1e-3  # A quaternion's length may be so far from one
 FARTHEST_M = 1000.0
 LATE = "a frame that came too late, after a newer one"
-LATEST = 100
-"""A number that falls by more is that of a tracker that has begun anew."""
-_ANEW = 3
-"""So many older numbers that rise from one to the next are no late frames either."""
+LATEST = 100  # A number that falls by more is that of a tracker that has begun anew
+_ANEW = 3  # So many older numbers that rise from one to the next are no late frames either
 
 TOO_FAR = "a body more than 1 km away"
 NO_QUATERNION = "a quaternion whose length is not one"
@@ -34,16 +31,13 @@ class Frame:
     """A frame as it was read.
 
     Attributes:
-        counter: its number.
-        stamp: when it was taken, by the tracker's clock (s), where that is given.
         bodies: ``world_T_body`` (4 x 4, m) by name; None where the body is not seen.
-        wrong: why bodies that are listed as seen count as lost, one reason for each.
     """
 
-    counter: int
-    stamp: float | None
+    counter: int  # its number
+    stamp: float | None  # when it was taken, by the tracker's clock (s), where that is given
     bodies: Mapping[str, Array | None] = field(default_factory=dict)
-    wrong: tuple[str, ...] = ()
+    wrong: tuple[str, ...] = ()  # why bodies that are listed as seen count as lost, one reason for each
 
     @classmethod
     def of(cls, counter: int, stamp: float | None, poses: Mapping[str, Array | str | None]) -> Self:

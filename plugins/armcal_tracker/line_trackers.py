@@ -32,8 +32,7 @@ from typing_extensions import override
 
 from armcal_tracker.frames import CountingTracker, Frame, FrameCounter, UnreadableError, body_pose
 
-ONLY_BODY = "tool"
-"""What a body is called whose columns have no name before them."""
+ONLY_BODY = "tool"  # What a body is called whose columns have no name before them
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _TIMES = {"t": "s", "t_s": "s", "t_ms": "ms", "t_us": "us"}
 _FRAMES = ("frame", "frames")

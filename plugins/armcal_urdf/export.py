@@ -21,8 +21,7 @@ from scipy.spatial.transform import Rotation
 from armcal_urdf.model import RPY, XYZ, ChainJoint, UrdfModel, UrdfSettings, turned
 from armcal_urdf.robot import UTF8, Three, UrdfJoint, encode, words_of
 
-_ROUNDING = 1e-13
-"""m or rad: what a solver leaves of a number that nothing moved."""
+_ROUNDING = 1e-13  # m or rad: what a solver leaves of a number that nothing moved
 _WHITE = b" \t\r\n"
 _ATTRIBUTE = re.compile(rb"""\s+(?P<name>[^\s=/>]+)\s*=\s*(?P<value>"[^"]*"|'[^']*')""")
 _START_TAG = re.compile(rb"""(?P<name><[^\s/>]+)(?:\s+[^\s=/>]+\s*=\s*(?:"[^"]*"|'[^']*'))*\s*/?>""")
@@ -42,8 +41,7 @@ class Placed:
         return {name: now for name, (before, now) in pairs.items() if before != now}
 
 
-Edit = tuple[int, int, bytes]
-"""Bytes from an offset to before another become new ones."""
+Edit = tuple[int, int, bytes]  # Bytes from an offset to before another become new ones
 
 
 def with_origins(text: str, placed: Iterable[Placed]) -> str:
@@ -97,8 +95,7 @@ def _start_tag(data: bytes, start: int) -> tuple[int, dict[str, tuple[int, int]]
 
 TOLERANCE_M = 1e-9
 TOLERANCE_RAD = 1e-9
-MOST_SHIFT_MM, MOST_TURN_DEG = 5.0, 3.0
-"""Beyond these a first joint is not made wrong: it holds where the arm stands."""
+MOST_SHIFT_MM, MOST_TURN_DEG = 5.0, 3.0  # Beyond these a first joint is not made wrong: it holds where the arm stands
 
 
 class UrdfExportSettings(Settings):

@@ -37,19 +37,12 @@ _UNFIT = re.compile(r"[^\w-]")
 
 @dataclass(frozen=True)
 class ChainJoint:
-    """A joint of the chain.
+    """A joint of the chain."""
 
-    Attributes:
-        name: as parameters and records call it.
-        frame: what the frame of the link behind it is called.
-        mimic: the independent joint that it follows, by its name here.
-        urdf: as written.
-    """
-
-    name: str
-    frame: str
-    mimic: Mimic | None
-    urdf: UrdfJoint
+    name: str  # as parameters and records call it
+    frame: str  # what the frame of the link behind it is called
+    mimic: Mimic | None  # the independent joint that it follows, by its name here
+    urdf: UrdfJoint  # as written
 
     @property
     def moves(self) -> bool:
@@ -230,23 +223,18 @@ class UrdfSettings(Settings):
 
     Attributes:
         path: the file. It is read at once, and its content kept in ``text``: a calibration holds it whole.
-        text: the URDF.
-        encoding: of the file, so that it can be written again byte for byte.
-        file: the name of the file that the text was read from.
         root: the link that the chain stands on, and whose frame is the base; the tree's root unless given.
-        tip: the link whose frame is the tool; the tree's only leaf unless given.
-        inertials: whether stated masses load the arm.
         gimbal_lock: ``avoid`` counts the angles of a joint whose pitch is near a right angle from that right angle;
             ``keep`` has the roll, pitch and yaw of the file there too, of which two are then one rotation.
     """
 
     path: InputPath | None = None
-    text: str = ""
-    encoding: Encoding | None = None
-    file: str = ""
+    text: str = ""  # the URDF
+    encoding: Encoding | None = None  # of the file, so that it can be written again byte for byte
+    file: str = ""  # the name of the file that the text was read from
     root: str | None = None
-    tip: str | None = None
-    inertials: Literal["use", "ignore"] = "use"
+    tip: str | None = None  # the link whose frame is the tool; the tree's only leaf unless given
+    inertials: Literal["use", "ignore"] = "use"  # whether stated masses load the arm
     gimbal_lock: Literal["avoid", "keep"] = "avoid"
 
     @model_validator(mode="after")

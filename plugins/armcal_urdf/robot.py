@@ -26,10 +26,8 @@ from armcal.io.plain_files import input_bytes
 
 Encoding = Literal["utf-8", "utf-16-le", "utf-16-be", "iso-8859-1", "us-ascii"]
 
-MAX_BYTES = 256 * 1024
-"""Of a URDF: a calibration holds it whole, and may have four times as many itself."""
-_MOST = 1 << 26
-"""Read at all, so that what is too large is refused with the reason."""
+MAX_BYTES = 256 * 1024  # Of a URDF: a calibration holds it whole, and may have four times as many itself
+_MOST = 1 << 26  # Read at all, so that what is too large is refused with the reason
 _MARKS: tuple[tuple[bytes, Encoding], ...] = (
     (codecs.BOM_UTF8, "utf-8"),
     (codecs.BOM_UTF16_LE, "utf-16-le"),
@@ -121,8 +119,7 @@ MAX_DEPTH = 50
 UTF8 = "utf-8"
 Three = tuple[float, float, float]
 
-LARGEST = 1e6
-"""m, rad or kg: no arm is that far off, and sums with larger numbers lose the micrometres."""
+LARGEST = 1e6  # m, rad or kg: no arm is that far off, and sums with larger numbers lose the micrometres
 SHORTEST_AXIS = 1e-9
 _WHITE = re.compile(r"[ \t\r\n]+")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -130,23 +127,14 @@ _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 @dataclass(frozen=True)
 class Element:
-    """One element.
+    """One element."""
 
-    Attributes:
-        tag: its name.
-        attributes: values by name, references expanded.
-        line: of its start tag, from 1.
-        start: offset of its start tag in the text as UTF-8.
-        label: the file's name for people.
-        children: elements in it.
-    """
-
-    tag: str
-    attributes: Mapping[str, str]
-    line: int
-    start: int
-    label: str
-    children: list[Element] = field(default_factory=list)
+    tag: str  # its name
+    attributes: Mapping[str, str]  # values by name, references expanded
+    line: int  # of its start tag, from 1
+    start: int  # offset of its start tag in the text as UTF-8
+    label: str  # the file's name for people
+    children: list[Element] = field(default_factory=list)  # elements in it
 
     def all(self, tag: str) -> Iterator[Element]:
         return (child for child in self.children if child.tag == tag)
@@ -333,31 +321,18 @@ class UrdfLink:
 
 @dataclass(frozen=True)
 class UrdfJoint:
-    """A joint.
+    """A joint."""
 
-    Attributes:
-        name: as written.
-        kind: ``revolute``, ``continuous``, ``prismatic``, ``fixed``, ``floating`` or ``planar``.
-        parent: link it stands on.
-        child: link it carries.
-        xyz: where it stands in the parent's frame (m).
-        rpy: how it is turned there: Rz(yaw) Ry(pitch) Rx(roll) (rad).
-        axis: unit vector in the joint's own frame.
-        limits: of its displacement (rad or m); None where there are none.
-        mimic: the joint that it follows, if it does.
-        element: where it was written.
-    """
-
-    name: str
-    kind: str
-    parent: str
-    child: str
-    xyz: Three
-    rpy: Three
-    axis: Three
-    limits: tuple[float, float] | None
-    mimic: Mimic | None
-    element: Element
+    name: str  # as written
+    kind: str  # ``revolute``, ``continuous``, ``prismatic``, ``fixed``, ``floating`` or ``planar``
+    parent: str  # link it stands on
+    child: str  # link it carries
+    xyz: Three  # where it stands in the parent's frame (m)
+    rpy: Three  # how it is turned there: Rz(yaw) Ry(pitch) Rx(roll) (rad)
+    axis: Three  # unit vector in the joint's own frame
+    limits: tuple[float, float] | None  # of its displacement (rad or m); None where there are none
+    mimic: Mimic | None  # the joint that it follows, if it does
+    element: Element  # where it was written
 
 
 @dataclass(frozen=True)

@@ -33,15 +33,13 @@ class ElasticSite:
     """The coordinates of one site's deflection.
 
     Attributes:
-        site: 0 for the mount, i for joint i (from 1).
         directions: rotations about these unit vectors of the site's frame; empty for a displacement on the joint's
             own axis.
-        springs: what deflects there.
     """
 
-    site: int
+    site: int  # 0 for the mount, i for joint i (from 1)
     directions: tuple[Vector3, ...]
-    springs: tuple[Spring, ...]
+    springs: tuple[Spring, ...]  # what deflects there
 
     @property
     def size(self) -> int:
@@ -121,8 +119,7 @@ def _matrix(directions: Sequence[Vector3]) -> Expression:
     return ca.sparsify(ca.horzcat(*[ca.SX(list(axis)) for axis in directions]))
 
 
-PLACEMENT = "placement"
-"""What the blocks of an arm's placement are called."""
+PLACEMENT = "placement"  # What the blocks of an arm's placement are called
 
 
 @runtime_checkable
@@ -170,25 +167,19 @@ class Arm:
     """One arm of a problem.
 
     Attributes:
-        name: the instance name, first part of every parameter name.
-        model_name: the model's name within it (``mdh``).
-        model: the arm model.
-        effects: joint effects by their names.
-        masses: what gravity pulls on.
         placement: blocks of the pose of the model's base in the base frame (``placement_x`` and so on); none where
             the two are the same.
-        joint_noise: standard deviation of what a turning joint reads against where it stands (rad).
         residual: what corrects joints and tool where the rest leaves an error, once it is learned.
         couplings: by joint, how many times the commands of others its own angle contains beside its own command.
     """
 
-    name: str
-    model_name: str
-    model: ArmModel
-    effects: Mapping[str, JointEffect]
-    masses: tuple[MassSpec, ...]
+    name: str  # the instance name, first part of every parameter name
+    model_name: str  # the model's name within it (``mdh``)
+    model: ArmModel  # the arm model
+    effects: Mapping[str, JointEffect]  # joint effects by their names
+    masses: tuple[MassSpec, ...]  # what gravity pulls on
     placement: tuple[ParameterBlock, ...] = ()
-    joint_noise: float = 0.0
+    joint_noise: float = 0.0  # standard deviation of what a turning joint reads against where it stands (rad)
     residual: PoseResidual | None = None
     couplings: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 

@@ -13,8 +13,7 @@ from armcal.base.se3 import Expression
 from armcal.base.settings import Settings
 from armcal.plugins import expecting, refuse
 
-JointChoice = Literal["all"] | tuple[str, ...]
-"""All joints, or some by name."""
+JointChoice = Literal["all"] | tuple[str, ...]  # All joints, or some by name
 XYZ: tuple[Vector3, ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), Z_AXIS)
 """The directions of a spring that gives about every axis."""
 _Settings = Settings
@@ -38,8 +37,7 @@ class JointCommand:
         return self.index + 1
 
 
-MOUNT = JointCommand(-1, 0.0, 0.0)
-"""What the law of a spring at the mount is given, which nothing commands."""
+MOUNT = JointCommand(-1, 0.0, 0.0)  # What the law of a spring at the mount is given, which nothing commands
 
 
 @dataclass(frozen=True)
@@ -96,8 +94,7 @@ class Condition:
     dimension: str | None = None
 
 
-JOINT_RATE = "joint rate"
-"""The dimension of rates of joints, sliding ones too."""
+JOINT_RATE = "joint rate"  # The dimension of rates of joints, sliding ones too
 
 
 def joint_rate(joint: str) -> Condition:

@@ -26,33 +26,23 @@ from armcal.base.se3 import Expression
 from armcal.errors import NotConvergedError
 from armcal.functions.interpreted import InterpretedFunction
 
-REST_RAD = 1e-13
-"""A residual is taken when no deflection moves more than this in a pass: below 1e-6 mm on any arm."""
-NEAR_REST_RAD = 1e-10
-"""The linearisation corrects to second order, so it may start from here."""
+REST_RAD = 1e-13  # A residual is taken when no deflection moves more than this in a pass: below 1e-6 mm on any arm
+NEAR_REST_RAD = 1e-10  # The linearisation corrects to second order, so it may start from here
 MOST_DEFLECTION = 1.0
 """rad, or m: a spring that gives more does not hold the arm, and more than one equilibrium may be near."""
-LONGEST_STEP = 0.3
-"""rad, or m: of Newton's method."""
+LONGEST_STEP = 0.3  # rad, or m: of Newton's method
 MOST_PASSES = 100
-_SHIFTED_TO = 0.1
-"""Where the potential is not convex, its lowest eigenvalue is taken for this: the step goes down."""
+_SHIFTED_TO = 0.1  # Where the potential is not convex, its lowest eigenvalue is taken for this: the step goes down
 
-Evaluate = Callable[[Indices], tuple[Array, Array]]
-"""F (n_d x k) and S (k x n_d x n_d) of some records at their states."""
+Evaluate = Callable[[Indices], tuple[Array, Array]]  # F (n_d x k) and S (k x n_d x n_d) of some records at their states
 
 
 @dataclass(frozen=True)
 class Settled:
-    """Where states came to rest.
+    """Where states came to rest."""
 
-    Attributes:
-        at_rest: whether each did, within what springs may give (N).
-        held: whether the springs hold the arm there (N).
-    """
-
-    at_rest: Mask
-    held: Mask
+    at_rest: Mask  # whether each did, within what springs may give (N)
+    held: Mask  # whether the springs hold the arm there (N)
 
     @property
     def sound(self) -> Mask:
@@ -145,29 +135,19 @@ def settle(evaluate: Evaluate, state: Array) -> Settled:
     return Settled(at_rest, held)
 
 
-ManyRecords = Callable[..., list[Array]]
-"""A CasADi function over columns: ``InterpretedFunction`` or ``BatchFunction``."""
-_TOGETHER = 4096
-"""Records whose slopes are in memory at once."""
+ManyRecords = Callable[..., list[Array]]  # A CasADi function over columns: ``InterpretedFunction`` or ``BatchFunction``
+_TOGETHER = 4096  # Records whose slopes are in memory at once
 
 
 @dataclass(frozen=True, kw_only=True)
 class ElasticPass:
-    """One elastic pass of a record, as an expression.
+    """One elastic pass of a record, as an expression."""
 
-    Attributes:
-        record: symbols of what differs from record to record (n_c).
-        state: symbols of the deflections of all springs (n_d; rad or m).
-        next_state: what the springs answer with; equal to ``state`` in equilibrium.
-        values: symbols of what all records share (n_v).
-        springs: of each number of the state, what gives, in words.
-    """
-
-    record: Expression
-    state: Expression
-    next_state: Expression
-    values: Expression = field(default_factory=lambda: ca.SX(0, 1))
-    springs: tuple[str, ...] = ()
+    record: Expression  # symbols of what differs from record to record (n_c)
+    state: Expression  # symbols of the deflections of all springs (n_d; rad or m)
+    next_state: Expression  # what the springs answer with; equal to ``state`` in equilibrium
+    values: Expression = field(default_factory=lambda: ca.SX(0, 1))  # symbols of what all records share (n_v)
+    springs: tuple[str, ...] = ()  # of each number of the state, what gives, in words
 
     def described(self, index: int, record: Array) -> str:
         """What messages call a record (n_c) at a place among others."""

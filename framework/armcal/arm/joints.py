@@ -10,8 +10,7 @@ from armcal.base.arrays import Array
 from armcal.errors import ConfigError, Location
 
 V = TypeVar("V")
-Limits = tuple[float, float]
-"""Lowest and highest command of a joint (rad or m)."""
+Limits = tuple[float, float]  # Lowest and highest command of a joint (rad or m)
 _KINDS = {"angle": "turning ", "length": "sliding "}
 
 

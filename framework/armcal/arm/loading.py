@@ -18,14 +18,12 @@ class SiteLoads:
     """Loads and levers of all sites (0 the mount, i joint i), on the rigid arm.
 
     Attributes:
-        moments: in the site's own axes, about its origin (sites x 3 x N; N m).
-        efforts: about each joint's axis, or along it (joints x N; N m, N on sliding joints).
         levers: how the tip moves in the base frame when a site turns about each of its own axes (sites x 3 x 3 x N;
             base axis by site axis; m/rad).
     """
 
-    moments: Array
-    efforts: Array
+    moments: Array  # in the site's own axes, about its origin (sites x 3 x N; N m)
+    efforts: Array  # about each joint's axis, or along it (joints x N; N m, N on sliding joints)
     levers: Array
 
 

@@ -13,8 +13,7 @@ import casadi as ca
 from armcal.arm.effects import JointEffect
 from armcal.base.se3 import Expression
 
-SPLINE_TEETH = 25
-"""Of the usual spline."""
+SPLINE_TEETH = 25  # Of the usual spline
 TOOTH_DEG = 360 / SPLINE_TEETH
 
 
@@ -23,10 +22,8 @@ def teeth_text(number: int, tooth_deg: float = TOOTH_DEG) -> str:
     return f"{abs(number)} {'tooth' if abs(number) == 1 else 'teeth'} of its horn ({tooth_deg:.1f} deg each)"
 
 
-COUNTS = 4096
-"""In one period."""
-PRESCALES = (3, 255)
-"""The smallest and the largest."""
+COUNTS = 4096  # In one period
+PRESCALES = (3, 255)  # The smallest and the largest
 _FINE = 2.0**60
 
 
@@ -34,16 +31,12 @@ _FINE = 2.0**60
 class PulseTable:
     """Pulse lengths at known angles, linear between them and beyond the ends.
 
-    Attributes:
-        angles: rad, rising.
-        pulses: s, above zero, rising or falling.
-
     Raises:
         ValueError: it is no such table.
     """
 
-    angles: tuple[float, ...]
-    pulses: tuple[float, ...]
+    angles: tuple[float, ...]  # rad, rising
+    pulses: tuple[float, ...]  # s, above zero, rising or falling
 
     def __post_init__(self) -> None:
         if len(self.angles) != len(self.pulses) or len(self.angles) < 2:

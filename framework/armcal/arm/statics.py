@@ -34,17 +34,13 @@ class MassSpec:
     """A mass in a named frame of the chain, ``mount`` or ``tool``: numbers as stated, or expressions of parameters.
 
     Attributes:
-        name: what it is.
-        mass: kg.
-        com: centre of mass in its frame (3, or 3x1; m).
-        frame: that frame.
         loads_up_to: the last joint it loads (from 1); None for the physical one, the joint that moves it.
     """
 
-    name: str
-    mass: Expression
-    com: Expression
-    frame: str
+    name: str  # what it is
+    mass: Expression  # kg
+    com: Expression  # centre of mass in its frame (3, or 3x1; m)
+    frame: str  # that frame
     loads_up_to: int | None = None
 
 
@@ -53,19 +49,14 @@ class Load:
     """What acts on the arm in one record.
 
     Attributes:
-        gravity: acceleration in the base frame (3x1, m/s^2).
-        payload_mass: kg, on top of the arm's own masses.
-        payload_com: its centre in the tool frame (3x1, m).
-        force: external force at the tool frame's origin, in the base frame's axes (3x1, N).
-        torque: external torque, in the base frame's axes (3x1, N m).
         beyond: mass (kg) and first moment in the tool frame (3x1, kg m) of what hangs there beside the payload.
     """
 
-    gravity: Expression
-    payload_mass: Expression
-    payload_com: Expression
-    force: Expression
-    torque: Expression
+    gravity: Expression  # acceleration in the base frame (3x1, m/s^2)
+    payload_mass: Expression  # kg, on top of the arm's own masses
+    payload_com: Expression  # its centre in the tool frame (3x1, m)
+    force: Expression  # external force at the tool frame's origin, in the base frame's axes (3x1, N)
+    torque: Expression  # external torque, in the base frame's axes (3x1, N m)
     beyond: tuple[Expression, Expression] | None = None
 
     @classmethod
@@ -140,8 +131,7 @@ def frame_names(chain: Chain) -> Mapping[str, int]:
 
 
 _ZERO: Vector3 = (0.0, 0.0, 0.0)
-STATICS = "statics"
-"""The instance name of what acts on all arms."""
+STATICS = "statics"  # The instance name of what acts on all arms
 
 
 @dataclass(frozen=True)

@@ -14,15 +14,13 @@ class ConfigText(str):
     """A text scalar of a config.
 
     Attributes:
-        location: where it was written.
         base_dir: what a relative path in it is relative to: the directory of its file; for a value from the
             command line the working directory.
-        root: the directory that a path in it may not leave; None: anywhere (from the command line).
     """
 
-    location: Location
+    location: Location  # where it was written
     base_dir: Path
-    root: Path | None
+    root: Path | None  # the directory that a path in it may not leave; None: anywhere (from the command line)
 
     def __new__(
         cls,

@@ -25,15 +25,13 @@ _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 class Domain(ABC):
-    """What a parameter block needs to know of its own shape; coordinates are increments where a domain says no other.
+    """What a parameter block needs to know of its own shape.
 
-    Attributes:
-        entries: suffix of each canonical number; one empty suffix for a scalar.
-        increments: a short name for each number of an increment.
+    Coordinates are increments where a domain says no other.
     """
 
-    entries: ClassVar[tuple[str, ...]]
-    increments: ClassVar[tuple[str, ...]]
+    entries: ClassVar[tuple[str, ...]]  # suffix of each canonical number; one empty suffix for a scalar
+    increments: ClassVar[tuple[str, ...]]  # a short name for each number of an increment
 
     @property
     def dof(self) -> int:
@@ -310,8 +308,7 @@ def _entries(matrix: Array) -> Array:
     return np.array([matrix[row, col] for row, col in _SYMMETRIC])
 
 
-_PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-"""Where each entry of a symmetric matrix stands among the six."""
+_PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # Where each entry of a symmetric matrix stands among the six
 _UNITS = tuple(symmetric(unit) for unit in np.eye(6))
 _PRODUCTS = np.array([[one @ two for two in _UNITS] for one in _UNITS])
 

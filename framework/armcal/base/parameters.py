@@ -127,15 +127,13 @@ class _Layout:
     Attributes:
         places, entries, increments: of blocks that are numbers: in a value vector, among the free entries, and among
             the increments.
-        others: each other free block, with the same three.
-        shape: how many free entries and increments there are.
     """
 
     places: Indices
     entries: Indices
     increments: Indices
-    others: tuple[tuple[ParameterBlock, slice, slice, slice], ...]
-    shape: tuple[int, int]
+    others: tuple[tuple[ParameterBlock, slice, slice, slice], ...]  # each other free block, with the same three
+    shape: tuple[int, int]  # how many free entries and increments there are
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,7 @@ import numpy as np
 
 from armcal.base.arrays import Array
 
-PRINTED = 2e-3
-"""A printed matrix may be so far from a rotation, entry by entry; it is taken for the nearest one."""
+PRINTED = 2e-3  # A printed matrix may be so far from a rotation, entry by entry; it is taken for the nearest one
 
 
 def quaternion_matrix(q: Array) -> Array:

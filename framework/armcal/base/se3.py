@@ -16,8 +16,7 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.plugins import refuse
 
-Expression = Any
-"""A CasADi ``SX`` (or a number where a constant is meant)."""
+Expression = Any  # A CasADi ``SX`` (or a number where a constant is meant)
 
 if hasattr(ca.GlobalOptions, "setNumpyMode"):
     # A plugin may call numpy's functions on expressions: shapes are those of every version of CasADi, and no notice.

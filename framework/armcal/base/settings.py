@@ -81,17 +81,11 @@ InputPath: TypeAlias = Annotated[Path, BeforeValidator(_resolve)]
 
 @dataclass(frozen=True)
 class Kind:
-    """What a field takes.
+    """What a field takes."""
 
-    Attributes:
-        dimension: of the quantity it holds; None: not a quantity.
-        takes_text: ordinary text is a value too (``Angle | Literal["off"]``).
-        maps: the quantity may stand inside a mapping by name (``dict[str, Length]``).
-    """
-
-    dimension: str | None = None
-    takes_text: bool = False
-    maps: bool = False
+    dimension: str | None = None  # of the quantity it holds; None: not a quantity
+    takes_text: bool = False  # ordinary text is a value too (``Angle | Literal["off"]``)
+    maps: bool = False  # the quantity may stand inside a mapping by name (``dict[str, Length]``)
 
 
 def kind_of(annotations: Iterable[Any]) -> Kind:

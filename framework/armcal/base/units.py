@@ -115,8 +115,7 @@ _WRITTEN: Mapping[str, str] = MappingProxyType(
 """Units whose names, made for keys of a file, are not how people write them: their first spelling."""
 _NEAR_UNIT = 1.24
 """What sag and play may make of a gain. The nearest two, of inches in metres and in millimetres, are 1.55 apart."""
-SMALLEST_SHOWN = 0.0001
-"""Of sizes in mm, px and other thousandths: no instrument reads less."""
+SMALLEST_SHOWN = 0.0001  # Of sizes in mm, px and other thousandths: no instrument reads less
 _LONGEST_FIRST = tuple(sorted((n for n in UNITS if n != "1"), key=len, reverse=True))
 _QUANTITY = re.compile(r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*(\S.*?)?\s*", re.DOTALL)
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?[0-9]+,[0-9]+")

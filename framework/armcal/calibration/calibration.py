@@ -386,15 +386,12 @@ class Accepted:
     """A calibration as it is accepted.
 
     Attributes:
-        calibration: with a note of its acceptance and predictions at its check poses as they are now.
-        was_edited: its content is not what armcal wrote.
-        was_needed: false for one that is as armcal wrote it, with the same versions.
         moved_m: how far tools at its check poses are from where they were predicted (m); None if it keeps none.
     """
 
-    calibration: Calibration
-    was_edited: bool
-    was_needed: bool
+    calibration: Calibration  # with a note of its acceptance and predictions at its check poses as they are now
+    was_edited: bool  # its content is not what armcal wrote
+    was_needed: bool  # false for one that is as armcal wrote it, with the same versions
     moved_m: float | None
 
 

@@ -45,17 +45,11 @@ _SAME_MOUNT = 1e-9
 
 @dataclass(frozen=True)
 class ConvertSource:
-    """What is converted.
+    """What is converted."""
 
-    Attributes:
-        arm: the arm's instance name.
-        chain: of constants: nominal ones of a configuration, calibrated ones of a calibration.
-        left: what of the file belongs to the arm and is not in the chain, in words.
-    """
-
-    arm: str
-    chain: Chain
-    left: tuple[str, ...]
+    arm: str  # the arm's instance name
+    chain: Chain  # of constants: nominal ones of a configuration, calibrated ones of a calibration
+    left: tuple[str, ...]  # what of the file belongs to the arm and is not in the chain, in words
 
 
 @dataclass(frozen=True)
@@ -155,8 +149,7 @@ def _described(
 
 _DIGITS = 15
 BASE, TIP = "base_link", "tip_link"
-UNKNOWN = "0"
-"""What a URDF has to state and nobody knows: effort, velocity, and the travel of a sliding joint."""
+UNKNOWN = "0"  # What a URDF has to state and nobody knows: effort, velocity, and the travel of a sliding joint
 
 
 def poe_section(chain: RigidChain) -> dict[str, Any]:
@@ -246,10 +239,8 @@ def _attribute(text: str) -> str:
 
 
 Convention = Literal["standard", "craig"]
-NEARLY_PARALLEL = 0.01
-"""Sine of an angle between axes."""
-_MEET = 0.005
-"""m: axes that pass each other at less have their common normal's sense chosen by its direction."""
+NEARLY_PARALLEL = 0.01  # Sine of an angle between axes
+_MEET = 0.005  # m: axes that pass each other at less have their common normal's sense chosen by its direction
 _SIDEWAYS = 0.1
 _NOWHERE = 1e-13
 _NOTHING = 1e-15

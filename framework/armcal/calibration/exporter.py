@@ -22,8 +22,7 @@ from armcal.calibration.rigid_chain import tool_poses
 from armcal.calibration.tool_expression import ToolExpression, arm_expression
 from armcal.errors import NotConvergedError
 
-POSES = 1000
-"""So many random poses, within the joints' limits, are compared."""
+POSES = 1000  # So many random poses, within the joints' limits, are compared
 _LONGEST_M = 1.0
 _FARTHEST = {"angle": math.pi, "length": _LONGEST_M}
 _WIDEST = {"angle": 4 * math.pi, "length": 100.0}
@@ -35,15 +34,12 @@ class Origin:
     """Where the numbers of an export come from.
 
     Attributes:
-        experiment: the calibration's name.
-        created: when it was made (ISO 8601).
-        software: versions by name.
         identity: hashes of what it was made from, by name (``arm``, ``data``).
     """
 
-    experiment: str = ""
-    created: str = ""
-    software: Mapping[str, str] = field(default_factory=dict)
+    experiment: str = ""  # the calibration's name
+    created: str = ""  # when it was made (ISO 8601)
+    software: Mapping[str, str] = field(default_factory=dict)  # versions by name
     identity: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -67,29 +63,22 @@ class ExportRequest:
     """What is to be written: an arm, its instance name, and its calibrated parameters by full name.
 
     Attributes:
-        name: the arm's instance name.
-        arm: the arm.
-        values: its own calibrated parameters by full name (SI).
         tilt: how the real gravity is turned from the stated one, by full name (``statics.gravity_rx``; rad).
-        environment: what acts where nothing is said.
-        payload_stated: whether the calibration says what hangs on the tool.
         entries: what the calibration says of each number: unit, nominal value, value, standard deviation.
         description: the arm as a configuration in SI units: ``model``, ``effects``, ``links``.
-        origin: where the numbers come from.
-        out: the name of the file that is written, for formats whose files name one another.
         instruments: measurements by name: their settings, and what the calibration says of their numbers.
     """
 
-    name: str
-    arm: Arm
-    values: Mapping[str, Array]
+    name: str  # the arm's instance name
+    arm: Arm  # the arm
+    values: Mapping[str, Array]  # its own calibrated parameters by full name (SI)
     tilt: Mapping[str, Array] = field(default_factory=dict)
-    environment: Environment = _NOTHING
-    payload_stated: bool = True
+    environment: Environment = _NOTHING  # what acts where nothing is said
+    payload_stated: bool = True  # whether the calibration says what hangs on the tool
     entries: tuple[ParameterRecord, ...] = ()
     description: Mapping[str, Any] = field(default_factory=dict)
-    origin: Origin = field(default_factory=Origin)
-    out: str = ""
+    origin: Origin = field(default_factory=Origin)  # where the numbers come from
+    out: str = ""  # the name of the file that is written, for formats whose files name one another
     instruments: Mapping[str, Instrument] = field(default_factory=dict)
 
     def expression(self, conditions: Sequence[str] = ()) -> ToolExpression:
@@ -111,20 +100,15 @@ class Exported:
     """A file's content, how many of the arm's numbers changed in it, and what of the arm it cannot hold.
 
     Attributes:
-        content: of the file that was asked for.
-        changed: how many numbers are not the nominal ones.
-        left_out: what the format cannot hold.
-        companions: further files by name, which are written beside it.
-        remarks: what whoever uses the files should know, a sentence each.
         reach: how far what is left out moves the tool, at most over random poses (m), where the exporter measured it;
             None for all effects together, which armcal measures.
     """
 
-    content: bytes
-    changed: int
-    left_out: tuple[str, ...] = ()
-    companions: Mapping[str, bytes] = field(default_factory=dict)
-    remarks: tuple[str, ...] = ()
+    content: bytes  # of the file that was asked for
+    changed: int  # how many numbers are not the nominal ones
+    left_out: tuple[str, ...] = ()  # what the format cannot hold
+    companions: Mapping[str, bytes] = field(default_factory=dict)  # further files by name, which are written beside it
+    remarks: tuple[str, ...] = ()  # what whoever uses the files should know, a sentence each
     reach: float | None = None
 
 

@@ -38,10 +38,8 @@ from armcal.problem.drift import Chain, chain, with_drift
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.readings import reading_slopes, with_joint_noise
 
-_AT_ONCE = 1000
-"""Records whose slopes are in memory together."""
-_FORGOTTEN = 5.0
-"""So many correlation distances beyond the recording nothing is known of its drift."""
+_AT_ONCE = 1000  # Records whose slopes are in memory together
+_FORGOTTEN = 5.0  # So many correlation distances beyond the recording nothing is known of its drift
 _DIGITS = 12
 
 
@@ -103,7 +101,6 @@ class PlusMinus:
         shift: what the drift of the recording adds to each predicted channel (N each; zero in a new recording).
         deviations: standard deviation of each channel (N each; SI), not stretched; none of a measurement whose residual
             does not follow from its readings.
-        half_widths: of 90 % intervals, stretched as cross-validation found (N each).
         radii: of each position measurement by name: of a ball about the prediction that holds 95 % (N each; m).
         covariances: of each position measurement by name, stretched as half widths are (N x 3 x 3 each; m^2).
         turns: of each pose measurement by name: angles that 90 % of the orientations lie within (N each; rad).
@@ -112,7 +109,7 @@ class PlusMinus:
 
     shift: dict[str, Array]
     deviations: dict[str, Array]
-    half_widths: dict[str, Array]
+    half_widths: dict[str, Array]  # of 90 % intervals, stretched as cross-validation found (N each)
     radii: dict[str, Array]
     covariances: dict[str, Array] = field(default_factory=dict)
     turns: dict[str, Array] = field(default_factory=dict)
@@ -150,25 +147,15 @@ def recording_record(problem: Problem, dataset: Dataset, fitted: Sequence[Factor
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What a calibration knows of its own errors.
+    """What a calibration knows of its own errors."""
 
-    Attributes:
-        system: arms and measurements.
-        parameters: as fitted: free ones free, about the nominal values of the fit.
-        values: found.
-        record: as kept.
-        noise_scale: residuals in units of the declared noise.
-        freedom: degrees of freedom.
-        components: estimated variances, if there were any.
-    """
-
-    system: System
-    parameters: Parameters
-    values: Array
-    record: PredictionRecord
-    noise_scale: float
-    freedom: float
-    components: tuple[Component, ...] = ()
+    system: System  # arms and measurements
+    parameters: Parameters  # as fitted: free ones free, about the nominal values of the fit
+    values: Array  # found
+    record: PredictionRecord  # as kept
+    noise_scale: float  # residuals in units of the declared noise
+    freedom: float  # degrees of freedom
+    components: tuple[Component, ...] = ()  # estimated variances, if there were any
 
     def plus_minus(self, commands: Dataset, recording: Recording = "new") -> PlusMinus:
         """How far measurements at these commands may lie from predictions.

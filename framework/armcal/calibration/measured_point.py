@@ -18,8 +18,7 @@ from armcal.config.system import System
 from armcal.errors import ConfigError
 from armcal.measure.measurement import Measurement
 
-Point = Literal["tool", "target"]
-"""What arrives: the origin of the tool's frame, or the target that was measured."""
+Point = Literal["tool", "target"]  # What arrives: the origin of the tool's frame, or the target that was measured
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _SAME_M = 1e-9
@@ -30,14 +29,12 @@ class MeasuredPoint:
     """What a measurement reads of a tool.
 
     Attributes:
-        measurement: its instance name.
-        tool_T_target: the pose of the target (4 x 4).
         fitted: whether free parameters of the measurement say where the target sits: the records then determine where
             the target goes, and not where the tool's origin is beside it.
     """
 
-    measurement: str
-    tool_T_target: Array
+    measurement: str  # its instance name
+    tool_T_target: Array  # the pose of the target (4 x 4)
     fitted: bool = False
 
     @property

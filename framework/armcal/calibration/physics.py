@@ -32,10 +32,8 @@ from armcal.plugins import PluginRegistry
 from armcal.problem.problem import Problem
 from armcal.version import __version__
 
-SHARE = 0.05
-"""Of a stated half width or radius: predictions that moved by more are not those of the calibration."""
-UNSTATED_M = 1e-5
-"""The same where no accuracy of the tool is stated: below what any tracker can resolve."""
+SHARE = 0.05  # Of a stated half width or radius: predictions that moved by more are not those of the calibration
+UNSTATED_M = 1e-5  # The same where no accuracy of the tool is stated: below what any tracker can resolve
 CHECK_POSES = 8
 
 
@@ -72,17 +70,11 @@ class CheckRecord(Settings):
 
 @dataclass(frozen=True)
 class Movement:
-    """How far predictions at check poses are from what they were.
+    """How far predictions at check poses are from what they were."""
 
-    Attributes:
-        tool_m: the farthest that a tool's position moved, or a point 1 m from it by its rotation (m).
-        share: the largest movement of a channel or tool, in units of what is stated for it.
-        name: of that channel or arm.
-    """
-
-    tool_m: float
-    share: float
-    name: str
+    tool_m: float  # the farthest that a tool's position moved, or a point 1 m from it by its rotation (m)
+    share: float  # the largest movement of a channel or tool, in units of what is stated for it
+    name: str  # of that channel or arm
 
 
 def readable(system: System) -> Mapping[str, Measurement]:

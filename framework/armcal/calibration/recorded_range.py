@@ -34,19 +34,12 @@ def recorded_ranges(dataset: Dataset, arms: Mapping[str, Arm], payload: float | 
 
 @dataclass(frozen=True)
 class RecordedRange:
-    """Where predictions were tested, by channel; in SI.
+    """Where predictions were tested, by channel; in SI."""
 
-    Attributes:
-        names: what messages call each channel.
-        units: in which they show it.
-        ends: smallest and largest recorded value (C x 2); infinite where none is known.
-        limits: the same with their margins (C x 2).
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    ends: Array
-    limits: Array
+    names: tuple[str, ...]  # what messages call each channel
+    units: tuple[str, ...]  # in which they show it
+    ends: Array  # smallest and largest recorded value (C x 2); infinite where none is known
+    limits: Array  # the same with their margins (C x 2)
 
     @classmethod
     def of(cls, ranges: Ranges, channels: Sequence[str], arms: Mapping[str, Arm]) -> Self:

@@ -14,37 +14,24 @@ from armcal.base.arrays import Array
 from armcal.base.se3 import Transform, evaluated
 from armcal.errors import ProblemError
 
-NEGLIGIBLE = 1e-12
-"""m/rad, rad/m or 1: what rounding leaves of a pitch, of a turn, and of a difference of scale."""
+NEGLIGIBLE = 1e-12  # m/rad, rad/m or 1: what rounding leaves of a pitch, of a turn, and of a difference of scale
 FREE_ANGLE, FREE_TRAVEL = math.pi, 0.5
 _WIDEST = 4 * math.pi
 
 
 @dataclass(frozen=True)
 class RigidJoint:
-    """One joint at zero angles.
+    """One joint at zero angles."""
 
-    Attributes:
-        name: the joint's name.
-        base_T_joint: its frame (4x4).
-        axis: about or along which it moves (unit, in its frame).
-        slides: whether it slides.
-        pitch: how far it slides as it turns (m/rad); of a joint that slides, how far it turns (rad/m).
-        scale: how far it moves for a command of one.
-        limits: of its command (rad or m), if known.
-        endless: whether it turns on and on.
-        mimic: the joint that it follows.
-    """
-
-    name: str
-    base_T_joint: Array
-    axis: Array
-    slides: bool
-    pitch: float = 0.0
-    scale: float = 1.0
-    limits: tuple[float, float] | None = None
-    endless: bool = False
-    mimic: Mimic | None = None
+    name: str  # the joint's name
+    base_T_joint: Array  # its frame (4x4)
+    axis: Array  # about or along which it moves (unit, in its frame)
+    slides: bool  # whether it slides
+    pitch: float = 0.0  # how far it slides as it turns (m/rad); of a joint that slides, how far it turns (rad/m)
+    scale: float = 1.0  # how far it moves for a command of one
+    limits: tuple[float, float] | None = None  # of its command (rad or m), if known
+    endless: bool = False  # whether it turns on and on
+    mimic: Mimic | None = None  # the joint that it follows
 
     @property
     def direction(self) -> Array:

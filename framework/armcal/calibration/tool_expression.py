@@ -31,28 +31,21 @@ class ToolExpression(ElasticPass):
     """One arm whose parameters are numbers.
 
     Attributes:
-        name: the arm's instance name.
-        arm: without effects that only let some displacements be set.
-        joints: the commanded ones (n).
         channels: of ``record``, in this order: the joints, ``approach.JOINT`` of each, LOAD_CHANNELS, conditions.
-        defaults: of each channel where nothing is said; commands and approaches are zero.
         record: symbols, one a channel (commands in rad or m, approaches -1 to 1, loads in SI, in the base frame).
-        base_T_tool: at ``state``.
         origins: of the mount and of each joint's frame in the base frame, at ``state`` (3x1 each; m).
-        efforts: about or along the axes of all joints of the chain, at ``state`` (N m, N on sliding joints).
-        servos: by commanded joint, which displacements can be set.
         tool_T_point: the point of the tool that ``base_T_tool`` is of (constant); the tool itself unless ``at`` chose.
     """
 
-    name: str
-    arm: Arm
-    joints: tuple[str, ...]
+    name: str  # the arm's instance name
+    arm: Arm  # without effects that only let some displacements be set
+    joints: tuple[str, ...]  # the commanded ones (n)
     channels: tuple[str, ...]
-    defaults: Array
-    base_T_tool: Transform
+    defaults: Array  # of each channel where nothing is said; commands and approaches are zero
+    base_T_tool: Transform  # at ``state``
     origins: tuple[Expression, ...]
-    efforts: Expression
-    servos: Mapping[str, tuple[PulseTable, PulseClock]]
+    efforts: Expression  # about or along the axes of all joints of the chain, at ``state`` (N m, N on sliding joints)
+    servos: Mapping[str, tuple[PulseTable, PulseClock]]  # by commanded joint, which displacements can be set
     tool_T_point: Transform = field(default_factory=se3.identity)
 
     def at(self, tool_T_point: Transform) -> Self:

@@ -21,8 +21,7 @@ from armcal.run.experiment import Experiment
 from armcal.run.prepare import Prepared, Stopwatch, assemble, gravity_findings
 
 _MM = 1000.0
-_TILTED = 0.05
-"""Of gravity: what changes by less where the base was found is not worth a line."""
+_TILTED = 0.05  # Of gravity: what changes by less where the base was found is not worth a line
 
 
 @click.command()

@@ -20,8 +20,7 @@ from armcal.run.compensate import Assessed, Bench, TargetFile, assess, check_uni
 
 _SHOWN = 5
 _SAME_POINT_M = 1e-5
-_AT_THE_TARGET_MM = 1e-3
-"""A command so near was found, and something else keeps the arm from it."""
+_AT_THE_TARGET_MM = 1e-3  # A command so near was found, and something else keeps the arm from it
 _ARRIVES = {"tool": "by the tool frame's origin", "target": "by the measured target"}
 
 

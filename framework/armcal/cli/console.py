@@ -14,8 +14,7 @@ from rich.text import Text
 
 from armcal.base.config_text import shown
 
-_CUT = "\u2026"
-"""What rich ends a word with that its column has no room for."""
+_CUT = "\u2026"  # What rich ends a word with that its column has no room for
 
 
 def say(text: str, err: bool = False) -> None:
@@ -23,13 +22,9 @@ def say(text: str, err: bool = False) -> None:
 
 
 class Output(io.FileIO):
-    """Standard output or error: nothing raises where it is written, so that `| head` ends no run half way.
+    """Standard output or error: nothing raises where it is written, so that `| head` ends no run half way."""
 
-    Attributes:
-        fault: why nothing more can be written; None while it can.
-    """
-
-    fault: OSError | None = None
+    fault: OSError | None = None  # why nothing more can be written; None while it can
 
     @classmethod
     def instead_of(cls, stream: TextIO) -> io.TextIOWrapper:

@@ -24,8 +24,7 @@ from armcal.errors import ArmcalError, PluginError
 from armcal.io.file_set import write_over
 from armcal.plugins import PluginRegistry
 
-LARGEST = 1e-9
-"""m and rad: a conversion that is further off is not written."""
+LARGEST = 1e-9  # m and rad: a conversion that is further off is not written
 
 
 @click.command()

@@ -23,8 +23,7 @@ from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
 
 ALL_CALL = 0x70
-ADDRESSES = (0x40, 0x77)
-"""The lowest and the highest that a board's pins may set; 0x78 to 0x7f are reserved. [PCA9685]"""
+ADDRESSES = (0x40, 0x77)  # The lowest and the highest that a board's pins may set; 0x78 to 0x7f are reserved. [PCA9685]
 CHANNELS = 16
 
 _PLAIN = re.compile(r"[A-Za-z_]\w*")

@@ -93,8 +93,7 @@ class SystemSettings(Settings):
 
 _FARTHEST_LENGTHS, _FARTHEST_M = 1.5, 0.5
 """A centre of mass is no farther from its frame: in lengths of the arm from joint to joint, and beyond (m)."""
-ASSUMED_GRAVITY = (0.0, 0.0, -9.80665)
-"""m/s^2, on the earth with z up, where it is not stated. [Williams2024]"""
+ASSUMED_GRAVITY = (0.0, 0.0, -9.80665)  # m/s^2, on the earth with z up, where it is not stated. [Williams2024]
 
 
 @dataclass(frozen=True)
@@ -102,15 +101,12 @@ class System:
     """What is calibrated and measured.
 
     Attributes:
-        arms: by instance name.
-        measurements: by instance name.
-        statics: as stated.
         description: arms, measurements and statics as a configuration in SI units, complete and self-contained.
     """
 
-    arms: Mapping[str, Arm]
-    measurements: Mapping[str, Measurement]
-    statics: StaticsSettings
+    arms: Mapping[str, Arm]  # by instance name
+    measurements: Mapping[str, Measurement]  # by instance name
+    statics: StaticsSettings  # as stated
     description: Mapping[str, Any]
 
     @property

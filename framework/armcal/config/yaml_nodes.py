@@ -123,21 +123,13 @@ def dotted(path: tuple[Step, ...]) -> str:
 
 @dataclass(frozen=True)
 class Origin:
-    """What a text was read from.
+    """What a text was read from."""
 
-    Attributes:
-        label: the file's name for people, or the command line's argument.
-        base_dir: what relative paths in it are relative to.
-        root: the directory that paths in it may not leave; None: anywhere.
-        numbered: whether its lines mean anything to the user.
-        prefix: the path below which the text's root value stands.
-    """
-
-    label: str
-    base_dir: Path
-    root: Path | None = None
-    numbered: bool = True
-    prefix: tuple[Step, ...] = ()
+    label: str  # the file's name for people, or the command line's argument
+    base_dir: Path  # what relative paths in it are relative to
+    root: Path | None = None  # the directory that paths in it may not leave; None: anywhere
+    numbered: bool = True  # whether its lines mean anything to the user
+    prefix: tuple[Step, ...] = ()  # the path below which the text's root value stands
 
     def at(self, line: int | None, path: tuple[Step, ...] | None = None) -> Location:
         shown = dotted(self.prefix if path is None else path)

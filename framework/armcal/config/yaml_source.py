@@ -30,8 +30,7 @@ from armcal.io.plain_files import input_bytes
 
 __all__ = ["ConfigSource", "ConfigText", "find_key", "load_config", "resolve_path"]
 
-MAX_BYTES = 16 << 20
-"""A calibration with 600 free parameters, or with 50 000 records of a drift, is smaller."""
+MAX_BYTES = 16 << 20  # A calibration with 600 free parameters, or with 50 000 records of a drift, is smaller
 MAX_FILES = 32
 
 
@@ -50,18 +49,14 @@ class ConfigSource:
     """A merged configuration and where each value was written.
 
     Attributes:
-        data: plain nested dicts, lists and scalars; every text is a `ConfigText`.
         marks: file and line of the value at each path, such as ``("rows", 2, "d_mm")``; ``()`` is the whole.
-        path: the config that was asked for.
-        root: the directory that no path in it may leave.
-        files: every file read, the one asked for first.
     """
 
-    data: dict[str, Any]
+    data: dict[str, Any]  # plain nested dicts, lists and scalars; every text is a `ConfigText`
     marks: Mapping[tuple[Step, ...], Location]
-    path: Path
-    root: Path
-    files: tuple[Path, ...]
+    path: Path  # the config that was asked for
+    root: Path  # the directory that no path in it may leave
+    files: tuple[Path, ...]  # every file read, the one asked for first
 
     def where(self, path: tuple[Step, ...]) -> Location:
         """The place of a path, or of its nearest parent that was written; ``("d",)`` also finds ``d_mm``."""
@@ -252,8 +247,7 @@ def _scalar(node: Node, path: tuple[Step, ...]) -> Any:
     return node.value
 
 
-VARIANTS = ("study", "variants")
-"""Where a study lists its variants; the section is no part of any."""
+VARIANTS = ("study", "variants")  # Where a study lists its variants; the section is no part of any
 _KEYS = ("extends", "set", "add")
 
 

@@ -37,27 +37,19 @@ from armcal.estimate.validation import FitTask, JudgedFit, Recording, Split, fai
 from armcal.estimate.variance import apply_components
 from armcal.problem.problem import FactorRecords, Problem
 
-Residuals = tuple[Array, ...]
-"""Raw residuals, one (n_r x N) a factor."""
-FEWEST = 40
-"""Judged records for a stretch to be found."""
+Residuals = tuple[Array, ...]  # Raw residuals, one (n_r x N) a factor
+FEWEST = 40  # Judged records for a stretch to be found
 LEVEL = 0.05
 _MEANT = {"same": "", "new": " without the known drift, as in a new recording,"}
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Residuals of judged records in units of what was predicted; nan where there was no fit to judge, or no residual.
+    """Residuals of judged records in units of what was predicted; nan where nothing was judged."""
 
-    Attributes:
-        errors: residual numbers over their standard deviations, all factors stacked (n_r x N).
-        reaches: lengths of position residuals over their 95 % radii, one row a position factor (n_p x N).
-        freedom: degrees of freedom of the fit that judged each record (N).
-    """
-
-    errors: Array
-    reaches: Array
-    freedom: Array
+    errors: Array  # residual numbers over their standard deviations, all factors stacked (n_r x N)
+    reaches: Array  # lengths of position residuals over their 95 % radii, one row a position factor (n_p x N)
+    freedom: Array  # degrees of freedom of the fit that judged each record (N)
 
     def of_level(self, level: float) -> Array:
         """Sizes of residuals over half the widths of their intervals (n_r x N)."""
@@ -87,19 +79,16 @@ class Coverage:
 
     Attributes:
         records, coordinates: how many records and numbers were judged.
-        raw: share within the intervals as computed, one a level of ``LEVELS``.
-        raw_radius: share of positions within 95 % radii; None without positions.
         stretched, stretched_radius: the same by stretches of other records; None where there were too few.
-        independent: how many independent numbers the judged ones are worth.
     """
 
     records: int
     coordinates: int
-    raw: tuple[float, ...]
-    raw_radius: float | None
+    raw: tuple[float, ...]  # share within the intervals as computed, one a level of ``LEVELS``
+    raw_radius: float | None  # share of positions within 95 % radii; None without positions
     stretched: tuple[float, ...] | None
     stretched_radius: float | None
-    independent: float
+    independent: float  # how many independent numbers the judged ones are worth
 
     @property
     def stated(self) -> tuple[float, ...]:

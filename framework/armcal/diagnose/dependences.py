@@ -30,8 +30,7 @@ from armcal.measure.measurement import NamesMistakes
 from armcal.problem.motion import Motion, recorded_order
 from armcal.problem.problem import FactorRecords, Problem
 
-MOST_LEVELS = 12
-"""Levels of a joint are separated one by one up to so many; beyond, by a cubic."""
+MOST_LEVELS = 12  # Levels of a joint are separated one by one up to so many; beyond, by a cubic
 _SLOW = 3
 _CUBIC = 3
 _AXES = ("x", "y", "z")
@@ -54,25 +53,18 @@ class Dependence:
         kind: ``held``, ``order``, ``level``, ``approach``, ``coupling``, ``torque``, ``moment``, ``delay``,
             ``payload``, ``temperature``; of what is outside of the arm ``step``, ``slip``, ``gravity``, ``load``,
             ``scale``.
-        subject: the joint or site, as a user names it; empty where it is none.
-        arm: the arm's name; empty where it is none.
-        words: what residuals depend on, as the end of a sentence.
-        effect: the effect that would model it, and on what; empty if there is none.
-        measure: which measurement would show it.
-        columns: raw residual by coefficient, one (n_r x N x k) array a factor.
-        labels: what each coefficient is (k), for those that have a unit.
         unit: of the coefficients in SI (``rad``, ``m``, ``rad_per_Nm``; ``1`` for shares); empty if they have none.
         jumps: whether it is a change at one place of the recording; the same change elsewhere is no other cause.
     """
 
     kind: str
-    subject: str
-    arm: str
-    words: str
-    effect: str
-    measure: str
-    columns: tuple[Array, ...]
-    labels: tuple[str, ...] = ()
+    subject: str  # the joint or site, as a user names it; empty where it is none
+    arm: str  # the arm's name; empty where it is none
+    words: str  # what residuals depend on, as the end of a sentence
+    effect: str  # the effect that would model it, and on what; empty if there is none
+    measure: str  # which measurement would show it
+    columns: tuple[Array, ...]  # raw residual by coefficient, one (n_r x N x k) array a factor
+    labels: tuple[str, ...] = ()  # what each coefficient is (k), for those that have a unit
     unit: str = ""
     jumps: bool = False
 
@@ -327,17 +319,14 @@ class NoiseTrend:
     """What the scatter depends on.
 
     Attributes:
-        words: as the end of a sentence.
-        p_value: that it does not, over all things looked at.
         low, high: scatter in units of the declared noise, in the third of the records with the least and most of it.
-        alternatives: what else may be meant, the most likely first.
     """
 
-    words: str
-    p_value: float
+    words: str  # as the end of a sentence
+    p_value: float  # that it does not, over all things looked at
     low: float
     high: float
-    alternatives: tuple[str, ...]
+    alternatives: tuple[str, ...]  # what else may be meant, the most likely first
 
 
 def noise_trend(residual: Array, basis: Array, by_record: Indices, here: Records, place: Array) -> NoiseTrend | None:
@@ -387,19 +376,15 @@ class Repeats:
     """What records of one pose say of noise.
 
     Attributes:
-        scatter_mm: of a record about the mean of its pose (root mean square).
-        left_mm: of all residuals (root mean square).
         records, poses: how many repeats there are, and of how many poses.
-        p_value: that residuals are as repeats have them.
-        shared: whether the means of poses nearby miss alike.
     """
 
-    scatter_mm: float
-    left_mm: float
+    scatter_mm: float  # of a record about the mean of its pose (root mean square)
+    left_mm: float  # of all residuals (root mean square)
     records: int
     poses: int
-    p_value: float
-    shared: bool
+    p_value: float  # that residuals are as repeats have them
+    shared: bool  # whether the means of poses nearby miss alike
 
     @property
     def exceeded(self) -> bool:

@@ -28,17 +28,14 @@ class PriorsAlone:
     """What combinations that only priors hold do to the tip.
 
     Attributes:
-        worst_mm: the largest standard deviation of the tip that they leave, over the poses looked at.
         between_mm: the same at any pose: where joints stand between recorded positions too, approached from either
             recorded side.
-        poses: how many unseen poses of each kind were looked at.
-        up_to: motions that were left out, because nothing that was measured sees them; empty where none were.
     """
 
-    worst_mm: float
+    worst_mm: float  # the largest standard deviation of the tip that they leave, over the poses looked at
     between_mm: float
-    poses: int
-    up_to: str = ""
+    poses: int  # how many unseen poses of each kind were looked at
+    up_to: str = ""  # motions that were left out, because nothing that was measured sees them; empty where none were
 
 
 @dataclass(frozen=True)

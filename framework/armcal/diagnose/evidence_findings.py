@@ -19,16 +19,12 @@ from armcal.estimate.estimator import AT_BOUND, Estimate
 from armcal.estimate.validation import Halves
 
 MOST_TOLD = 5
-FEW_NAMED = 2
-"""So many combinations that only priors hold are named in the verdict; armcal identify names all."""
-_LIKELY = 0.05
-"""A cause with less of the odds is not named first."""
-NEGLIGIBLE_SHARE = 0.1
-"""Of the typical error: what moves the tip by less than this does not matter to it."""
+FEW_NAMED = 2  # So many combinations that only priors hold are named in the verdict; armcal identify names all
+_LIKELY = 0.05  # A cause with less of the odds is not named first
+NEGLIGIBLE_SHARE = 0.1  # Of the typical error: what moves the tip by less than this does not matter to it
 _NO_NOISE = 0.01
 """Of the declared noise: residuals below it are a simulation's without noise, and how they vary means nothing."""
-NOTICEABLE_SD = 0.3
-"""A shift by less than so many standard deviations is not reported."""
+NOTICEABLE_SD = 0.3  # A shift by less than so many standard deviations is not reported
 WORSE, POWER = 0.01, 0.9
 """Level of a loss against the nominal arm, and which share of losses of the size stated is found."""
 _MM = "mm"

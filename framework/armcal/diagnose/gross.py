@@ -24,29 +24,19 @@ _POSES = 60
 _FEWEST_LENGTHS = 3
 AS_MUCH, BY_SHARES = 0.01, 0.05
 """Levels at which lengths are off in proportion: against each off by as much, and each by a share of its own."""
-_SAME_MOTION = 0.02
-"""Of a parameter's motion of the tool: what may differ from that of the base or of the tool's point."""
+_SAME_MOTION = 0.02  # Of a parameter's motion of the tool: what may differ from that of the base or of the tool's point
 
 
 @dataclass(frozen=True)
 class Displaced:
-    """A parameter far from its nominal value.
+    """A parameter far from its nominal value."""
 
-    Attributes:
-        name: of its coordinate.
-        amount: how far, in ``unit``.
-        unit: that people are shown.
-        times: how many standard deviations of its prior, or typical corrections.
-        by_prior: whether it has a prior.
-        placement: whether it only moves where the base stands or which point of the tool is meant.
-    """
-
-    name: str
-    amount: float
-    unit: str
-    times: float
-    by_prior: bool
-    placement: bool
+    name: str  # of its coordinate
+    amount: float  # how far, in ``unit``
+    unit: str  # that people are shown
+    times: float  # how many standard deviations of its prior, or typical corrections
+    by_prior: bool  # whether it has a prior
+    placement: bool  # whether it only moves where the base stands or which point of the tool is meant
 
 
 @dataclass(frozen=True)
@@ -54,15 +44,12 @@ class Proportion:
     """By how much lengths of the arm are longer than nominal, all in proportion, as a scale that is off makes them.
 
     Attributes:
-        count: how many lengths.
-        share: of each length, by which it is longer.
-        sd: of the share: lengths that differ from nominal each by its own, and how well they are known.
         freedoms: all lengths less one, and as many as carry the share, less one: one long one that is off is no scale.
     """
 
-    count: int
-    share: float
-    sd: float
+    count: int  # how many lengths
+    share: float  # of each length, by which it is longer
+    sd: float  # of the share: lengths that differ from nominal each by its own, and how well they are known
     freedoms: tuple[float, float]
 
     @classmethod
@@ -88,20 +75,17 @@ class Figure:
     """The calibrated arm beside the nominal one.
 
     Attributes:
-        reach_mm: largest distance of the nominal tool from the first joint, over the poses.
         size: extent of the calibrated tool positions by that with nominal lengths and all else calibrated: a joint's
             wrong zero is no size; nan where they do not move.
         moved_mm, turned_deg: how the calibrated arm as a whole stands away from where the configuration has it.
-        displaced: parameters beyond what their priors say, the farthest first.
-        proportion: of its free lengths; None where they are too few.
     """
 
-    reach_mm: float
+    reach_mm: float  # largest distance of the nominal tool from the first joint, over the poses
     size: float
     moved_mm: float
     turned_deg: float
-    displaced: tuple[Displaced, ...]
-    proportion: Proportion | None = None
+    displaced: tuple[Displaced, ...]  # parameters beyond what their priors say, the farthest first
+    proportion: Proportion | None = None  # of its free lengths; None where they are too few
 
 
 def thinned(chosen: Indices, most: int) -> Indices:

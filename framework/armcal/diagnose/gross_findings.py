@@ -41,8 +41,7 @@ _MOVED = (
 )
 SIZE, GROSS_SIZE = 0.02, 0.05
 """How far the calibrated arm may be larger or smaller than the nominal one: worth a look, and gross."""
-EXACT = 1e-5
-"""Of the reach, 10 um a metre: no arm follows a model so closely, and no instrument measures it so well."""
+EXACT = 1e-5  # Of the reach, 10 um a metre: no arm follows a model so closely, and no instrument measures it so well
 MOST_NAMED = 3
 
 

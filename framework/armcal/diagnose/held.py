@@ -22,33 +22,22 @@ from armcal.problem.problem import FactorRecords, Problem
 Moves = Mapping[str, tuple[Array, ...]]
 """How raw residuals move with each increment of a parameter, by its name (n_r x N x k a factor)."""
 MOST_RECORDS = 60
-MISTAKEN = 0.001
-"""Level of each parameter that a mistake names."""
-OFF = 0.05
-"""Level of a scale, on which every length depends."""
+MISTAKEN = 0.001  # Level of each parameter that a mistake names
+OFF = 0.05  # Level of a scale, on which every length depends
 _DETERMINED = 1e-6
 _RANK = 1e-9
 
 
 @dataclass(frozen=True)
 class HeldParameter:
-    """A parameter that was not free.
+    """A parameter that was not free."""
 
-    Attributes:
-        name: in full.
-        unit: SI.
-        value: at which it is held.
-        off: by how much it should differ from that.
-        sd: standard deviation of that, rows of a record that err alike counted; infinite if records do not show it.
-        freedom: degrees of freedom of that deviation.
-    """
-
-    name: str
-    unit: str
-    value: float
-    off: float
-    sd: float
-    freedom: float
+    name: str  # in full
+    unit: str  # SI
+    value: float  # at which it is held
+    off: float  # by how much it should differ from that
+    sd: float  # standard deviation of that, rows of a record that err alike counted; infinite if records do not show it
+    freedom: float  # degrees of freedom of that deviation
 
     @property
     def p_value(self) -> float:

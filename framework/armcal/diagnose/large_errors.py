@@ -19,12 +19,9 @@ from armcal.problem.factor_records import noise_roots
 from armcal.problem.motion import Motion
 from armcal.problem.problem import FactorRecords, Problem
 
-BY_CHANCE = 0.01
-"""Of recordings in which noise alone puts any record beyond the limit, where none is configured."""
-_EFFICIENCY = 0.37
-"""Of a median as a measure of spread, against all numbers."""
-UNUSUAL = 0.95
-"""What is above this share of all records is unusual."""
+BY_CHANCE = 0.01  # Of recordings in which noise alone puts any record beyond the limit, where none is configured
+_EFFICIENCY = 0.37  # Of a median as a measure of spread, against all numbers
+UNUSUAL = 0.95  # What is above this share of all records is unusual
 MOST_EXPLAINED = 50
 _ALIKE = 0.5
 _CHANCE = 0.05
@@ -36,35 +33,24 @@ class Miss:
 
     Attributes:
         record_id, row: which it is.
-        error_mm: its error, by a fit that did not see it.
-        reasons: what is unusual about it, in words.
-        advice: what to do about it.
     """
 
     record_id: str
     row: int
-    error_mm: float
-    reasons: tuple[str, ...]
-    advice: str
+    error_mm: float  # its error, by a fit that did not see it
+    reasons: tuple[str, ...]  # what is unusual about it, in words
+    advice: str  # what to do about it
 
 
 @dataclass(frozen=True)
 class LargeErrors:
-    """All records beyond the limit, the farthest first; at most ``MOST_EXPLAINED`` of them are explained.
+    """All records beyond the limit, the farthest first; at most ``MOST_EXPLAINED`` of them are explained."""
 
-    Attributes:
-        limit_mm: the limit; the median one, where it grows with how uncertain a record's prediction is.
-        configured: whether it is a setting; else it is ``noise_limit``.
-        judged: how many records were judged.
-        beyond: how many lie beyond.
-        explained: these, with reasons.
-    """
-
-    limit_mm: float
-    configured: bool
-    judged: int
-    beyond: int
-    explained: tuple[Miss, ...]
+    limit_mm: float  # the limit; the median one, where it grows with how uncertain a record's prediction is
+    configured: bool  # whether it is a setting; else it is ``noise_limit``
+    judged: int  # how many records were judged
+    beyond: int  # how many lie beyond
+    explained: tuple[Miss, ...]  # these, with reasons
 
     def in_words(self, unit: str) -> str:
         stated = f"{readable(self.limit_mm)} {unit}"
@@ -73,17 +59,11 @@ class LargeErrors:
 
 @dataclass(frozen=True)
 class Judged:
-    """What is known of every record of a dataset once it was judged.
+    """What is known of every record of a dataset once it was judged."""
 
-    Attributes:
-        errors_mm: by fits that did not see the record (N; nan where there is none).
-        residuals: raw, of each factor (n_r x N), in one sign convention.
-        position: how many records were recorded before each (N).
-    """
-
-    errors_mm: Array
-    residuals: tuple[Array, ...]
-    position: Indices
+    errors_mm: Array  # by fits that did not see the record (N; nan where there is none)
+    residuals: tuple[Array, ...]  # raw, of each factor (n_r x N), in one sign convention
+    position: Indices  # how many records were recorded before each (N)
 
 
 def noise_limit(errors: Array, rows: float) -> float:
@@ -234,10 +214,8 @@ def _along(record: int, problem: Problem, motion: Motion, judged: Judged) -> str
 
 Grade = Literal["good", "note", "warning", "bad"]
 MOST_LISTED = 10
-MOST_SUSPICIOUS = 0.2
-"""Of the training records; more of them are no outliers."""
-_SMALLEST = 1e-3
-"""Of the noise, in thousandths: smaller errors are a simulation's without noise."""
+MOST_SUSPICIOUS = 0.2  # Of the training records; more of them are no outliers
+_SMALLEST = 1e-3  # Of the noise, in thousandths: smaller errors are a simulation's without noise
 _MOST_NAMED = 5
 _TOO_MANY = "their noise is larger than the others', or the model lacks something where they are"
 _SHOWN = {"rad": (180 / np.pi, " deg"), "m": (1000.0, " mm")}

@@ -16,8 +16,7 @@ from armcal.diagnose.score_tests import FitRows
 from armcal.measure.groups import group_key
 from armcal.problem.problem import FactorRecords, Problem
 
-LEAST_SHARE = 0.1
-"""Of the records: fewer than these are outliers, which the other tests name one by one."""
+LEAST_SHARE = 0.1  # Of the records: fewer than these are outliers, which the other tests name one by one
 FAR, FAR_IN_NOISE = 7.0, 5.0
 """In standard deviations by the lower quartile of all residuals, and by the declared noise: what is far. Of three equal
 normal coordinates one record in 10^9 is."""
@@ -29,8 +28,7 @@ _SMALLEST = 1e-9
 _RUN = 0.9
 """So much of a run of records from one place on is far, and so little of those before, where something moved there."""
 
-FEWEST = 8
-"""Records of a group for it to be judged."""
+FEWEST = 8  # Records of a group for it to be judged
 _LEAST_PART = 3
 APART = 5.0
 """Parts whose means lie so many standard deviations of their records apart: neighbouring postures are alike, and so
@@ -43,15 +41,12 @@ class Minority:
     """Records that contradict the others.
 
     Attributes:
-        far: which of the records looked at.
-        typical_mm: of those that agree, what they are off by (median).
-        far_mm: of those that do not, likewise.
         since: the first of them in the recording, if it is all those from there on (or up to there); else None.
     """
 
-    far: Indices
-    typical_mm: float
-    far_mm: float
+    far: Indices  # which of the records looked at
+    typical_mm: float  # of those that agree, what they are off by (median)
+    far_mm: float  # of those that do not, likewise
     since: int | None
 
 
@@ -107,19 +102,15 @@ class Moved:
     """A group whose first records lie elsewhere than the others.
 
     Attributes:
-        measurement: whose residuals show it.
-        key: of the group.
         before, after: how many records there are of each.
-        distance: of the two means (m).
-        scatter: standard deviation of a residual's entry within the two parts (m).
     """
 
-    measurement: str
-    key: str
+    measurement: str  # whose residuals show it
+    key: str  # of the group
     before: int
     after: int
-    distance: float
-    scatter: float
+    distance: float  # of the two means (m)
+    scatter: float  # standard deviation of a residual's entry within the two parts (m)
 
 
 def moved_groups(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[Moved, ...]:

@@ -50,16 +50,14 @@ from armcal.problem.rigid_alignment import (
     tools_of,
 )
 
-MUCH_BETTER = 3.0
-"""A permutation leaves so many times less than the data as they stand."""
+MUCH_BETTER = 3.0  # A permutation leaves so many times less than the data as they stand
 FITS, MISSES = 0.15, 0.01
 """Of the spread of the positions: what a right reading leaves at most to first order, what is worth a look."""
 _EXPLAINS, _FAR_BETTER, _NOISE = (0.05, 0.08), 10.0, 3.0
 """What it leaves at most once fitted: times the noise, or of the spread, the more the worse the data as given fit."""
 _FITTED, _FIT_STEPS, _FIT_DAMPING, _FARTHEST, _DETERMINED = 5, 25, 1e-3, 8.0, 1e-3
 _MOST_RECORDS = 300
-_EQUATIONS = 2.0
-"""So many numbers a parameter are needed to separate readings."""
+_EQUATIONS = 2.0  # So many numbers a parameter are needed to separate readings
 _ALIKE = 1.5
 _SMALLEST = 1e-9
 _ROUGHLY = 2.0
@@ -69,23 +67,14 @@ _MM = 1000.0
 
 @dataclass(frozen=True)
 class PermutedAxes:
-    """A reading of the data that fits much better than the data as they stand.
+    """A reading of the data that fits much better than the data as they stand."""
 
-    Attributes:
-        measurement: whose positions.
-        readings: those that fit about as well as the best one, in words.
-        as_given_mm: what the data leave as they stand (root mean square, free parameters adapted).
-        left_mm: what the best reading leaves.
-        of_joints: whether it is joints that it reads otherwise; else axes.
-        adapted: whether free parameters were; else the arm is the nominal one.
-    """
-
-    measurement: str
-    readings: tuple[str, ...]
-    as_given_mm: float
-    left_mm: float
-    of_joints: bool
-    adapted: bool = True
+    measurement: str  # whose positions
+    readings: tuple[str, ...]  # those that fit about as well as the best one, in words
+    as_given_mm: float  # what the data leave as they stand (root mean square, free parameters adapted)
+    left_mm: float  # what the best reading leaves
+    of_joints: bool  # whether it is joints that it reads otherwise; else axes
+    adapted: bool = True  # whether free parameters were; else the arm is the nominal one
 
 
 @dataclass(frozen=True)
@@ -101,23 +90,14 @@ class _Reading:
 
 @dataclass(frozen=True)
 class _Seen:
-    """Positions of one measurement.
+    """Positions of one measurement."""
 
-    Attributes:
-        sighting: what was measured.
-        records: of its kernel alone, their noise as declared.
-        rows: what was measured a row before and a row after, in words (3 x n each, m).
-        placing: what places the arm; None where its base may not stand anywhere.
-        noise: declared, of each axis (3, m).
-        ids: of the records (n).
-    """
-
-    sighting: Sighting
-    records: FactorRecords
-    rows: tuple[tuple[str, Array], ...]
-    placing: Placing | None
-    noise: Array
-    ids: tuple[str, ...] = ()
+    sighting: Sighting  # what was measured
+    records: FactorRecords  # of its kernel alone, their noise as declared
+    rows: tuple[tuple[str, Array], ...]  # what was measured a row before and a row after, in words (3 x n each, m)
+    placing: Placing | None  # what places the arm; None where its base may not stand anywhere
+    noise: Array  # declared, of each axis (3, m)
+    ids: tuple[str, ...] = ()  # of the records (n)
 
     @property
     def measured(self) -> Array:

@@ -34,10 +34,8 @@ from armcal.measure.groups import PairedMeasurement, pose_numbers
 from armcal.problem.motion import Motion, recorded_order
 from armcal.problem.problem import Problem
 
-CLEAR = 3.0
-"""Logarithm of the odds, 20 to 1, from which on one explanation is preferred."""
-IMITATED = 0.1
-"""An explanation of which another predicts this share cannot be distinguished from it."""
+CLEAR = 3.0  # Logarithm of the odds, 20 to 1, from which on one explanation is preferred
+IMITATED = 0.1  # An explanation of which another predicts this share cannot be distinguished from it
 _POSE_LENGTHS = (1.0, 2.0, 4.0)
 _TIME_LENGTHS = (3.0, 10.0, 30.0, 100.0)
 _MOST_FEATURES = 180
@@ -48,17 +46,11 @@ _RIDGE = 0.05
 
 @dataclass(frozen=True)
 class Smooth:
-    """The best process of one kind.
+    """The best process of one kind."""
 
-    Attributes:
-        evidence: logarithm of its odds against noise alone, two hyperparameters paid for.
-        function: what it takes up (rows).
-        hat: a root of the matrix that gives it from the residual (rows x n).
-    """
-
-    evidence: float
-    function: Array
-    hat: Array
+    evidence: float  # logarithm of its odds against noise alone, two hyperparameters paid for
+    function: Array  # what it takes up (rows)
+    hat: Array  # a root of the matrix that gives it from the residual (rows x n)
 
 
 @dataclass(frozen=True)
@@ -174,37 +166,25 @@ class TimeOrPose:
 
 
 LEVEL = 0.02
-FEWEST_POSES = 40
-"""Distinct poses below which nothing is said."""
+FEWEST_POSES = 40  # Distinct poses below which nothing is said
 MOST_CARRIERS = 3
 _DRAWS = 99
 _FOLDS = 5
-_FINE, _COARSE, _SLOW = 30, 3, 6
-"""Highest harmonics: of a joint along its own motion, of anything else, of time."""
+_FINE, _COARSE, _SLOW = 30, 3, 6  # Highest harmonics: of a joint along its own motion, of anything else, of time
 _RECORDS_PER_HARMONIC = 6
-_SIZES = (0.03, 0.1, 0.3, 1.0)
-"""Standard deviations of one function, in those of the residuals."""
-MOST_OF_MEDIAN = 3.0
-"""A record farther off than so many medians counts as one that is as far off."""
-_OF_PLACE = 3
-"""So many numbers a record place a tool."""
-_NEXT_CARRIER = 0.1
-"""Of the whole share: what predicts less beside the ones before it is not named."""
+_SIZES = (0.03, 0.1, 0.3, 1.0)  # Standard deviations of one function, in those of the residuals
+MOST_OF_MEDIAN = 3.0  # A record farther off than so many medians counts as one that is as far off
+_OF_PLACE = 3  # So many numbers a record place a tool
+_NEXT_CARRIER = 0.1  # Of the whole share: what predicts less beside the ones before it is not named
 
 
 @dataclass(frozen=True)
 class Carrier:
-    """What predicts residuals.
+    """What predicts residuals."""
 
-    Attributes:
-        kind: ``joint``, ``time``, ``payload``, ``approach`` or ``temperature``.
-        name: of the joint, with its arm where there are several; empty where it is none.
-        share: of the residual variance, beside the carriers before it.
-    """
-
-    kind: str
-    name: str
-    share: float
+    kind: str  # ``joint``, ``time``, ``payload``, ``approach`` or ``temperature``
+    name: str  # of the joint, with its arm where there are several; empty where it is none
+    share: float  # of the residual variance, beside the carriers before it
 
     @property
     def words(self) -> str:
@@ -217,26 +197,19 @@ class Predictable:
     """What other records predict of a record's residual.
 
     Attributes:
-        share: of the squared residuals of records held out; below 0 where predictions are worse than none.
-        chance: below what 98 % of the shares of residuals without any dependence lie.
-        p_value: of the share, by chance.
         carriers: what it is predicted by, the most important first; empty where the share is not above chance.
-        records: how many were looked at.
-        poses: how many distinct ones.
-        by_time: share that time alone predicts.
         learnable: whether a pose residual could learn most of it from what is measured; None where one was asked for.
-        imitated: which share of the function of time that residuals follow the pose predicts.
     """
 
-    share: float
-    chance: float
-    p_value: float
+    share: float  # of the squared residuals of records held out; below 0 where predictions are worse than none
+    chance: float  # below what 98 % of the shares of residuals without any dependence lie
+    p_value: float  # of the share, by chance
     carriers: tuple[Carrier, ...]
-    records: int
-    poses: int
-    by_time: float
+    records: int  # how many were looked at
+    poses: int  # how many distinct ones
+    by_time: float  # share that time alone predicts
     learnable: bool | None
-    imitated: float = 0.0
+    imitated: float = 0.0  # which share of the function of time that residuals follow the pose predicts
 
     @property
     def above_chance(self) -> bool:
@@ -275,8 +248,7 @@ class _Input:
     kind: str
     name: str
     channel: str
-    angle: Array
-    """On a circle, or on half of one where it does not close (N; rad)."""
+    angle: Array  # On a circle, or on half of one where it does not close (N; rad)
 
 
 def predictable(problem: Problem, rows: FitRows, basis: Array, motion: Motion, dataset: Dataset) -> Predictable | None:
@@ -378,16 +350,11 @@ class _Regression:
     """On columns of blocks, of which each fold is predicted by the others.
 
     Columns are not freed of what the fit takes up: the residuals of a fold would then follow from those of the others.
-
-    Attributes:
-        blocks: whose columns.
-        members: which rows each fold has.
-        values: rows x m.
     """
 
-    blocks: Sequence[_Block]
-    members: Sequence[Indices]
-    values: Array
+    blocks: Sequence[_Block]  # whose columns
+    members: Sequence[Indices]  # which rows each fold has
+    values: Array  # rows x m
 
     def of_first(self) -> Self:
         return replace(self, values=self.values[:, :1])

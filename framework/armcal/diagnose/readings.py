@@ -28,15 +28,12 @@ _AXES = "xyz"
 _INCH = 25.4
 _ROUNDED = 1e-6
 _REACH_RATIO = 10.0
-_ALIKE = 0.35
-"""In powers of ten: so alike are two distances of one unit."""
+_ALIKE = 0.35  # In powers of ten: so alike are two distances of one unit
 _FEWEST_ROWS, _NEARLY_ALL, _NEAREST = 3, 0.95, 1e-6
-_NEAR = 0.2
-"""Of their distance from the base: so near are positions to where the nominal arm has them."""
+_NEAR = 0.2  # Of their distance from the base: so near are positions to where the nominal arm has them
 _TURNED = 0.05
 _FAR, _HALVINGS = 3.0, 60
-FEWEST_IN_PART = 8
-"""Records in a part: an alignment has nine numbers."""
+FEWEST_IN_PART = 8  # Records in a part: an alignment has nine numbers
 _PARTS, _ROUNDS = (0.25, 0.5, 0.75), 3
 _UNITS = {"millimetres": 0.001, "centimetres": 0.01, "metres": 1.0, "inches": _INCH / 1000}
 LENGTHS = (10.0, 0.1, 1000.0, 0.001, _INCH, 1 / _INCH, 1000 / _INCH, _INCH / 1000)

@@ -60,24 +60,17 @@ from armcal.problem.problem import FactorRecords, Problem
 UNLISTED = "something that is none of these"
 CHANCE = "nothing: it may be chance"
 NOISE_LEVEL = 0.05
-NEGLIGIBLE = 0.1
-"""Of what causes take up: less than this may be what is not linear in them."""
+NEGLIGIBLE = 0.1  # Of what causes take up: less than this may be what is not linear in them
 CHANGING = "something that changes with time and is none of these"
 
 
 @dataclass(frozen=True)
 class Odds:
-    """What speaks for one cause beside others.
+    """What speaks for one cause beside others."""
 
-    Attributes:
-        share: of the odds of all causes, of what is not among them, and of chance, the cause's own.
-        alternatives: in words, those that it does not beat 20 to 1, the most likely first.
-        chance: the share of nothing at all.
-    """
-
-    share: float
-    alternatives: tuple[str, ...]
-    chance: float
+    share: float  # of the odds of all causes, of what is not among them, and of chance, the cause's own
+    alternatives: tuple[str, ...]  # in words, those that it does not beat 20 to 1, the most likely first
+    chance: float  # the share of nothing at all
 
 
 @dataclass(frozen=True)
@@ -85,21 +78,15 @@ class Contest:
     """All causes for the residuals of a fit.
 
     Attributes:
-        causes: that were tried.
-        columns: of each (rows x k).
-        residual: of the fit (rows).
-        basis: of what the fit takes up (rows x n), orthonormal.
-        by_record: the data's rows as (records x rows a record), in recorded order.
-        fold: of each row, which part of the recording judges it.
         pose, time: correlations of the records.
     """
 
-    causes: Sequence[Dependence]
-    columns: Sequence[Array]
-    residual: Array
-    basis: Array
-    by_record: Indices
-    fold: Indices
+    causes: Sequence[Dependence]  # that were tried
+    columns: Sequence[Array]  # of each (rows x k)
+    residual: Array  # of the fit (rows)
+    basis: Array  # of what the fit takes up (rows x n), orthonormal
+    by_record: Indices  # the data's rows as (records x rows a record), in recorded order
+    fold: Indices  # of each row, which part of the recording judges it
     pose: Kernels
     time: Kernels
 
@@ -173,11 +160,9 @@ FEWEST_RECORDS = 30
 _MOST_BLOCKS, _FEWEST_BLOCKS = 60, 30
 _FOLDS = 5
 _MM = 1000.0
-_SAME = 0.999
-"""Cosine from which on two causes are one."""
+_SAME = 0.999  # Cosine from which on two causes are one
 _IN_ORDER = 0.5  # share of the order of records from which on poses tell the time
-_LIKELIER = 0.5
-"""Where chance has more of the odds, a cause is none."""
+_LIKELIER = 0.5  # Where chance has more of the odds, a cause is none
 
 
 @dataclass(frozen=True)
@@ -186,12 +171,6 @@ class Structure:
 
     Attributes:
         kind, subject, words, effect, measure: as in ``Dependence``.
-        p_value: that the residuals do not depend on it, family-wise.
-        share: of the squared residuals left by the ones before it.
-        falls_mm: by how much the mean error would fall if it were modelled, judged on records left out.
-        size: how large it is, in words; empty if its coefficients have no unit.
-        odds: its share of the odds of everything that was tried, and of what was not.
-        alternatives: what it does not beat 20 to 1, the most likely first; only a measurement can decide.
     """
 
     kind: str
@@ -199,12 +178,12 @@ class Structure:
     words: str
     effect: str
     measure: str
-    p_value: float
-    share: float
-    falls_mm: float
-    size: str
-    odds: float
-    alternatives: tuple[str, ...]
+    p_value: float  # that the residuals do not depend on it, family-wise
+    share: float  # of the squared residuals left by the ones before it
+    falls_mm: float  # by how much the mean error would fall if it were modelled, judged on records left out
+    size: str  # how large it is, in words; empty if its coefficients have no unit
+    odds: float  # its share of the odds of everything that was tried, and of what was not
+    alternatives: tuple[str, ...]  # what it does not beat 20 to 1, the most likely first; only a measurement can decide
 
 
 @dataclass(frozen=True)
@@ -212,37 +191,25 @@ class ResidualStructure:
     """What the residuals of a fit still depend on.
 
     Attributes:
-        structures: in the order in which they were taken into the model.
-        more: whether something was significant still when the search ended.
-        lag_one: correlation of neighbouring residuals, less what the fit itself makes of it.
-        lag_p: its p-value, in the same family.
         lag_after, lag_after_p: the same once the structures found are modelled.
-        alike: why neighbours resemble each other even then; None if they do not.
         predictable: what other records predict of them, whatever the cause; None where poses are too few.
-        noise: what their scatter depends on; None if on nothing.
-        repeats: what records of one pose say of noise; None where too few are.
-        mean_mm: mean residual of the training records.
-        tested: how many dependences were tested.
-        records: how many records were looked at.
-        block: how many neighbours count as one observation.
-        level: family-wise.
     """
 
-    structures: tuple[Structure, ...]
-    more: bool
-    lag_one: float
-    lag_p: float
+    structures: tuple[Structure, ...]  # in the order in which they were taken into the model
+    more: bool  # whether something was significant still when the search ended
+    lag_one: float  # correlation of neighbouring residuals, less what the fit itself makes of it
+    lag_p: float  # its p-value, in the same family
     lag_after: float
     lag_after_p: float
-    alike: TimeOrPose | None
+    alike: TimeOrPose | None  # why neighbours resemble each other even then; None if they do not
     predictable: Predictable | None
-    noise: NoiseTrend | None
-    repeats: Repeats | None
-    mean_mm: float
-    tested: int
-    records: int
-    block: int
-    level: float = LEVEL
+    noise: NoiseTrend | None  # what their scatter depends on; None if on nothing
+    repeats: Repeats | None  # what records of one pose say of noise; None where too few are
+    mean_mm: float  # mean residual of the training records
+    tested: int  # how many dependences were tested
+    records: int  # how many records were looked at
+    block: int  # how many neighbours count as one observation
+    level: float = LEVEL  # family-wise
 
     @property
     def is_predictable(self) -> bool:

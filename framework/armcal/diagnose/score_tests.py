@@ -36,20 +36,13 @@ class FitRows:
 
     Without the ties, known distances of sockets, an arm could change its size: that moves residuals of a contact in
     proportion to themselves, and would take up all of them.
-
-    Attributes:
-        slopes: by coordinates, and by innovations (rows x n).
-        residual: at the solution (rows).
-        record_of: of the data's rows, which record each belongs to.
-        by_record: the data's rows as (records x rows a record).
-        whitening: of each factor (n_r x n_r x N), weights counted.
     """
 
-    slopes: Array
-    residual: Array
-    record_of: Indices
-    by_record: Indices
-    whitening: tuple[Array, ...]
+    slopes: Array  # by coordinates, and by innovations (rows x n)
+    residual: Array  # at the solution (rows)
+    record_of: Indices  # of the data's rows, which record each belongs to
+    by_record: Indices  # the data's rows as (records x rows a record)
+    whitening: tuple[Array, ...]  # of each factor (n_r x n_r x N), weights counted
     points: tuple[Array, ...]
     positions: tuple[bool, ...]
 
@@ -131,35 +124,23 @@ def _whitening(noise: Sequence[float], records: FactorRecords) -> Array:
 
 DRAWS = 999
 """Of noise, in the test that decides whether anything is found: the level of one design then scatters by 0.7 %."""
-FEWER_DRAWS = 299
-"""In the tests after it, and wherever they show enough."""
-SEEN = 0.05
-"""A direction that the fit takes up but for so much of its length is the model's own."""
+FEWER_DRAWS = 299  # In the tests after it, and wherever they show enough
+SEEN = 0.05  # A direction that the fit takes up but for so much of its length is the model's own
 _FEWEST_SPARE_BLOCKS = 8
 _SMALLEST_P = 1e-300
-_OUT_OF_QUESTION = 0.1
-"""A p-value by the fewer draws that all of them would bring to 0.05 once in ten thousand times."""
-_COLUMNS_AT_ONCE = 12
-"""Their products with the draws, block by block, stay in a processor's cache."""
+_OUT_OF_QUESTION = 0.1  # A p-value by the fewer draws that all of them would bring to 0.05 once in ten thousand times
+_COLUMNS_AT_ONCE = 12  # Their products with the draws, block by block, stay in a processor's cache
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A fit as its last linear step: all rows whitened, those of priors and drifts behind those of the data.
+    """A fit as its last linear step: all rows whitened, those of priors and drifts behind those of the data."""
 
-    Attributes:
-        residual: at the solution (rows).
-        draws: independent noise that went through the same fit (rows x draws).
-        block: of each row, which block of records it belongs to.
-        records: rows of the data as (records x rows a record), in recorded order.
-        neighbours: whether each record but the last is followed by its neighbour in the recording (records - 1).
-    """
-
-    residual: Array
-    draws: Array
-    block: Indices
-    records: Indices
-    neighbours: Mask
+    residual: Array  # at the solution (rows)
+    draws: Array  # independent noise that went through the same fit (rows x draws)
+    block: Indices  # of each row, which block of records it belongs to
+    records: Indices  # rows of the data as (records x rows a record), in recorded order
+    neighbours: Mask  # whether each record but the last is followed by its neighbour in the recording (records - 1)
 
     @property
     def blocks(self) -> int:
@@ -196,19 +177,12 @@ def own_basis(columns: Array, basis: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class FamilyTest:
-    """A family of tests at once.
+    """A family of tests at once."""
 
-    Attributes:
-        adjusted: p-values of each set, counting that so many were looked at (family-wise).
-        share: of the squared residual, how much each set would take up.
-        lag_one: correlation of neighbouring residuals, less what the fit itself makes of it.
-        lag_adjusted: its p-value in the same family; 1 where there are too few neighbours.
-    """
-
-    adjusted: Array
-    share: Array
-    lag_one: float
-    lag_adjusted: float
+    adjusted: Array  # p-values of each set, counting that so many were looked at (family-wise)
+    share: Array  # of the squared residual, how much each set would take up
+    lag_one: float  # correlation of neighbouring residuals, less what the fit itself makes of it
+    lag_adjusted: float  # its p-value in the same family; 1 where there are too few neighbours
 
 
 def family_test(fit: Fit, bases: Sequence[Array]) -> FamilyTest:
@@ -291,8 +265,7 @@ def _neighbours(fit: Fit, both: Array) -> tuple[float, Array]:
 
 
 LEVEL = 0.05
-MATTERS = 1.1
-"""Standard deviations that grow by less are left as they are."""
+MATTERS = 1.1  # Standard deviations that grow by less are left as they are
 FEWEST_RECORDS = 30
 LEAST_LEFT = 1e-3
 _MOST_RECORDS, _MOST_FITTED = 1000, 300

@@ -32,8 +32,7 @@ from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.rigid_alignment import apart_from
 
 LEVEL = 0.05
-COMPARABLE = 2.0
-"""Variances, each less than so many times the other."""
+COMPARABLE = 2.0  # Variances, each less than so many times the other
 _RESOLUTION = 1e-9
 """Of the steps that are looked for, in units of the file: finer than readings of joints, coarser than floats."""
 _NOISES = np.logspace(-4, 0, 41)
@@ -45,20 +44,15 @@ class Rounding:
     """Commands of joints that seem to have been rounded.
 
     Attributes:
-        step: of which they are whole multiples (rad or m).
-        unit: in which it was sought.
-        joints: by channel.
         leaves: what the rounding alone leaves, root mean square over records, in thousandths of the SI unit of errors.
-        residual: what the fit leaves, likewise.
-        log_odds: of this rounding beside even noise, against even noise alone.
     """
 
-    step: float
-    unit: str
-    joints: tuple[str, ...]
+    step: float  # of which they are whole multiples (rad or m)
+    unit: str  # in which it was sought
+    joints: tuple[str, ...]  # by channel
     leaves: float
-    residual: float
-    log_odds: float
+    residual: float  # what the fit leaves, likewise
+    log_odds: float  # of this rounding beside even noise, against even noise alone
 
 
 def rounding(
@@ -159,43 +153,28 @@ def rounding_findings(rounded: Rounding | None, of_errors: str = "mm") -> list[F
     ]
 
 
-UNSEEN = 0.2
-"""An error of a scale that is larger than this and would not show is said to be of any size."""
-_HIDDEN = 0.5
-"""Where more than this share of what a payload does is left, the score tests of unstated loads see it."""
-_LEAST_SHARE = 0.1
-"""A parameter that takes up less of it is not named."""
+UNSEEN = 0.2  # An error of a scale that is larger than this and would not show is said to be of any size
+_HIDDEN = 0.5  # Where more than this share of what a payload does is left, the score tests of unstated loads see it
+_LEAST_SHARE = 0.1  # A parameter that takes up less of it is not named
 _MOST_NAMED = 3
 
 
 @dataclass(frozen=True)
 class HiddenPayload:
-    """A mass at the payload's place.
+    """A mass at the payload's place."""
 
-    Attributes:
-        sd: its standard deviation if it were free beside the parameters and their priors (kg).
-        taken_up: the share of what it does to the residuals that parameters make up for.
-        by: those that make up most of it, the first most.
-    """
-
-    sd: float
-    taken_up: float
-    by: tuple[str, ...]
+    sd: float  # its standard deviation if it were free beside the parameters and their priors (kg)
+    taken_up: float  # the share of what it does to the residuals that parameters make up for
+    by: tuple[str, ...]  # those that make up most of it, the first most
 
 
 @dataclass(frozen=True)
 class Elsewhere:
-    """How well contacts determine the tool away from them, where their own errors say nothing.
+    """How well contacts determine the tool away from them, where their own errors say nothing."""
 
-    Attributes:
-        rms_mm: root mean square of the tool's distance from where it is predicted, for the parameters' uncertainty.
-        poses: how many unseen poses were looked at.
-        up_to: motions that were left out, because nothing that was measured sees them; empty where none were.
-    """
-
-    rms_mm: float
-    poses: int
-    up_to: str
+    rms_mm: float  # root mean square of the tool's distance from where it is predicted, for the parameters' uncertainty
+    poses: int  # how many unseen poses were looked at
+    up_to: str  # motions that were left out, because nothing that was measured sees them; empty where none were
 
     @property
     def in_words(self) -> str:

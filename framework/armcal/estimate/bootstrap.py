@@ -28,8 +28,7 @@ from armcal.problem.readings import disturbed_records, reading_slopes
 
 BlockLength = int | Literal["auto"]
 _SIGNIFICANT = 2.0
-_FEW = 8
-"""Series shorter than this do not determine their own correlation."""
+_FEW = 8  # Series shorter than this do not determine their own correlation
 
 
 def automatic_block_length(series: Array) -> int:
@@ -92,8 +91,7 @@ def draw_weights(count: int, block: int, random: np.random.Generator) -> Array:
     return np.bincount(drawn, minlength=count).astype(float)
 
 
-_FEWEST = 20
-"""Refits that have to converge for an interval to be stated."""
+_FEWEST = 20  # Refits that have to converge for an interval to be stated
 
 
 class BootstrapSettings(Settings):
@@ -107,21 +105,13 @@ class BootstrapSettings(Settings):
 
 @dataclass(frozen=True)
 class Bootstrap:
-    """Refits to resampled records.
+    """Refits to resampled records."""
 
-    Attributes:
-        names: of the free canonical entries.
-        values: of each refit that converged (B x n).
-        method: ``blocks`` or ``parametric``.
-        block: how many neighbours were drawn together (1 in a parametric one).
-        failed: how many refits did not converge; they are left out.
-    """
-
-    names: tuple[str, ...]
-    values: Array
-    method: str
-    block: int
-    failed: int
+    names: tuple[str, ...]  # of the free canonical entries
+    values: Array  # of each refit that converged (B x n)
+    method: str  # ``blocks`` or ``parametric``
+    block: int  # how many neighbours were drawn together (1 in a parametric one)
+    failed: int  # how many refits did not converge; they are left out
 
     @property
     def deviations(self) -> Array:

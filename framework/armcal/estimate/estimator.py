@@ -20,13 +20,10 @@ from armcal.problem.problem import FactorRecords, Problem, triangular
 from armcal.problem.projection import factor_at_zero
 
 CONFIDENCE = 0.95
-NEAR_A_BOUND_SD = 3.0
-"""Within so many standard deviations of a bound an interval is one-sided."""
+NEAR_A_BOUND_SD = 3.0  # Within so many standard deviations of a bound an interval is one-sided
 SMALLEST_SPREAD = 1e-12
-OF_PRIOR = 0.95
-"""Of its prior's standard deviation: data that leave more of it say nothing of a parameter."""
-AT_BOUND = 1e-6
-"""In typical scales of the parameter: closer than this, a parameter lies on its bound."""
+OF_PRIOR = 0.95  # Of its prior's standard deviation: data that leave more of it say nothing of a parameter
+AT_BOUND = 1e-6  # In typical scales of the parameter: closer than this, a parameter lies on its bound
 
 CHECK_THE_DATA = (
     "Check the axes, units and frame of the measurements, the order and signs of the joints, and the start values; "
@@ -34,8 +31,7 @@ CHECK_THE_DATA = (
 )
 """What to do about a fit that leads nowhere."""
 
-Progress = Callable[[str, float], None]
-"""Called with what is being done, and which fraction of it is."""
+Progress = Callable[[str, float], None]  # Called with what is being done, and which fraction of it is
 
 
 def no_progress(what: str, fraction: float) -> None:
@@ -236,19 +232,12 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Influence:
-    """How residuals act on an estimate: all alike in least squares, less when large under a robust loss [Huber1981].
+    """How residuals act on an estimate: all alike in least squares, less when large under a robust loss [Huber1981]."""
 
-    Attributes:
-        weights: of each record, factor by factor (N each); None for ones.
-        spread: root mean square of what a residual number contributes, in units of the declared noise.
-        slope: mean derivative of that by the residual.
-        noise_scale: residuals in units of the declared noise, outliers discounted.
-    """
-
-    weights: tuple[Array, ...] | None
-    spread: float
-    slope: float
-    noise_scale: float
+    weights: tuple[Array, ...] | None  # of each record, factor by factor (N each); None for ones
+    spread: float  # root mean square of what a residual number contributes, in units of the declared noise
+    slope: float  # mean derivative of that by the residual
+    noise_scale: float  # residuals in units of the declared noise, outliers discounted
 
     @classmethod
     def of_least_squares(cls, cost: float, freedom: float) -> Influence:

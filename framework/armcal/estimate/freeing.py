@@ -16,31 +16,21 @@ from armcal.base.parameters import Parameters
 from armcal.problem.normal_equations import NormalEquations
 from armcal.problem.problem import FactorRecords, Problem
 
-LEVEL = 0.05
-"""Of naming any parameter though nothing is to be gained."""
-MOST_UNCERTAIN = 0.5
-"""In typical scales: what the noise leaves less certain than this is not determined."""
+LEVEL = 0.05  # Of naming any parameter though nothing is to be gained
+MOST_UNCERTAIN = 0.5  # In typical scales: what the noise leaves less certain than this is not determined
 MOST_FREED = 12
-_OWN = 1e-6
-"""Of what a parameter does: less than this beside the free ones is theirs."""
+_OWN = 1e-6  # Of what a parameter does: less than this beside the free ones is theirs
 _RANK = 1e-11
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A fixed parameter that the records would determine.
+    """A fixed parameter that the records would determine."""
 
-    Attributes:
-        name: of its block.
-        sd: of its coordinates if it were free, by the residuals found (SI).
-        change: by how much it would move, to first order (SI).
-        p_value: that it gains nothing, counting that so many were looked at.
-    """
-
-    name: str
-    sd: Array
-    change: Array
-    p_value: float
+    name: str  # of its block
+    sd: Array  # of its coordinates if it were free, by the residuals found (SI)
+    change: Array  # by how much it would move, to first order (SI)
+    p_value: float  # that it gains nothing, counting that so many were looked at
 
 
 @dataclass(frozen=True)

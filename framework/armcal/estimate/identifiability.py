@@ -36,8 +36,7 @@ from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.projection import approach_channels, factor_at_zero, fits, joint_channels, projected
 from armcal.problem.rigid_alignment import along, apart_from, tools, unseen_motions
 
-MOST_NAMES = 6
-"""A longer combination is cut when it is shown; ``terms`` has all of it."""
+MOST_NAMES = 6  # A longer combination is cut when it is shown; ``terms`` has all of it
 
 
 @dataclass(frozen=True)
@@ -54,15 +53,10 @@ class Measure:
 
 @dataclass(frozen=True)
 class Combination:
-    """A direction in parameter space.
+    """A direction in parameter space."""
 
-    Attributes:
-        terms: (name, coefficient in typical scales of the parameter), the largest first.
-        measures: one a term; empty to show coefficients in typical scales.
-    """
-
-    terms: tuple[tuple[str, float], ...]
-    measures: tuple[Measure, ...] = ()
+    terms: tuple[tuple[str, float], ...]  # (name, coefficient in typical scales of the parameter), the largest first
+    measures: tuple[Measure, ...] = ()  # one a term; empty to show coefficients in typical scales
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -106,8 +100,7 @@ def _listed(words: Sequence[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
-EXACT = 1e-6
-"""Sine of the angle within which a vector belongs to a space."""
+EXACT = 1e-6  # Sine of the angle within which a vector belongs to a space
 _LEAST_SHARE = 3e-3
 _MOST_SUBSETS = 60_000
 _LARGEST_SUBSET = 3
@@ -228,25 +221,15 @@ _LARGE_SHARE = 0.2
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What the data determines of the free parameters.
+    """What the data determines of the free parameters."""
 
-    Attributes:
-        names: of the coordinates.
-        singular_values: of the scaled whitened Jacobian, largest first.
-        directions: right singular vectors, one a row.
-        rank: how many are determined.
-        undetermined: combinations the data does not see.
-        rank_by_qr: how many are determined by the diagonal of a QR decomposition with pivoting.
-        measures: how each coordinate is shown; empty for coefficients in typical scales.
-    """
-
-    names: tuple[str, ...]
-    singular_values: Array
-    directions: Array
-    rank: int
-    undetermined: tuple[Combination, ...]
-    rank_by_qr: int = 0
-    measures: tuple[Measure, ...] = ()
+    names: tuple[str, ...]  # of the coordinates
+    singular_values: Array  # of the scaled whitened Jacobian, largest first
+    directions: Array  # right singular vectors, one a row
+    rank: int  # how many are determined
+    undetermined: tuple[Combination, ...]  # combinations the data does not see
+    rank_by_qr: int = 0  # how many are determined by the diagonal of a QR decomposition with pivoting
+    measures: tuple[Measure, ...] = ()  # how each coordinate is shown; empty for coefficients in typical scales
 
     @cached_property
     def determined(self) -> tuple[bool, ...]:
@@ -320,14 +303,12 @@ class InverseInformation:
     """The inverse of the information of data and priors, R'R + P, by coordinates (SI).
 
     Attributes:
-        root: B (n x k) with B B' the inverse, in the k directions that data and priors determine together.
-        null: orthonormal rows, in typical scales, that neither determines.
         spent: how many of the data's numbers the fit takes up, tr J B B' J', the trace of its hat matrix: one for a
             direction that the data alone determines, none for one that its prior alone holds [Hastie2009].
     """
 
-    root: Array
-    null: Array
+    root: Array  # B (n x k) with B B' the inverse, in the k directions that data and priors determine together
+    null: Array  # orthonormal rows, in typical scales, that neither determines
     spent: float
 
     @classmethod
@@ -398,8 +379,7 @@ def _count_above(values: Array) -> int:
     return int(np.sum(values > RANK_TOLERANCE * largest)) if largest > 0 else 0
 
 
-_NEW = 1e-6
-"""Of a column's own length: less than this beyond what is kept adds nothing."""
+_NEW = 1e-6  # Of a column's own length: less than this beyond what is kept adds nothing
 
 
 @dataclass(frozen=True)
@@ -407,14 +387,12 @@ class Dropped:
     """A coordinate that need not be free.
 
     Attributes:
-        name: of the coordinate.
         absorbed_by: it first, then what the kept ones do instead: the combination that changes no measurement.
-        left: the part of its effect that the kept ones cannot imitate, 0 to 1.
     """
 
-    name: str
+    name: str  # of the coordinate
     absorbed_by: Combination
-    left: float
+    left: float  # the part of its effect that the kept ones cannot imitate, 0 to 1
 
 
 @dataclass(frozen=True)
@@ -422,15 +400,13 @@ class MinimalSet:
     """Which blocks to free.
 
     Attributes:
-        kept: block names, in the order of the parameters.
-        redundant: coordinates that the kept ones absorb entirely.
         left_out: coordinates that would add something, but were not wanted (too many, or too uncertain).
         deviations: of the kept coordinates, in typical scales, by the declared noise; infinite where a kept block
             has an undetermined combination within it.
     """
 
-    kept: tuple[str, ...]
-    redundant: tuple[Dropped, ...]
+    kept: tuple[str, ...]  # block names, in the order of the parameters
+    redundant: tuple[Dropped, ...]  # coordinates that the kept ones absorb entirely
     left_out: tuple[Dropped, ...]
     deviations: dict[str, float]
 
@@ -549,24 +525,17 @@ CAUSES: dict[Cause, str] = {
     "poses": "these poses do not determine it, others would",
     "unknown": "it could not be found out whether other poses would determine it",
 }
-_AWAY = 0.1
-"""How far from the values at hand a point lies where the rank is taken, in typical scales."""
-_HARDLY_AWAY = 1e-3
-"""And one where undetermined directions are taken: they turn along with the values."""
-_BEYOND = 0.7
-"""rad, or m: how far random poses go beyond the recorded ones."""
-_WITHIN = 1e-2
-"""Sine of the angle within which a direction is the one that is undetermined there."""
+_AWAY = 0.1  # How far from the values at hand a point lies where the rank is taken, in typical scales
+_HARDLY_AWAY = 1e-3  # And one where undetermined directions are taken: they turn along with the values
+_BEYOND = 0.7  # rad, or m: how far random poses go beyond the recorded ones
+_WITHIN = 1e-2  # Sine of the angle within which a direction is the one that is undetermined there
 
 UNSEEN_SCALE = "scale is not observable: the same arm, larger or smaller with all it touches, fits as well"
 GIVE_A_LENGTH = "give one length: a known distance, a tracker's record, or a dimension of the arm that is held"
-_GROWTH_LEFT = 1e-4
-"""Of the size of the workspace: what may be left of a growth of all tool positions in proportion."""
+_GROWTH_LEFT = 1e-4  # Of the size of the workspace: what may be left of a growth of all tool positions in proportion
 _POSES = 60
-MOST_LISTED = 5
-"""So many undetermined combinations are listed in one message."""
-FEW_HELD = 2
-"""Combinations under priors that are listed in full: they do no harm, and more of them bury the rest."""
+MOST_LISTED = 5  # So many undetermined combinations are listed in one message
+FEW_HELD = 2  # Combinations under priors that are listed in full: they do no harm, and more of them bury the rest
 
 
 @dataclass(frozen=True)

@@ -27,17 +27,11 @@ class Gaussian:
 
 @dataclass(frozen=True)
 class Linearised:
-    """A record, linearised at one point.
+    """A record, linearised at one point."""
 
-    Attributes:
-        innovation: measured minus predicted there (m; m or rad).
-        slope: derivative of the prediction by the scaled coordinates (m x N).
-        noise: covariance of the record's own error (m x m).
-    """
-
-    innovation: Array
-    slope: Array
-    noise: Array
+    innovation: Array  # measured minus predicted there (m; m or rad)
+    slope: Array  # derivative of the prediction by the scaled coordinates (m x N)
+    noise: Array  # covariance of the record's own error (m x m)
 
 
 class Observation(Protocol):
@@ -53,17 +47,11 @@ class Observation(Protocol):
 
 @dataclass(frozen=True)
 class Update:
-    """A belief after a record.
+    """A belief after a record."""
 
-    Attributes:
-        posterior: the belief.
-        innovation: measured minus predicted by the prior, linearised where the update ended (m).
-        covariance: of that innovation, as expected (m x m).
-    """
-
-    posterior: Gaussian
-    innovation: Array
-    covariance: Array
+    posterior: Gaussian  # the belief
+    innovation: Array  # measured minus predicted by the prior, linearised where the update ended (m)
+    covariance: Array  # of that innovation, as expected (m x m)
 
 
 class OnlineEstimator(Protocol):

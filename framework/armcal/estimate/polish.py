@@ -29,8 +29,7 @@ is some thousandths off."""
 _FEWEST, _MOST_RECORDS = 10, 60
 _SEARCH_STEPS, _SEARCH_DAMPING = 25, 1e-3
 MOST_STEPS = 50
-AT_REST = 1e-10
-"""A step this many standard deviations long (of the noise found) changes nothing anybody can see."""
+AT_REST = 1e-10  # A step this many standard deviations long (of the noise found) changes nothing anybody can see
 _ROUNDING = 1e-12
 _LEAST_RETRY, _MOST_DAMPING, _STILL = 1e-6, 1e6, 1e-12
 _LINEAR, _FLAT = 0.1, 0.9

@@ -24,31 +24,22 @@ from armcal.problem.factor_records import correlation_of, noise_roots, unweighte
 from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem
 
-LEVELS = (0.5, 0.9, 0.95)
-"""Of the intervals that are stated and judged."""
-STATED = 0.9
-"""The level of a plus-minus."""
+LEVELS = (0.5, 0.9, 0.95)  # Of the intervals that are stated and judged
+STATED = 0.9  # The level of a plus-minus
 RADIUS_LEVEL = 0.95
-POSITION, TURN = range(3), range(3, 6)
-"""Rows of the residual of a position, and of a pose."""
+POSITION, TURN = range(3), range(3, 6)  # Rows of the residual of a position, and of a pose
 _LEAST_LEFT = 1e-3
 """Of the information on a direction that a record alone gives: without it next to nothing would be known."""
-_MOST_COMPARED = 2000
-"""Records of which all pairs are compared; the degrees of freedom of more grow in proportion."""
+_MOST_COMPARED = 2000  # Records of which all pairs are compared; the degrees of freedom of more grow in proportion
 _Parts = tuple[Array, Array, Array]
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How residuals of one factor are expected to vary.
+    """How residuals of one factor are expected to vary."""
 
-    Attributes:
-        covariance: of each record's residual (N x n_r x n_r; m^2 or rad^2).
-        freedom: degrees of freedom of the noise found.
-    """
-
-    covariance: Array
-    freedom: float
+    covariance: Array  # of each record's residual (N x n_r x n_r; m^2 or rad^2)
+    freedom: float  # degrees of freedom of the noise found
 
     def of(self, rows: range) -> Spread:
         return replace(self, covariance=self.covariance[:, rows.start : rows.stop, rows.start : rows.stop])
@@ -81,17 +72,11 @@ def quantile(level: float, freedom: float | Array) -> Array:
 
 @dataclass(frozen=True)
 class KnownDrift:
-    """A drift as the records of a fit determine it.
+    """A drift as the records of a fit determine it."""
 
-    Attributes:
-        states: the most likely ones (n_k x n_s x 1).
-        slopes: of the states by the values found (n_k x n_s x n_v).
-        covariance: of the states at each node (n_k x n_s x n_s).
-    """
-
-    states: Array
-    slopes: Array
-    covariance: Array
+    states: Array  # the most likely ones (n_k x n_s x 1)
+    slopes: Array  # of the states by the values found (n_k x n_s x n_v)
+    covariance: Array  # of the states at each node (n_k x n_s x n_s)
 
     @classmethod
     def by(cls, problem: Problem, values: Array, records: Sequence[FactorRecords]) -> KnownDrift | None:
@@ -106,38 +91,23 @@ class KnownDrift:
 
 @dataclass(frozen=True)
 class NewRecording:
-    """What the errors of one recording say of another one, where something drifts.
+    """What the errors of one recording say of another one, where something drifts."""
 
-    Attributes:
-        ratio: typical error in a new recording over that of each judged record (n).
-        freedom: degrees of freedom of the errors' mean square, as their records share a drift.
-        independent: the same, if the records were independent.
-    """
-
-    ratio: Array
-    freedom: float
-    independent: float
+    ratio: Array  # typical error in a new recording over that of each judged record (n)
+    freedom: float  # degrees of freedom of the errors' mean square, as their records share a drift
+    independent: float  # the same, if the records were independent
 
 
 @dataclass(frozen=True)
 class Predictor:
-    """A fit as far as its predictions need it.
+    """A fit as far as its predictions need it."""
 
-    Attributes:
-        problem: of the fit, or one for other records with the same free parameters.
-        values: found (all canonical entries).
-        covariance: of the free canonical entries.
-        noise_scale: residuals in units of the declared noise.
-        freedom: degrees of freedom of that.
-        drift: as the records of the fit determine it; None where nothing drifts.
-    """
-
-    problem: Problem
-    values: Array
-    covariance: Array
-    noise_scale: float
-    freedom: float
-    drift: KnownDrift | None = None
+    problem: Problem  # of the fit, or one for other records with the same free parameters
+    values: Array  # found (all canonical entries)
+    covariance: Array  # of the free canonical entries
+    noise_scale: float  # residuals in units of the declared noise
+    freedom: float  # degrees of freedom of that
+    drift: KnownDrift | None = None  # as the records of the fit determine it; None where nothing drifts
 
     @property
     def drifts(self) -> bool:

@@ -27,8 +27,7 @@ from armcal.problem.projection import factor_at_zero
 
 End = Literal["crossed", "bound", "open"]
 """How an interval ends: where the rise passes the quantile, at the parameter's bound, or not as far as was looked."""
-SETTLED = 2e-3
-"""Of a standard deviation: an end is known so well."""
+SETTLED = 2e-3  # Of a standard deviation: an end is known so well
 _MOST_STEPS = 24
 _FARTHEST = 50.0
 _BISECTIONS = 40
@@ -41,28 +40,21 @@ class Profile:
     """One parameter's profile.
 
     Attributes:
-        name: of the parameter.
-        value: found (SI).
-        deviation: its standard deviation by the curvature at the estimate.
         lower, upper: ends of the interval; the last place looked at where it is open.
         lower_end, upper_end: how it ends there.
-        curve: places and twice the adjusted rise of the cost (2 x K), in order.
-        quantile: what the rise must not pass.
-        better: whether a fit was found that is better than the estimate: it was not the best one.
-        failed: fits that did not converge; the search ends at them.
     """
 
-    name: str
-    value: float
-    deviation: float
+    name: str  # of the parameter
+    value: float  # found (SI)
+    deviation: float  # its standard deviation by the curvature at the estimate
     lower: float
     upper: float
     lower_end: End
     upper_end: End
-    curve: Array
-    quantile: float
-    better: bool
-    failed: int
+    curve: Array  # places and twice the adjusted rise of the cost (2 x K), in order
+    quantile: float  # what the rise must not pass
+    better: bool  # whether a fit was found that is better than the estimate: it was not the best one
+    failed: int  # fits that did not converge; the search ends at them
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""

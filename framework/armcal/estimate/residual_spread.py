@@ -25,8 +25,7 @@ from armcal.problem.problem import FactorRecords, Problem
 _FEWEST = 20
 _SIGNIFICANT_SD = 3.0
 _LONGEST = 50.0
-_WEIGHTS = np.geomspace(1.0, 1e5, 51)
-"""Of the declared noise, in records: those that are tried."""
+_WEIGHTS = np.geomspace(1.0, 1e5, 51)  # Of the declared noise, in records: those that are tried
 
 
 @dataclass(frozen=True)
@@ -34,18 +33,14 @@ class ResidualSpread:
     """Of one measurement.
 
     Attributes:
-        covariance: of the raw residual (n_r x n_r; m or rad).
-        share: of it that neighbours have in common, 0 to 1.
-        over: distance over which the common part falls by e.
         channel: what counts it: ``sequence`` where the records say their place, else ``record``, one by one.
-        freedom: degrees of freedom with which the covariance is known.
     """
 
-    covariance: Array
-    share: float
-    over: float
+    covariance: Array  # of the raw residual (n_r x n_r; m or rad)
+    share: float  # of it that neighbours have in common, 0 to 1
+    over: float  # distance over which the common part falls by e
     channel: str = "record"
-    freedom: float = math.inf
+    freedom: float = math.inf  # degrees of freedom with which the covariance is known
 
 
 def residual_spread(

@@ -60,17 +60,11 @@ _LARGEST_NORM, _STEPS = 12.0, 20000
 
 @dataclass(frozen=True)
 class Loss:
-    """A loss with its tuning constant, for residuals of one dimension.
+    """A loss with its tuning constant, for residuals of one dimension."""
 
-    Attributes:
-        name: which one.
-        constant: beyond this many scales a record weighs less (Huber), or half or less (Cauchy).
-        dimension: m, how many residual numbers a record has.
-    """
-
-    name: LossName
-    constant: float
-    dimension: int
+    name: LossName  # which one
+    constant: float  # beyond this many scales a record weighs less (Huber), or half or less (Cauchy)
+    dimension: int  # m, how many residual numbers a record has
 
     def rho(self, norms: Array) -> Array:
         """The loss; t^2/2 for small norms t."""
@@ -123,12 +117,10 @@ def median_norm(dimension: int) -> float:
     return float(np.sqrt(chdtri(dimension, 0.5)))
 
 
-LEVEL = 0.01
-"""Of calling any record an outlier though all noise is Gaussian."""
+LEVEL = 0.01  # Of calling any record an outlier though all noise is Gaussian
 SMALLEST_SCALE = 1e-3
 """In units of the declared noise: residuals smaller than this are none, and no measure of what is large."""
-UNCONTROLLED = 1e-3
-"""Of a residual's variance: below this it would hardly show an error of its own record."""
+UNCONTROLLED = 1e-3  # Of a residual's variance: below this it would hardly show an error of its own record
 
 
 @dataclass(frozen=True)
@@ -137,12 +129,11 @@ class Distances:
 
     Attributes:
         studentised: length of each residual in its own standard deviations (N each); 0 where nothing controls it.
-        limits: the length that the largest of all stays below in 99 % of experiments without outliers.
         scales: residuals in units of their noise, by their median, so that a minority of outliers hardly matters.
     """
 
     studentised: tuple[Array, ...]
-    limits: tuple[float, ...]
+    limits: tuple[float, ...]  # the length that the largest of all stays below in 99 % of experiments without outliers
     scales: tuple[float, ...]
 
     def beyond(self) -> tuple[Array, ...]:
@@ -217,21 +208,13 @@ class Round:
 
 @dataclass(frozen=True)
 class RobustFit:
-    """Where reweighting or selecting came to rest.
+    """Where reweighting or selecting came to rest."""
 
-    Attributes:
-        solution: the solver's, with all rounds counted; converged only if the weights settled too.
-        weights: of each record, factor by factor (N each), from 0 to 1.
-        scales: residuals in units of their noise, one a factor.
-        rounds: in order.
-        warnings: what a user should know.
-    """
-
-    solution: Solution
-    weights: Weights
-    scales: tuple[float, ...]
-    rounds: tuple[Round, ...]
-    warnings: tuple[str, ...] = ()
+    solution: Solution  # the solver's, with all rounds counted; converged only if the weights settled too
+    weights: Weights  # of each record, factor by factor (N each), from 0 to 1
+    scales: tuple[float, ...]  # residuals in units of their noise, one a factor
+    rounds: tuple[Round, ...]  # in order
+    warnings: tuple[str, ...] = ()  # what a user should know
 
 
 def losses(problem: Problem, name: LossName) -> tuple[Loss, ...]:
@@ -453,21 +436,13 @@ class NoiseSettings(Settings):
 
 @dataclass(frozen=True)
 class Suspect:
-    """A record farther from the fit than noise alone takes any record in 99 % of experiments.
+    """A record farther from the fit than noise alone takes any record in 99 % of experiments."""
 
-    Attributes:
-        record: its place among the records of the fit.
-        measurement: whose residual it is.
-        distance: length of its residual in its own standard deviations, robustly scaled.
-        limit: what was allowed.
-        weight: in the fit: 0 if it was set aside.
-    """
-
-    record: int
-    measurement: str
-    distance: float
-    limit: float
-    weight: float
+    record: int  # its place among the records of the fit
+    measurement: str  # whose residual it is
+    distance: float  # length of its residual in its own standard deviations, robustly scaled
+    limit: float  # what was allowed
+    weight: float  # in the fit: 0 if it was set aside
 
 
 @dataclass(frozen=True)
@@ -475,27 +450,18 @@ class WeighedFit:
     """A fit, and how its records weighed.
 
     Attributes:
-        solution: the solver's.
-        estimate: values and how sure they are.
-        records: those of the fit, with the whitening used; set-aside ones have weight zero.
-        weights: of each record, factor by factor (N each).
-        suspects: the farthest first; empty without a loss.
-        components: estimated variances, or None.
-        loss: which one; ``none`` for least squares.
-        rounds: of reweighting and selecting.
-        warnings: what a user should know.
         as_declared: values of the fit by the declared noise, which came before variances were estimated; else None.
     """
 
-    solution: Solution
-    estimate: Estimate
-    records: tuple[FactorRecords, ...]
-    weights: tuple[Array, ...]
-    suspects: tuple[Suspect, ...] = ()
-    components: VarianceComponents | None = None
-    loss: str = "none"
-    rounds: tuple[Round, ...] = ()
-    warnings: tuple[str, ...] = ()
+    solution: Solution  # the solver's
+    estimate: Estimate  # values and how sure they are
+    records: tuple[FactorRecords, ...]  # those of the fit, with the whitening used; set-aside ones have weight zero
+    weights: tuple[Array, ...]  # of each record, factor by factor (N each)
+    suspects: tuple[Suspect, ...] = ()  # the farthest first; empty without a loss
+    components: VarianceComponents | None = None  # estimated variances, or None
+    loss: str = "none"  # which one; ``none`` for least squares
+    rounds: tuple[Round, ...] = ()  # of reweighting and selecting
+    warnings: tuple[str, ...] = ()  # what a user should know
     as_declared: Array | None = None
 
     @property

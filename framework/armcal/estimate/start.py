@@ -45,12 +45,10 @@ from armcal.problem.rigid_alignment import (
 )
 
 _POSES, _STEP = 24, 1e-5
-_SAME_MOTION = 0.02
-"""Of a parameter's motion of the tool: what may differ from one rigid motion."""
+_SAME_MOTION = 0.02  # Of a parameter's motion of the tool: what may differ from one rigid motion
 _RANK = 1e-3
 _DRAWS, _SEED, _MOST_STEPS, _DAMPING = 12, 5, 30, 1e-4
-_REACHED = 1e-3
-"""Of the spread of the positions: a place is reached."""
+_REACHED = 1e-3  # Of the spread of the positions: a place is reached
 
 
 @dataclass(frozen=True)
@@ -67,17 +65,13 @@ class Placing:
     """Free parameters that move the arm as a whole, or the target on its tool.
 
     Attributes:
-        base: names of those that move the arm.
-        target: names of those that move the target.
-        basis: orthonormal directions in the tool's axes along which these move it (3 x k).
-        rank: how many of the six motions the base can make.
         shifts: of each number that only shifts the target, its name and the direction (3, by its increment).
     """
 
-    base: tuple[str, ...]
-    target: tuple[str, ...]
-    basis: Array
-    rank: int
+    base: tuple[str, ...]  # names of those that move the arm
+    target: tuple[str, ...]  # names of those that move the target
+    basis: Array  # orthonormal directions in the tool's axes along which these move it (3 x k)
+    rank: int  # how many of the six motions the base can make
     shifts: tuple[tuple[str, Array], ...] = ()
 
     @property
@@ -220,12 +214,9 @@ def _turned(parameters: Parameters, random: np.random.Generator) -> Array:
 
 
 MOST_RECORDS = 300
-FAR = 0.03
-"""Of the spread of the positions: a start that is off by less is near enough for any fit."""
-BETTER = 2.0
-"""So many times less must be left for the configuration's start to be given up."""
-BEYOND = 4.0
-"""Standard deviations of a prior: what is farther contradicts it."""
+FAR = 0.03  # Of the spread of the positions: a start that is off by less is near enough for any fit
+BETTER = 2.0  # So many times less must be left for the configuration's start to be given up
+BEYOND = 4.0  # Standard deviations of a prior: what is farther contradicts it
 _MM = 1000.0
 
 
@@ -234,27 +225,21 @@ class Start:
     """Where a fit starts.
 
     Attributes:
-        problem: its nominal values are where base and target were found, where the configuration's are far off.
-        names: of the parameters that place the arm and the target.
         vectors: values at which they were found, the best first; other parameters are not theirs to say. Those with a
             prior keep their nominal value in ``problem``, and start where they were found.
-        alignment: of the nominal arm; None where there is none.
         tools: of the nominal arm as configured, in the records looked at.
         configured, left: typical distance (m) of the arm from the positions, before and after.
-        taken: whether the start is elsewhere than the configuration has it.
-        gauges: what the positions do not determine of base and target, in words.
-        warnings: for the user.
     """
 
-    problem: Problem
-    names: tuple[str, ...] = ()
+    problem: Problem  # its nominal values are where base and target were found, where the configuration's are far off
+    names: tuple[str, ...] = ()  # of the parameters that place the arm and the target
     vectors: tuple[Array, ...] = ()
-    alignment: Alignment | None = None
+    alignment: Alignment | None = None  # of the nominal arm; None where there is none
     configured: float = 0.0
     left: float = 0.0
-    taken: bool = False
-    gauges: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    taken: bool = False  # whether the start is elsewhere than the configuration has it
+    gauges: tuple[str, ...] = ()  # what the positions do not determine of base and target, in words
+    warnings: tuple[str, ...] = ()  # for the user
 
     def values(self, problem: Problem) -> tuple[Array, ...]:
         starts, parameters = list[Array](), problem.parameters

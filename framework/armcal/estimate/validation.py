@@ -230,29 +230,22 @@ class JudgedFit:
     """How a fit on the records that train does on those that judge; errors are nan if it did not converge.
 
     Attributes:
-        errors: m.
-        at_rest: the errors if nothing is known of a drift.
-        turns: errors of orientations (rad), where measured.
-        converged: whether the fit did.
-        seconds: that it took.
         held_residuals: raw residuals of the records that judge, by recording (``new`` only where something drifts);
             none where no predictions were asked for.
         unknown: covariance of these by what a pose residual did not know (N x n_r x n_r each); None without one.
         without: the errors ``at_rest`` without the pose residual that the fit learned; None where it learns none.
-        values: of the fit; None if it did not converge.
-        gains: by how much that makes errors of each measurement smaller at rest (measurements x N).
     """
 
-    errors: Array
-    at_rest: Array
-    turns: Array | None
-    converged: bool
-    seconds: float
+    errors: Array  # m
+    at_rest: Array  # the errors if nothing is known of a drift
+    turns: Array | None  # errors of orientations (rad), where measured
+    converged: bool  # whether the fit did
+    seconds: float  # that it took
     held_residuals: Mapping[Recording, tuple[Array, ...]] = field(default_factory=dict)
     unknown: tuple[Array, ...] | None = None
     without: Array | None = None
-    values: Array | None = None
-    gains: Array | None = None
+    values: Array | None = None  # of the fit; None if it did not converge
+    gains: Array | None = None  # by how much that makes errors of each measurement smaller at rest (measurements x N)
 
 
 @dataclass(frozen=True)
@@ -327,11 +320,10 @@ class Halves:
 
     Attributes:
         apart: how far the pose of each measurement that is ``Placed`` differs between the two (mm, deg; K x 2).
-        errors: of records by the fit to the other half, on average (K; thousandths, as errors are shown).
     """
 
     apart: Mapping[str, Array]
-    errors: Array
+    errors: Array  # of records by the fit to the other half, on average (K; thousandths, as errors are shown)
 
 
 def halves(problem: Problem, records: Sequence[FactorRecords], estimator: Estimator, start: Array) -> Halves | None:

@@ -35,10 +35,8 @@ from armcal.problem.many_points import with_few_points
 from armcal.problem.problem import FactorRecords, NormalEquations, Problem
 
 MOST_STEPS = 100
-AT_REST = 1e-3
-"""A step this many standard deviations long ends the search."""
-INSTRUMENT_FLOOR = 1e-4
-"""Of the whole variance: an instrument without any noise would make records exact that are not."""
+AT_REST = 1e-3  # A step this many standard deviations long ends the search
+INSTRUMENT_FLOOR = 1e-4  # Of the whole variance: an instrument without any noise would make records exact that are not
 _MOST_HALVINGS = 30
 
 
@@ -174,44 +172,29 @@ class Component:
     """One source of variance.
 
     Attributes:
-        name: an instrument (``tracker``), one of its axes (``tracker.x``) or a joint (``arm.q3``).
-        kind: ``instrument`` or ``joint``.
-        unit: of ``sd`` in SI: rad or m for a joint; ``1``, multiples of the declared noise, for an instrument.
-        sd: standard deviation.
-        sd_error: its own standard deviation; not a number where it ended at zero.
         lower, upper: 95 % interval of ``sd``; reaches zero where the data allows it.
-        share: of the variance of all residuals, 0 to 1.
-        rms: what it contributes to a residual number (m or rad), root mean square over records.
     """
 
-    name: str
-    kind: Literal["instrument", "joint"]
-    unit: str
-    sd: float
-    sd_error: float
+    name: str  # an instrument (``tracker``), one of its axes (``tracker.x``) or a joint (``arm.q3``)
+    kind: Literal["instrument", "joint"]  # ``instrument`` or ``joint``
+    unit: str  # of ``sd`` in SI: rad or m for a joint; ``1``, multiples of the declared noise, for an instrument
+    sd: float  # standard deviation
+    sd_error: float  # its own standard deviation; not a number where it ended at zero
     lower: float
     upper: float
-    share: float
-    rms: float
+    share: float  # of the variance of all residuals, 0 to 1
+    rms: float  # what it contributes to a residual number (m or rad), root mean square over records
 
 
 @dataclass(frozen=True)
 class VarianceComponents:
-    """How much of the residuals is whose.
+    """How much of the residuals is whose."""
 
-    Attributes:
-        components: in the order of instruments, then joints.
-        inseparable: pairs whose estimates correlate beyond 0.95, with the correlation.
-        unseen: joints that move no residual.
-        log_likelihood: restricted, up to a constant.
-        rounds: estimates with refits between them.
-    """
-
-    components: tuple[Component, ...]
-    inseparable: tuple[tuple[str, str, float], ...]
-    unseen: tuple[str, ...]
-    log_likelihood: float
-    rounds: int = 1
+    components: tuple[Component, ...]  # in the order of instruments, then joints
+    inseparable: tuple[tuple[str, str, float], ...]  # pairs whose estimates correlate beyond 0.95, with the correlation
+    unseen: tuple[str, ...]  # joints that move no residual
+    log_likelihood: float  # restricted, up to a constant
+    rounds: int = 1  # estimates with refits between them
 
     def share(self, kind: str) -> float:
         return sum(c.share for c in self.components if c.kind == kind)

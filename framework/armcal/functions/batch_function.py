@@ -20,8 +20,7 @@ EvaluatorChoice = Literal["auto", "compiled", "interpreted"]
 
 _ENTRY, _VECTOR, _ITERATE = "armcal_evaluate", "armcal_evaluate_vector", "armcal_iterate"
 _AGREEMENT = 1e-9
-_WORTH_COMPILING = 100_000
-"""Records that the interpreter takes longer for than the compiler takes to make a library."""
+_WORTH_COMPILING = 100_000  # Records that the interpreter takes longer for than the compiler takes to make a library
 
 
 class BatchFunction:

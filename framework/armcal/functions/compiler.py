@@ -66,16 +66,13 @@ class Trial:
     """A call of a new library, made in a process of its own, and what it has to give.
 
     Attributes:
-        entry: the C function.
         arguments: integers (long), floats (double) and arrays, handed over by their address.
-        expected: by the places of arguments, what these arrays have to hold afterwards.
-        tolerance: in units of the largest number of an array, or of 1.
     """
 
-    entry: str
+    entry: str  # the C function
     arguments: Sequence[int | float | Array]
-    expected: Mapping[int, Array]
-    tolerance: float
+    expected: Mapping[int, Array]  # by the places of arguments, what these arrays have to hold afterwards
+    tolerance: float  # in units of the largest number of an array, or of 1
 
     def as_json(self) -> dict[str, object]:
         arguments = [one.ravel().tolist() if isinstance(one, np.ndarray) else one for one in self.arguments]

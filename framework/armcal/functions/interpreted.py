@@ -9,8 +9,7 @@ import numpy as np
 
 from armcal.base.arrays import Array
 
-_BLOCKS = (64, 8, 1)
-"""Records that are evaluated together; what does not fill a block goes to smaller ones."""
+_BLOCKS = (64, 8, 1)  # Records that are evaluated together; what does not fill a block goes to smaller ones
 
 
 class BoundFunction:

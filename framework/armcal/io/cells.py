@@ -12,8 +12,7 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.units import UNITS
 
-MISSING = frozenset({"", "na", "n/a", "nan", "null", "none"})
-"""In small letters."""
+MISSING = frozenset({"", "na", "n/a", "nan", "null", "none"})  # In small letters
 DELIMITERS = ",;\t|"
 DECIMAL_COMMA = re.compile(r"\s*[+-]?[0-9]+,[0-9]+(?:[eE][+-]?[0-9]+)?\s*")
 

@@ -11,8 +11,7 @@ from pathlib import Path
 from armcal.errors import InputError, Location
 from armcal.io.plain_files import check_output
 
-_LEFT_BEHIND_S = 3600.0
-"""A file that was staged so long ago is nobody's any more."""
+_LEFT_BEHIND_S = 3600.0  # A file that was staged so long ago is nobody's any more
 
 
 def write_new(files: Mapping[Path, bytes]) -> None:

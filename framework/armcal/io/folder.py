@@ -27,24 +27,17 @@ _LONGEST_NAME = 200
 _STAGING = ".armcal-"
 _UNFINISHED = f"{_STAGING}unfinished"
 """In a set that is being made: without it, a directory beside ours is an earlier set that is on its way."""
-_HERE = -100
-"""AT_FDCWD: paths are as they are."""
-_EXCHANGE = 2
-"""RENAME_EXCHANGE"""
+_HERE = -100  # AT_FDCWD: paths are as they are
+_EXCHANGE = 2  # RENAME_EXCHANGE
 _CANNOT = {errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP, errno.EBUSY, errno.EXDEV, errno.EPERM, errno.EACCES}
 
 
 @dataclass(frozen=True)
 class Reservation:
-    """A directory that no other run writes to meanwhile.
+    """A directory that no other run writes to meanwhile."""
 
-    Attributes:
-        folder: as it was given.
-        ours: the files that may be in it; what was put in place last is moved away first.
-    """
-
-    folder: Path
-    ours: Collection[str]
+    folder: Path  # as it was given
+    ours: Collection[str]  # the files that may be in it; what was put in place last is moved away first
     _held: list[int] = field(default_factory=list, repr=False)
 
     def place(self, texts: Mapping[str, str | bytes]) -> None:

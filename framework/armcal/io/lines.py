@@ -44,11 +44,9 @@ class LineCutter:
             self._open += piece
 
 
-PATIENCE_S = 5.0
-"""How long a reader may take, once; after that, lines are left out until it reads on."""
+PATIENCE_S = 5.0  # How long a reader may take, once; after that, lines are left out until it reads on
 
-_AT_ONCE = 4096
-"""A pipe that is ready takes so many bytes without waiting (PIPE_BUF)."""
+_AT_ONCE = 4096  # A pipe that is ready takes so many bytes without waiting (PIPE_BUF)
 
 
 class StandardOutput:

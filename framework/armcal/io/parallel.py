@@ -18,11 +18,9 @@ from armcal.plugins import blaming
 
 T = TypeVar("T")
 R = TypeVar("R")
-Report = Callable[[float], None]
-"""Takes which fraction of the work is done."""
+Report = Callable[[float], None]  # Takes which fraction of the work is done
 
-WORTH_WORKERS_S = 6.0
-"""Starting worker processes takes a second or two: not worth it for less work than this."""
+WORTH_WORKERS_S = 6.0  # Starting worker processes takes a second or two: not worth it for less work than this
 _SAFE_PATH = "PYTHONSAFEPATH"
 _DASK_TIMEOUT = "10s"
 _OPTION = Location("--parallel")
@@ -78,17 +76,11 @@ class Automatic:
 
 @dataclass(frozen=True)
 class Workers:
-    """A joblib backend.
+    """A joblib backend."""
 
-    Attributes:
-        backend: ``loky`` (processes), ``threading`` or ``dask``.
-        count: how many at once; as many as there are processors, or the cluster's own number, if None.
-        address: of a dask scheduler.
-    """
-
-    backend: str = "loky"
-    count: int | None = None
-    address: str = ""
+    backend: str = "loky"  # ``loky`` (processes), ``threading`` or ``dask``
+    count: int | None = None  # how many at once; as many as there are processors, or the cluster's own number, if None
+    address: str = ""  # of a dask scheduler
 
     def map(self, work: Callable[[T], R], tasks: Sequence[T], report: Report = unreported) -> list[R]:
         """As the protocol says.

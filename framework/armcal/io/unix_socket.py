@@ -9,8 +9,7 @@ from stat import S_ISSOCK
 
 from armcal.errors import InputError, Location
 
-_PATH_BYTES = 100
-"""A longer path does not fit a Unix socket's address."""
+_PATH_BYTES = 100  # A longer path does not fit a Unix socket's address
 
 
 @contextmanager

@@ -44,8 +44,7 @@ __all__ = [
     "warn_small_degrees",
 ]
 
-FROZEN_RECORDS = 5
-"""So many identical measurements in a row, while the joints moved, and the instrument has stopped."""
+FROZEN_RECORDS = 5  # So many identical measurements in a row, while the joints moved, and the instrument has stopped
 MAX_BACKWARD_FRACTION = 0.01
 """Of the records; more of them out of order in time, and the time itself is not to be trusted."""
 
@@ -55,8 +54,7 @@ _SMALL_DEGREES = (0.5, 6.3)
 """A largest joint angle between these, in degrees, is more likely one in radians (6.3 is one turn)."""
 _MAX_DEGREES = 720.0
 _LATEST_S, _HOTTEST_C = 1e11, 150.0
-_VARIES_AT_REST = ("time", "temperature")
-"""Channels that may differ between a record and its copy."""
+_VARIES_AT_REST = ("time", "temperature")  # Channels that may differ between a record and its copy
 
 
 def records_of(reader: Reader, request: ReadRequest) -> Dataset:

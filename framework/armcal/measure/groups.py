@@ -68,11 +68,9 @@ def _partners(dataset: Dataset, label: str) -> Array:
     return partners
 
 
-Groups = Mapping[str, tuple[str, ...]]
-"""Keys of the groups, in order, by the instance that owns them."""
+Groups = Mapping[str, tuple[str, ...]]  # Keys of the groups, in order, by the instance that owns them
 NO_GROUP = -1
-ONLY = "one"
-"""The key of the one group of a measurement without labels."""
+ONLY = "one"  # The key of the one group of a measurement without labels
 _FORBIDDEN = frozenset("[]*?\"'")
 
 
@@ -82,11 +80,10 @@ class OwnedTie:
 
     Attributes:
         names: local names of each group's parameters to full ones, one mapping a group.
-        tie: what is known.
     """
 
     names: tuple[Mapping[str, str], Mapping[str, str]]
-    tie: Tie
+    tie: Tie  # what is known
 
 
 def owner_of(instance: str, measurement: GroupedMeasurement) -> str:

@@ -167,15 +167,12 @@ class Proposal:
 
     Attributes:
         values: canonical entries by local name; none where nothing could be found.
-        open: what the records leave open, a sentence; empty if nothing.
-        close: which further records would close it, a sentence.
-        undetermined: local names of the parameters that are left open.
     """
 
     values: Mapping[str, Array] = field(default_factory=dict)
-    open: str = ""
-    close: str = ""
-    undetermined: tuple[str, ...] = ()
+    open: str = ""  # what the records leave open, a sentence; empty if nothing
+    close: str = ""  # which further records would close it, a sentence
+    undetermined: tuple[str, ...] = ()  # local names of the parameters that are left open
 
 
 @dataclass(frozen=True)
@@ -185,17 +182,13 @@ class Reading:
     Attributes:
         frames: base_T_tool of each record (N x 4 x 4, m) as ``tool``, and ``base``; for one that is ``Carried``, the
             poses of its carriers.
-        channels: each channel (N; NaN where it is missing), by local name.
-        values: canonical entries of all its parameters, by local name.
-        free: local names of those that may move.
-        ids: what each record is called.
     """
 
     frames: Mapping[str, Array]
-    channels: Mapping[str, Array]
-    values: Mapping[str, Array]
-    free: frozenset[str]
-    ids: tuple[str, ...]
+    channels: Mapping[str, Array]  # each channel (N; NaN where it is missing), by local name
+    values: Mapping[str, Array]  # canonical entries of all its parameters, by local name
+    free: frozenset[str]  # local names of those that may move
+    ids: tuple[str, ...]  # what each record is called
 
 
 @runtime_checkable

@@ -16,32 +16,22 @@ class Layout:
     """What the channels of a dataset are, and what they were called in its source.
 
     Attributes:
-        joints: channels of commanded joint displacements, revolute (angle) and prismatic (length).
-        revolute: those of ``joints`` that turn, but not on and on.
-        approach: channels of approach directions.
-        measured: channels of measured values, ``instance.name``.
-        deviations: channels of their standard deviations.
-        columns: channel to its column in the source, for messages.
         units: channel to the unit that its column declares; absent or SI means SI.
-        by_line: whether ``Dataset.rows`` are lines of a text file; otherwise they are row numbers.
-        by_id: whether a record's id says where it stood, better than its row does.
         parts: channel to the measurements that need it; one that is absent belongs to the record as a whole.
-        of_points: channels of points, of which a record may lack some but not all.
-        evidence: channels that only the verdict reads, which a record may lack.
     """
 
-    joints: tuple[str, ...] = ()
-    revolute: tuple[str, ...] = ()
-    approach: tuple[str, ...] = ()
-    measured: tuple[str, ...] = ()
-    columns: Mapping[str, str] = field(default_factory=dict)
+    joints: tuple[str, ...] = ()  # channels of commanded joint displacements, revolute (angle) and prismatic (length)
+    revolute: tuple[str, ...] = ()  # those of ``joints`` that turn, but not on and on
+    approach: tuple[str, ...] = ()  # channels of approach directions
+    measured: tuple[str, ...] = ()  # channels of measured values, ``instance.name``
+    columns: Mapping[str, str] = field(default_factory=dict)  # channel to its column in the source, for messages
     units: Mapping[str, str] = field(default_factory=dict)
-    by_line: bool = False
-    deviations: tuple[str, ...] = ()
-    by_id: bool = False
+    by_line: bool = False  # whether ``Dataset.rows`` are lines of a text file; otherwise they are row numbers
+    deviations: tuple[str, ...] = ()  # channels of their standard deviations
+    by_id: bool = False  # whether a record's id says where it stood, better than its row does
     parts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    of_points: frozenset[str] = frozenset()
-    evidence: frozenset[str] = frozenset()
+    of_points: frozenset[str] = frozenset()  # channels of points, of which a record may lack some but not all
+    evidence: frozenset[str] = frozenset()  # channels that only the verdict reads, which a record may lack
 
     def column(self, channel: str) -> str:
         return self.columns.get(channel, channel)

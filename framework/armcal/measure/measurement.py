@@ -58,14 +58,12 @@ class Tie:
     """What is known between two groups, beside all records: the distance of two sockets.
 
     Attributes:
-        groups: their keys.
         residual: of the values of their parameters, under local names, to what is left open (n x 1, m or rad).
-        noise: standard deviation of each entry.
     """
 
-    groups: tuple[str, str]
+    groups: tuple[str, str]  # their keys
     residual: Callable[[Mapping[str, Expression], Mapping[str, Expression]], Expression]
-    noise: tuple[float, ...]
+    noise: tuple[float, ...]  # standard deviation of each entry
 
 
 @runtime_checkable
@@ -170,21 +168,16 @@ class Mistake:
     """Something that may have gone wrong with an instrument.
 
     Attributes:
-        kind: in a word, ``focus``.
-        words: what residuals then depend on, as the end of a sentence; of what is there always, the sentence.
-        measure: which measurement would show it, and what to do about it.
-        parameters: local names of what changes.
         course: how it changes over the recording; ``always`` is no change, and looked for in those that are fixed,
             each of one number.
-        together: whether all change by the same share, and not each by itself.
     """
 
-    kind: str
-    words: str
-    measure: str
-    parameters: tuple[str, ...]
+    kind: str  # in a word, ``focus``
+    words: str  # what residuals then depend on, as the end of a sentence; of what is there always, the sentence
+    measure: str  # which measurement would show it, and what to do about it
+    parameters: tuple[str, ...]  # local names of what changes
     course: Literal["slowly", "once", "always"]
-    together: bool = False
+    together: bool = False  # whether all change by the same share, and not each by itself
 
 
 @runtime_checkable

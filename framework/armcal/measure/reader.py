@@ -22,28 +22,19 @@ class RequestedChannel:
     """One number a record may carry.
 
     Attributes:
-        channel: its name in a dataset (``arm.q1``, ``tracker.x``, ``gravity_x``).
-        columns: names it may have in a file, without the unit suffix, the most specific first.
-        dimension: of its unit.
-        required: whether a record without it is useless.
-        is_deviation: whether it is the standard deviation of a measured number.
-        is_endless: whether it is the angle of a joint that may turn on and on.
         parts: the measurements (instances) that need it; none if the record as a whole does, or nothing does.
-        effects: the joint effects (``arm.thermal``) that read it.
-        is_of_point: whether it belongs to one of many points, of which a record may lack some.
-        is_evidence: whether only the verdict reads it, so that a record that lacks it loses nothing.
     """
 
-    channel: str
-    columns: tuple[str, ...]
-    dimension: str
-    required: bool
-    is_deviation: bool = False
-    is_endless: bool = False
+    channel: str  # its name in a dataset (``arm.q1``, ``tracker.x``, ``gravity_x``)
+    columns: tuple[str, ...]  # names it may have in a file, without the unit suffix, the most specific first
+    dimension: str  # of its unit
+    required: bool  # whether a record without it is useless
+    is_deviation: bool = False  # whether it is the standard deviation of a measured number
+    is_endless: bool = False  # whether it is the angle of a joint that may turn on and on
     parts: tuple[str, ...] = ()
-    effects: tuple[str, ...] = ()
-    is_of_point: bool = False
-    is_evidence: bool = False
+    effects: tuple[str, ...] = ()  # the joint effects (``arm.thermal``) that read it
+    is_of_point: bool = False  # whether it belongs to one of many points, of which a record may lack some
+    is_evidence: bool = False  # whether only the verdict reads it, so that a record that lacks it loses nothing
 
     @property
     def what(self) -> str:
@@ -78,10 +69,8 @@ class Reader(Protocol):
         """
 
 
-CYCLE = "cycle"
-"""A channel that numbers repeated visits to poses: where it is read, records that agree are no copies."""
-ID_NAMES = ("pose_id", "id")
-"""Columns that name a record."""
+CYCLE = "cycle"  # A channel that numbers repeated visits to poses: where it is read, records that agree are no copies
+ID_NAMES = ("pose_id", "id")  # Columns that name a record
 
 ENVIRONMENT: tuple[tuple[str, str], ...] = (
     *((f"gravity_{axis}", "acceleration") for axis in "xyz"),

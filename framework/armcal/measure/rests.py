@@ -16,14 +16,10 @@ from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.quaternions import nearest_turn
 from armcal.base.settings import Angle, Duration, Settings
 
-LEVER_M = 0.1
-"""A turn counts as much as it moves points this far from the target."""
-MOST_OUTLYING = 0.1
-"""A larger part of the frames that lies far off is no accident."""
-_LONGEST_OUTLYING = 2
-"""So many frames in a row may be wrong; more have seen the arm elsewhere."""
-_SURE = 5.5
-"""Standard deviations that the length of a normal vector of three exceeds once in a million times."""
+LEVER_M = 0.1  # A turn counts as much as it moves points this far from the target
+MOST_OUTLYING = 0.1  # A larger part of the frames that lies far off is no accident
+_LONGEST_OUTLYING = 2  # So many frames in a row may be wrong; more have seen the arm elsewhere
+_SURE = 5.5  # Standard deviations that the length of a normal vector of three exceeds once in a million times
 _MOST_CORRELATED = 0.95
 
 
@@ -35,15 +31,10 @@ _TINY_M = 1e-9
 
 @dataclass(frozen=True)
 class Stillness:
-    """Whether some poses are those of an arm that stands.
+    """Whether some poses are those of an arm that stands."""
 
-    Attributes:
-        why_not: why they are not those of an arm that stands, a sentence; empty if they are.
-        kept: which poses count (N); the others lie far off.
-    """
-
-    why_not: str
-    kept: Mask
+    why_not: str  # why they are not those of an arm that stands, a sentence; empty if they are
+    kept: Mask  # which poses count (N); the others lie far off
 
 
 def judged(poses: Array, spread: float) -> Stillness:

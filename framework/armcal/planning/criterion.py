@@ -15,8 +15,7 @@ from armcal.base.arrays import Array
 
 Goal = Literal["D", "A", "E", "O1", "O2", "O3", "O4", "O5"]
 GOALS: tuple[Goal, ...] = get_args(Goal)
-FLOOR = 1e-300
-"""Eigenvalues are kept above it, so that a singular matrix is very bad and not an error."""
+FLOOR = 1e-300  # Eigenvalues are kept above it, so that a singular matrix is very bad and not an error
 _SAME = 1e-6
 
 
@@ -25,13 +24,11 @@ class Criterion:
     """A goal as something to maximise, a function of eigenvalues (... x n, smallest first).
 
     Attributes:
-        name: ``D``, ``A``, ``E``, ``O2``, ``O4`` or ``O5``; O1 is D and O3 is E.
-        value: what is maximised.
         trace: where the criterion is a concave sum over eigenvalues, its derivative and second derivative by one.
     """
 
-    name: str
-    value: Callable[[Array], Array]
+    name: str  # ``D``, ``A``, ``E``, ``O2``, ``O4`` or ``O5``; O1 is D and O3 is E
+    value: Callable[[Array], Array]  # what is maximised
     trace: tuple[Callable[[Array], Array], Callable[[Array], Array]] | None
 
     def of(self, information: Array) -> Array:
@@ -84,20 +81,13 @@ class Observability:
     """The five indices; larger is better, 0 where a combination is undetermined.
 
     With s_1 >= ... >= s_n > 0 the singular values of the scaled whitened Jacobian of m equations:
-
-    Attributes:
-        o1: geometric mean over sqrt(m), (s_1 ... s_n)^(1/n) / sqrt(m). [Borm1989] [Borm1991]
-        o2: inverse condition, s_n / s_1. [Driels1990]
-        o3: smallest singular value, s_n. [Nahvi1994]
-        o4: noise amplification, s_n^2 / s_1. [Nahvi1996]
-        o5: harmonic mean, n / (1/s_1 + ... + 1/s_n). [Sun2008]
     """
 
-    o1: float
-    o2: float
-    o3: float
-    o4: float
-    o5: float
+    o1: float  # geometric mean over sqrt(m), (s_1 ... s_n)^(1/n) / sqrt(m). [Borm1989] [Borm1991]
+    o2: float  # inverse condition, s_n / s_1. [Driels1990]
+    o3: float  # smallest singular value, s_n. [Nahvi1994]
+    o4: float  # noise amplification, s_n^2 / s_1. [Nahvi1996]
+    o5: float  # harmonic mean, n / (1/s_1 + ... + 1/s_n). [Sun2008]
 
     def as_dict(self) -> dict[str, float]:
         return asdict(self)

@@ -25,10 +25,8 @@ from armcal.planning.candidates import Candidates
 from armcal.planning.criterion import Criterion, Goal, criterion
 from armcal.planning.relaxation import AT_ONCE, Relaxation, Task, relax
 
-Rows = Callable[[Array], Array]
-"""Poses (joints x N) to whitened Jacobians (n_r x N x n)."""
-Allowed = Callable[[Array], Mask]
-"""Poses (joints x N) to whether each may be visited (N, bool)."""
+Rows = Callable[[Array], Array]  # Poses (joints x N) to whitened Jacobians (n_r x N x n)
+Allowed = Callable[[Array], Mask]  # Poses (joints x N) to whether each may be visited (N, bool)
 STARTS = 10
 KICKS_A_START = 4
 DECOMPOSED_STARTS = 1
@@ -42,8 +40,7 @@ _KICKED = 0.12
 _QUICK: tuple[Goal, ...] = ("D", "A")
 _REFRESH = 64
 _TOLERANCE = 1e-9
-_DOUBTFUL = -12.0
-"""A removal that takes so much of the log determinant would carry rounding into the inverse."""
+_DOUBTFUL = -12.0  # A removal that takes so much of the log determinant would carry rounding into the inverse
 _SMALLEST = 1e-13  # determinant
 _FIRST_STEP, _SHRINK, _GAIN = 0.125, 0.5, 1e-9  # of a pose that is moved through joint space
 

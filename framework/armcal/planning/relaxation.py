@@ -22,8 +22,7 @@ from armcal.base.arrays import Array, Indices
 from armcal.planning.candidates import Candidates
 from armcal.planning.criterion import Criterion, spread
 
-AT_ONCE = 2000
-"""Above so many candidates the relaxation is solved on those that matter, and certified on all."""
+AT_ONCE = 2000  # Above so many candidates the relaxation is solved on those that matter, and certified on all
 _MANY_COORDINATES = 64
 _FEW = 600
 _GAP = 1e-7

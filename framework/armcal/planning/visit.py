@@ -6,8 +6,7 @@ import numpy as np
 
 from armcal.base.arrays import Array, Indices
 
-WINDOW = 5
-"""Poses over which squared torque is averaged: a servo warms and cools over about so many."""
+WINDOW = 5  # Poses over which squared torque is averaged: a servo warms and cools over about so many
 _MOST_SWAPPED = 300
 _MOST_PASSES = 50
 

@@ -19,48 +19,30 @@ from scipy.linalg.lapack import dpstrf
 
 from armcal.base.arrays import Array, Indices
 
-_TOGETHER = 48
-"""Rows of nodes that one matrix leads over: more are more arithmetic, fewer more steps."""
-_LEAST_SHARED = 1e-3
-"""Of the noise's variance: a part of the covariance that is smaller is left out of its root."""
+_TOGETHER = 48  # Rows of nodes that one matrix leads over: more are more arithmetic, fewer more steps
+_LEAST_SHARED = 1e-3  # Of the noise's variance: a part of the covariance that is smaller is left out of its root
 
 
 @dataclass(frozen=True)
 class _Node:
-    """One step of the filter.
+    """One step of the filter."""
 
-    Attributes:
-        left: how much of each state the node before passes on (n_s); none to the first.
-        records: those at this node.
-        slopes: their rows by the states (m x n_s).
-        covariance: of the states before these rows are counted (n_s x n_s).
-        whitening: inverse of the lower Cholesky factor of these rows' covariance (m x m).
-        gain: what these rows change of the states (n_s x m).
-    """
-
-    left: Array
-    records: Indices
-    slopes: Array
-    covariance: Array
-    whitening: Array
-    gain: Array
+    left: Array  # how much of each state the node before passes on (n_s); none to the first
+    records: Indices  # those at this node
+    slopes: Array  # their rows by the states (m x n_s)
+    covariance: Array  # of the states before these rows are counted (n_s x n_s)
+    whitening: Array  # inverse of the lower Cholesky factor of these rows' covariance (m x m)
+    gain: Array  # what these rows change of the states (n_s x m)
 
 
 @dataclass(frozen=True)
 class Correlation:
-    """What all records share.
+    """What all records share."""
 
-    Attributes:
-        slopes: whitened and weighted residuals by states, one (n_r x width x n_s) array a factor.
-        raw: the residuals themselves (m or rad) by states, of the same shapes.
-        node: where on the chain each record is (width).
-        apart: from each node to the next, in distances over which each state forgets (n_k - 1 x n_s).
-    """
-
-    slopes: tuple[Array, ...]
-    raw: tuple[Array, ...]
-    node: Indices
-    apart: Array
+    slopes: tuple[Array, ...]  # whitened and weighted residuals by states, one (n_r x width x n_s) array a factor
+    raw: tuple[Array, ...]  # the residuals themselves (m or rad) by states, of the same shapes
+    node: Indices  # where on the chain each record is (width)
+    apart: Array  # from each node to the next, in distances over which each state forgets (n_k - 1 x n_s)
 
     def independent(self, rows: Sequence[Array]) -> tuple[Array, ...]:
         """Whitened and weighted rows, one (n_r x N x k) a factor, made independent: of covariance I (same shapes)."""

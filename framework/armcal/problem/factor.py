@@ -48,43 +48,32 @@ class Factor(ElasticPass):
     """The expressions of one measurement.
 
     Attributes:
-        name: the measurement's instance name.
-        channels: the record channels it reads, in the order of ``record``.
         values: free canonical entries (symbols, n_v); fixed ones are numbers in the expressions.
         record: symbols, one a channel.
         state: deflections of all arms that take part (symbols, n_d).
-        residual: m or rad (n_r).
-        outputs: what the instrument would read (n_o), named by ``output_channels``.
-        tools: each arm's base_T_tool without its last row, column by column (12 an arm; m).
-        noise: standard deviation of each residual entry.
         noise_channels: of each residual entry, the channels that may carry a record's own one, the nearest first.
-        dimensions: ``length`` or ``angle`` of each residual entry.
         nuisance_starts: entries of the group's parameters by the record alone, to start from; empty for none.
-        nuisance_names: local names of the parameters of these entries, one an entry.
-        mean_weight: how many times more the mean of a group's residuals weighs.
-        joints: channels of commanded joints, each with ``angle`` or ``length``.
         points: what distinguishes the points of a measurement that reads the same of many (P x k); None of any other.
             Channels, noise and dimensions are then those of all points, and ``of_point`` has the expressions.
         of_point: the factor of one point: its channels are the shared ones, its own, and the k numbers of the point.
-        margin: of one point, above zero where it is in view; None where the view is not limited.
     """
 
-    name: str
-    channels: tuple[str, ...]
+    name: str  # the measurement's instance name
+    channels: tuple[str, ...]  # the record channels it reads, in the order of ``record``
     output_channels: tuple[str, ...]
-    residual: Expression
-    outputs: Expression
-    tools: Expression
-    noise: tuple[float, ...]
+    residual: Expression  # m or rad (n_r)
+    outputs: Expression  # what the instrument would read (n_o), named by ``output_channels``
+    tools: Expression  # each arm's base_T_tool without its last row, column by column (12 an arm; m)
+    noise: tuple[float, ...]  # standard deviation of each residual entry
     noise_channels: tuple[tuple[str, ...], ...] = ()
-    dimensions: tuple[str, ...] = ()
+    dimensions: tuple[str, ...] = ()  # ``length`` or ``angle`` of each residual entry
     nuisance_starts: Expression = None
-    nuisance_names: tuple[str, ...] = ()
-    mean_weight: float = 1.0
-    joints: tuple[tuple[str, str], ...] = ()
+    nuisance_names: tuple[str, ...] = ()  # local names of the parameters of these entries, one an entry
+    mean_weight: float = 1.0  # how many times more the mean of a group's residuals weighs
+    joints: tuple[tuple[str, str], ...] = ()  # channels of commanded joints, each with ``angle`` or ``length``
     points: Array | None = None
     of_point: Factor | None = None
-    margin: Expression = None
+    margin: Expression = None  # of one point, above zero where it is in view; None where the view is not limited
 
     @property
     def rows(self) -> int:

@@ -15,8 +15,7 @@ from armcal.measure.groups import NO_GROUP
 from armcal.problem.correlation import Correlation
 from armcal.problem.factor import Factor
 
-_FEW_ROWS = 8
-"""Up to so many rows records are faster side by side than matrix by matrix."""
+_FEW_ROWS = 8  # Up to so many rows records are faster side by side than matrix by matrix
 
 
 @dataclass(frozen=True)
@@ -246,15 +245,10 @@ def transformed(matrices: Array, rows: Array) -> Array:
 
 @dataclass(frozen=True)
 class PointRecords:
-    """Between records of P points and as many records of one point, those of a record side by side.
+    """Between records of P points and as many records of one point, those of a record side by side."""
 
-    Attributes:
-        shared: how many channels all points of a record have in common; they come first.
-        points: what distinguishes the points (P x k).
-    """
-
-    shared: int
-    points: Array
+    shared: int  # how many channels all points of a record have in common; they come first
+    points: Array  # what distinguishes the points (P x k)
 
     @property
     def count(self) -> int:

@@ -165,8 +165,7 @@ def _signature(function: Any, outputs: int) -> Any:
     return function
 
 
-AS_IT_STANDS = 1e300
-"""Any state is at rest: take the one given, to which repeated passes might not lead."""
+AS_IT_STANDS = 1e300  # Any state is at rest: take the one given, to which repeated passes might not lead
 WORTH_COMPILING_RECORDS = 5000
 """From this many records on, waiting for the compiler costs less than the interpreter does."""
 
@@ -334,8 +333,7 @@ HELD = -1
 BLOCK_RECORDS = 1024
 _THREADS = 2
 
-Block = tuple[Array, Array]
-"""Whitened, weighted Jacobian by the free entries (n_r x n_v x B) and residual (n_r x B)."""
+Block = tuple[Array, Array]  # Whitened, weighted Jacobian by the free entries (n_r x n_v x B) and residual (n_r x B)
 
 
 @dataclass(frozen=True)
@@ -343,12 +341,11 @@ class Shown:
     """What records show in equilibrium.
 
     Attributes:
-        outputs: what the instrument would read (n_o x N).
         tools: base_T_tool of each of the measurement's arms, column by column: three axes, then the place
             (arms x 4 x 3 x N, m).
     """
 
-    outputs: Array
+    outputs: Array  # what the instrument would read (n_o x N)
     tools: Array
 
 
@@ -359,19 +356,15 @@ class GroupedKernel:
     Results cover the records' whole width; their states are left in equilibrium.
 
     Attributes:
-        kernel: of one factor.
         entries: positions in a value vector, a row a group (groups x n_values); one row without groups, or while none
             is known: then -1 stands where the spare values do.
-        free: positions among the free entries, -1 where an entry is held (the same shape).
-        width: how many free entries there are.
-        spare: values for the group's own slots while no group is known.
     """
 
-    kernel: Kernel
+    kernel: Kernel  # of one factor
     entries: Indices
-    free: Indices
-    width: int
-    spare: Array
+    free: Indices  # positions among the free entries, -1 where an entry is held (the same shape)
+    width: int  # how many free entries there are
+    spare: Array  # values for the group's own slots while no group is known
 
     @property
     def _block_records(self) -> int:

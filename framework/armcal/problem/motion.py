@@ -16,8 +16,7 @@ from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem
 
 ORDER_CHANNELS = ("sequence", "time")
-_STEP_M = 1e-3
-"""So small that a load that hangs there hardly stands elsewhere."""
+_STEP_M = 1e-3  # So small that a load that hangs there hardly stands elsewhere
 LOADS = ("turn_x", "turn_y", "turn_z", "gravity", "mass", "moment_x", "moment_y", "moment_z")
 """Gravity turned about base axes (rad) and multiplied; a mass at the payload's centre (kg), its moments (kg m)."""
 
@@ -27,15 +26,13 @@ class Motion:
     """Records as an arm goes through them.
 
     Attributes:
-        channels: the command channels of all joints of all arms.
         slopes: raw residual by these channels, one (n_r x joints x N) array a factor (m/rad and the like).
-        loads: of each arm.
         by_load: raw residual by ``LOADS``, one (n_r x 8 x N) array a factor; empty if nothing gives way under loads.
     """
 
-    channels: tuple[str, ...]
+    channels: tuple[str, ...]  # the command channels of all joints of all arms
     slopes: tuple[Array, ...]
-    loads: Mapping[str, SiteLoads]
+    loads: Mapping[str, SiteLoads]  # of each arm
     by_load: tuple[Array, ...] = ()
 
     @classmethod

@@ -57,17 +57,13 @@ class TieFunction:
     """One tie, ready to evaluate.
 
     Attributes:
-        groups: the keys.
-        entries: positions in a value vector of what it holds together (n).
-        noise: standard deviation of each entry of its residual.
-        function: of those numbers to the residual (m or rad) and its Jacobian.
         bend: of those numbers and a factor for each entry of the residual to the second derivative of their product.
     """
 
-    groups: tuple[str, str]
-    entries: Indices
-    noise: Array
-    function: ca.Function
+    groups: tuple[str, str]  # the keys
+    entries: Indices  # positions in a value vector of what it holds together (n)
+    noise: Array  # standard deviation of each entry of its residual
+    function: ca.Function  # of those numbers to the residual (m or rad) and its Jacobian
     bend: ca.Function
 
     @classmethod

@@ -17,8 +17,7 @@ from armcal.problem.kernel import GroupedKernel
 from armcal.problem.problem import FactorRecords, Problem
 
 _MOST_STEPS = 12
-_AT_ZERO = 1e-6
-"""In units of the noise: a residual below this is none."""
+_AT_ZERO = 1e-6  # In units of the noise: a residual below this is none
 
 
 def projected(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:

@@ -18,10 +18,8 @@ from armcal.problem.factor_records import by_covariance, transformed, whitening_
 from armcal.problem.problem import FactorRecords, Problem
 
 _STEPS = 8
-_EXACT = 1e-9
-"""In units of the noise."""
-_LEAST_SLOPE = 1e-6
-"""Of the largest one: a residual that changes less with every reading is none of theirs."""
+_EXACT = 1e-9  # In units of the noise
+_LEAST_SLOPE = 1e-6  # Of the largest one: a residual that changes less with every reading is none of theirs
 
 
 def reading_slopes(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[Array | None, ...]:

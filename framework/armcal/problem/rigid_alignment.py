@@ -69,18 +69,15 @@ def rigid_fit(points: Array, others: Array) -> tuple[Array, Array]:
     return turn, other - turn @ middle
 
 
-FEWEST = 8
-"""Records: with fewer, nine numbers explain anything."""
+FEWEST = 8  # Records: with fewer, nine numbers explain anything
 _STARTS, _SHORT, _LONG, _KEPT, _FEW, _QUICK = 8, 8, 20, 2, 60, 5
 _SEED = 3
 _AT_REST, _SINGULAR = 1e-6, 1e-12
-_SAME = 0.02
-"""Of the spread of the positions: two alignments that show targets so near to each other are one."""
+_SAME = 0.02  # Of the spread of the positions: two alignments that show targets so near to each other are one
 _UNSEEN, _PART = 1e-3, 0.3
 """Of the best determined direction: what is not determined; of a direction's largest part: what belongs to it."""
 _STRIDES, _MOST_PAIRS = (1, 2, 3, 5), 600
-_LONGEST_TURN_RAD = 2.6
-"""Beyond it a rotation vector may jump to the other end of its axis."""
+_LONGEST_TURN_RAD = 2.6  # Beyond it a rotation vector may jump to the other end of its axis
 
 
 @dataclass(frozen=True)
@@ -100,14 +97,12 @@ class Alignment:
 
     Attributes:
         turn, shift: of the base frame (3 x 3; 3, m).
-        offset: by which the target is moved, in the tool's axes (3, m).
-        left: typical distance that is left (median, m).
     """
 
     turn: Array
     shift: Array
-    offset: Array
-    left: float
+    offset: Array  # by which the target is moved, in the tool's axes (3, m)
+    left: float  # typical distance that is left (median, m)
 
     def moved(self, tools: Tools) -> Array:
         """Where targets are then, in the instrument's frame (3 x N, m)."""
@@ -269,19 +264,12 @@ _QUATERNION = ("qw", "qx", "qy", "qz")
 
 @dataclass(frozen=True)
 class Sighting:
-    """Records of a measurement that reads positions in a frame, all of one arm.
+    """Records of a measurement that reads positions in a frame, all of one arm."""
 
-    Attributes:
-        kernel: which measurement.
-        chosen: places of its records (n).
-        measured: positions (3 x n, m).
-        turned: rotations of the body that was measured (n x 3 x 3); None where only positions are.
-    """
-
-    kernel: int
-    chosen: Indices
-    measured: Array
-    turned: Array | None = None
+    kernel: int  # which measurement
+    chosen: Indices  # places of its records (n)
+    measured: Array  # positions (3 x n, m)
+    turned: Array | None = None  # rotations of the body that was measured (n x 3 x 3); None where only positions are
 
     @property
     def size(self) -> float:

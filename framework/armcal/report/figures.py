@@ -20,8 +20,7 @@ _CURVE_POINTS = 240
 _LOG_FROM = 6.0
 _OUTLIER = 4.0
 _TRIANGLE = "m-4 5l4-7l4 7z"
-MOST_POINTS = 4000
-"""More positions than this are thinned out."""
+MOST_POINTS = 4000  # More positions than this are thinned out
 _MOST_VECTORS = 500
 _COLOURS = ("#9bd93c", "#4ac16d", "#1fa187", "#277f8e", "#365c8d", "#46327e", "#440154")
 """Light to dark, distinct with any colour vision."""
@@ -167,21 +166,13 @@ def _drawn(chosen: int, total: int) -> str:
 
 @dataclass(frozen=True)
 class Coloured:
-    """What colours the tip positions.
+    """What colours the tip positions."""
 
-    Attributes:
-        key: of the figures on the page.
-        numbers: one a record (N).
-        unit: theirs.
-        name: of one of them.
-        vectors: lines from the positions (3 x N; mm), if they are to be drawn.
-    """
-
-    key: str
-    numbers: Array
-    unit: str
-    name: str
-    vectors: Array | None = None
+    key: str  # of the figures on the page
+    numbers: Array  # one a record (N)
+    unit: str  # theirs
+    name: str  # of one of them
+    vectors: Array | None = None  # lines from the positions (3 x N; mm), if they are to be drawn
 
 
 def views(result: RunResult) -> list[Figure]:

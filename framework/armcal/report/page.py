@@ -28,8 +28,7 @@ from armcal.report.tables import (
 from armcal.run.result import RunResult
 from armcal.version import __version__
 
-MOST_LISTED = 50
-"""Of records set aside and of correlated pairs; the rest is counted."""
+MOST_LISTED = 50  # Of records set aside and of correlated pairs; the rest is counted
 _STRONGEST = 20
 _WORDS = {"bad": "Bad", "warning": "Warning", "note": "Note", "good": "Good"}
 _SYMBOLS = {"bad": "✕", "warning": "!", "note": "i", "good": "✓"}

@@ -34,15 +34,10 @@ class SectionMaker(Protocol):
 
 @dataclass(frozen=True)
 class PluginSection:
-    """A registered section as the page shows it.
+    """A registered section as the page shows it."""
 
-    Attributes:
-        name: as registered.
-        content: None where ``fault`` says why there is none.
-    """
-
-    name: str
-    content: ReportSection | None
+    name: str  # as registered
+    content: ReportSection | None  # None where ``fault`` says why there is none
     fault: str = ""
 
 

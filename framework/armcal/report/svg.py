@@ -11,8 +11,7 @@ from armcal.base.arrays import Array
 from armcal.report.numbers import MINUS, count, decimals_for, fixed, significant
 
 WIDE, HALF, NARROW = 1040, 504, 344
-MONO = 6.7
-"""Width of a character of the monospaced labels."""
+MONO = 6.7  # Width of a character of the monospaced labels
 DIAMOND = "m-3.6 0l3.6-3.6l3.6 3.6l-3.6 3.6z"
 _GROUPED = 10_000
 _LOG_ALL_STEPS = 2.2

@@ -30,8 +30,7 @@ from armcal.measure.reader import ReadRequest, RequestedChannel, requested_chann
 from armcal.plugins import PluginRegistry
 from armcal.run.plan_poses import Workspace, workspace_of
 
-_WORTH_COMPILING = 5000
-"""From this many targets on, waiting for the compiler costs less than doing without it."""
+_WORTH_COMPILING = 5000  # From this many targets on, waiting for the compiler costs less than doing without it
 Column = tuple[str, tuple[str, ...]]
 _ENGLISH = {False: "no", True: "yes"}
 _QUATERNION = ("qw", "qx", "qy", "qz")
@@ -169,37 +168,27 @@ class Assessed:
     """Commands, and what is known about them.
 
     Attributes:
-        commands: found.
         nominal_distances: how far from its target the real arm is with the nominal arm's command (N; m); nan where the
             nominal arm has none.
         radii: of the ball about the expected place that holds a measurement of it with 95 % (N; m); None if unknown,
             as for a tool's origin that no measurement judges.
     """
 
-    commands: Commands
+    commands: Commands  # found
     nominal_distances: Array
     radii: Array | None
 
 
 @dataclass(frozen=True)
 class Bench:
-    """An arm of a calibration, where it may go and how its commands are chosen.
+    """An arm of a calibration, where it may go and how its commands are chosen."""
 
-    Attributes:
-        calibration: as loaded.
-        arm: its instance name.
-        options: of compensation.
-        space: where it may go.
-        target: what its instrument reads, if it reads a point of the tool.
-        point: what is brought to targets.
-    """
-
-    calibration: Calibration
-    arm: str
-    options: Options
-    space: Workspace
-    target: MeasuredPoint | None
-    point: Point = "tool"
+    calibration: Calibration  # as loaded
+    arm: str  # its instance name
+    options: Options  # of compensation
+    space: Workspace  # where it may go
+    target: MeasuredPoint | None  # what its instrument reads, if it reads a point of the tool
+    point: Point = "tool"  # what is brought to targets
 
     @classmethod
     def of(

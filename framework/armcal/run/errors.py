@@ -46,18 +46,15 @@ class NominalErrors:
     Attributes:
         errors: as it is shown: where the configuration has it, or placed by the training records where nobody
             configured where it stands, or what it carries.
-        crossed: the same, what is cross-validated by the placement of the fold that did not train on it.
         rival: what a calibration is compared with, placed by the records that train, of records that do not; nan of
             others, and of all where nothing is free but what places the arm.
-        turns: those three of orientations (rad); None where none are measured.
-        residual: of the arm as it is shown (n_r x N).
     """
 
     errors: Array
-    crossed: Array
+    crossed: Array  # the same, what is cross-validated by the placement of the fold that did not train on it
     rival: Array
-    turns: tuple[Array, Array, Array] | None
-    residual: Sequence[Array]
+    turns: tuple[Array, Array, Array] | None  # those three of orientations (rad); None where none are measured
+    residual: Sequence[Array]  # of the arm as it is shown (n_r x N)
 
 
 def placing_names(problem: Problem, records: Sequence[FactorRecords]) -> set[str]:
@@ -114,8 +111,7 @@ def _found(run: FittedRecords, names: set[str], placed: Array) -> bool:
     return bool(np.nanmedian(placed) * BETTER < np.nanmedian(configured))
 
 
-_MM = 1000.0
-"""Thousandths of m; of rad where errors are angles."""
+_MM = 1000.0  # Thousandths of m; of rad where errors are angles
 
 
 @dataclass(frozen=True)
@@ -134,37 +130,25 @@ class RecordErrors:
     """Error of each record of the dataset, in dataset order: in mm, or in ``unit`` where nothing measured is a length.
 
     Attributes:
-        nominal_mm: of the nominal arm, as ``NominalErrors`` has it (N).
-        calibrated_mm: with the calibrated ones (N).
-        cross_validated_mm: by the fold that did not train on it (N; nan outside of cross-validation).
-        nominal_residual_mm: measured minus predicted, all factors stacked (n_r x N).
-        calibrated_residual_mm: the same after calibration.
-        position_mm: predicted tool position of the first arm in its base frame (3 x N).
-        failed_folds: how many folds of the cross-validation did not converge.
         at_rest_mm: with the calibrated parameters where nothing is known of a drift (N); None if nothing drifts.
-        cross_validated_at_rest_mm: the same by the fold that did not train on it.
-        residual_columns: names of the rows of the residuals, with their units (mm; mrad for angles).
-        unit: of all errors, ``mm`` or ``mrad``.
-        name: what they are errors of, ``Tip``.
-        turns: of orientations, where they are measured beside lengths.
         nominal_crossed_mm, rival_mm: as ``NominalErrors`` has them (N).
     """
 
-    nominal_mm: Array
-    calibrated_mm: Array
-    cross_validated_mm: Array
-    nominal_residual_mm: Array
-    calibrated_residual_mm: Array
-    position_mm: Array
+    nominal_mm: Array  # of the nominal arm, as ``NominalErrors`` has it (N)
+    calibrated_mm: Array  # with the calibrated ones (N)
+    cross_validated_mm: Array  # by the fold that did not train on it (N; nan outside of cross-validation)
+    nominal_residual_mm: Array  # measured minus predicted, all factors stacked (n_r x N)
+    calibrated_residual_mm: Array  # the same after calibration
+    position_mm: Array  # predicted tool position of the first arm in its base frame (3 x N)
     nominal_crossed_mm: Array
     rival_mm: Array
-    failed_folds: int = 0
+    failed_folds: int = 0  # how many folds of the cross-validation did not converge
     at_rest_mm: Array | None = None
-    cross_validated_at_rest_mm: Array | None = None
-    residual_columns: tuple[str, ...] = ()
-    unit: str = "mm"
-    name: str = "Tip"
-    turns: TurnErrors | None = None
+    cross_validated_at_rest_mm: Array | None = None  # the same by the fold that did not train on it
+    residual_columns: tuple[str, ...] = ()  # names of the rows of the residuals, with their units (mm; mrad for angles)
+    unit: str = "mm"  # of all errors, ``mm`` or ``mrad``
+    name: str = "Tip"  # what they are errors of, ``Tip``
+    turns: TurnErrors | None = None  # of orientations, where they are measured beside lengths
 
     def fold_warnings(self, folds: int) -> tuple[str, ...]:
         """That some of the folds did not converge."""

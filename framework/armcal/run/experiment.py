@@ -31,8 +31,7 @@ from armcal.measure.reader import Reader, ReadRequest, evidence_channels, reques
 from armcal.plugins import PluginRegistry, discover
 from armcal.run.settings import ExperimentSettings
 
-STANDARD_GRAVITY = {"earth": 9.80665, "moon": 1.62, "mars": 3.71}
-"""m/s^2; [Williams2024]"""
+STANDARD_GRAVITY = {"earth": 9.80665, "moon": 1.62, "mars": 3.71}  # m/s^2; [Williams2024]
 _HEAVY = 20.0
 _GRAVITY_TOLERANCE = 0.02
 

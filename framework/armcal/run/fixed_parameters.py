@@ -33,16 +33,13 @@ class FixedParameters:
     """What fixed parameters would gain.
 
     Attributes:
-        error: mean error of records held out as configured (m, or rad where nothing measured is a length).
-        steps: parameters that explain residuals, in the order in which they are freed.
         recommended: of these the ones to free: none if held-out errors do not fall by more than chance, and by 1 %.
-        others: names of what the records would determine too, and that gains nothing.
     """
 
-    error: float
-    steps: tuple[FreedStep, ...]
+    error: float  # mean error of records held out as configured (m, or rad where nothing measured is a length)
+    steps: tuple[FreedStep, ...]  # parameters that explain residuals, in the order in which they are freed
     recommended: tuple[str, ...]
-    others: tuple[str, ...]
+    others: tuple[str, ...]  # names of what the records would determine too, and that gains nothing
 
 
 def fixed_parameters(experiment: Experiment, ready: Prepared, progress: Progress = no_progress) -> FixedParameters:

@@ -26,26 +26,19 @@ from armcal.run.settings import PlanSettings
 
 NAMES = ("P1", "P2", "P3", "P4", "P5")
 """P1 is the centre, P2 to P5 go round the plane; P2 and P4 are ends of one diagonal."""
-DIRECTED = ("P1", "P2", "P4")
-"""Of which the standard takes several directions of approach."""
+DIRECTED = ("P1", "P2", "P4")  # Of which the standard takes several directions of approach
 SIZES = (2.5, 1.6, 1.0, 0.63, 0.4, 0.25, 0.16, 0.1, 0.063, 0.04, 0.025)
 """Edges that are tried, a series of preferred numbers (m)."""
-_FROM_CORNER = 0.1
-"""Of a diagonal's length, from its corner to the pose."""
+_FROM_CORNER = 0.1  # Of a diagonal's length, from its corner to the pose
 _PLANE = np.array([[0, 0, 0], [-1, -1, -1], [-1, 1, -1], [1, 1, 1], [1, -1, 1]]) / 2
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
-_CHECKED = 24
-"""Cubes of a size whose corners are looked at."""
-_NEAR_RAD = 2.1
-"""A joint that moves farther between poses is in another posture."""
+_CHECKED = 24  # Cubes of a size whose corners are looked at
+_NEAR_RAD = 2.1  # A joint that moves farther between poses is in another posture
 _JOINTS_OF_A_POSE = 6
 _MM = 1000.0
-PATH = "path"
-"""The direction of poses that are come to one from another."""
-_OF_SIZE, _FARTHEST = 0.1, 0.05
-"""How far an approach begins: of the cube's edge, and at most (m)."""
-_STILL = 1e-6
-"""A joint that moves less (rad or m) does not come from a side."""
+PATH = "path"  # The direction of poses that are come to one from another
+_OF_SIZE, _FARTHEST = 0.1, 0.05  # How far an approach begins: of the cube's edge, and at most (m)
+_STILL = 1e-6  # A joint that moves less (rad or m) does not come from a side
 _POSTURES = 1024
 _NO_CLEARANCE = "no clearance is stated (plan.clearance): nothing here keeps the arm from itself or the table."
 

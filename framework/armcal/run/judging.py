@@ -92,20 +92,17 @@ class IntervalResult:
     Attributes:
         stretches: what half widths are multiplied by, from cross-validation; empty without.
         crossed: shares held of training records, by folds that did not see them; stretched from the other folds.
-        holdout: shares held of held-out records.
         half_width_mm: of 90 % intervals of a position coordinate, median over all records; stretched.
-        radius_mm: of 95 % radii of positions, likewise.
         scores: of cross-validated and held-out records, in dataset order; nan elsewhere.
-        levels: each joint stood at no more angles than these, and nothing states its error between them; else 0.
     """
 
     stretches: Mapping[Recording, Stretch] = field(default_factory=dict)
     crossed: Mapping[Recording, Coverage] = field(default_factory=dict)
-    holdout: Mapping[Recording, Coverage] = field(default_factory=dict)
+    holdout: Mapping[Recording, Coverage] = field(default_factory=dict)  # shares held of held-out records
     half_width_mm: Mapping[Recording, float] = field(default_factory=dict)
-    radius_mm: Mapping[Recording, float] = field(default_factory=dict)
+    radius_mm: Mapping[Recording, float] = field(default_factory=dict)  # of 95 % radii of positions, likewise
     scores: Mapping[Recording, Scores] = field(default_factory=dict)
-    levels: int = 0
+    levels: int = 0  # each joint stood at no more angles than these, and nothing states its error between them; else 0
 
     @property
     def judged(self) -> tuple[Mapping[Recording, Coverage], str]:

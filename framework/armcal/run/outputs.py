@@ -36,10 +36,8 @@ FILES = ("experiment.yaml", "residuals.csv", "metrics.json", "report.html", "log
 NOT_CONVERGED_SUFFIX = ".not-converged"
 DO_NOT_USE_SUFFIX = ".do-not-use"
 UNREADABLE_SUFFIX = ".unreadable"
-BOOTSTRAP_FILE = "bootstrap.csv"
-"""Only where a bootstrap was asked for."""
-PROFILE_FILE = "profile.json"
-"""Only where profiles were asked for."""
+BOOTSTRAP_FILE = "bootstrap.csv"  # Only where a bootstrap was asked for
+PROFILE_FILE = "profile.json"  # Only where profiles were asked for
 _OURS = (
     BOOTSTRAP_FILE,
     PROFILE_FILE,

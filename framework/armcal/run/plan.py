@@ -182,14 +182,10 @@ def _approaches(visited: Dataset, space: JointSpace) -> dict[str, Array]:
     return approaches
 
 
-APPROACH_ROOM = np.deg2rad(3.0)
-"""A joint that is come to from a side comes from as far: more than servos have play."""
-PLANNED = ("continuous", "grid")
-"""Kinds of candidates whose approaches can be chosen."""
-SHARE = 0.2
-"""Of the poses, those between the angles that the others repeat."""
-_SAME_LEVEL = 0.02
-"""Of a joint's range."""
+APPROACH_ROOM = np.deg2rad(3.0)  # A joint that is come to from a side comes from as far: more than servos have play
+PLANNED = ("continuous", "grid")  # Kinds of candidates whose approaches can be chosen
+SHARE = 0.2  # Of the poses, those between the angles that the others repeat
+_SAME_LEVEL = 0.02  # Of a joint's range
 
 
 def depends_on_approach(problem: Problem) -> bool:
@@ -272,37 +268,24 @@ class PlanResult:
 
     Attributes:
         dataset: the poses in the order of visit, each with the approach that was planned, else that this order gives.
-        pool: the candidates.
-        given: how many records were there before.
-        equations: how many residual numbers the plan and the records before give.
-        value: of the criterion.
-        log_det: log determinant of the information by coordinates in their typical scales, at the nominal values.
-        certificate: None where the goal has none.
-        observability: O1 to O5, of plan, records before and priors.
-        names: of the coordinates.
-        deviations: standard deviations before and after (2 x n, SI; infinite where undetermined).
-        identifiability: after the plan.
-        travel_s: of the whole visit.
         peak: of the moving average of squared holding torque beside the plan's largest; None where nothing is held.
-        starts: of the exchange.
-        refined: poses that were moved through joint space.
     """
 
     dataset: Dataset
-    pool: Pool
-    given: int
-    equations: int
-    value: float
-    log_det: float
-    certificate: Certificate | None
-    observability: Observability
-    names: tuple[str, ...]
-    deviations: Array
-    identifiability: Identifiability
-    travel_s: float
+    pool: Pool  # the candidates
+    given: int  # how many records were there before
+    equations: int  # how many residual numbers the plan and the records before give
+    value: float  # of the criterion
+    log_det: float  # log determinant of the information by coordinates in their typical scales, at the nominal values
+    certificate: Certificate | None  # None where the goal has none
+    observability: Observability  # O1 to O5, of plan, records before and priors
+    names: tuple[str, ...]  # of the coordinates
+    deviations: Array  # standard deviations before and after (2 x n, SI; infinite where undetermined)
+    identifiability: Identifiability  # after the plan
+    travel_s: float  # of the whole visit
     peak: float | None
-    starts: int
-    refined: int
+    starts: int  # of the exchange
+    refined: int  # poses that were moved through joint space
 
 
 def make_plan(

@@ -36,17 +36,11 @@ _BARRED = "too little clearance"
 
 @dataclass(frozen=True)
 class JointSpace:
-    """The joints of all arms, in order.
+    """The joints of all arms, in order."""
 
-    Attributes:
-        channels: of their commands (``arm.q1``).
-        names: as a configuration calls them (``q1``; ``left.q1`` where there are several arms).
-        dimensions: ``angle`` or ``length``.
-    """
-
-    channels: tuple[str, ...]
-    names: tuple[str, ...]
-    dimensions: tuple[str, ...]
+    channels: tuple[str, ...]  # of their commands (``arm.q1``)
+    names: tuple[str, ...]  # as a configuration calls them (``q1``; ``left.q1`` where there are several arms)
+    dimensions: tuple[str, ...]  # ``angle`` or ``length``
 
     @classmethod
     def of(cls, experiment: Experiment) -> Self:
@@ -94,17 +88,11 @@ def stated_beyond(experiment: Experiment, stated: Mapping[str, Limits]) -> tuple
 
 @dataclass(frozen=True)
 class Pool:
-    """Candidates for a plan.
+    """Candidates for a plan."""
 
-    Attributes:
-        kind: where they come from.
-        dataset: joint commands, approach, load and gravity.
-        left_out: how many were left out, by reason.
-    """
-
-    kind: str
-    dataset: Dataset
-    left_out: Mapping[str, int]
+    kind: str  # where they come from
+    dataset: Dataset  # joint commands, approach, load and gravity
+    left_out: Mapping[str, int]  # how many were left out, by reason
 
     def without(self, faulty: Mask, reason: str) -> Self:
         """Those that are not faulty (N, bool)."""

@@ -41,8 +41,7 @@ _STRETCHES = 10
 _SURE = 2.6
 """Standard errors, one in 200 by chance, by which errors of records held out must be smaller, and may be larger."""
 _REGIONS = 5
-_NEAR = 0.99
-"""Of records like those that taught it, that count as near them."""
+_NEAR = 0.99  # Of records like those that taught it, that count as near them
 _LEAST_GAIN = 0.01
 _FEWEST = 20
 _DETERMINED = 1e-6
@@ -55,12 +54,11 @@ class Comparison:
 
     Attributes:
         without, with_it: mean errors (mm, or mrad).
-        sure: the difference in standard errors, of the measurement where it is least; above 0 where all are better.
     """
 
     without: float
     with_it: float
-    sure: float
+    sure: float  # the difference in standard errors, of the measurement where it is least; above 0 where all are better
 
     @classmethod
     def of(cls, without: Array, with_it: Array, gains: Array) -> Self:
@@ -80,35 +78,20 @@ def _sure(gains: Array) -> float:
 
 @dataclass(frozen=True)
 class ResidualOutcome:
-    """What became of a pose residual.
+    """What became of a pose residual."""
 
-    Attributes:
-        arm: whose.
-        kind: its type.
-        unit: of errors.
-        folds: random ones; None where nothing could be compared.
-        why: in words, then.
-        harm: where it makes errors larger, in words, if its mean does not say so.
-        reach: as little as it may know of a pose that is near its records (m, standard deviation).
-        stretches: of records that were recorded one after another.
-        residual: as learned; None if it is not kept.
-        crossed: of the random folds, with it.
-        splits: these folds.
-        moved: what it does in the run's records, once it is kept.
-    """
-
-    arm: str
-    kind: str
-    unit: str
-    folds: Comparison | None = None
-    why: str = "the records are too few for it, or show no such error"
-    harm: str = ""
-    reach: float = np.inf
-    stretches: Comparison | None = None
-    residual: PoseResidual | None = None
-    crossed: CrossValidation | None = None
-    splits: tuple[Split, ...] = ()
-    moved: Moved | None = None
+    arm: str  # whose
+    kind: str  # its type
+    unit: str  # of errors
+    folds: Comparison | None = None  # random ones; None where nothing could be compared
+    why: str = "the records are too few for it, or show no such error"  # in words, then
+    harm: str = ""  # where it makes errors larger, in words, if its mean does not say so
+    reach: float = np.inf  # as little as it may know of a pose that is near its records (m, standard deviation)
+    stretches: Comparison | None = None  # of records that were recorded one after another
+    residual: PoseResidual | None = None  # as learned; None if it is not kept
+    crossed: CrossValidation | None = None  # of the random folds, with it
+    splits: tuple[Split, ...] = ()  # these folds
+    moved: Moved | None = None  # what it does in the run's records, once it is kept
 
     def system(self, system: System) -> System:
         if self.residual is None:

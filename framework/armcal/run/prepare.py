@@ -63,25 +63,15 @@ class Stopwatch:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A problem ready to solve: data read and checked, functions compiled.
+    """A problem ready to solve: data read and checked, functions compiled."""
 
-    Attributes:
-        dataset: all records that are used, in SI.
-        problem: compiled, with the arm and the target where ``start`` places them.
-        records: the dataset as the problem's factors read it, one entry a measurement.
-        split: which records train, and which are held out.
-        warnings: what a user should know before the fit.
-        start: where the fit begins.
-        findings: of the checks, for the verdict.
-    """
-
-    dataset: Dataset
-    problem: Problem
-    records: tuple[FactorRecords, ...]
-    split: Split
-    warnings: tuple[str, ...]
-    start: Start
-    findings: tuple[Finding, ...] = ()
+    dataset: Dataset  # all records that are used, in SI
+    problem: Problem  # compiled, with the arm and the target where ``start`` places them
+    records: tuple[FactorRecords, ...]  # the dataset as the problem's factors read it, one entry a measurement
+    split: Split  # which records train, and which are held out
+    warnings: tuple[str, ...]  # what a user should know before the fit
+    start: Start  # where the fit begins
+    findings: tuple[Finding, ...] = ()  # of the checks, for the verdict
 
     @property
     def training(self) -> tuple[FactorRecords, ...]:

@@ -61,19 +61,15 @@ class NoiseResult:
     """How the records of a run weighed.
 
     Attributes:
-        loss: ``none``, ``huber``, ``cauchy`` or ``reject``.
         weights: of each record of the dataset in the fit, its least one if it has several (N; nan: not trained on).
-        suspicious: the farthest first; not sought in plain least squares.
-        components: estimated variances, or None.
-        rounds: solves beyond the first.
         scatter: of what the fit leaves unexplained, by measurement.
     """
 
-    loss: str = "none"
+    loss: str = "none"  # ``none``, ``huber``, ``cauchy`` or ``reject``
     weights: Array | None = None
-    suspicious: tuple[SuspiciousRecord, ...] = ()
-    components: VarianceComponents | None = None
-    rounds: int = 0
+    suspicious: tuple[SuspiciousRecord, ...] = ()  # the farthest first; not sought in plain least squares
+    components: VarianceComponents | None = None  # estimated variances, or None
+    rounds: int = 0  # solves beyond the first
     scatter: Mapping[str, ResidualSpread] = field(default_factory=dict)
 
     @property

@@ -44,8 +44,7 @@ from armcal.run.settings import ExperimentSettings, ValidationSettings
 from armcal.run.study_result import Cell, Change, NestedResult, StudyResult, VariantResult
 
 R = TypeVar("R")
-PREVIOUS = "previous"
-"""As a reference: each variant is compared with the one before it."""
+PREVIOUS = "previous"  # As a reference: each variant is compared with the one before it
 WORTH_COMPILING = 1000
 """Records to fit: less than for a run, since the models of a study may be large and their fits long."""
 MOST_LISTED = 10

@@ -17,25 +17,15 @@ FILES = ("experiment.yaml", "study.csv", "study.json", "study.html")
 
 @dataclass(frozen=True)
 class Change:
-    """One model against another, record by record; negative is better.
+    """One model against another, record by record; negative is better."""
 
-    Attributes:
-        against: the other model.
-        mean: of the differences of each record's error.
-        standard_error: of that mean, from blocks of neighbouring records; the fitted models are taken as given.
-        block: how many neighbours a block has.
-        helped: the share of records whose error is smaller.
-        most_helped: ids and differences of the records that gain most.
-        most_hurt: of those that lose most.
-    """
-
-    against: str
-    mean: float
-    standard_error: float
-    block: int
-    helped: float
-    most_helped: tuple[tuple[str, float], ...]
-    most_hurt: tuple[tuple[str, float], ...]
+    against: str  # the other model
+    mean: float  # of the differences of each record's error
+    standard_error: float  # of that mean, from blocks of neighbouring records; the fitted models are taken as given
+    block: int  # how many neighbours a block has
+    helped: float  # the share of records whose error is smaller
+    most_helped: tuple[tuple[str, float], ...]  # ids and differences of the records that gain most
+    most_hurt: tuple[tuple[str, float], ...]  # of those that lose most
 
 
 @dataclass(frozen=True)
@@ -43,34 +33,23 @@ class VariantResult:
     """One variant, judged.
 
     Attributes:
-        name: of the variant.
-        free: how many numbers the fit may change.
-        nominal: errors without calibration (mm).
-        train: errors of a fit on all records, on the same records (mm).
         crossed: errors of each record by a fit that did not see it (mm), the mean of each figure over the repeats.
-        at_rest: the same if nothing is known of a drift; equal where nothing drifts.
-        errors_mm: ``crossed`` record by record, mean over the repeats (N; nan where a fold did not converge).
-        change: against the variant it is compared with (mm); None for the reference itself.
-        converged: whether the fit on all records did.
-        failed_folds: how many fits of the cross-validation did not converge.
-        fit_seconds: of the fit on all records.
-        seconds: of all fits of this variant.
         turns: errors of orientations (deg), where they are measured beside lengths: ``nominal``, ``train``,
             ``cross_validated``.
     """
 
-    name: str
-    free: int
-    nominal: ErrorSummary
-    train: ErrorSummary
+    name: str  # of the variant
+    free: int  # how many numbers the fit may change
+    nominal: ErrorSummary  # errors without calibration (mm)
+    train: ErrorSummary  # errors of a fit on all records, on the same records (mm)
     crossed: ErrorSummary
-    at_rest: ErrorSummary
-    errors_mm: Array
-    change: Change | None
-    converged: bool
-    failed_folds: int
-    fit_seconds: float
-    seconds: float
+    at_rest: ErrorSummary  # the same if nothing is known of a drift; equal where nothing drifts
+    errors_mm: Array  # ``crossed`` record by record, mean over the repeats (N; nan where a fold did not converge)
+    change: Change | None  # against the variant it is compared with (mm); None for the reference itself
+    converged: bool  # whether the fit on all records did
+    failed_folds: int  # how many fits of the cross-validation did not converge
+    fit_seconds: float  # of the fit on all records
+    seconds: float  # of all fits of this variant
     turns: Mapping[str, ErrorSummary] | None = None
 
     def as_dict(self) -> dict[str, Any]:

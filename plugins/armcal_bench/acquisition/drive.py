@@ -145,19 +145,15 @@ def travel(path: Sequence[Array]) -> float:
     return float(sum(np.max(np.abs(b - a)) for a, b in pairwise(path)))
 
 
-_LONGEST_STEP = 2.0
-"""Periods: after a pause of the host, the arm goes on from where it is and does not catch up."""
+_LONGEST_STEP = 2.0  # Periods: after a pause of the host, the arm goes on from where it is and does not catch up
 _ALIVE_EVERY_S = 0.1
 _NOTED_EVERY_S = 1.0
 _HEATED_EVERY_S = 0.25
 _RELEASED_EVERY_S = 0.25
 _SAME_RAD = 1e-9
-_MOST_WAYPOINTS = 6
-"""So many are given to a board whose memory the whole path does not fit."""
-_PLAY_RAD = np.deg2rad(3.0)
-"""More than servos have play."""
-_TAKEN_UP_RAD = np.deg2rad(1.5)
-"""A turn by less may end within the play, on neither side of it."""
+_MOST_WAYPOINTS = 6  # So many are given to a board whose memory the whole path does not fit
+_PLAY_RAD = np.deg2rad(3.0)  # More than servos have play
+_TAKEN_UP_RAD = np.deg2rad(1.5)  # A turn by less may end within the play, on neither side of it
 
 
 class Motion(ABC):

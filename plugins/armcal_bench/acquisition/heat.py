@@ -15,17 +15,14 @@ from armcal.devices.clock import Clock
 from armcal_bench.acquisition.settings import ServoHeatSettings
 
 NEVER = float("inf")
-_ENOUGH = 0.8
-"""Of the budget: one more point warms a servo by less than the rest of it."""
-COOLED_TO = 0.5
-"""Of the budget: a rest goes on to here, so that the servos do not rest before every pose."""
+_ENOUGH = 0.8  # Of the budget: one more point warms a servo by less than the rest of it
+COOLED_TO = 0.5  # Of the budget: a rest goes on to here, so that the servos do not rest before every pose
 _SAME_HEAT = 1e-4
 _TIMES_OVER = 20.0
 _RESOLUTION_S = 0.01
 
 
-Torques = Callable[[Array], Array]
-"""Holding torques (joints, N m) at joint angles (joints, rad)."""
+Torques = Callable[[Array], Array]  # Holding torques (joints, N m) at joint angles (joints, rad)
 
 
 @dataclass(frozen=True)
@@ -35,20 +32,13 @@ class HeatModel:
     What a servo loses goes with the square of its current, and the current with its torque. It warms the winding, which
     is quick, and the case, which is slow; each has a share of the heat and a time constant:
     ``thermal_state' = ((torque / continuous)^2 - thermal_state) / time``, and heat is the sum of share times warmth.
-
-    Attributes:
-        continuous: N m (joints; infinite where a servo is not reckoned with).
-        times: s (joints x 2: winding, case).
-        shares: of the heat (joints x 2).
-        budget: the heat that each may come to (joints).
-        torques: that heat them.
     """
 
-    continuous: Array
-    times: Array
-    shares: Array
-    budget: Array
-    torques: Torques
+    continuous: Array  # N m (joints; infinite where a servo is not reckoned with)
+    times: Array  # s (joints x 2: winding, case)
+    shares: Array  # of the heat (joints x 2)
+    budget: Array  # the heat that each may come to (joints)
+    torques: Torques  # that heat them
 
     @classmethod
     def of(cls, joints: Sequence[str], settings: Mapping[str, ServoHeatSettings], torques: Torques) -> Self:

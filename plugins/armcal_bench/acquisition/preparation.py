@@ -32,25 +32,16 @@ _SLACK = 1e-9
 
 @dataclass(frozen=True)
 class Prepared:
-    """All that a run needs besides its devices.
-
-    Attributes:
-        plan: joint commands and the plan's ids, in its order.
-        scheduler: over the angles that the device can set nearest to them; with the planner and the heat model.
-        arrival: whether the arm stands where it was commanded to.
-        sag: names a joint that gives way.
-        judge: of what is dangerous in the first motions and the last.
-        warnings: of limits beyond the arm model's own.
-    """
+    """All that a run needs besides its devices."""
 
     bench: Bench
     device: JointDevice
-    plan: Dataset
-    scheduler: Scheduler
-    arrival: Arrival
-    sag: SagJudge
-    judge: HazardJudge
-    warnings: tuple[str, ...]
+    plan: Dataset  # joint commands and the plan's ids, in its order
+    scheduler: Scheduler  # over the angles that the device can set nearest to them; with the planner and the heat model
+    arrival: Arrival  # whether the arm stands where it was commanded to
+    sag: SagJudge  # names a joint that gives way
+    judge: HazardJudge  # of what is dangerous in the first motions and the last
+    warnings: tuple[str, ...]  # of limits beyond the arm model's own
 
     @property
     def settings(self) -> AcquisitionSettings:

@@ -18,8 +18,7 @@ from armcal_bench.acquisition.tracker_monitor import MotionGate
 T = TypeVar("T")
 AGAIN_EVERY_S = 0.25
 _MOST_IN_A_ROW = 10
-_LAST_TRIES_S = 2.0
-"""Somebody who wants the end gets it as it should be, if the device is back within this time."""
+_LAST_TRIES_S = 2.0  # Somebody who wants the end gets it as it should be, if the device is back within this time
 
 
 class DeviceLost(Exception):  # noqa: N818 - an ending, not an error of a caller

@@ -23,11 +23,9 @@ from scipy.spatial.transform import Rotation
 from armcal_bench.journal_folder import JOURNAL
 
 STARTED, ENERGISED, GOING, HERE = "started", "energised", "going", "here"
-MEASURED, LEFT_OUT, NOTICE, ENDED = "measured", "left_out", "told", "ended"
-"""Kinds of entries."""
+MEASURED, LEFT_OUT, NOTICE, ENDED = "measured", "left_out", "told", "ended"  # Kinds of entries
 DATASET, SUMMARY = "dataset.csv", "summary.json"
-BENCH = "bench"
-"""Of a rehearsal: where its simulated bench lives."""
+BENCH = "bench"  # Of a rehearsal: where its simulated bench lives
 OURS = (DATASET, SUMMARY, JOURNAL, BENCH)
 _POSITION, _QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 
@@ -43,19 +41,16 @@ class Progress:
 
     Attributes:
         measured: what was written of each pose, by its id, in the order of measuring.
-        left_out: why, by pose id.
         angles: the angles that were commanded last (rad, by joint); empty before the first.
         thermal_state: of winding and case, by joint, when ``angles`` were written.
-        at: unix s of that.
-        ended: how it ended, if it did: see ``EndedHow``.
     """
 
     measured: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    left_out: Mapping[str, str] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)  # why, by pose id
     angles: Mapping[str, float] = field(default_factory=dict)
     thermal_state: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    at: float = 0.0
-    ended: str = ""
+    at: float = 0.0  # unix s of that
+    ended: str = ""  # how it ended, if it did: see ``EndedHow``
 
     def after(self, kind: str, content: Mapping[str, Any]) -> Self:
         """One entry later."""

@@ -26,14 +26,10 @@ class Arrival:
 
     Neither depends on where the tracker's frame, the base body and the tool body are. What is not known of the arm, and
     a target that is not at its nominal place, make them differ as well: the limits have to be generous.
-
-    Attributes:
-        expected: ``base_T_tool`` of the nominal, rigid arm in each pose of the plan (N x 4 x 4, m).
-        settings: the limits.
     """
 
-    expected: Array
-    settings: ArrivalSettings
+    expected: Array  # ``base_T_tool`` of the nominal, rigid arm in each pose of the plan (N x 4 x 4, m)
+    settings: ArrivalSettings  # the limits
 
     def doubt(self, pose: int, seen: Array, measured: Mapping[int, Array]) -> str:
         """Why the arm is not where it was commanded to be, a sentence; empty if it may be there.
@@ -85,10 +81,8 @@ def _worst(differences: Array) -> float:
 
 _STEP = 1e-4
 _LEVER_M = 0.1
-_SURE = 5.0
-"""Standard deviations."""
-_LEFT = 0.2
-"""Of the squared motion: what the right joint leaves at most."""
+_SURE = 5.0  # Standard deviations
+_LEFT = 0.2  # Of the squared motion: what the right joint leaves at most
 _ALIKE = 9.0
 _MINUTE = 60.0
 _AS_CONFIGURED = MeasuredFrame(1.0, False, False, np.eye(3), np.zeros(3), np.zeros(3), 0.0)
@@ -98,21 +92,13 @@ Poses = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Sag:
-    """A motion while the arm should stand.
+    """A motion while the arm should stand."""
 
-    Attributes:
-        joints: that it could be, the likeliest first; empty where that is not known.
-        rate: of that joint (rad/s), towards larger angles; NaN where no joint is known.
-        tip: how fast the target moves (m/s).
-        sinks: whether the joint turns the way of its load.
-        poses: by how many it was seen.
-    """
-
-    joints: tuple[str, ...]
-    rate: float
-    tip: float
-    sinks: bool
-    poses: int
+    joints: tuple[str, ...]  # that it could be, the likeliest first; empty where that is not known
+    rate: float  # of that joint (rad/s), towards larger angles; NaN where no joint is known
+    tip: float  # how fast the target moves (m/s)
+    sinks: bool  # whether the joint turns the way of its load
+    poses: int  # by how many it was seen
 
     @property
     def sentence(self) -> str:
@@ -151,17 +137,11 @@ class Sag:
 
 @dataclass(frozen=True, eq=False)
 class SagJudge:
-    """Names the joint that gives way.
+    """Names the joint that gives way."""
 
-    Attributes:
-        joints: by name.
-        poses: of the arm.
-        torques: of the load on each joint (joints, N m) at joint angles (joints, rad), by the sign of the turn.
-    """
-
-    joints: tuple[str, ...]
-    poses: Poses
-    torques: Torques
+    joints: tuple[str, ...]  # by name
+    poses: Poses  # of the arm
+    torques: Torques  # of the load on each joint (joints, N m) at joint angles (joints, rad), by the sign of the turn
 
     def sag_of(self, angles: Array, stands: Sequence[Stand], known: tuple[Array, Array]) -> Sag | None:
         """The motion, where it is beyond doubt.

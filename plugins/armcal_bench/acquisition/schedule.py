@@ -50,24 +50,18 @@ class Scheduler:
     """Decides from where the arm stands, how warm its servos are, and what is left.
 
     Attributes:
-        poses: N x joints, rad.
-        ids: of the poses.
         approaches: from which side each joint of a pose is to come (N x joints): 1 from below, -1 from above, 0 either.
-        park: where it rests (joints, rad).
-        rate: of the fastest joint, rad/s.
-        capture: how long it is expected to stand in a pose, s.
-        order: ``plan``, or ``cool`` (the pose that costs least time, cooling included).
     """
 
-    poses: Array
-    ids: tuple[str, ...]
+    poses: Array  # N x joints, rad
+    ids: tuple[str, ...]  # of the poses
     approaches: Array
-    park: Array
+    park: Array  # where it rests (joints, rad)
     planner: PathPlanner
     model: HeatModel
-    rate: float
-    capture: float
-    order: str
+    rate: float  # of the fastest joint, rad/s
+    capture: float  # how long it is expected to stand in a pose, s
+    order: str  # ``plan``, or ``cool`` (the pose that costs least time, cooling included)
 
     def next(self, at: Array, thermal_state: Array, left: Sequence[int]) -> Next:
         """What to do now; ``left`` are indices of poses, in the plan's order, at least one."""
@@ -138,21 +132,13 @@ class Scheduler:
 
 @dataclass(frozen=True)
 class ScheduleForecast:
-    """What a run is expected to take.
+    """What a run is expected to take."""
 
-    Attributes:
-        steps: in order.
-        seconds: from the first move to the last capture.
-        travel: of the joint that turns most in each move, rad.
-        resting: s.
-        hottest: the largest heat of each joint.
-    """
-
-    steps: tuple[Next, ...]
-    seconds: float
-    travel: float
-    resting: float
-    hottest: Array
+    steps: tuple[Next, ...]  # in order
+    seconds: float  # from the first move to the last capture
+    travel: float  # of the joint that turns most in each move, rad
+    resting: float  # s
+    hottest: Array  # the largest heat of each joint
 
 
 def forecast_schedule(scheduler: Scheduler, at: Array, thermal_state: Array, left: Sequence[int]) -> ScheduleForecast:

@@ -121,8 +121,7 @@ class Evidence:
 
 T = TypeVar("T")
 _TRIES = 2
-_READINGS = 10
-"""Of servos that know where they stand: their mean is finer than a count."""
+_READINGS = 10  # Of servos that know where they stand: their mean is finer than a count
 _AS_IT_IS = "its pulses go on as they are, unless the board parks the arm by itself"
 
 
@@ -387,22 +386,16 @@ class RunOptions:
     """How a run is done, and who hears of it.
 
     Attributes:
-        folder: where everything of it is kept.
-        start: ``anew``, or ``resume`` what is there.
-        asked_to_end: whether somebody wants it parked.
         may_energise: asked once, with what is about to move and what is dangerous in it, before anything does.
-        on_progress: called after each pose.
-        unchecked: drive servos too of which nobody has checked that they move their joint.
-        waits: says what is waited for.
     """
 
-    folder: Path
-    start: Start
-    asked_to_end: Callable[[], bool]
+    folder: Path  # where everything of it is kept
+    start: Start  # ``anew``, or ``resume`` what is there
+    asked_to_end: Callable[[], bool]  # whether somebody wants it parked
     may_energise: Callable[[FirstMotion], bool]
-    on_progress: Callable[[Progress], None]
-    unchecked: bool = False
-    waits: Waits = field(default_factory=Waits)
+    on_progress: Callable[[Progress], None]  # called after each pose
+    unchecked: bool = False  # drive servos too of which nobody has checked that they move their joint
+    waits: Waits = field(default_factory=Waits)  # says what is waited for
 
 
 @dataclass(frozen=True)

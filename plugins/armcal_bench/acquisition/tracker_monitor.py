@@ -11,8 +11,7 @@ from armcal_bench.acquisition.settings import LostSettings
 from armcal_bench.bench import Bench, BodySettings, base_fault, repeats, tool_fault
 from armcal_bench.settling import Settled, Settling, Stand
 
-_WELL_S = 0.1
-"""A tracker whose last frame was usable and came so lately is well."""
+_WELL_S = 0.1  # A tracker whose last frame was usable and came so lately is well
 _FIRST_FRAME_S = 3.0
 _SAID_EVERY_S = 60.0
 
@@ -175,8 +174,7 @@ class TrackerLost(StopRequested):
     """The tracker has given nothing of use for long, be it for where the arm is or for good."""
 
 
-MayMove = Callable[[], bool]
-"""Whether to move now; an arm that may not, holds. It may raise ``StopRequested``."""
+MayMove = Callable[[], bool]  # Whether to move now; an arm that may not, holds. It may raise ``StopRequested``.
 
 
 def unguarded() -> bool:
@@ -186,20 +184,13 @@ def unguarded() -> bool:
 
 @dataclass(frozen=True)
 class MotionGate:
-    """Takes in the tracker's frames, and says whether the arm may go on.
+    """Takes in the tracker's frames, and says whether the arm may go on."""
 
-    Attributes:
-        monitor: of the tracker; None where none is used.
-        lost: for how long the tracker may give nothing of use.
-        asked_to_end: whether somebody wants the end.
-        waits: says what is waited for.
-    """
-
-    monitor: TrackerMonitor | None
+    monitor: TrackerMonitor | None  # of the tracker; None where none is used
     clock: Clock
-    lost: LostSettings
-    asked_to_end: Callable[[], bool]
-    waits: Waits = field(default_factory=Waits)
+    lost: LostSettings  # for how long the tracker may give nothing of use
+    asked_to_end: Callable[[], bool]  # whether somebody wants the end
+    waits: Waits = field(default_factory=Waits)  # says what is waited for
 
     def resting(self) -> bool:
         """Always, for an arm that rests needs no tracker.

@@ -21,12 +21,9 @@ from armcal_bench.hazards import FirstMotion, Hazard
 
 F = TypeVar("F", bound=Callable[..., Any])
 FILE = click.Path(path_type=Path)
-Question = Callable[[FirstMotion], bool]
-"""Whether the arm may be moved."""
-_MOST_TEXTS = 4096
-"""Kept for a terminal that takes nothing (Ctrl-S, a connection that hangs); of more, the oldest go."""
-_PATIENCE_S = 3.0
-"""How long the end of a command waits for it."""
+Question = Callable[[FirstMotion], bool]  # Whether the arm may be moved
+_MOST_TEXTS = 4096  # Kept for a terminal that takes nothing (Ctrl-S, a connection that hangs); of more, the oldest go
+_PATIENCE_S = 3.0  # How long the end of a command waits for it
 
 
 class QueuedOutput(io.TextIOBase):

@@ -29,8 +29,7 @@ from armcal_bench.recording.recording_log import DATASET, IMAGES
 from armcal_bench.recording.session import record
 
 _TERMINAL = Path("/dev/tty")
-_AS_CSV = "--set 'data={type: csv}' "
-"""For a run whose configuration reads another kind of data."""
+_AS_CSV = "--set 'data={type: csv}' "  # For a run whose configuration reads another kind of data
 
 
 @click.command("record")

@@ -54,53 +54,37 @@ from scipy.special import fdtri
 from armcal_bench.recording.recording_log import Posture, dataset_of
 from armcal_bench.recording.window import JointKinds
 
-_FAR = 100.0
-"""Ordinary sizes within which a group (a socket) is looked for."""
+_FAR = 100.0  # Ordinary sizes within which a group (a socket) is looked for
 _MOST_STEPS = 30
 _DAMPING = 1e-9
-_AT_REST = 1e-5
-"""A step that lowers half the sum of squares by less than this part of it is the last."""
+_AT_REST = 1e-5  # A step that lowers half the sum of squares by less than this part of it is the last
 _LEAST_LEFT = 1e-6
 _POSE_NUMBERS = 6
 """Points of an image err alike, by an arm's error or a lens: they say no more of noise than the pose of the board."""
-_DECLARED_COUNTS = 2.0
-"""The declared noise counts as so many numbers when the real one is estimated."""
+_DECLARED_COUNTS = 2.0  # The declared noise counts as so many numbers when the real one is estimated
 _LEAST_SCALE = 0.05
 
 
 @dataclass(frozen=True)
 class PredictedResidual:
-    """What a fit predicts of one posture that it did not see.
+    """What a fit predicts of one posture that it did not see."""
 
-    Attributes:
-        residual: raw (n; SI).
-        covariance: of it, parameters and noise together (n x n).
-        distance: squared, in units of it, of so many ``numbers``: the entries, or fewer where these err alike.
-        dimensions: of each entry (n): ``length``, ``angle``, ``image``.
-    """
-
-    residual: Array
-    covariance: Array
-    distance: float
+    residual: Array  # raw (n; SI)
+    covariance: Array  # of it, parameters and noise together (n x n)
+    distance: float  # squared, in units of it, of so many ``numbers``: the entries, or fewer where these err alike
     numbers: int
-    dimensions: NDArray[np.str_]
+    dimensions: NDArray[np.str_]  # of each entry (n): ``length``, ``angle``, ``image``
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """Values, how sure their coordinates are, and the noise found in units of the declared one.
-
-    Attributes:
-        half: a root of the covariance by coordinates (n x k).
-        freedom: how many numbers the noise was estimated from.
-        used: which postures were fitted (N).
-    """
+    """Values, how sure their coordinates are, and the noise found in units of the declared one."""
 
     values: Array
-    half: Array
+    half: Array  # a root of the covariance by coordinates (n x k)
     scale: float
-    freedom: float
-    used: Mask
+    freedom: float  # how many numbers the noise was estimated from
+    used: Mask  # which postures were fitted (N)
 
 
 class QuickFitter:
@@ -244,15 +228,12 @@ def _placed(
     return problem, frozenset(block.name for block in own)
 
 
-FEW = 6
-"""So many undetermined combinations are named at most."""
+FEW = 6  # So many undetermined combinations are named at most
 _TURN = np.radians(25.0)
 _SLIDE = 0.05
-_ABOUT = 6
-"""So many of the newest postures are varied, joint by joint."""
+_ABOUT = 6  # So many of the newest postures are varied, joint by joint
 _RIDGE = 1e-6
-_WORTH = 0.7
-"""Joints that add nearly as much as the best one are named too."""
+_WORTH = 0.7  # Joints that add nearly as much as the best one are named too
 _MOST_NAMED = 3
 _QUICK = SolverVerdict("quick fit", "ended", True, 0, 0.0)
 
@@ -263,16 +244,14 @@ class Knowledge:
 
     Attributes:
         rank, free: determined combinations, of so many numbers.
-        records: how many postures train.
         missing: the undetermined combinations, once they are few: to name many takes long, and helps little.
-        vary: joints that would add most if they were moved more, the best first.
     """
 
     rank: int
     free: int
-    records: int
+    records: int  # how many postures train
     missing: tuple[str, ...]
-    vary: tuple[str, ...]
+    vary: tuple[str, ...]  # joints that would add most if they were moved more, the best first
 
 
 def knowledge(
@@ -367,18 +346,14 @@ class Advice:
     """What is known, and what would help.
 
     Attributes:
-        accuracy: how well what a user wants to know is known, a sentence a measurement.
         deviations: standard deviations of the instruments' own coordinates (SI); finite ones alone.
-        next: the posture that would help most, for people; empty where none is better than others.
-        commands: it, by channel (rad or m).
-        shrink: what it would multiply standard deviations by, on average.
     """
 
-    accuracy: tuple[str, ...] = ()
+    accuracy: tuple[str, ...] = ()  # how well what a user wants to know is known, a sentence a measurement
     deviations: Mapping[str, float] = field(default_factory=dict)
-    next: str = ""
-    commands: Mapping[str, float] = field(default_factory=dict)
-    shrink: float = 1.0
+    next: str = ""  # the posture that would help most, for people; empty where none is better than others
+    commands: Mapping[str, float] = field(default_factory=dict)  # it, by channel (rad or m)
+    shrink: float = 1.0  # what it would multiply standard deviations by, on average
 
     def fell_by(self, before: Self) -> float | None:
         """The share by which the instruments' standard deviations fell; None while nothing can be compared."""
@@ -406,13 +381,10 @@ def advice(fitter: QuickFitter, fitted: Fitted, dataset: Dataset, joints: Mappin
 
 
 _CHANCE = 1e-4
-_CHANCE_LATER = 1e-5
-"""For postures that agreed when they came: they are judged again and again."""
-_LOOKED_AT = 1e-2
-"""A posture this unlikely is fitted without, to see."""
+_CHANCE_LATER = 1e-5  # For postures that agreed when they came: they are judged again and again
+_LOOKED_AT = 1e-2  # A posture this unlikely is fitted without, to see
 _MOST_DROPPED_AT_ONCE = 3
-_UNFIT = (ArmcalError, ArithmeticError, ValueError)
-"""Faults of postures that no fit can take."""
+_UNFIT = (ArmcalError, ArithmeticError, ValueError)  # Faults of postures that no fit can take
 
 
 @dataclass(frozen=True)
@@ -438,19 +410,12 @@ class Offset:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Which postures agree.
+    """Which postures agree."""
 
-    Attributes:
-        doubtful: those that disagree, by place (from 0).
-        newest: of the last one; None where there is nothing to compare it with.
-        values: of the last fit, to begin the next one from.
-        fitted: the last fit.
-    """
-
-    doubtful: Mapping[int, Offset] = field(default_factory=dict)
-    newest: Offset | None = None
-    values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    fitted: Fitted | None = None
+    doubtful: Mapping[int, Offset] = field(default_factory=dict)  # those that disagree, by place (from 0)
+    newest: Offset | None = None  # of the last one; None where there is nothing to compare it with
+    values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # of the last fit, to begin the next one from
+    fitted: Fitted | None = None  # the last fit
 
 
 class AgreementJudge:
@@ -550,16 +515,13 @@ class Assessment:
 
     Attributes:
         newest: how the last posture lies to the others; None where there is nothing to compare it with.
-        doubts: postures that disagree, by name.
-        known: what is determined; None if that could not be judged.
         advice: how well an instrument's parameters are known, and what to take next.
-        why_not: why not, a sentence.
     """
 
     newest: Offset | None = None
-    doubts: Mapping[str, Offset] = field(default_factory=dict)
-    known: Knowledge | None = None
-    why_not: str = ""
+    doubts: Mapping[str, Offset] = field(default_factory=dict)  # postures that disagree, by name
+    known: Knowledge | None = None  # what is determined; None if that could not be judged
+    why_not: str = ""  # why not, a sentence
     advice: Advice = field(default_factory=Advice)
 
 

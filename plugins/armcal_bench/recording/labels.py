@@ -7,8 +7,7 @@ from armcal.errors import DataError
 from armcal.measure.groups import record_keys
 from armcal.measure.measurement import GroupedMeasurement, Measurement, NamesGroups
 
-KEPT = "*"
-"""A part of a name that stays what it was."""
+KEPT = "*"  # A part of a name that stays what it was
 
 
 class Labels:

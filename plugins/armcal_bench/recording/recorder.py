@@ -25,8 +25,7 @@ Capture = Literal["keys", "still", "rests", "images"]
 image comes."""
 KEYS = "c or Enter captures, u takes the last one back, g NAME or a digit names what is touched, s tells more, q ends"
 LOOK = "v looks without keeping"
-_MOST_UNSEEN = 20
-"""Images without a board, and none with one: something is wrong for all of them."""
+_MOST_UNSEEN = 20  # Images without a board, and none with one: something is wrong for all of them
 
 
 @dataclass(frozen=True)
@@ -36,13 +35,11 @@ class Message:
     Attributes:
         kind: ``captured``, ``refused``, ``undone``, ``named``, ``disagrees``, ``agrees_again``, ``known``, ``status``,
             ``warning``, ``silent``, ``heard``, ``seen``, ``next``, ``finished``.
-        sentence: for people.
-        content: for programs; JSON.
     """
 
     kind: str
-    sentence: str
-    content: Mapping[str, Any] = field(default_factory=dict)
+    sentence: str  # for people
+    content: Mapping[str, Any] = field(default_factory=dict)  # for programs; JSON
 
 
 def _captured(posture: Posture, assessment: Assessment) -> Message:

@@ -18,35 +18,22 @@ from armcal_bench.recording.window import Mean
 DATASET = "dataset.csv"
 IMAGES = "images"
 OURS = (DATASET, JOURNAL, IMAGES)
-CAPTURED, UNDONE = "captured", "undone"
-"""Kinds of entries."""
+CAPTURED, UNDONE = "captured", "undone"  # Kinds of entries
 
 
 @dataclass(frozen=True)
 class Posture:
-    """The mean of readings of arms that stood still.
+    """The mean of readings of arms that stood still."""
 
-    Attributes:
-        name: its number, counted from 1 over all that were ever captured here.
-        angles: by channel (``arm.q1``; rad, or m of sliding joints).
-        spread: the largest less the smallest reading of the joint that moved most (rad or m).
-        readings: how many it is the mean of.
-        at: unix seconds; of two postures the later one's is not the smaller.
-        labels: the group it belongs to (a socket's name), by column.
-        stamp: when it was, by the source's own clock (s), where it says so.
-        image: the name of its image's file; empty where none was taken.
-        values: what the image says, by channel (``camera.u_3``, SI).
-    """
-
-    name: str
-    angles: Mapping[str, float]
-    spread: float
-    readings: int
-    at: float
-    labels: Mapping[str, str] = field(default_factory=dict)
-    stamp: float | None = None
-    image: str = ""
-    values: Mapping[str, float] = field(default_factory=dict)
+    name: str  # its number, counted from 1 over all that were ever captured here
+    angles: Mapping[str, float]  # by channel (``arm.q1``; rad, or m of sliding joints)
+    spread: float  # the largest less the smallest reading of the joint that moved most (rad or m)
+    readings: int  # how many it is the mean of
+    at: float  # unix seconds; of two postures the later one's is not the smaller
+    labels: Mapping[str, str] = field(default_factory=dict)  # the group it belongs to (a socket's name), by column
+    stamp: float | None = None  # when it was, by the source's own clock (s), where it says so
+    image: str = ""  # the name of its image's file; empty where none was taken
+    values: Mapping[str, float] = field(default_factory=dict)  # what the image says, by channel (``camera.u_3``, SI)
 
     @property
     def place(self) -> str:

@@ -14,22 +14,16 @@ from armcal.devices.live import JointSample
 from pydantic import Field, model_validator
 
 _FULL_TURN = 2 * math.pi * (1 + 1e-9)
-_LONG_ENOUGH = 0.8
-"""Of the window: readings need not fall on its ends."""
+_LONG_ENOUGH = 0.8  # Of the window: readings need not fall on its ends
 _MOST = 100_000
 
 
 @dataclass(frozen=True)
 class JointKinds:
-    """What the channels of some arms are.
+    """What the channels of some arms are."""
 
-    Attributes:
-        dimensions: ``angle`` or ``length`` by channel, in order.
-        endless: channels of joints that may turn on and on.
-    """
-
-    dimensions: Mapping[str, str]
-    endless: frozenset[str]
+    dimensions: Mapping[str, str]  # ``angle`` or ``length`` by channel, in order
+    endless: frozenset[str]  # channels of joints that may turn on and on
 
     @classmethod
     def of(cls, arms: Mapping[str, Arm]) -> Self:
@@ -60,15 +54,10 @@ class JointKinds:
 
 @dataclass(frozen=True)
 class Mean:
-    """The readings of a window.
+    """The readings of a window."""
 
-    Attributes:
-        angles: means by channel.
-        spread: of the joint that moved most (rad or m).
-    """
-
-    angles: Mapping[str, float]
-    spread: float
+    angles: Mapping[str, float]  # means by channel
+    spread: float  # of the joint that moved most (rad or m)
     readings: int
     labels: Mapping[str, str]
     stamp: float | None
@@ -146,24 +135,19 @@ class RecordingSettings(Settings):
     """How postures are captured.
 
     Attributes:
-        window: a posture is the mean of the readings of so long.
-        samples: it has at least so many.
         spread: no turning joint moves by more within the window; ``sliding_spread``: no sliding one.
-        stale: a stream that is silent for longer does not show where the arm stands now.
-        rest: with ``--capture still``, how long the arm must stand before it is captured by itself.
-        moved: and how far a joint must have gone since the posture before.
         alike: postures of one group whose joints all differ by less are reported as nearly the same.
         groups: names that the digits stand for, ``[front/hole_0, front/hole_1]``; an asterisk keeps what was named
             before. Without any, those that the measurements' settings speak of.
     """
 
-    window: Duration = 0.5
-    samples: Annotated[int, Field(ge=2)] = 5
+    window: Duration = 0.5  # a posture is the mean of the readings of so long
+    samples: Annotated[int, Field(ge=2)] = 5  # it has at least so many
     spread: Angle = math.radians(0.2)
     sliding_spread: Length = 0.0002
-    stale: Duration = 1.0
-    rest: Duration = 1.0
-    moved: Angle = math.radians(5.0)
+    stale: Duration = 1.0  # a stream that is silent for longer does not show where the arm stands now
+    rest: Duration = 1.0  # with ``--capture still``, how long the arm must stand before it is captured by itself
+    moved: Angle = math.radians(5.0)  # and how far a joint must have gone since the posture before
     alike: Angle = math.radians(2.0)
     groups: tuple[str, ...] = ()
 

@@ -43,21 +43,17 @@ class Turning:
     """How the tool turned.
 
     Attributes:
-        axis: unit, base frame; along the model's.
-        angles: of each pose about it (rad), from some pose in their midst.
         off_axis: how far rotations are from turning about the axis alone (rad), or positions from the circle (m), root
             mean square.
         off: what of each rotation is not about the axis (N x 3, rad, base frame); empty where only positions were seen.
-        radius: of the circle (m) where positions alone were seen; None with rotations.
-        centre: of the circle (m).
     """
 
-    axis: Array
-    angles: Array
+    axis: Array  # unit, base frame; along the model's
+    angles: Array  # of each pose about it (rad), from some pose in their midst
     off_axis: float
     off: Array
-    radius: float | None = None
-    centre: Array | None = None
+    radius: float | None = None  # of the circle (m) where positions alone were seen; None with rotations
+    centre: Array | None = None  # of the circle (m)
 
 
 def turning_of_rotations(rotations: Array, model_axis: Array) -> Turning:
@@ -140,10 +136,8 @@ def mean_angle(angles: Array) -> float:
     return float(np.angle(np.mean(np.exp(1j * angles))))
 
 
-By = Literal["rotation", "position"]
-"""What shows a turn about an axis."""
-Pose = Mapping[str, float]
-"""Joint angles (rad) by joint; those not named are zero."""
+By = Literal["rotation", "position"]  # What shows a turn about an axis
+Pose = Mapping[str, float]  # Joint angles (rad) by joint; those not named are zero
 _COMPLIANCE_UNIT = "rad_per_Nm"
 _ENTRIES = 12
 
@@ -164,19 +158,12 @@ class _ToolFrame(ArmsAlone):
 
 @dataclass(frozen=True)
 class NominalArm:
-    """An arm at the parameters' nominal values.
+    """An arm at the parameters' nominal values."""
 
-    Attributes:
-        arm: the arm.
-        parameters: whose nominal values are taken; the arm's own are free.
-        kernel: evaluates the tool in elastic equilibrium, from the free parameters and the joints' commands.
-        zeros: what the joints' angles are to be enlarged by (rad).
-    """
-
-    arm: Arm
-    parameters: Parameters
-    kernel: Kernel
-    zeros: Mapping[str, float] = field(default_factory=dict)
+    arm: Arm  # the arm
+    parameters: Parameters  # whose nominal values are taken; the arm's own are free
+    kernel: Kernel  # evaluates the tool in elastic equilibrium, from the free parameters and the joints' commands
+    zeros: Mapping[str, float] = field(default_factory=dict)  # what the joints' angles are to be enlarged by (rad)
 
     @classmethod
     def of(cls, arm: Arm, parameters: Parameters, environment: Environment) -> NominalArm:

@@ -46,29 +46,20 @@ from armcal_bench.servo.trial import permuted
 
 _LEAST_SEEN_M = 1e-4
 _FARTHEST_AXIS = math.radians(30.0)
-_MOST_OFF_AXIS = math.radians(10.0)
-"""Springs, and axes that are not as drawn, give less."""
+_MOST_OFF_AXIS = math.radians(10.0)  # Springs, and axes that are not as drawn, give less
 _CHECK_IT = "is another servo on its channel? Look with armcal servo --check"
 Entry = Mapping[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
 class Sweeps:
-    """A joint's lines that show angles, and these angles.
+    """A joint's lines that show angles, and these angles."""
 
-    Attributes:
-        lines: of the record.
-        angles: of the joint (rad), what springs give taken out as far as it is known.
-        sds: of these (rad).
-        by: what showed them; None: somebody's eyes.
-        turning: how the tool turned, where a tracker saw it.
-    """
-
-    lines: tuple[Entry, ...]
-    angles: Array
-    sds: Array
-    by: By | None = None
-    turning: Turning | None = None
+    lines: tuple[Entry, ...]  # of the record
+    angles: Array  # of the joint (rad), what springs give taken out as far as it is known
+    sds: Array  # of these (rad)
+    by: By | None = None  # what showed them; None: somebody's eyes
+    turning: Turning | None = None  # how the tool turned, where a tracker saw it
 
     @property
     def joint(self) -> str:
@@ -96,13 +87,11 @@ class Springs:
     """An arm with its springs, and where a joint stood in each line: what they give there can be taken out.
 
     Attributes:
-        about: the arm, with the compliances as well as they are known.
-        angles: of the joint (rad), line by line.
         seat: ``tool_R_body``, how the tracked body sits on the model's tool (3x3).
     """
 
-    about: NominalArm
-    angles: tuple[float, ...]
+    about: NominalArm  # the arm, with the compliances as well as they are known
+    angles: tuple[float, ...]  # of the joint (rad), line by line
     seat: Array = field(default_factory=lambda: np.eye(3))
 
     def given(self, lines: Sequence[Entry]) -> Array:
@@ -194,8 +183,7 @@ _ANGLE_SD = math.radians(4.0)
 _ZERO_SD = math.radians(2.0)
 _FRAME_SD = math.radians(4.0)
 _MOST_SDS = 3.0
-_PLAY_SD = math.radians(0.1)
-"""Of where a joint stands from one joint's sweep to another's."""
+_PLAY_SD = math.radians(0.1)  # Of where a joint stands from one joint's sweep to another's
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,12 +193,11 @@ class Alignment:
     Attributes:
         numbers: of the model's angles, then the joints' zeros, less their nominal values; then the tilt of ``base`` and
             what ``seat`` was turned by since it was first estimated (3 each, rad).
-        compliances: of the springs, less their nominal values (rad/(N m)).
         base, seat: rotations (3x3).
     """
 
     numbers: Array
-    compliances: Array
+    compliances: Array  # of the springs, less their nominal values (rad/(N m))
     base: Array = field(default_factory=lambda: np.eye(3))
     seat: Array | None = None
 
@@ -335,22 +322,16 @@ class Outcome:
     """A fit and where it came from.
 
     Attributes:
-        fit: tables, lags, oscillators.
-        task: that was fitted.
-        sweeps: by joint.
-        silent: why a joint's table could not be found, by joint.
         compliances: of the arm's springs (rad/(N m)) by parameter, value and deviation, where they were fitted.
-        zero: whether stated zeros were kept.
-        sag_span: by joint, how much what the springs give varies over its sweep (rad).
     """
 
-    fit: ServoFit
-    task: FitTask
-    sweeps: Mapping[str, Sweeps]
-    silent: Mapping[str, str]
+    fit: ServoFit  # tables, lags, oscillators
+    task: FitTask  # that was fitted
+    sweeps: Mapping[str, Sweeps]  # by joint
+    silent: Mapping[str, str]  # why a joint's table could not be found, by joint
     compliances: Mapping[str, tuple[float, float]]
-    zero: Zero
-    sag_span: Mapping[str, float]
+    zero: Zero  # whether stated zeros were kept
+    sag_span: Mapping[str, float]  # by joint, how much what the springs give varies over its sweep (rad)
 
 
 def outcome_of(

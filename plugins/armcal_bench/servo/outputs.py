@@ -136,8 +136,7 @@ def _of_springs(outcome: Outcome) -> list[str]:
     ]
 
 
-Edit = tuple[int, int, str]
-"""The characters from here to there become this."""
+Edit = tuple[int, int, str]  # The characters from here to there become this
 
 
 def edited_text(text: str, before: ServoFile, after: ServoFile) -> str | None:
@@ -217,8 +216,7 @@ def _is_flow(node: yaml.Node) -> bool:
 
 
 RESULTS = "servo.json"
-_APART = math.radians(0.5)
-"""Knots that are nearer to the end of a shortened table add nothing."""
+_APART = math.radians(0.5)  # Knots that are nearer to the end of a shortened table add nothing
 Part = TypeVar("Part", BoardSettings, ServoSettings)
 
 

@@ -29,21 +29,13 @@ _LEAST_SLOPE = 50 * US
 
 @dataclass(frozen=True)
 class KnownServo:
-    """A servo as its table states it.
+    """A servo as its table states it."""
 
-    Attributes:
-        joint: that it turns.
-        board: that drives it.
-        table: as stated; pulses by the board's stated oscillator.
-        trusted_sd: of the table's pulses (s), where the table is believed; None: it is to be fitted.
-        knots: angles (rad) that the table is to be given at; empty: those of the stated one.
-    """
-
-    joint: str
-    board: str
-    table: PulseTable
-    trusted_sd: float | None = None
-    knots: tuple[float, ...] = ()
+    joint: str  # that it turns
+    board: str  # that drives it
+    table: PulseTable  # as stated; pulses by the board's stated oscillator
+    trusted_sd: float | None = None  # of the table's pulses (s), where the table is believed; None: it is to be fitted
+    knots: tuple[float, ...] = ()  # angles (rad) that the table is to be given at; empty: those of the stated one
 
     def pulses_at(self, angles: Array) -> Array:
         """The stated table's pulses (s) at angles (rad)."""
@@ -72,21 +64,15 @@ class Observation:
     """An angle measured at a pulse.
 
     Attributes:
-        joint: whose.
-        counts: of the pulse.
-        approach: from where the joint came: 1 from below, -1 from above, 0 not known.
-        angle: as measured (rad).
-        sd: of that (rad).
-        sag: how much of it is what the arm's springs give, by its model (rad).
         sag_slopes: how much more it would be, by compliance (rad per rad/(N m)): each is a parameter of the arm.
     """
 
-    joint: str
-    counts: int
-    approach: int
-    angle: float
-    sd: float
-    sag: float = 0.0
+    joint: str  # whose
+    counts: int  # of the pulse
+    approach: int  # from where the joint came: 1 from below, -1 from above, 0 not known
+    angle: float  # as measured (rad)
+    sd: float  # of that (rad)
+    sag: float = 0.0  # how much of it is what the arm's springs give, by its model (rad)
     sag_slopes: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -109,18 +95,14 @@ class FitTask:
 
     Attributes:
         servos, boards: as known before; boards by name.
-        observations: of any of the servos.
-        zero: ``measured`` angles are absolute; ``kept``: each servo's pulse at zero stays the stated one.
-        compliance_sd: how far the arm's compliances may well be from the model's (rad/(N m)).
-        springs: what else is known of them.
     """
 
     servos: tuple[KnownServo, ...]
     boards: dict[str, KnownBoard]
-    observations: tuple[Observation, ...]
-    zero: Zero
-    compliance_sd: float = 0.2
-    springs: SpringRows | None = None
+    observations: tuple[Observation, ...]  # of any of the servos
+    zero: Zero  # ``measured`` angles are absolute; ``kept``: each servo's pulse at zero stays the stated one
+    compliance_sd: float = 0.2  # how far the arm's compliances may well be from the model's (rad/(N m))
+    springs: SpringRows | None = None  # what else is known of them
 
     def of(self, joint: str) -> tuple[Observation, ...]:
         return tuple(observation for observation in self.observations if observation.joint == joint)
@@ -270,8 +252,7 @@ class Residuals:
 _FAR_OFF = 5.0
 _LOSSES: tuple[Literal["linear", "soft_l1"], ...] = ("soft_l1", "linear", "linear")
 """Of a round each, after which outliers are judged anew."""
-_DETERMINED = 0.2
-"""A deviation below this part of the weak prior's: the observations determine the number."""
+_DETERMINED = 0.2  # A deviation below this part of the weak prior's: the observations determine the number
 
 
 @dataclass(frozen=True)
@@ -279,32 +260,23 @@ class FittedServo:
     """A servo's table and backlash.
 
     Attributes:
-        known: as it was stated.
-        angles: knots (rad).
         pulses, pulse_sds: at the knots (s); of a knot that no observation determines the stated pulse, and NaN.
-        determined: whether the observations determine the pulse of a knot.
         lag, lag_sd: half the backlash (rad); None where it was not approached from both sides.
-        zero: what was added to the measured angles so that the stated zero is kept (rad).
-        scatter: of the observations about the fit (rad, root mean square).
-        scale: the same in units of the stated deviations; deviations are enlarged by it where it is above 1.
-        used: how many observations.
-        outliers: those set aside.
-        reach: the lowest and highest angle observed (rad).
     """
 
-    known: KnownServo
-    angles: tuple[float, ...]
+    known: KnownServo  # as it was stated
+    angles: tuple[float, ...]  # knots (rad)
     pulses: tuple[float, ...]
     pulse_sds: tuple[float, ...]
-    determined: tuple[bool, ...]
+    determined: tuple[bool, ...]  # whether the observations determine the pulse of a knot
     lag: float | None
     lag_sd: float
-    zero: float
-    scatter: float
-    scale: float
-    used: int
-    outliers: tuple[Observation, ...]
-    reach: tuple[float, float]
+    zero: float  # what was added to the measured angles so that the stated zero is kept (rad)
+    scatter: float  # of the observations about the fit (rad, root mean square)
+    scale: float  # the same in units of the stated deviations; deviations are enlarged by it where it is above 1
+    used: int  # how many observations
+    outliers: tuple[Observation, ...]  # those set aside
+    reach: tuple[float, float]  # the lowest and highest angle observed (rad)
 
 
 @dataclass(frozen=True)
@@ -312,19 +284,15 @@ class ServoFit:
     """Servos, boards and springs.
 
     Attributes:
-        servos: by joint, those with observations.
-        clocks: by board, at the fitted oscillator, or the stated one.
-        oscillator_sds: by board (Hz), of those that are determined.
         compliances: of the arm's springs, by parameter, where determined: how far from the model's, and the standard
             deviation (rad/(N m)).
-        undetermined: compliances that the observations do not determine.
     """
 
-    servos: Mapping[str, FittedServo]
-    clocks: Mapping[str, PulseClock]
-    oscillator_sds: Mapping[str, float]
+    servos: Mapping[str, FittedServo]  # by joint, those with observations
+    clocks: Mapping[str, PulseClock]  # by board, at the fitted oscillator, or the stated one
+    oscillator_sds: Mapping[str, float]  # by board (Hz), of those that are determined
     compliances: Mapping[str, tuple[float, float]]
-    undetermined: tuple[str, ...] = ()
+    undetermined: tuple[str, ...] = ()  # compliances that the observations do not determine
 
 
 def fit_servos(task: FitTask) -> ServoFit:

@@ -23,8 +23,7 @@ from armcal_bench.servo.setup import Setup
 
 NAME = "observations.jsonl"
 _HINT = "Give --out a writable folder."
-BEGUN, POSE, ANGLE, LEFT_OUT = "begun", "pose", "angle", "left_out"
-"""Kinds of lines."""
+BEGUN, POSE, ANGLE, LEFT_OUT = "begun", "pose", "angle", "left_out"  # Kinds of lines
 
 _ROTATION_OFF = 1e-6
 

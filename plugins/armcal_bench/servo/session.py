@@ -33,8 +33,7 @@ _LOOKED_AT_EVERY_S = 1.0
 _FAR_GAIN = 8.0
 """Of lengths: in sweeps of one joint after the other a reversed servo resembles a frame with a smaller one."""
 
-ReportProgress = Callable[[str, int, int], None]
-"""Takes the joint, and how many of its points are done and planned."""
+ReportProgress = Callable[[str, int, int], None]  # Takes the joint, and how many of its points are done and planned
 
 
 @dataclass(frozen=True)
@@ -73,12 +72,11 @@ class FrameWatch:
     """Where the target was seen in poses that were commanded, whether the arm stood or not.
 
     Attributes:
-        expected: ``base_T_tool`` of the rigid arm in each pose (4 x 4, m).
         seen: ``base_T_target`` there, in whatever units and frame the tracker gives it.
     """
 
     mover: Mover
-    expected: list[Array] = field(default_factory=list)
+    expected: list[Array] = field(default_factory=list)  # ``base_T_tool`` of the rigid arm in each pose (4 x 4, m)
     seen: list[Array] = field(default_factory=list)
 
     def look(self, pose: Mapping[str, float]) -> None:
@@ -331,21 +329,16 @@ class Conversation:
     """How a calibration speaks with whom it is for.
 
     Attributes:
-        asked_to_stop: whether somebody wants it to hold and end.
         may_energise: whether the arm may be moved; called once before anything moves, with what is
             about to move and what is dangerous in it.
-        report: takes how far a tracked calibration is.
-        say: takes a line, of a guided one.
-        wishes: what somebody presses or writes, while it is asked for.
-        waits: says what is waited for.
     """
 
-    asked_to_stop: Callable[[], bool]
+    asked_to_stop: Callable[[], bool]  # whether somebody wants it to hold and end
     may_energise: Callable[[FirstMotion], bool]
-    report: ReportProgress
-    say: Callable[[str], None]
-    wishes: Callable[[], AbstractContextManager[Wishes]]
-    waits: Waits = field(default_factory=Waits)
+    report: ReportProgress  # takes how far a tracked calibration is
+    say: Callable[[str], None]  # takes a line, of a guided one
+    wishes: Callable[[], AbstractContextManager[Wishes]]  # what somebody presses or writes, while it is asked for
+    waits: Waits = field(default_factory=Waits)  # says what is waited for
 
 
 def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:

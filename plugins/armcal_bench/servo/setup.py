@@ -57,48 +57,40 @@ class ServoCalibrationSettings(Settings):
     """What ``armcal servo`` measures, and how. When the arm stands is as in ``acquisition.settle``.
 
     Attributes:
-        servos: the servo file to improve; the device's own where it is not given.
-        joints: those to calibrate; all of the servo file.
         knots: the angles that all tables are to be given at; without them each table keeps its own, and its ends reach
             as far as the joint is measured.
         base: where the other joints stand while one is measured; joints that are not named stand at zero.
         ranges: over which joints are moved; the limits of ``acquisition`` or ``plan`` where none are given here.
-        step: between the angles of a sweep, or of a guided calibration.
         approach: how far a joint comes from below or above before it is measured, so that its play is taken up.
         pulses: no pulse outside this range is ever set, nor one outside the servo's own ``pulse_range``.
         rate_deg_per_s: the fastest that a joint is moved, by its stated table.
-        period: between two steps of a motion.
         zero: ``kept``: each servo's pulse at zero stays; ``model``: angles are absolute, by the model and the tracker.
         sag: what springs give is taken from the model's compliances, fitted with the tables, or not reckoned with.
         sag_sd: how far compliances may well be from the model's, where they are fitted.
-        rotation_sd: of a settled rotation about an axis.
-        least_radius: of a circle that shows an angle, where a tracker sees positions only.
-        guided_sd: how well a joint is put at an angle by eye.
         measured_pulses: pulses measured at boards' pins: they determine the oscillators.
         trusted: joints whose stated tables are believed, by how well: they determine the oscillators too.
-        check: how far ``--check`` moves a joint.
         silence: after this silence of the host a board that can brings the arm back to the base pose.
     """
 
-    servos: InputPath | None = None
-    joints: tuple[str, ...] = ()
+    servos: InputPath | None = None  # the servo file to improve; the device's own where it is not given
+    joints: tuple[str, ...] = ()  # those to calibrate; all of the servo file
     knots: Angles = ()
     base: dict[str, Angle] = Field(default_factory=dict)
     ranges: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)
-    step: PositiveAngle = math.radians(10)
+    step: PositiveAngle = math.radians(10)  # between the angles of a sweep, or of a guided calibration
     approach: PositiveAngle = math.radians(4)
     pulses: PulseRange = (500e-6, 2600e-6)
     rate_deg_per_s: Annotated[float, Field(gt=0, le=60)] = 20.0
-    period: PositiveDuration = 0.02
+    period: PositiveDuration = 0.02  # between two steps of a motion
     zero: Literal["kept", "model"] = "kept"
     sag: Literal["none", "model", "fitted"] = "fitted"
     sag_sd: Annotated[Compliance, Field(gt=0)] = 0.2
-    rotation_sd: PositiveAngle = math.radians(0.03)
-    least_radius: Length = 0.03
-    guided_sd: PositiveAngle = math.radians(0.5)
+    rotation_sd: PositiveAngle = math.radians(0.03)  # of a settled rotation about an axis
+    least_radius: Length = 0.03  # of a circle that shows an angle, where a tracker sees positions only
+    guided_sd: PositiveAngle = math.radians(0.5)  # how well a joint is put at an angle by eye
     measured_pulses: tuple[MeasuredPulseSettings, ...] = ()
     trusted: dict[str, PositiveDuration] = Field(default_factory=dict)
-    check: PositiveAngle = math.radians(10)
+    check: PositiveAngle = math.radians(10)  # how far ``--check`` moves a joint
     silence: PositiveDuration = 1.0
 
     @model_validator(mode="after")
@@ -119,33 +111,19 @@ _LOOK_STEP = math.radians(2.0)
 
 @dataclass(frozen=True)
 class Setup:
-    """All that is known before anything moves.
+    """All that is known before anything moves."""
 
-    Attributes:
-        bench: the configured one.
-        settings: of the calibration.
-        path: of the servo file.
-        file: what it states.
-        joints: those to calibrate.
-        base: where every servo's joint stands while others are measured (rad).
-        ranges: over which each joint may be moved from there (rad).
-        nominal: the arm by its model.
-        heat: of the servos.
-        planner: of straight ways on which nothing comes too near, if that is stated.
-        judge: of what is dangerous in the first motions.
-    """
-
-    bench: Bench
-    settings: ServoCalibrationSettings
-    path: Path
-    file: ServoFile
-    joints: tuple[str, ...]
-    base: Mapping[str, float]
-    ranges: Mapping[str, tuple[float, float]]
-    nominal: NominalArm
-    heat: HeatModel
-    planner: PathPlanner
-    judge: HazardJudge
+    bench: Bench  # the configured one
+    settings: ServoCalibrationSettings  # of the calibration
+    path: Path  # of the servo file
+    file: ServoFile  # what it states
+    joints: tuple[str, ...]  # those to calibrate
+    base: Mapping[str, float]  # where every servo's joint stands while others are measured (rad)
+    ranges: Mapping[str, tuple[float, float]]  # over which each joint may be moved from there (rad)
+    nominal: NominalArm  # the arm by its model
+    heat: HeatModel  # of the servos
+    planner: PathPlanner  # of straight ways on which nothing comes too near, if that is stated
+    judge: HazardJudge  # of what is dangerous in the first motions
 
     @classmethod
     def of(cls, experiment: Experiment) -> Self:

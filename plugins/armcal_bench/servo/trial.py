@@ -21,8 +21,7 @@ _LEVER_M = 0.1
 _STILL = math.radians(1.5)
 _STILL_M = 0.002
 _GAIN_OFF = 0.25
-_USUAL_M = 0.004
-"""How far a move of a few degrees lies from the model's, since arms sag and are not as drawn."""
+_USUAL_M = 0.004  # How far a move of a few degrees lies from the model's, since arms sag and are not as drawn
 _UNCLEAR_M = 0.02
 _EACH_FAULT, _MOST, _UNSURE = 4.0, 100.0, 4.0
 _USUAL_TURN = math.radians(10.0)
@@ -32,23 +31,14 @@ _TURN = 2 * math.pi
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a joint did.
+    """What a joint did."""
 
-    Attributes:
-        joint: that was commanded.
-        kind: ``right``, ``reversed``, ``gain``, ``another``, ``still``, ``wrapped`` or ``unclear``.
-        sentence: what was seen.
-        mend: what to do; empty if nothing.
-        turned: the measured angle (rad); NaN where none is known.
-        other: the joint that moved instead, or that cannot be distinguished.
-    """
-
-    joint: str
-    kind: str
-    sentence: str
-    mend: str = ""
-    turned: float = math.nan
-    other: str = ""
+    joint: str  # that was commanded
+    kind: str  # ``right``, ``reversed``, ``gain``, ``another``, ``still``, ``wrapped`` or ``unclear``
+    sentence: str  # what was seen
+    mend: str = ""  # what to do; empty if nothing
+    turned: float = math.nan  # the measured angle (rad); NaN where none is known
+    other: str = ""  # the joint that moved instead, or that cannot be distinguished
 
 
 def noted(record: WiringRecord, verdicts: Sequence[Verdict], seen: Mapping[str, Any]) -> None:

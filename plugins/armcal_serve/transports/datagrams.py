@@ -15,11 +15,9 @@ from armcal_serve.poller import Poller
 from armcal_serve.protocol import as_bytes, id_of, refusal
 from armcal_serve.transports.transport import Transport
 
-_LONGEST = 65_507
-"""What a datagram can hold (bytes)."""
+_LONGEST = 65_507  # What a datagram can hold (bytes)
 _MOST_OPEN = 256
-_AT_ONCE = 32
-"""So many are taken before others have their turn."""
+_AT_ONCE = 32  # So many are taken before others have their turn
 
 
 class Datagrams(Transport):

@@ -18,13 +18,11 @@ from armcal_serve.protocol import MAX_LINE_BYTES
 from armcal_serve.transports.transport import Transport
 
 CHUNK = 64 * 1024
-MOST_UNREAD_BYTES = 1024**2
-"""A client that leaves so much unread is not listened to until it reads."""
+MOST_UNREAD_BYTES = 1024**2  # A client that leaves so much unread is not listened to until it reads
 
 Receive = Callable[[], bytes]
 """What has come: nothing where the stream has ended; raises BlockingIOError where nothing has come."""
-Send = Callable[[memoryview], int]
-"""How many bytes were taken; 0, or BlockingIOError, where none can be."""
+Send = Callable[[memoryview], int]  # How many bytes were taken; 0, or BlockingIOError, where none can be
 
 
 class StreamClient:

@@ -18,14 +18,10 @@ from armcal_serve.transports.stream import CHUNK, StreamClient
 from armcal_serve.transports.transport import Transport
 
 MOST_CLIENTS = 64
-PATIENCE_S = 10.0
-"""A client that leaves answers unread for so long is disconnected."""
-FIRST_LINE_S = 30.0
-"""So long a client may take over its first line, and over any that it began."""
-_LEAST_IDLE_S = 1.0
-"""A client that has sent no request for so long is disconnected where there is no place left."""
-_PAUSE_S = 1.0
-"""No client is accepted for so long where the system has no descriptor and no client is idle."""
+PATIENCE_S = 10.0  # A client that leaves answers unread for so long is disconnected
+FIRST_LINE_S = 30.0  # So long a client may take over its first line, and over any that it began
+_LEAST_IDLE_S = 1.0  # A client that has sent no request for so long is disconnected where there is no place left
+_PAUSE_S = 1.0  # No client is accepted for so long where the system has no descriptor and no client is idle
 _NO_MORE = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 

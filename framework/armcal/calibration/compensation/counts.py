@@ -21,11 +21,9 @@ from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
 Counts = NDArray[np.int64]
 _MOST_PAIRS = 20_000
-_WIDEST = 2
-"""Counts to either side of the exact one."""
+_WIDEST = 2  # Counts to either side of the exact one
 _ROUNDED_AT_ONCE = 64
-TRIED = 4
-"""Combinations that are tried on the arm."""
+TRIED = 4  # Combinations that are tried on the arm
 
 
 class ServoCounts:

@@ -22,14 +22,12 @@ from armcal.calibration.compensation.search import (
 from armcal.calibration.rigid_chain import FREE_ANGLE, FREE_TRAVEL
 from armcal.calibration.tool_expression import Equilibrium, ToolExpression
 
-Allowed = Callable[[Array], Mask]
-"""From commands (n x N) to whether the arm may be there."""
+Allowed = Callable[[Array], Mask]  # From commands (n x N) to whether the arm may be there
 Score = Callable[[Array, Array, Rows], Array]
 """From commands (n x R), states and the targets they are for, to what is to be small (R)."""
 
 _ROUNDS = (1, 1, 2, 4, 8, 16, 32, 64)
-_CANDIDATES = (12, 16, 32, 64)
-"""Where the best of several is wanted."""
+_CANDIDATES = (12, 16, 32, 64)  # Where the best of several is wanted
 _AT_ONCE = 4096
 _BESIDE = 0.6
 """Commands that moved no joint farther (rad or m) are taken for the nearest without a look at other postures."""
@@ -37,8 +35,7 @@ _POSTURES, _MOVED = 24, 0.2
 """Starts from which the nearest of all commands is sought; what their distance from where the arm is counts beside
 that of their tool from the target."""
 _NEAREST_STARTS = 4
-_WIDEST = 2 * np.pi
-"""To either side; a joint that goes farther is tried about where it is nearest to zero."""
+_WIDEST = 2 * np.pi  # To either side; a joint that goes farther is tried about where it is nearest to zero
 
 
 class Finder:

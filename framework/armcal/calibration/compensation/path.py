@@ -15,14 +15,11 @@ from armcal.calibration.compensation.finder import Finder
 from armcal.calibration.compensation.search import Solutions
 
 WAYS = 12
-_SAME = 1e-3
-"""Commands nearer than this (rad or m) are the same posture."""
-_JUMP = 0.5
-"""A longer move (rad or m) between neighbouring targets is a jump."""
+_SAME = 1e-3  # Commands nearer than this (rad or m) are the same posture
+_JUMP = 0.5  # A longer move (rad or m) between neighbouring targets is a jump
 
 _ROUNDS = 3
-_STILL = 1e-9
-"""A joint that moves by less (rad or m) keeps its side."""
+_STILL = 1e-9  # A joint that moves by less (rad or m) keeps its side
 
 
 @dataclass(frozen=True)
@@ -30,13 +27,11 @@ class Path:
     """Commands along a path.
 
     Attributes:
-        solutions: the commands for each target.
-        approach: from where each joint came (n x N).
         moves: of each joint to each target from the one before it (n x N; rad or m; 0 for the first without a start).
     """
 
-    solutions: Solutions
-    approach: Array
+    solutions: Solutions  # the commands for each target
+    approach: Array  # from where each joint came (n x N)
     moves: Array
 
 

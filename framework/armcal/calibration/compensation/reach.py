@@ -74,15 +74,13 @@ class Reach:
     the longest exceeds the others, is out of reach.
 
     Attributes:
-        centre: the mount's origin (m; base frame).
         farthest: m; infinite where nothing is known, as of arms whose joints turn about axes beside their frames, or
             whose lengths change with the surroundings.
-        nearest: m.
     """
 
-    centre: Array
+    centre: Array  # the mount's origin (m; base frame)
     farthest: float
-    nearest: float
+    nearest: float  # m
 
     def bounds(self, positions: Array) -> Array:
         """No command brings the tool nearer to positions (N x 3; m) than this (N; m)."""

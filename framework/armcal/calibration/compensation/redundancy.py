@@ -17,8 +17,7 @@ from armcal.calibration.tool_expression import ToolExpression, sample_inputs
 from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
 _STEPS = 25
-_FIRST, _LEAST = 0.3, 1e-4
-"""Lengths of steps (rad or m): the first, and the one below which the way ends."""
+_FIRST, _LEAST = 0.3, 1e-4  # Lengths of steps (rad or m): the first, and the one below which the way ends
 _MOST = 0.6
 _SOFTENED = 1e-6
 

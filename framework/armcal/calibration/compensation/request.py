@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from armcal.base.arrays import Array, Indices, Mask
 
 Redundancy = Literal["nearest", "stiffest", "least_sag", "coolest"]
-FARTHEST_M = 1e6
-"""A target beyond this is a slip of a unit, and its square may be no number."""
+FARTHEST_M = 1e6  # A target beyond this is a slip of a unit, and its square may be no number
 _ORTHOGONAL = 1e-6
 
 

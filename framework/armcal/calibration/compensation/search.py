@@ -26,18 +26,14 @@ class Goal:
     """What commands are sought for.
 
     Attributes:
-        record: channels x N; with the commands from which the search starts.
-        state: n_d x N; where the search starts.
-        target: position, and where turns count the rotation column by column (3 or 12 x N).
         towards: commands to come near to where the target leaves a choice (n x N); None for no preference.
-        held: joints that stay where the search starts, by index.
     """
 
-    record: Array
-    state: Array
-    target: Array
+    record: Array  # channels x N; with the commands from which the search starts
+    state: Array  # n_d x N; where the search starts
+    target: Array  # position, and where turns count the rotation column by column (3 or 12 x N)
     towards: Array | None = None
-    held: tuple[int, ...] = ()
+    held: tuple[int, ...] = ()  # joints that stay where the search starts, by index
 
     def subset(self, rows: Rows) -> Goal:
         towards = None if self.towards is None else chosen_of(self.towards, rows)
@@ -47,23 +43,14 @@ class Goal:
 
 @dataclass(frozen=True)
 class Solutions:
-    """What was found of targets (N).
+    """What was found of targets (N)."""
 
-    Attributes:
-        commands: n x N (rad or m); of those that are not reached, the nearest.
-        states: n_d x N.
-        distances: what is left (m).
-        turns: what is left (rad).
-        there: whether it is reached.
-        forbidden: of those that are not reached, whether only clearance forbids it.
-    """
-
-    commands: Array
-    states: Array
-    distances: Array
-    turns: Array
-    there: Mask
-    forbidden: Mask
+    commands: Array  # n x N (rad or m); of those that are not reached, the nearest
+    states: Array  # n_d x N
+    distances: Array  # what is left (m)
+    turns: Array  # what is left (rad)
+    there: Mask  # whether it is reached
+    forbidden: Mask  # of those that are not reached, whether only clearance forbids it
 
     @classmethod
     def nothing(cls, joints: int, state: int, count: int) -> Solutions:
@@ -86,45 +73,30 @@ class Solutions:
 
 @dataclass(frozen=True)
 class Manner:
-    """How a search goes on.
+    """How a search goes on."""
 
-    Attributes:
-        damping: times the squared error.
-        patience: steps in which an error must halve, or the search ends.
-        steps: at most.
-    """
-
-    damping: float
-    patience: int
-    steps: int
+    damping: float  # times the squared error
+    patience: int  # steps in which an error must halve, or the search ends
+    steps: int  # at most
 
 
-QUICK = Manner(damping=1e-2, patience=5, steps=40)
-"""To a target that can be reached."""
+QUICK = Manner(damping=1e-2, patience=5, steps=40)  # To a target that can be reached
 NEAREST = Manner(damping=1.0, patience=25, steps=100)
 """To the nearest where it cannot: what is left must not throw the arm about."""
-PREFERRED = Manner(damping=1e-2, patience=20, steps=100)
-"""Along targets towards preferred commands."""
+PREFERRED = Manner(damping=1e-2, patience=20, steps=100)  # Along targets towards preferred commands
 
 
 @dataclass(frozen=True)
 class Near:
-    """What counts as being there.
+    """What counts as being there."""
 
-    Attributes:
-        metres: from the target.
-        radians: from the target.
-        rest: what may be left of the equilibrium (rad or m).
-    """
-
-    metres: float
-    radians: float
-    rest: float
+    metres: float  # from the target
+    radians: float  # from the target
+    rest: float  # what may be left of the equilibrium (rad or m)
 
 
 _REST = 1e-11
-_ROUGH = Near(metres=1e-3, radians=5e-3, rest=1e-2)
-"""Where rough steps end."""
+_ROUGH = Near(metres=1e-3, radians=5e-3, rest=1e-2)  # Where rough steps end
 
 
 class Search:

@@ -26,34 +26,23 @@ from armcal.base.se3 import Expression
 from armcal.calibration.tool_expression import ToolExpression
 
 FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-14
-_LONGEST = 0.4
-"""rad or m in one step."""
-_NEAR_PREFERRED = 1e-4
-"""Preferred commands are reached when they move no joint by more (rad or m)."""
-_WILD = 2.0
-"""A deflection beyond this (rad or m) is started anew."""
+_LONGEST = 0.4  # rad or m in one step
+_NEAR_PREFERRED = 1e-4  # Preferred commands are reached when they move no joint by more (rad or m)
+_WILD = 2.0  # A deflection beyond this (rad or m) is started anew
 _FINITE = 1e300
 SETTINGS = ("damping", "patience", "steps", "metres", "radians", "rest", "preferred")
 """Of a search; after them come the lowest and the highest command of each joint, and whether it is held."""
-REACHED = 2.0
-"""How a search ends that reaches its target; others end with 1, and go on at 0."""
+REACHED = 2.0  # How a search ends that reaches its target; others end with 1, and go on at 0
 
 
 @dataclass(frozen=True)
 class Slopes:
-    """How the tool moves with the commands, in equilibrium to first order.
+    """How the tool moves with the commands, in equilibrium to first order."""
 
-    Attributes:
-        left: what is left of the equilibrium, d0 (n_d).
-        state: d state / d commands (n_d x n).
-        tool: d (rotation column by column, then position) / d commands (12 x n).
-        corrected: rotation and position (12) at the equilibrium.
-    """
-
-    left: Expression
-    state: Expression
-    tool: Expression
-    corrected: Expression
+    left: Expression  # what is left of the equilibrium, d0 (n_d)
+    state: Expression  # d state / d commands (n_d x n)
+    tool: Expression  # d (rotation column by column, then position) / d commands (12 x n)
+    corrected: Expression  # rotation and position (12) at the equilibrium
 
 
 def slopes(expression: ToolExpression, rough: bool = False) -> Slopes:

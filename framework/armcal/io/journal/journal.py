@@ -36,21 +36,13 @@ USUAL_LIMITS = JournalLimits()
 
 @dataclass(frozen=True)
 class Recovered:
-    """What a journal held when it was opened.
+    """What a journal held when it was opened."""
 
-    Attributes:
-        header: what the writer of the newest segment said of itself; empty if the journal is new.
-        checkpoint: the newest full state; None if none was written yet.
-        checkpoint_sequence: its sequence number.
-        entries: what came after it.
-        cut: the torn end that was cut off, if there was one.
-    """
-
-    header: Mapping[str, Any]
-    checkpoint: Any
-    checkpoint_sequence: int
-    entries: tuple[Entry, ...]
-    cut: Cut | None
+    header: Mapping[str, Any]  # what the writer of the newest segment said of itself; empty if the journal is new
+    checkpoint: Any  # the newest full state; None if none was written yet
+    checkpoint_sequence: int  # its sequence number
+    entries: tuple[Entry, ...]  # what came after it
+    cut: Cut | None  # the torn end that was cut off, if there was one
 
 
 class Journal:

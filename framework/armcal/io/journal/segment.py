@@ -62,22 +62,15 @@ class Link:
 
 @dataclass(frozen=True)
 class Cut:
-    """The end of the newest segment that is no whole entry, as a power loss or a kill leaves it.
-
-    Attributes:
-        sequence: the number the first lost entry would have had.
-        data: the bytes.
-        reason: what they lack.
-        kept: the file in which they were kept, if they were.
-    """
+    """The end of the newest segment that is no whole entry, as a power loss or a kill leaves it."""
 
     path: Path
     line: int
     offset: int
-    sequence: int
-    data: bytes
-    reason: str
-    kept: Path | None = None
+    sequence: int  # the number the first lost entry would have had
+    data: bytes  # the bytes
+    reason: str  # what they lack
+    kept: Path | None = None  # the file in which they were kept, if they were
 
     @property
     def sentence(self) -> str:
@@ -94,25 +87,17 @@ class Cut:
 
 @dataclass(frozen=True)
 class Segment:
-    """A segment that begins with a whole header and checkpoint.
-
-    Attributes:
-        header: what the writer said of itself.
-        start: the byte after the checkpoint.
-        end: the byte after the last whole entry.
-        link: what the next entry follows on.
-        cut: where the segment stops being whole; None if it is whole to its end.
-    """
+    """A segment that begins with a whole header and checkpoint."""
 
     path: Path
     number: int
-    header: Any
+    header: Any  # what the writer said of itself
     checkpoint: Entry
     entries: tuple[Entry, ...]
-    start: int
-    end: int
-    link: Link
-    cut: Cut | None
+    start: int  # the byte after the checkpoint
+    end: int  # the byte after the last whole entry
+    link: Link  # what the next entry follows on
+    cut: Cut | None  # where the segment stops being whole; None if it is whole to its end
 
 
 @dataclass(frozen=True)
