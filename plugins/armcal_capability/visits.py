@@ -1,46 +1,49 @@
-"""Visits to poses: the arm that is judged, and a table of its records with pose, cycle and direction of approach."""
+"""Records of visits to poses: by pose, cycle and direction, and beside what was commanded, in one frame."""
 
-import csv
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NoReturn, Self
+from typing import Literal, NoReturn, Self, get_args
 
 import numpy as np
 from armcal.arm.assembly import command_channels
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
+from armcal.base.quaternions import nearest_turn
 from armcal.base.units import DIMENSIONLESS
 from armcal.calibration.calibration import Calibration
+from armcal.calibration.intervals import PredictionRecord
 from armcal.config.system import System, build_component
 from armcal.config.yaml_source import ConfigSource, load_config
-from armcal.errors import ConfigError, DataError, Location
-from armcal.io.plain_files import input_file
+from armcal.diagnose.readings import check_reach
+from armcal.errors import ConfigError, DataError, Location, NotConvergedError
+from armcal.estimate.start import BETTER, FAR, placings, pose_words
 from armcal.measure.checks import records_of
 from armcal.measure.environment import noticed
 from armcal.measure.groups import pose_numbers
 from armcal.measure.reader import CYCLE, Reader, ReadRequest, RequestedChannel, requested_channels
 from armcal.plugins import PluginRegistry
+from armcal.problem.problem import Problem
+from armcal.problem.rigid_alignment import FEWEST as FEWEST_SEEN
+from armcal.problem.rigid_alignment import Sighting, Tools, alignments, sighting_of, tools_of, undetermined
+from armcal.report.numbers import plural
 from armcal.run.experiment import Experiment, with_data
+from scipy.spatial.transform import Rotation
 
 from armcal_capability.designs import examined_arm
 
 POSE, DIRECTION, FEWEST = "pose", "direction", 2
-COMMANDED = tuple(f"commanded_{axis}" for axis in "xyz")
-COMMANDED_TURN = tuple(f"commanded_{part}" for part in ("qw", "qx", "qy", "qz"))
-_MOST_BYTES, _FEWEST_WORDS = 1 << 31, "Repeatability needs two visits, ISO 9283 asks for 30"
-_OWN = (
-    RequestedChannel(CYCLE, (CYCLE,), DIMENSIONLESS, required=False),
-    *(RequestedChannel(name, (name,), "length", required=False) for name in COMMANDED),
-    *(RequestedChannel(name, (name,), DIMENSIONLESS, required=False) for name in COMMANDED_TURN),
-)
+_FEWEST_WORDS = "Repeatability needs two visits, ISO 9283 asks for 30"
 _REPEATS = "Records of one pose are held out together"
 """In what readers warn of: repeats, which are what is measured here."""
 _FAR = 0.1
 """Of the typical distance of the positions that arms reach: no arm repeats as badly."""
 _FACTORS = {1000.0: "m", 10.0: "cm", 25.4: "inches", 0.001: "thousandths of the column's unit"}
 _NEAR, _MM = 0.02, 1000.0
+FrameChoice = Literal["auto", "stated", "found"]
+FRAMES = get_args(FrameChoice)
+_COMPILED_FROM = 5000
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,7 @@ class ArmToJudge:
     system: System  # with the arm, and the one measurement that is judged
     models: Mapping[str, Parameters]  # nominal and, from a calibration, calibrated; free are those without a prior
     source: ConfigSource  # with the section data, which says how records are read
-    columns: Mapping[str, str] = field(default_factory=dict)  # what the calibration's data called its columns
+    kept: PredictionRecord | None = None  # of a calibration, if the records are read as its data was
     trained_on: str = ""  # hash of the data that the calibration comes from
 
     @classmethod
@@ -66,32 +69,30 @@ class ArmToJudge:
         """From a calibration or a configuration; ``settings`` is one whose section ``data`` is taken instead."""
         given = load_config(path)
         rules = None if settings is None else load_config(settings, overrides)
+        kept, trained_on = None, ""
         if "armcal_calibration" in given.data:
             calibration = Calibration.load(path, registry, accept)
             source = with_data(rules or replace(given, data={**given.data, "data": {"type": "csv"}}), records)
-            record, kept = calibration.record, calibration.record.prediction
+            system, record = calibration.system, calibration.record
             free = {e.name.partition("[")[0] for e in record.parameters if e.free and not e.held_by_prior}
-            models = {"nominal": calibration.nominal.with_free(free)}
-            models["calibrated"] = calibration.parameters.with_free(free)
-            columns = dict(kept.columns) if kept and rules is None else {}
-            return cls(_judged(calibration.system, path), models, source, columns, record.identity.get("data", ""))
-        experiment = Experiment.load(path, overrides if rules is None else (), records, registry)
-        source = with_data(rules, records) if rules else experiment.source
-        free = {b.name for b in experiment.parameters.free if b.prior_sd is None and not b.nuisance}
-        return cls(_judged(experiment.system, path), {"nominal": experiment.parameters.with_free(free)}, source)
-
-
-def _judged(system: System, path: Path) -> System:
-    """With the measurement that reads positions of a target on the only arm."""
-    examined_arm(system, path)
-    for name, measurement in system.measurements.items():
-        if {channel.name for channel in measurement.channels()}.issuperset("xyz"):
-            return replace(system, measurements={name: measurement})
-    raise ConfigError(
-        f"found {', '.join(system.measurements) or 'no measurement'}, expected one that reads positions.",
-        where=Location(str(path)),
-        hint="Add a measurement tip_position or tip_pose: accuracy is judged by measured poses.",
-    )
+            models = {"nominal": calibration.nominal, "calibrated": calibration.parameters}
+            kept, trained_on = None if rules else record.prediction, record.identity.get("data", "")
+        else:
+            experiment = Experiment.load(path, overrides if rules is None else (), records, registry)
+            source = with_data(rules, records) if rules else experiment.source
+            system, models = experiment.system, {"nominal": experiment.parameters}
+            free = {b.name for b in experiment.parameters.free if b.prior_sd is None and not b.nuisance}
+        examined_arm(system, path)
+        reading = (n for n, m in system.measurements.items() if {c.name for c in m.channels()}.issuperset("xyz"))
+        if (judged := next(reading, None)) is None:
+            raise ConfigError(
+                f"found {', '.join(system.measurements) or 'no measurement'}, expected one that reads positions.",
+                where=Location(str(path)),
+                hint="Add a measurement tip_position or tip_pose: accuracy is judged by measured poses.",
+            )
+        system = replace(system, measurements={judged: system.measurements[judged]})
+        models = {name: parameters.with_free(free) for name, parameters in models.items()}
+        return cls(system, models, source, kept, trained_on)
 
 
 @dataclass(frozen=True)
@@ -116,9 +117,6 @@ class Visits:
     def poses(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys(group.pose for group in self.groups))
 
-    def main(self, pose: str) -> Group:
-        return max((group for group in self.groups if group.pose == pose), key=lambda group: len(group.members))
-
 
 def read_visits(subject: ArmToJudge, registry: PluginRegistry, path: Path) -> Visits:
     """The records of a table as visits; poses are named by a column, or found by their joint channels.
@@ -127,26 +125,14 @@ def read_visits(subject: ArmToJudge, registry: PluginRegistry, path: Path) -> Vi
         DataError: the table is refused, a cycle is no whole number or occurs twice, or a pose has too few visits.
     """
     source, arms = subject.source, subject.system.arms
-    channels = (*requested_channels(arms, subject.system.measurements, measured=True), *_OWN)
+    cycle = RequestedChannel(CYCLE, (CYCLE,), DIMENSIONLESS, required=False)
+    channels = (*requested_channels(arms, subject.system.measurements, measured=True), cycle)
     section = dict(source.data["data"])
-    if subject.columns:
-        with input_file(path, _MOST_BYTES, "a table of records") as stream:
-            line = stream.readline(1 << 20).decode("utf-8-sig", "replace").rstrip("\r\n")
-        names = [cell.strip() for cell in next(csv.reader([line], delimiter=str(section.get("delimiter", ","))), [])]
-        known = {name: own for name, own in subject.columns.items() if own in names and name not in names}
-        section["columns"] = {**known, **section.get("columns", {})}
+    if subject.kept is not None:
+        section["columns"] = subject.kept.columns_in(path, channels)
     reader: Reader
     reader, _ = build_component(replace(source, data={**source.data, "data": section}), registry, "reader", ("data",))
     dataset = noticed(records_of(reader, ReadRequest(arms, subject.system.measurements, channels)))
-    for whole in (COMMANDED, COMMANDED_TURN):
-        there = [name for name in whole if dataset.has(name)]
-        if there and len(there) < len(whole):
-            missing = next(name for name in whole if name not in there)
-            raise DataError(
-                f"found {', '.join(there)}, expected {missing} too.",
-                where=Location(dataset.source, line=1, field=missing),
-                hint="Give the whole commanded pose, or none: then it is that of the commanded joint angles.",
-            )
     labelled = POSE in dataset.extra
     poses = [f"pose {n + 1}" for n in pose_numbers(dataset, [*command_channels(arms)])]
     if labelled:
@@ -218,6 +204,110 @@ def refuse_strangers(visits: Visits, measured: Array, reach: float) -> None:
             text += f", and {apart[nearest] * _MM:.3g} mm from those to {nearest}"
             hint = "If two rows were exchanged, put them right."
         _refuse(visits.dataset, int(group.members[worst]), POSE, f"{text}.", hint)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Commanded and attained poses of the measured target by one model of the arm (N records), in one frame."""
+
+    words: str  # where the base is in the instrument's frame
+    fitted: int  # how many numbers were found from the positions; 0: base and target are as stated
+    commanded: Array  # N x 3; m
+    attained: Array  # N x 3; m
+    turns: Array | None  # rotation vectors from commanded to attained (N x 3; rad); None: only positions were measured
+    warnings: tuple[str, ...] = ()
+
+
+def compare(subject: ArmToJudge, model: str, visits: Visits, choice: FrameChoice) -> Comparison:
+    """The comparison by one model of the arm.
+
+    Raises:
+        DataError: positions of the records cannot be compared, or no frame can be found.
+    """
+    system, parameters, dataset = subject.system, subject.models[model], visits.dataset
+    evaluator: Literal["auto", "interpreted"] = "interpreted" if len(dataset) < _COMPILED_FROM else "auto"
+    problem = Problem.build(
+        system.arms, system.measurements, parameters, system.environment, dataset, evaluator, groups={}
+    )
+    records, where = problem.records(dataset), Location(dataset.source)
+    try:
+        sighting = sighting_of(problem, records, dataset, 0, len(dataset))
+        if sighting is None or len(sighting.chosen) < len(dataset):
+            raise DataError(
+                f"{next(iter(system.measurements))} does not read the position of a target in a frame in each record.",
+                where=where,
+                hint="Judge by a measurement tip_position or tip_pose, and leave out rows without positions.",
+            )
+        tools = tools_of(problem, parameters.nominal(), records[0], 0)
+        if model == "nominal":
+            refuse_strangers(visits, sighting.measured.T, float(np.median(np.linalg.norm(tools.places, axis=0))))
+        basis, is_turned = np.eye(3), True
+        if choice == "auto":
+            placing, _ = placings(problem, records, sighting)
+            basis, is_turned = placing.basis, bool(set(placing.target) - {name for name, _ in placing.shifts})
+        if choice == "found" or (choice == "auto" and placing.stands_anywhere):
+            return _aligned(tools, sighting, basis, is_turned, where)
+        check_reach(problem, records, dataset)
+    except NotConvergedError as fault:
+        hint = "Check payload, gravity and compliances, and their units."
+        raise DataError(f"the {model} arm has no equilibrium ({fault.message})", where=where, hint=hint) from fault
+    off, warnings = sighting.off(tools), []
+    if off > FAR * sighting.size:
+        ranked = alignments(tools, sighting.measured, np.zeros((3, 0)))
+        if ranked and ranked[0].left * BETTER < off:
+            warnings.append(
+                f"typically {off * _MM:.3g} mm are between commanded and attained positions, and "
+                f"{ranked[0].left * _MM:.3g} mm where the records themselves place the base, at "
+                f"{pose_words(ranked[0])}. Either the arm is as far off, or the instrument's frame is not the stated "
+                "one: then give --frame found."
+            )
+    words = "as stated: nothing was fitted to these records"
+    turns = None if sighting.turned is None else _turns(tools.rotations, sighting.turned)
+    return Comparison(words, 0, tools.places.T, sighting.measured.T, turns, tuple(warnings))
+
+
+def _aligned(tools: Tools, sighting: Sighting, basis: Array, is_turned: bool, where: Location) -> Comparison:
+    """With the base, and the target along a basis (3 x k) and turned on the tool, where the records have them."""
+    poses = np.unique(np.round(tools.places, 4), axis=1).shape[1]
+    ranked = alignments(tools, sighting.measured, basis, sighting.turned)
+    if not ranked or poses < 3:
+        records = f"{len(sighting.chosen)} records of {plural(poses, 'pose')}"
+        raise DataError(
+            f"found {records}, expected {FEWEST_SEEN} of three or more: the instrument's frame cannot be found from "
+            "fewer.",
+            where=where,
+            hint="Measure more poses, or state where the instrument is and give --frame stated.",
+        )
+    best = ranked[0]
+    fitted = 6 + basis.shape[1] - len(undetermined(tools, best, basis))
+    commanded = (tools.places + np.einsum("nij,j->in", tools.rotations, best.offset)).T
+    words = f"found from these records: the described base frame at {pose_words(best)} in the instrument's frame"
+    if basis.shape[1]:
+        x, y, z = best.offset * _MM
+        words += f", the target ({x:.2f}, {y:.2f}, {z:.2f}) mm from where it is stated on the tool"
+    turns = None
+    if sighting.turned is not None:
+        seen, mounted = best.turn.T @ sighting.turned, np.eye(3)
+        if is_turned:
+            mounted = nearest_turn(np.einsum("nji,njk->ik", tools.rotations, seen))
+            a, b, c = Rotation.from_matrix(mounted).as_rotvec(degrees=True)
+            words += f", turned by ({a:.2f}, {b:.2f}, {c:.2f}) deg"
+        turns = _turns(tools.rotations @ mounted, seen)
+    warnings: tuple[str, ...] = ()
+    remaining = 1 - fitted / (3 * poses)
+    if remaining <= 0.75:
+        much = f"by about {100 * (1 - np.sqrt(remaining)):.0f} %" if remaining > 0 else "to nothing, whatever it does"
+        warnings = (
+            f"{fitted} numbers of base and target were found from the {3 * poses} coordinates of {poses} poses, which "
+            f"makes AP smaller, {much}. RP, AD, RD and vAP depend on it little or not at all. "
+            "State the frame (--frame stated), or measure more poses.",
+        )
+    return Comparison(words, fitted, commanded, best.back(sighting.measured).T, turns, warnings)
+
+
+def _turns(commanded: Array, attained: Array) -> Array:
+    """Rotation vectors (N x 3) from rotations to others (N x 3 x 3 each), in the frame's axes."""
+    return np.asarray(Rotation.from_matrix(attained @ np.swapaxes(commanded, 1, 2)).as_rotvec())
 
 
 def _line(dataset: Dataset, index: int) -> int:

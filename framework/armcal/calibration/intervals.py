@@ -6,8 +6,10 @@ times larger than the records that tell of it. Those are kept instead, and the d
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -17,6 +19,7 @@ from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Drift, Parameters
 from armcal.base.settings import Settings
+from armcal.base.units import split_suffix
 from armcal.calibration.tool_expression import APPROACH
 from armcal.config.system import System
 from armcal.diagnose.coverage import Stretch, level_name
@@ -33,6 +36,8 @@ from armcal.estimate.prediction import (
 )
 from armcal.estimate.validation import Recording
 from armcal.estimate.variance import Axes, Component, VarianceComponents, apply_components
+from armcal.io.plain_files import input_file
+from armcal.measure.reader import RequestedChannel
 from armcal.problem.corrected import sizes_of, unexplained
 from armcal.problem.drift import Chain, chain, with_drift
 from armcal.problem.problem import FactorRecords, Problem
@@ -84,6 +89,21 @@ class PredictionRecord(Settings):
     columns: dict[str, str] = Field(default_factory=dict)
     recording: RecordingRecord | None = None
     ranges: dict[str, tuple[float, float]] = Field(default_factory=dict)
+
+    def columns_in(self, path: Path, requested: Sequence[RequestedChannel]) -> dict[str, str]:
+        """What the calibration's data called the columns of these channels, as far as a CSV has them."""
+        used = {name for channel in requested for name in channel.columns}
+        try:
+            with input_file(path, 1 << 31, "a CSV file") as file:
+                line = file.readline(1 << 20).decode("utf-8-sig")
+            header = {cell.strip() for cell in next(csv.reader([line]), [])}
+        except (DataError, OSError, UnicodeDecodeError, csv.Error):
+            return {}  # the reader says what is wrong
+        return {
+            name: own
+            for name, own in self.columns.items()
+            if own in header and name not in header and (name in used or (split_suffix(name) or (name,))[0] in used)
+        }
 
     @property
     def symmetric_covariance(self) -> Array:

@@ -1,6 +1,5 @@
 """``armcal predict``."""
 
-import csv
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,13 +11,12 @@ import numpy as np
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
 from armcal.base.quaternions import quaternion_of
-from armcal.base.units import DIMENSIONLESS, readable, split_suffix, to_unit
+from armcal.base.units import DIMENSIONLESS, readable, to_unit
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.intervals import PlusMinus
 from armcal.calibration.recorded_range import beyond_records
 from armcal.cli.common import FILE, Console, accept, spare_inputs, speaking
-from armcal.errors import DataError, InputError, Location
-from armcal.io.plain_files import input_file
+from armcal.errors import InputError, Location
 from armcal.measure.checks import records_of
 from armcal.measure.csv_writer import column_names, write_csv
 from armcal.measure.environment import noticed
@@ -26,7 +24,6 @@ from armcal.measure.reader import ReadRequest, RequestedChannel, requested_chann
 from armcal.plugins import PluginRegistry
 from armcal.run.compensate import short_texts
 
-_MOST_BYTES, _LONGEST_HEADER = 1 << 31, 1 << 20
 _MOST_NAMED = 8
 _LAYOUT = "Say what the file calls a column by --columns NAME=COLUMN, with commas between columns and decimal points."
 _RECORDINGS: Mapping[str, Literal["same", "new"]] = {"calibrated": "same", "new": "new"}
@@ -135,7 +132,8 @@ def read_commands(registry: PluginRegistry, loaded: Calibration, poses: Path, co
     arms = loaded.system.arms
     requested = requested_channels(arms, {}, measured=False)
     reader_class = registry.find("reader", "csv").load()
-    named = _known_columns(loaded, poses, requested)
+    kept = loaded.record.prediction
+    named = kept.columns_in(poses, requested) if kept else {}
     for text in columns:
         name, _, own = (part.strip() for part in text.partition("="))
         if not (name and own):
@@ -147,24 +145,6 @@ def read_commands(registry: PluginRegistry, loaded: Calibration, poses: Path, co
         named[name] = own
     reader = reader_class(reader_class.Settings(path=ConfigText(str(poses)), columns=named))
     return noticed(records_of(reader, ReadRequest(arms, {}, requested, layout_hint=_LAYOUT)))
-
-
-def _known_columns(loaded: Calibration, poses: Path, requested: Sequence[RequestedChannel]) -> dict[str, str]:
-    """What the calibration's data called the columns that a prediction uses, as far as the file has them."""
-    kept = loaded.record.prediction
-    used = {name for channel in requested for name in channel.columns}
-    try:
-        with input_file(poses, _MOST_BYTES, "a CSV file") as file:
-            line = file.readline(_LONGEST_HEADER).decode("utf-8-sig")
-        header = {cell.strip() for cell in next(csv.reader([line]), [])}
-    except (DataError, OSError, UnicodeDecodeError, csv.Error):
-        return {}  # the reader says what is wrong
-    columns = kept.columns if kept else {}
-    return {
-        name: own
-        for name, own in columns.items()
-        if own in header and name not in header and (name in used or (split_suffix(name) or (name,))[0] in used)
-    }
 
 
 def _warn_of_missing(console: Console, loaded: Calibration, commands: Dataset, recording: str) -> None:
