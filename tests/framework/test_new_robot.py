@@ -415,11 +415,11 @@ def test_a_target_that_is_no_place_is_refused(target: str) -> None:
 # What is refused
 
 TABLES = {
-    "a column without its unit": ("alpha,a_mm,theta_deg,d_mm\n0,1,2,3\n", ":1, alpha: found 'alpha' with no unit"),
-    "another unit": ("alpha_mm,a_mm,theta_deg,d_mm\n", ":1, alpha_mm: found 'alpha_mm' with a unit of length"),
-    "a missing column": ("alpha_deg,a_mm,theta_deg\n", ":1: found no column for d"),
+    "a column without its unit": ("alpha,a_mm,theta_deg,d_mm\n0,1,2,3\n", ":1, alpha: alpha has no unit. Write alpha_"),
+    "another unit": ("alpha_mm,a_mm,theta_deg,d_mm\n", ":1, alpha_mm: alpha_mm has a unit of length"),
+    "a missing column": ("alpha_deg,a_mm,theta_deg\n", "found no column for d, expected d_m or d_cm or d_mm"),
     "a misspelt column": (f"{HEADER},masss_g\n", "Did you mean mass_g?"),
-    "a column twice": (f"{HEADER},a_m\n", ":1, a_m: found a twice"),
+    "a column twice": (f"{HEADER},a_m\n", ":1, a_mm: found both a_m and a_mm"),
     "another delimiter": (HEADER.replace(",", ";") + "\n", ":1: found ';' between the columns"),
     "NaN": (f"{HEADER}\n0,1,2,3\n0,1,nan,3\n", ":3, theta_deg: found 'nan', expected a number"),
     "infinity": (f"{HEADER}\n0,1,2,3\n0,inf,0,3\n", ":3, a_mm: found 'inf', expected a number"),

@@ -14,14 +14,14 @@ from pydantic import ValidationError
 
 from armcal.arm.assembly import PLACEMENT, MassiveModel
 from armcal.arm.model import Joint
-from armcal.base.units import Unit as KnownUnit
-from armcal.base.units import display_unit, from_unit, split_suffix, units_of
+from armcal.base.units import display_unit, from_unit, split_suffix
 from armcal.calibration.convert import nominal_values
 from armcal.calibration.rigid_chain import numeric_chain
 from armcal.errors import ConfigError, DataError, InputError, Location
 from armcal.io.cells import CellFault, read_cell
 from armcal.io.plain_files import input_bytes, refuse, text_of
-from armcal.measure.reader import ENVIRONMENT
+from armcal.measure.column_match import header_of, match_columns, renamed, spellings
+from armcal.measure.reader import ENVIRONMENT, RequestedChannel
 from armcal.plugins import PluginRegistry
 from armcal.scaffold.plugin_files import check_length
 
@@ -188,54 +188,49 @@ def check_joint_names(names: Sequence[str], places: Sequence[Location]) -> None:
 MAX_BYTES = 1 << 20
 _NUMBERS = {"alpha": "angle", "a": "length", "theta": "angle", "d": "length"}
 _OPTIONAL = {"mass": "mass", "com_x": "length", "com_y": "length", "com_z": "length"}
-_LIMITS = ("lower", "upper")
-_NAME, _TYPE = ("name", "joint"), ("type", "kind")
+_LIMITS = {f"{which} {dimension}": dimension for dimension in ("angle", "length") for which in ("lower", "upper")}
+_COLUMNS = {
+    name: RequestedChannel(name, (name.partition(" ")[0],), dimension, required=name in _NUMBERS)
+    for name, dimension in (_NUMBERS | _OPTIONAL | _LIMITS).items()
+}
+_TEXTS = {"name": "name", "joint": "name", "type": "type", "kind": "type"}
 _KINDS = {"": True, "revolute": True, "prismatic": False}
 _SHOWN = "alpha_deg,a_mm,theta_deg,d_mm"
 _AS_TEXT = "Save the table as CSV text in UTF-8."
 
-Key = tuple[str, str]
-"""A column's name without its unit, and its dimension; text for one without."""
-
 
 @dataclass(frozen=True)
 class _Line:
-    """One row of the file: its cells by column, its line, and how the columns are called there."""
+    """One row of the file: its cells by what they say, its line, and the columns' names and units there."""
 
     source: str
     line: int
-    cells: dict[Key, str]
-    columns: dict[Key, tuple[str, KnownUnit | None]]
+    cells: dict[str, str]
+    columns: dict[str, tuple[str, str]]
 
-    def refuse(self, key: Key | None, message: str, hint: str) -> NoReturn:
-        refuse(self.source, message, hint, self.line, self.columns[key][0] if key else None)
+    def refuse(self, name: str, message: str, hint: str) -> NoReturn:
+        refuse(self.source, message, hint, self.line, self.columns[name][0])
 
-    def number(self, stem: str, dimension: str) -> float | None:
+    def number(self, name: str) -> float | None:
         """A number in SI; None for an empty cell or no such column."""
-        key = (stem, dimension)
-        text = self.cells.get(key, "").strip()
-        unit = self.columns[key][1] if text else None
-        if unit is None:
+        text = self.cells.get(name, "")
+        if not text:
             return None
-        cell = read_cell(text)
+        cell, unit = read_cell(text), self.columns[name][1]
         if isinstance(cell, CellFault):
-            self.refuse(key, cell.text, "Correct it.")
+            self.refuse(name, cell.text, "Correct it.")
         if not math.isfinite(cell):
-            self.refuse(key, f"found {text!r}, expected a number.", "Correct it.")
-        value = from_unit(cell, unit.name)
+            self.refuse(name, f"found {text!r}, expected a number.", "Correct it.")
+        value, dimension = from_unit(cell, unit), _COLUMNS[name].dimension
         if abs(value) > MOST[dimension]:
-            self.refuse(key, f"found {text} {unit.name}, expected an arm's {dimension}.", "Check the column's unit.")
+            self.refuse(name, f"found {text} {unit}, expected an arm's {dimension}.", "Check the column's unit.")
         return value
 
-    def required(self, stem: str, dimension: str) -> float:
-        number = self.number(stem, dimension)
+    def required(self, name: str) -> float:
+        number = self.number(name)
         if number is None:
-            self.refuse((stem, dimension), "found nothing, expected a number.", "Write 0 for none.")
+            self.refuse(name, "found nothing, expected a number.", "Write 0 for none.")
         return number
-
-    def text(self, stems: tuple[str, ...]) -> str:
-        """A text, from the first column of several that is there; empty if none is."""
-        return next((self.cells[stem, "text"].strip() for stem in stems if (stem, "text") in self.cells), "")
 
 
 def read_rows(path: Path) -> tuple[Row, ...]:
@@ -259,19 +254,21 @@ def read_rows(path: Path) -> tuple[Row, ...]:
 def _lines(path: Path, text: str) -> list[_Line]:
     reader = csv.reader(text.splitlines(keepends=True), strict=True)
     lines: list[_Line] = []
-    columns: dict[Key, tuple[str, KnownUnit | None]] = {}
+    columns: dict[str, tuple[int, str, str]] = {}
+    width = 0
     try:
         for cells in reader:
             line = reader.line_num
             if not any(cell.strip() for cell in cells):
                 continue
             if not columns:
-                columns = _header(path, line, [cell.strip() for cell in cells])
+                columns, width = _header(path, line, cells), len(cells)
                 continue
-            if len(cells) != len(columns):
+            if len(cells) != width:
                 hint = "Leave a cell empty if its value is not known, and write decimal points (12.5), no commas."
-                refuse(path, f"found {len(cells)} cells, expected {len(columns)} as in the header.", hint, line)
-            lines.append(_Line(str(path), line, dict(zip(columns, cells, strict=True)), columns))
+                refuse(path, f"found {len(cells)} cells, expected {width} as in the header.", hint, line)
+            shown = {name: cells[place].strip() for name, (place, _, _) in columns.items()}
+            lines.append(_Line(str(path), line, shown, {name: (own, unit) for name, (_, own, unit) in columns.items()}))
     except csv.Error as fault:
         refuse(path, f"found a line that is not CSV ({fault}).", "Close every quote.", max(1, reader.line_num))
     if not columns:
@@ -279,79 +276,56 @@ def _lines(path: Path, text: str) -> list[_Line]:
     return lines
 
 
-def _header(path: Path, line: int, names: list[str]) -> dict[Key, tuple[str, KnownUnit | None]]:
-    columns: dict[Key, tuple[str, KnownUnit | None]] = {}
+def _header(path: Path, line: int, cells: list[str]) -> dict[str, tuple[int, str, str]]:
+    """The columns by what they say: place, name and unit, which is empty of texts."""
+    header = header_of(cells, str(path), line, f"Begin with a header such as {_SHOWN}.")
+    names = [column.name for column in header.columns]
     other = next((character for character in ";\t|" if len(names) == 1 and character in names[0]), None)
     if other:
-        refuse(path, f"found {other!r} between the columns, expected ','.", "Write commas.", line)
-    for name in names:
-        where = Location(str(path), line=line, field=name[:60] or None)
-        key, unit = _column(name, where)
-        if key in columns:
-            raise DataError(f"found {key[0]} twice.", where=where, hint="Remove one of the columns.")
-        columns[key] = (name, unit)
-    for stem, dimension in _NUMBERS.items():
-        if (stem, dimension) not in columns:
-            hint = f"Begin with a header such as {_SHOWN}."
-            refuse(path, f"found no column for {stem}, expected {_spellings(stem, dimension)}.", hint, line)
+        header.refuse(f"found {other!r} between the columns, expected ','.", "Write commas.")
+    matched = match_columns(renamed(header, {}), tuple(_COLUMNS.values())).channels
+    columns = {name: (own.index, own.name, unit) for name, (own, unit) in matched.items()}
+    taken = {index for index, _, _ in columns.values()}
+    for column in header.columns:
+        if column.name in _TEXTS:
+            columns[_TEXTS[column.name]] = (column.index, column.name, "")
+        elif column.index not in taken:
+            choices = [*_TEXTS, *(f"{w.columns[0]}_{display_unit(w.dimension).name}" for w in _COLUMNS.values())]
+            near = difflib.get_close_matches(column.name, choices, n=1)
+            hint = f"Did you mean {near[0]}?" if near else header.layout_hint
+            text = f"found the column {column.name[:60]!r}, expected some of {', '.join(choices)}."
+            header.refuse(text, hint, column.name[:60])
     return columns
 
 
-def _column(name: str, where: Location) -> tuple[Key, KnownUnit | None]:
-    """What a column is: stem, dimension, unit."""
-    known: dict[str, tuple[str, ...]] = {stem: (dimension,) for stem, dimension in (_NUMBERS | _OPTIONAL).items()}
-    known |= dict.fromkeys(_LIMITS, ("angle", "length"))
-    if name in (*_NAME, *_TYPE):
-        return (name, "text"), None
-    stem, unit = split_suffix(name) or (name, None)
-    if stem in known and unit is not None and unit.dimension in known[stem]:
-        return (stem, unit.dimension), unit
-    if stem in known:
-        expected = " or ".join(_spellings(stem, dimension) for dimension in known[stem])
-        text = "no unit" if unit is None else f"a unit of {unit.dimension}"
-        raise DataError(f"found {name!r} with {text}, expected {expected}.", where=where, hint="Rename the column.")
-    shown = [f"{s}_{display_unit(d).name}" for s, dimensions in known.items() for d in dimensions]
-    choices = [*_NAME, *_TYPE, *shown]
-    near = difflib.get_close_matches(name, choices, n=1)
-    hint = f"Did you mean {near[0]}?" if near else f"Begin with a header such as {_SHOWN}."
-    raise DataError(f"found the column {name[:60]!r}, expected some of {', '.join(choices)}.", where=where, hint=hint)
-
-
-def _spellings(stem: str, dimension: str) -> str:
-    return " or ".join(f"{stem}_{unit.name}" for unit in units_of(dimension))
-
-
 def _row(line: _Line, number: int) -> Row:
-    kind = line.text(_TYPE).lower()
+    kind, name = line.cells.get("type", "").lower(), line.cells.get("name", "")
     if kind not in _KINDS:
-        key = next((stem, "text") for stem in _TYPE if (stem, "text") in line.cells)
-        line.refuse(key, f"found {kind!r}, expected revolute or prismatic.", "Leave it empty for revolute.")
+        line.refuse("type", f"found {kind!r}, expected revolute or prismatic.", "Leave it empty for revolute.")
     turns = _KINDS[kind]
-    name = line.text(_NAME)
     name = f"q{name or number}" if not name or name.isdecimal() else name
-    limits = _limits(line, "angle" if turns else "length")
+    limits = _limits(line, turns)
     joint = RobotJoint(name, turns, limits or (ASSUMED_TURN if turns else ASSUMED_TRAVEL), limits is None)
-    alpha, a, theta, d = (line.required(stem, dimension) for stem, dimension in _NUMBERS.items())
-    mass = line.number("mass", "mass") or 0.0
+    alpha, a, theta, d = (line.required(own) for own in _NUMBERS)
+    mass, *com = (line.number(own) or 0.0 for own in _OPTIONAL)
     if mass < 0:
-        line.refuse(("mass", "mass"), "found a mass below zero.", "Leave it empty where it is not known.")
-    x, y, z = (line.number(f"com_{axis}", "length") or 0.0 for axis in "xyz")
-    return Row(joint, alpha, a, theta, d, (Mass(mass, (x, y, z)) if mass else None))
+        line.refuse("mass", "found a mass below zero.", "Leave it empty where it is not known.")
+    return Row(joint, alpha, a, theta, d, (Mass(mass, (com[0], com[1], com[2])) if mass else None))
 
 
-def _limits(line: _Line, dimension: str) -> Range | None:
-    low, high = (line.number(stem, dimension) for stem in _LIMITS)
+def _limits(line: _Line, turns: bool) -> Range | None:
+    own, moves = ("angle", "turns") if turns else ("length", "slides")
+    low, high = (line.number(f"{which} {own}") for which in ("lower", "upper"))
     if low is None and high is None:
-        other = "length" if dimension == "angle" else "angle"
-        wrong = next((stem for stem in _LIMITS if line.cells.get((stem, other), "").strip()), None)
+        wrong = next((name for name, dimension in _LIMITS.items() if dimension != own and line.cells.get(name)), None)
         if wrong:
-            moves = "turns" if dimension == "angle" else "slides"
-            mend = f"Write them under {_spellings('lower', dimension)}, or leave them empty."
-            line.refuse((wrong, other), f"found a limit of {other}, and the joint {moves}.", mend)
+            names = " or ".join(spellings(_COLUMNS[f"lower {own}"]))
+            text = f"found a limit of {_LIMITS[wrong]}, and the joint {moves}."
+            line.refuse(wrong, text, f"Write them under {names}, or leave them empty.")
         return None
     if low is None or high is None or not low < high:
-        key = next((stem, dimension) for stem in _LIMITS if (stem, dimension) in line.cells)
-        line.refuse(key, "found no lower limit below an upper one.", "Give both, or leave both empty.")
+        first = next(name for name, dimension in _LIMITS.items() if dimension == own and name in line.cells)
+        line.refuse(first, "found no lower limit below an upper one.", "Give both, or leave both empty.")
     return low, high
 
 

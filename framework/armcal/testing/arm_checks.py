@@ -26,7 +26,7 @@ from armcal.measure.reader import surroundings
 from armcal.problem.factor import Factor, build_factor
 from armcal.problem.readings import readings_by_residual
 from armcal.testing.checking import PLUGIN_FAULTS, ContractError, Subject, check, expect
-from armcal.testing.planar import ARM, GRAVITY, all_parameters, planar_arms, skewed_arms
+from armcal.testing.planar import ARM, GRAVITY, SkewedArm, all_parameters, planar_arms
 
 C = TypeVar("C")
 JOINTS = ("q1", "q2", "q3")
@@ -149,6 +149,12 @@ def expect_gain(gain: float, what: str, of: str, unit: str) -> None:
     )
 
 
+def expect_gains(gains: Array, what: str, blocks: Sequence[ParameterBlock], unit: str, moved: str = "") -> None:
+    """``expect_gain`` of each block in a unit."""
+    for place, block in scalars(blocks, unit):
+        expect_gain(float(gains[place]), what, block.name, moved or unit)
+
+
 # --- arm models -----------------------------------------------------------------------------------------------------
 
 POSES = 20
@@ -229,12 +235,10 @@ def lengths_move_it_by_lengths_and_angles_by_angles(s: Subject) -> None:  # m fo
     random, jacobian = np.random.default_rng(5), s.poses.jacobian()
     points = [_point(s, random) for _ in range(3)]
     slopes = np.array([np.asarray(jacobian(at, s.poses(at)))[:12].reshape(4, 3, -1) for at in points])
-    for place, block in scalars(s.blocks, "m"):
-        moved = np.linalg.norm(slopes[:, 3, :, place], axis=1)
-        expect_gain(float(moved.max()), "the tool's position", block.name, "m")
-    for place, block in scalars(s.blocks, "rad"):
-        turned = np.linalg.norm(slopes[:, :3, :, place], axis=(1, 2)) / np.sqrt(2)
-        expect_gain(float(turned.max()), "the tool's orientation", block.name, "rad")
+    moved = np.linalg.norm(slopes[:, 3], axis=1).max(axis=0)
+    expect_gains(moved, "the tool's position", s.blocks, "m")
+    turned = np.linalg.norm(slopes[:, :3], axis=(1, 2)).max(axis=0) / np.sqrt(2)
+    expect_gains(turned, "the tool's orientation", s.blocks, "rad")
 
 
 def _poses(given: Expression, chain: Chain) -> ca.Function:
@@ -283,8 +287,8 @@ def lengths_and_angles_move_a_joint_by_as_much(s: Subject) -> None:  # at comman
     entries = _entries(s, 3)
     points = [[command, side] * len(JOINTS) for command in (0.4, -1.2, 2.0) for side in (-1.0, 1.0)]
     gains = np.abs([np.asarray(slope(entries, at)) for at in points]).max(axis=(0, 1), initial=0.0)
-    for place, block in scalars(s.blocks, "m", "rad"):
-        expect_gain(float(gains[place]), "a joint's displacement", block.name, block.unit)
+    for unit in ("m", "rad"):
+        expect_gains(gains, "a joint's displacement", s.blocks, unit)
 
 
 @check("effect")
@@ -341,8 +345,7 @@ def its_laws_are_finite_smooth_and_in_rad_at_zero_load_too(s: Subject) -> None:
     for unit, most in (("rad", 1.0), ("rad_per_Nm", 2.0)) if s.springs else ():
         loads = most * random.choice([-1, 1], (3, count))
         gains = np.abs([np.asarray(slope(entries, load)) for load in loads]).max(axis=(0, 1), initial=0.0)
-        for place, block in scalars(s.blocks, unit):
-            expect_gain(float(gains[place]) / most, "a deflection", block.name, "rad")
+        expect_gains(gains / most, "a deflection", s.blocks, unit, "rad")
 
 
 def _entries(s: Subject, seed: int) -> Array:
@@ -402,19 +405,14 @@ def the_residual_learns_an_error_that_its_commands_explain(s: Subject) -> None:
 
 
 @check("residual")
-def it_corrects_nothing_beyond_and_is_less_sure_away_from_what_it_learned(s: Subject) -> None:
+def it_is_less_sure_away_from_what_it_learned_and_kept_in_its_settings(s: Subject) -> None:
     turned, away = (Postures(s.unseen.commands + angle, s.unseen.approaches) for angle in (2 * np.pi, np.pi))
     expect(not s.learned.corrections(turned).any(), "found corrections beyond the commands that it learned from")
     near, far = (float(np.linalg.norm(s.learned.deviations(own))) for own in (s.unseen, away))
     expect(0 < near < far, f"found deviations of {near:.3g} near and {far:.3g} away, expected that they grow")
-
-
-@check("residual")
-def what_it_learned_is_kept_in_its_settings_and_the_same_each_time(s: Subject) -> None:
-    learned, again = s.learned, s.built.learned(_errors(_COUNT))
-    kept = type(learned)(type(learned.settings).model_validate(learned.settings.to_config()), JOINTS)
-    for other in (kept, again):
-        expect_repeated(lambda made: np.vstack([made.corrections(s.unseen), made.deviations(s.unseen)]), learned, other)
+    kept = type(s.learned)(type(s.learned.settings).model_validate(s.learned.settings.to_config()), JOINTS)
+    for other in (kept, s.built.learned(_errors(_COUNT))):
+        expect_repeated(lambda own: np.vstack([own.corrections(s.unseen), own.deviations(s.unseen)]), s.learned, other)
 
 
 def _errors(count: int) -> ModelErrors:
@@ -453,7 +451,7 @@ class _Case:
 
     @classmethod
     def of(cls, measurement: Measurement, s: Subject) -> "_Case":
-        arms = skewed_arms(s.arms)
+        arms = planar_arms(s.arms, SkewedArm)
         of_arms, own = all_parameters(arms).blocks, prefixed(f"{_INSTRUMENT}.", s.blocks)
         parameters = Parameters((*of_arms, *own))
         parameters = parameters.with_free(parameters.names)

@@ -27,7 +27,7 @@ from armcal.devices.device import (
     standing_at,
     state_of,
 )
-from armcal.devices.link import GuardedLink, LinkIdentity
+from armcal.devices.link import LinkIdentity
 from armcal.devices.live import frames_of, refused_by, samples_of
 from armcal.errors import InputError
 from armcal.testing.checking import ContractError, NotRun, Subject, check, expect, raises_only
@@ -82,9 +82,6 @@ def the_link_is_lost_before_it_is_opened_and_may_be_closed_twice(s: Subject) -> 
     link.close()
     _expect_lost("reading before it is opened", lambda: link.read(64, 0, 1))
     _expect_lost("writing before it is opened", lambda: link.write(64, b"\0\0"))
-    if isinstance(link, GuardedLink):
-        _expect_lost("a beat before it is opened", link.beat)
-        expect(not link.took_over, "found that somebody took over before it was opened")
 
 
 @check("device", needed=True)
@@ -155,13 +152,8 @@ def its_state_is_read_from_the_board_and_a_released_joint_has_no_angle(s: Subjec
 @check("device")
 def it_passes_on_that_the_link_was_lost(s: Subject) -> None:
     device, s.link.lost = s.device, "the link was cut."
-    calls = {
-        "state": (),
-        "command": ({JOINTS[1]: -0.2},),
-        "energise": (JOINTS[0], 0.1),
-        "keep_alive": (),
-        "release": (JOINTS[0],),
-    }
+    at = {JOINTS[1]: -0.2}
+    calls = {"state": (), "command": (at,), "energise": (JOINTS[0], 0.1), "keep_alive": (), "release": (JOINTS[0],)}
     for name, given in calls.items():
         _expect_lost(f"{name}()", partial(getattr(device, name), *given))
 

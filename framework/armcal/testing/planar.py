@@ -20,16 +20,14 @@ from armcal.measure.measurement import Channel
 ARM, TRACKER, WALLS = "arm", "tracker", "walls"
 GRAVITY = Environment((0.0, 0.0, -9.81))
 NOISE_M = 1e-3
-_Y_AXIS = (0.0, 1.0, 0.0)
 QUATERNION = ("qw", "qx", "qy", "qz")
 
 
 class PlanarArm:
     """Joints q1 and q2 about y; links a1 and a2 along x; ``side`` shifts the arm along y, across its plane."""
 
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        return ("q1", "q2")
+    joint_names = ("q1", "q2")
+    first_axis = (0.0, 1.0, 0.0)
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         return (
@@ -43,8 +41,8 @@ class PlanarArm:
     def chain(self, values: Mapping[str, Expression]) -> Chain:
         upper, fore = (se3.translation_along("x", values[name]) for name in ("a1", "a2"))
         joints = (
-            Joint("q1", se3.identity(), _Y_AXIS, offset=values["theta1"]),
-            Joint("q2", upper, _Y_AXIS, offset=values["theta2"]),
+            Joint("q1", se3.identity(), self.first_axis, offset=values["theta1"]),
+            Joint("q2", upper, (0.0, 1.0, 0.0), offset=values["theta2"]),
         )
         base = se3.translation_along("y", values["side"])
         return Chain(base, joints, Attachment(2, fore), {"elbow": Attachment(1, upper)})
@@ -53,10 +51,7 @@ class PlanarArm:
 class SkewedArm(PlanarArm):
     """The same, but that q1 turns about z: every point of the tool moves in a way of its own."""
 
-    def chain(self, values: Mapping[str, Expression]) -> Chain:
-        chain = super().chain(values)
-        first, second = chain.joints
-        return replace(chain, joints=(replace(first, angular=(0.0, 0.0, 1.0)), second))
+    first_axis = (0.0, 0.0, 1.0)
 
 
 class Walls(Contact):
@@ -110,12 +105,8 @@ class Body(Tip):
         return {**super().outputs(arms, values), **{name: turned[i] for i, name in enumerate(QUATERNION)}}
 
 
-def planar_arms(names: Sequence[str]) -> dict[str, Arm]:
-    return {name: Arm(name, "planar", PlanarArm(), {}, ()) for name in names}
-
-
-def skewed_arms(names: Sequence[str]) -> dict[str, Arm]:
-    return {name: Arm(name, "planar", SkewedArm(), {}, ()) for name in names}
+def planar_arms(names: Sequence[str], model: type[PlanarArm] = PlanarArm) -> dict[str, Arm]:
+    return {name: Arm(name, "planar", model(), {}, ()) for name in names}
 
 
 def all_parameters(arms: Mapping[str, Arm]) -> Parameters:
