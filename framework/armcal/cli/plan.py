@@ -16,7 +16,7 @@ from armcal.estimate.identifiability import Measure
 from armcal.measure.csv_writer import write_csv
 from armcal.planning.criterion import GOALS
 from armcal.run.experiment import Experiment
-from armcal.run.iso_plan import NAMES, IsoPlan, make_iso_plan
+from armcal.run.iso_plan import NAMES, make_iso_plan
 from armcal.run.plan import PlanResult, make_plan
 from armcal.run.plan_poses import counts_text, stated_beyond
 from armcal.run.settings import PlanSettings
@@ -67,7 +67,7 @@ def plan(
     for text in stated_beyond(experiment, {**settings.limits, **settings.travel_limits}):
         console.danger(text)
     if given["iso_cube"]:
-        show_iso_plan(console, experiment, edge, out, given)
+        _show_iso_plan(console, experiment, edge, out, given)
         return
     assert count is not None
     with console.progress() as progress:
@@ -194,47 +194,40 @@ def _bound_text(content: dict[str, Any]) -> str:
     )
 
 
-def show_iso_plan(
+def _show_iso_plan(
     console: Console, experiment: Experiment, size: float | None, out: Path, options: Mapping[str, Any]
 ) -> None:
     """Plan the test in a cube of this size (m; None: the largest), write it to ``out`` and show it."""
     began = time.perf_counter()
     plan = make_iso_plan(experiment, size, options["cycles"], options["directions"], options["calibration"])
     write_csv(out, plan.dataset, experiment.request(measured=False).channels)
-    content = _iso_content(experiment, plan, options["cycles"])
-    console.result({**content, "out": str(out)})
-    for text in plan.warnings:
-        console.warn(text)
-    cube, turned = content["cube"], content["tool_rpy_deg"]
-    x, y, z = cube["centre_mm"]
-    console.line(
-        f"{experiment.name}: cube of {cube['size_mm']:g} mm about ({x:.1f}, {y:.1f}, {z:.1f}) mm, "
-        + (f"tool at roll, pitch, yaw {_three(turned)} deg." if turned else "the tool turns from pose to pose.")
-    )
-    rows = ((name, *(f"{coordinate:.1f}" for coordinate in place)) for name, place in content["poses"].items())
-    console.table("Poses of the tool, mm, base frame", ("pose", "x", "y", "z"), rows)
-    console.line(
-        f"{content['visits']} visits in {content['cycles']} cycles: {out}  ({time.perf_counter() - began:.1f} s)"
-    )
-    console.line("Measure each visit, add the columns of the instrument, and give the table to armcal acceptance.")
-
-
-def _iso_content(experiment: Experiment, plan: IsoPlan, cycles: int) -> dict[str, Any]:
     cube, turned = plan.cube, None
     if cube.rotation is not None:
         turned = Rotation.from_matrix(cube.rotation).as_euler("xyz", degrees=True).tolist()
-    return {
-        "experiment": experiment.name,
-        "cube": {"size_mm": cube.size * _MM, "centre_mm": (cube.centre * _MM).tolist()},
-        "tool_rpy_deg": turned,
-        "poses": dict(zip(NAMES, (cube.points * _MM).tolist(), strict=True)),
-        "cycles": cycles,
-        "visits": len(plan.dataset),
-        "directions": list(dict.fromkeys(plan.dataset.extra["direction"])),
-        "largest_joint_motion_rad_or_m": plan.motion,
-        "warnings": list(plan.warnings),
-    }
-
-
-def _three(numbers: Any) -> str:
-    return "(" + ", ".join(f"{number:.1f}" for number in numbers) + ")"
+    centre, poses = (cube.centre * _MM).tolist(), dict(zip(NAMES, (cube.points * _MM).tolist(), strict=True))
+    console.result(
+        {
+            "experiment": experiment.name,
+            "cube": {"size_mm": cube.size * _MM, "centre_mm": centre},
+            "tool_rpy_deg": turned,
+            "poses": poses,
+            "cycles": options["cycles"],
+            "visits": len(plan.dataset),
+            "directions": list(dict.fromkeys(plan.dataset.extra["direction"])),
+            "largest_joint_motion_rad_or_m": plan.motion,
+            "warnings": list(plan.warnings),
+            "out": str(out),
+        }
+    )
+    for text in plan.warnings:
+        console.warn(text)
+    at, angles = (", ".join(f"{number:.1f}" for number in numbers) for numbers in (centre, turned or ()))
+    console.line(
+        f"{experiment.name}: cube of {cube.size * _MM:g} mm about ({at}) mm, "
+        + (f"tool at roll, pitch, yaw ({angles}) deg." if turned else "the tool turns from pose to pose.")
+    )
+    rows = ((name, *(f"{coordinate:.1f}" for coordinate in place)) for name, place in poses.items())
+    console.table("Poses of the tool, mm, base frame", ("pose", "x", "y", "z"), rows)
+    visits = f"{len(plan.dataset)} visits in {options['cycles']} cycles"
+    console.line(f"{visits}: {out}  ({time.perf_counter() - began:.1f} s)")
+    console.line("Measure each visit, add the columns of the instrument, and give the table to armcal acceptance.")

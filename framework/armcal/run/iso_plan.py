@@ -26,8 +26,8 @@ from armcal.run.settings import PlanSettings
 
 NAMES = ("P1", "P2", "P3", "P4", "P5")
 """P1 is the centre, P2 to P5 go round the plane; P2 and P4 are ends of one diagonal."""
-DIRECTED = ("P1", "P2", "P4")  # Of which the standard takes several directions of approach
-SIZES = (2.5, 1.6, 1.0, 0.63, 0.4, 0.25, 0.16, 0.1, 0.063, 0.04, 0.025)
+_DIRECTED = ("P1", "P2", "P4")  # Of which the standard takes several directions of approach
+_SIZES = (2.5, 1.6, 1.0, 0.63, 0.4, 0.25, 0.16, 0.1, 0.063, 0.04, 0.025)
 """Edges that are tried, a series of preferred numbers (m)."""
 _FROM_CORNER = 0.1  # Of a diagonal's length, from its corner to the pose
 _PLANE = np.array([[0, 0, 0], [-1, -1, -1], [-1, 1, -1], [1, 1, 1], [1, -1, 1]]) / 2
@@ -36,7 +36,7 @@ _CHECKED = 24  # Cubes of a size whose corners are looked at
 _NEAR_RAD = 2.1  # A joint that moves farther between poses is in another posture
 _JOINTS_OF_A_POSE = 6
 _MM = 1000.0
-PATH = "path"  # The direction of poses that are come to one from another
+_PATH = "path"  # The direction of poses that are come to one from another
 _OF_SIZE, _FARTHEST = 0.1, 0.05  # How far an approach begins: of the cube's edge, and at most (m)
 _STILL = 1e-6  # A joint that moves less (rad or m) does not come from a side
 _POSTURES = 1024
@@ -71,31 +71,24 @@ def corners_about(centres: Array, size: float) -> Array:
     return np.asarray(centres[:, None] + size * _CORNERS, dtype=float)
 
 
-def placed(compensator: Compensator, postures: Array, size: float | None) -> Cube:
-    """The cube of this size (m), or the largest one that fits, about the tool of one of some postures (n x M).
+def _placed(compensator: Compensator, starts: Array, size: float | None) -> Cube:
+    """The cube of this size (m), or the largest one that fits, about the tool of one of some postures (M x n).
 
     The tool keeps its rotation in all poses where a cube is found for which it can.
-
-    Raises:
-        ProblemError: none fits.
     """
-    sizes = sorted({*(other for other in SIZES if size is None or other < size), *([size] if size else [])})
-    tools, largest = compensator.forward(postures.T), None
-    for turned in (True, False) if len(postures) >= _JOINTS_OF_A_POSE else (False,):
-        best = next(_fitting(compensator, postures.T, tools, sizes, turned), None)
-        if best is None:
-            continue
-        if size is None or best.size == size:
+    sizes = sorted({*(other for other in _SIZES if size is None or other < size), *([size] if size else [])})
+    tools, largest = compensator.forward(starts), 0.0
+    for turned in (True, False) if starts.shape[1] >= _JOINTS_OF_A_POSE else (False,):
+        best = next(_fitting(compensator, starts, tools, sizes, turned), None)
+        if best is not None and size in (None, best.size):
             return best
-        largest = max(best.size, largest or 0.0)
-    if largest is None:
-        raise ProblemError(
-            f"no cube of {sizes[0] * _MM:g} mm or more was found within joint limits and clearance.",
-            hint="Widen plan.limits, check plan.clearance; an arm that moves in a plane has no cube.",
-        )
+        largest = max(best.size if best else 0.0, largest)
     raise ProblemError(
-        f"no cube of {sizes[-1] * _MM:g} mm was found within joint limits and clearance.",
-        hint=f"One of {largest * _MM:g} mm fits: give --iso-cube auto, or a size near to that.",
+        f"no cube of {sizes[-1 if largest else 0] * _MM:g} mm{'' if largest else ' or more'} was found within joint "
+        "limits and clearance.",
+        hint=f"One of {largest * _MM:g} mm fits: give --iso-cube auto, or a size near to that."
+        if largest
+        else "Widen plan.limits, check plan.clearance; an arm that moves in a plane has no cube.",
     )
 
 
@@ -130,71 +123,40 @@ def _fitting(
             yield Cube(size, tool[:3, 3], tool[:3, :3] if turned else None, poses_of[i])
 
 
-@dataclass(frozen=True)
-class Visit:
-    """A pose, by which cycle and direction it is visited, and commands there and before (n each)."""
+def _table(
+    compensator: Compensator, cube: Cube, cycles: int, directions: int, space: JointSpace
+) -> tuple[Dataset, tuple[str, ...]]:
+    """All visits in order, and warnings of directions that cannot be come from.
 
-    pose: str
-    cycle: int
-    direction: str
-    command: Array
-    before: Array
-
-
-def visits(
-    compensator: Compensator, cube: Cube, cycles: int, directions: int
-) -> tuple[tuple[Visit, ...], tuple[str, ...]]:
-    """All visits in order, and warnings of directions that cannot be come from."""
-    commands, table = cube.commands, list[Visit]()
-    for cycle in range(1, cycles + 1):
-        for i, name in enumerate(NAMES):
-            table.append(Visit(name, cycle, PATH, commands[i], commands[i - 1]))
-    warnings = []
-    for axis in range(directions):
-        begun = {name: _begun(compensator, cube, NAMES.index(name), axis) for name in DIRECTED}
-        lost = [name for name, before in begun.items() if before is None]
-        if lost:
-            warnings.append(f"{', '.join(lost)}: no approach along {'xyz'[axis]} lies within limits; it is left out.")
-        for cycle in range(1, cycles + 1):
-            for name, before in begun.items():
-                if before is not None:
-                    table.append(Visit(name, cycle, "xyz"[axis], commands[NAMES.index(name)], before))
-    return tuple(table), tuple(warnings)
-
-
-def _begun(compensator: Compensator, cube: Cube, index: int, axis: int) -> Array | None:
-    """Where an approach along an axis of the base frame begins (n): below the pose, else above it."""
-    far = min(_OF_SIZE * cube.size, _FARTHEST)
-    for side in (-1.0, 1.0):
-        place = cube.points[index] + side * far * np.eye(3)[axis]
-        target = compensator.targets(place, None if cube.rotation is None else cube.rotation[None])
-        begun = compensator.onward(target, cube.commands[index])
-        if begun.reached[0]:
-            return np.asarray(begun.joint_angles[0])
-    return None
-
-
-def dataset_of_visits(table: Sequence[Visit], space: JointSpace, tools: Array) -> Dataset:
-    """The table; beside joints and sides the pose, the cycle, the direction, whence joints come, where the tool is.
-
-    ``tools`` is base_T_tool of each visit (N x 4 x 4).
+    Beside joints and sides the pose, the cycle, the direction, whence joints come, where the tool is.
     """
-    commands = np.array([visit.command for visit in table]).T
-    before = np.array([visit.before for visit in table]).T
-    moves = commands - before
+    order, index = range(1, cycles + 1), {name: i for i, name in enumerate(NAMES)}
+    visits = [(name, cycle, _PATH, i, cube.commands[i - 1]) for cycle in order for name, i in index.items()]
+    own, far, warnings = [index[name] for name in _DIRECTED], min(_OF_SIZE * cube.size, _FARTHEST), []
+    rotations = None if cube.rotation is None else np.repeat(cube.rotation[None], len(own), axis=0)
+    for axis, direction in enumerate("xyz"[:directions]):
+        begun: dict[str, Array] = {}
+        for side in (-1.0, 1.0):  # an approach begins below the pose, else above it
+            places = cube.points[own] + side * far * np.eye(3)[axis]
+            poses = compensator.onward(compensator.targets(places, rotations), cube.commands[own])
+            begun = {name: poses.joint_angles[k] for k, name in enumerate(_DIRECTED) if poses.reached[k]} | begun
+        kept = [name for name in _DIRECTED if name in begun]
+        if lost := [name for name in _DIRECTED if name not in begun]:
+            warnings.append(f"{', '.join(lost)}: no approach along {direction} lies within limits; it is left out.")
+        visits += [(name, cycle, direction, index[name], begun[name]) for cycle in order for name in kept]
+    commands = np.array([cube.commands[visit[3]] for visit in visits])
+    before = np.array([visit[4] for visit in visits])
+    moves = (commands - before).T
     sides = np.where(np.abs(moves) > _STILL, np.sign(moves), 0.0)
-    channels = dict(zip((*space.channels, *approach_channels(space)), (*commands, *sides), strict=True))
-    extra: dict[str, tuple[str, ...]] = {
-        "pose": tuple(visit.pose for visit in table),
-        "cycle": tuple(str(visit.cycle) for visit in table),
-        "direction": tuple(visit.direction for visit in table),
-    }
-    for name, dimension, row in zip(space.names, space.dimensions, before, strict=True):
+    channels = dict(zip((*space.channels, *approach_channels(space)), (*commands.T, *sides), strict=True))
+    extra = {key: tuple(str(visit[k]) for visit in visits) for k, key in enumerate(("pose", "cycle", "direction"))}
+    for name, dimension, row in zip(space.names, space.dimensions, before.T, strict=True):
         unit = display_unit(dimension).name
         extra[f"from_{name}_{unit}"] = _texts(to_unit(row, unit))
+    tools = compensator.forward(commands)
     extra |= {f"tool_{axis}_mm": _texts(to_unit(tools[:, i, 3], "mm")) for i, axis in enumerate("xyz")}
-    ids = tuple(f"{visit.pose}.{visit.direction}.{visit.cycle}" for visit in table)
-    return Dataset(ids, channels, extra, source="plan")
+    ids = tuple(f"{pose}.{direction}.{cycle}" for pose, cycle, direction, *_ in visits)
+    return Dataset(ids, channels, extra, source="plan"), tuple(warnings)
 
 
 def _texts(values: Array) -> tuple[str, ...]:
@@ -222,8 +184,7 @@ def make_iso_plan(
     """
     hint = "Describe the arm that is to be tested alone."
     arm = only_arm(experiment.system.arms, "the test is of a single arm", hint)
-    space = JointSpace.of(experiment)
-    settings = experiment.settings.plan or PlanSettings()
+    space, settings = JointSpace.of(experiment), experiment.settings.plan or PlanSettings()
     # Of each joint, stated or the model's own; ``spread`` refuses a joint without.
     own, stated, check = joint_limits(arm.nominal_chain), space.limits(settings), clearance_of(experiment)
     model = np.array([own.get(joint) or (-np.inf, np.inf) for joint in arm.commanded], dtype=float)
@@ -237,12 +198,7 @@ def make_iso_plan(
         check,
     )
     pool = spread(settings.model_copy(update={"count": _POSTURES}), space, limits, check)
-    cube = placed(compensator, pool.dataset.stacked(space.channels), size)
-    table, warnings = visits(compensator, cube, cycles, directions)
-    tools = compensator.forward(np.array([visit.command for visit in table]))
-    return IsoPlan(
-        cube,
-        dataset_of_visits(table, space, tools),
-        float(np.ptp(cube.commands, axis=0).max()),
-        warnings if check is not None else (*warnings, _NO_CLEARANCE),
-    )
+    cube = _placed(compensator, pool.dataset.stacked(space.channels).T, size)
+    dataset, warnings = _table(compensator, cube, cycles, directions, space)
+    motion = float(np.ptp(cube.commands, axis=0).max())
+    return IsoPlan(cube, dataset, motion, warnings if check is not None else (*warnings, _NO_CLEARANCE))
