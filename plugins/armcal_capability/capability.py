@@ -13,8 +13,7 @@ from armcal.io.cells import csv_text
 from armcal.io.folder import reserved
 from armcal.report.numbers import count
 
-from armcal_capability.designs import load_task
-from armcal_capability.search import ORIENTATIONS, Survey, survey
+from armcal_capability.survey import ORIENTATIONS, Survey, load_task, survey
 
 OURS = ("capability.json", "areas.csv")
 _MM = 1000.0

@@ -21,22 +21,20 @@ from armcal.measure.instrument import ArmsAlone
 from armcal.plugins import discover
 from armcal.problem.problem import Problem
 from armcal_capability.capability import summaries
-from armcal_capability.designs import (
+from armcal_capability.survey import (
+    ORIENTATIONS,
+    AreaSearch,
     AreaSettings,
     CapabilitySettings,
     Corrections,
     Design,
     LoadSettings,
-    Task,
-    ToolDirectionSettings,
-    load_task,
-)
-from armcal_capability.search import (
-    ORIENTATIONS,
-    AreaSearch,
     MechanicsFunction,
     Pointing,
+    Task,
+    ToolDirectionSettings,
     cells_of,
+    load_task,
     quantities,
     reach_for,
     spread,
