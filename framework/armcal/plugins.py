@@ -63,11 +63,7 @@ def use_plugins(*places: str | Path, disabled: Sequence[str] = ()) -> None:
 
 
 def plugin_files() -> dict[str, Path]:
-    """The chosen files by the name of their plugin.
-
-    Raises:
-        PluginError: a file or folder is not there or holds no plugin, or two files make plugins of one name.
-    """
+    """The chosen files by the name of their plugin."""
     paths: dict[str, Path] = {}
     for place in map(Path, _listed(CHOSEN)):
         for file in _files_of(place):
@@ -154,11 +150,7 @@ class Component:
     module: str = ""  # what that entry point names
 
     def load(self) -> Any:
-        """The component's class.
-
-        Raises:
-            PluginError: its module does not import, or lacks the attribute.
-        """
+        """The component's class."""
         named = f"the {_kind_name(self.kind)} {self.name!r}"
         try:
             return resolve_name(self.target)
@@ -208,11 +200,7 @@ class PluginRegistry:
         return index
 
     def find(self, kind: str, name: str) -> Component:
-        """The component of that kind and name.
-
-        Raises:
-            PluginError: there is none (the nearest and the failed plugins are named), or two offer it.
-        """
+        """The component of that kind and name."""
         components = self._by_name.get((kind, name), [])
         if len(components) > 1:
             offered = " and ".join(f"{c.plugin} ({c.target})" for c in components)
@@ -267,10 +255,6 @@ def discover(points: Iterable[EntryPoint] | None = None) -> PluginRegistry:
 
     A plugin that fails to import, or has a hook that armcal does not know, is listed with its fault and breaks nothing
     else; one that ``use_plugins`` (``--plugin``) names must load.
-
-    Raises:
-        PluginError: a plugin's file is not there, does not load or registers nothing, or has another plugin's name; or
-            a plugin that is to be left out is not there.
     """
     if points is None:
         return _registered(_chosen(_installed(tuple(sys.path))))
@@ -289,12 +273,7 @@ def _published(distribution: Distribution | None) -> tuple[str, str]:
 
 
 def _chosen(installed: Iterable[EntryPoint]) -> tuple[tuple[PluginInfo, EntryPoint | ModuleType], ...]:
-    """Installed plugins, and files, which are imported; without those that are to be left out, by name.
-
-    Raises:
-        PluginError: a file takes an installed plugin's name or does not import, or one that is to be left out is not
-            there.
-    """
+    """Installed plugins, and files, which are imported; without those that are to be left out, by name."""
     origins: dict[tuple[str, str], tuple[PluginInfo, EntryPoint | Path]] = {
         (p.name, p.value): (PluginInfo(p.name, p.value, *_published(p.dist)), p) for p in installed
     }
@@ -451,11 +430,7 @@ def expecting(method: Callable[..., Any] | property, returned: Any, expected: st
 
 
 def refuse(method: Callable[..., Any] | property, returned: str, expected: str) -> NoReturn:
-    """Refuse what a method of a component (or a property, or the class that sets an attribute) returned.
-
-    Raises:
-        PluginError: with the method, its file and line, what it returned and what was expected.
-    """
+    """Refuse what a method of a component (or a property, or the class that sets an attribute) returned."""
     getter: Any = getattr(method, "fget", method)  # of a property
     function = inspect.unwrap(getattr(getter, "__func__", getter))
     code = getattr(function, "__code__", None)
@@ -474,11 +449,7 @@ DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "serial": "py
 
 
 def library(module: str, needed_by: str) -> Any:
-    """A library that only ``needed_by`` needs ("reading images").
-
-    Raises:
-        ArmcalError: it is not installed, or does not load.
-    """
+    """A library that only ``needed_by`` needs ("reading images")."""
     try:
         return import_module(module)
     except ImportError as fault:
@@ -486,15 +457,11 @@ def library(module: str, needed_by: str) -> Any:
 
 
 def missing_library(fault: ImportError, needed_by: str = "this") -> ArmcalError:
-    """What to say of a library that is not installed, or does not load.
-
-    Raises:
-        ImportError: it is a module of armcal: a fault of ours, not of the installation.
-    """
+    """What to say of a library that is not installed, or does not load."""
     absent = isinstance(fault, ModuleNotFoundError)
     module = (fault.name or ("armcal" if absent else "")).partition(".")[0]
     if module == "armcal":
-        raise fault
+        raise fault  # of ours, not of the installation
     if absent and (extra := extra_of(module)):
         text = f"{needed_by} needs the library {module}, which is not installed."
         return PluginError(text, hint=f"Run pip install 'armcal[{extra}]'.")

@@ -69,11 +69,7 @@ def number(value: float) -> str:
 
 @contextmanager
 def staged(folder: Path) -> Iterator[Path]:
-    """A folder beside ``folder`` that takes its place at the end; on any fault nothing is left of it.
-
-    Raises:
-        InputError: something is there already, or the place cannot be written.
-    """
+    """A folder beside ``folder`` that takes its place at the end; on any fault nothing is left of it."""
     if folder.exists() or folder.is_symlink():
         hint = "Give another --out, or move it away."
         raise InputError("it is there already.", where=Location(str(folder)), hint=hint)
@@ -97,11 +93,7 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
 
 
 def plugin_name(text: str, registry: PluginRegistry) -> str:
-    """The name of a new plugin and its component, hyphens made underscores.
-
-    Raises:
-        InputError: it is no name for a Python module, or is taken.
-    """
+    """The name of a new plugin and its component, hyphens made underscores."""
     name = text.replace("-", "_")
     check_length(text, name)
     if name.startswith(PREFIX):
@@ -156,9 +148,6 @@ def write_plugin(name: str, kind: str, folder: Path, package: bool = False) -> t
         kind: one of ``KINDS``.
         folder: to be made.
         package: whether it is to be installed, with a registration that imports nothing heavy; else one file.
-
-    Raises:
-        InputError: it is there already, or cannot be written.
     """
     own, title = PREFIX + name, "".join(part.capitalize() for part in name.split("_"))
     context = {

@@ -146,19 +146,14 @@ def robot_of_rows(name: str, convention: Convention, rows: tuple[Row, ...]) -> R
     )
 
 
-_JOINT = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _TAKEN = frozenset({"x", "y", "z", "id", "pose_id", *(name for name, _ in ENVIRONMENT)})
-_ROBOT = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
 
 def robot_name(text: str) -> str:
-    """The name of a new robot: of its folder and its experiments.
-
-    Raises:
-        InputError: it is no name for both.
-    """
+    """The name of a new robot: of its folder and its experiments."""
     check_length(text, text)
-    if not _ROBOT.fullmatch(text):
+    if not _NAME.fullmatch(text):
         raise InputError(
             f"found the name {text!r}, expected letters, digits, - and _.", hint="Begin with a letter, as in arm5."
         )
@@ -166,13 +161,9 @@ def robot_name(text: str) -> str:
 
 
 def check_joint_names(names: Sequence[str], places: Sequence[Location]) -> None:
-    """Refuse names that stand twice, or that a table has other columns for; ``places`` say where each stands.
-
-    Raises:
-        DataError: with the name.
-    """
+    """Refuse names that stand twice, or that a table has other columns for; ``places`` say where each stands."""
     for index, (name, where) in enumerate(zip(names, places, strict=True)):
-        if not _JOINT.fullmatch(name):
+        if not _NAME.fullmatch(name):
             fault = "expected letters, digits, - and _, the first a letter"
         elif name in _TAKEN or name.startswith(("approach", "noise")):
             fault = "which tables of poses have for something else"
@@ -234,11 +225,7 @@ class _Line:
 
 
 def read_rows(path: Path) -> tuple[Row, ...]:
-    """The rows of a table.
-
-    Raises:
-        DataError: with file, line and column.
-    """
+    """The rows of a table."""
     lines = _lines(path, text_of(input_bytes(path, MAX_BYTES, "a CSV file, a table of joints"), path, _AS_TEXT))
     rows = tuple(_row(line, number) for number, line in enumerate(lines, start=1))
     if not FEWEST_JOINTS <= len(rows) <= MOST_JOINTS:
@@ -334,12 +321,7 @@ _MOST_TRAVEL_RAD = 3.2
 
 
 def robot_of_urdf(name: str, path: Path, tip: str | None, registry: PluginRegistry) -> Robot:
-    """A robot from a URDF; ``tip`` names its last link where the file leaves a choice.
-
-    Raises:
-        ConfigError: the file is refused, or has no chain to calibrate.
-        PluginError: no plugin reads URDFs.
-    """
+    """A robot from a URDF; ``tip`` names its last link where the file leaves a choice."""
     where = Location(str(path))
     model = urdf_model(path, tip, registry)
     chain = numeric_chain(model, nominal_values(model))
@@ -371,12 +353,7 @@ def robot_of_urdf(name: str, path: Path, tip: str | None, registry: PluginRegist
 
 
 def urdf_model(path: Path, tip: str | None, registry: PluginRegistry) -> Any:
-    """The arm model of a URDF; ``tip`` names its last link where the file leaves a choice.
-
-    Raises:
-        ConfigError: the file is refused.
-        PluginError: no plugin reads URDFs.
-    """
+    """The arm model of a URDF; ``tip`` names its last link where the file leaves a choice."""
     made = registry.find("model", "urdf").load()
     try:
         return made(made.Settings.model_validate({"path": str(path), **({"tip": tip} if tip else {})}))

@@ -61,11 +61,7 @@ class RobotFolder:
 
 
 def write_robot(robot: Robot, folder: Path, registry: PluginRegistry) -> RobotFolder:
-    """Write a new robot's folder, with simulated records of it.
-
-    Raises:
-        InputError: the folder cannot be written, or what it would hold is refused.
-    """
+    """Write a new robot's folder, with simulated records of it."""
     with staged(folder) as place:
         try:
             chosen = _fill(place, robot, registry)
@@ -189,11 +185,7 @@ class Trial:
 
 
 def try_out(made: RobotFolder, registry: PluginRegistry, command: str = "", progress: Progress = no_progress) -> Trial:
-    """Calibrate on the simulated records, as ``armcal run`` does.
-
-    Raises:
-        InputError: the data or the configuration is refused.
-    """
+    """Calibrate on the simulated records, as ``armcal run`` does."""
     watch, folder = Stopwatch(), made.folder / RESULTS
     experiment = Experiment.load(made.folder / SIMULATED, registry=registry)
     result = calibrate(experiment, command, progress, watch)
