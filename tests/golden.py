@@ -44,7 +44,7 @@ RECORDED = ROOT / "tests" / "data" / "golden.json"
 RELATIVE, ABSOLUTE = 1e-6, 1e-12
 WHOLE = 12  # entries of a list, or rows of a table, that are kept one by one; of longer ones sums and three of them
 VOLATILE = re.compile(
-    r"created|written|started_at|seconds|.*(?:took|waited)_m?s|elapsed.*|duration.*|source|path|out|folder|files?"
+    r"at|created|written|started_at|seconds|.*(?:took|waited)_m?s|elapsed.*|duration.*|source|path|out|folder|files?"
     r"|software|version|plugins|evaluator|identity|provenance|.*sha256|digests?|config|host|pid|process|port"
     r"|armcal_\w+|schema.*"
 )
