@@ -49,35 +49,29 @@ from scipy.stats import chi2
 from armcal_capability.survey import examined_arm
 
 OURS = ("acceptance.html", "acceptance.json", "acceptance.csv")
-ISO_CYCLES = 30
-"""Visits to a pose that the standard asks for."""
+ISO_CYCLES = 30  # visits to a pose that the standard asks for
 _SECTIONS = {
     "poses": ("Poses: accuracy AP and repeatability RP, position (mm) and orientation (deg)", ("Pose", "Direction")),
     "distances": ("Pairs of poses: distance accuracy AD and repeatability RD (mm)", ("From", "To")),
     "directions": ("Several directions of approach: variation of accuracy vAP (mm)", ("Pose", "Directions")),
 }
-_BY_AXIS = ("AP_x_mm", "AP_y_mm", "AP_z_mm")
-"""In the files, not in tables."""
+_BY_AXIS = ("AP_x_mm", "AP_y_mm", "AP_z_mm")  # in the files, not in tables
 _LARGEST, _MUCH = 1e4, 0.3
-_MOST_ROWS = 40
-"""Of a table on the screen and the page; the CSV has all."""
+_MOST_ROWS = 40  # of a table on the screen and the page; the CSV has all
 _COMMANDED = {
     "nominal": "the nominal arm at the commanded joint positions",
     "calibrated": "the calibrated arm at the same positions",
 }
 _MM = 1000.0
-_TIMES = 3.0
-"""Standard deviations that a repeatability counts."""
-_MOST_PAIRED = 10
-"""Poses of which all pairs are taken; of more, each with the next."""
+_TIMES = 3.0  # standard deviations that a repeatability counts
+_MOST_PAIRED = 10  # poses of which all pairs are taken; of more, each with the next
 _DRAWS, _FEWEST_DRAWS, _MOST_NUMBERS, _SEED = 2000, 200, 1_000_000, 9283
 _LOW, _HIGH = (1 - RADIUS_LEVEL) / 2, (1 + RADIUS_LEVEL) / 2
 _POSE, _DIRECTION, _FEWEST = "pose", "direction", 2
 _FEWEST_WORDS = "Repeatability needs two visits, ISO 9283 asks for 30"
 _REPEATS = "Records of one pose are held out together"
 """In what readers warn of: repeats, which are what is measured here."""
-_FAR = 0.1
-"""Of the typical distance of the positions that arms reach: no arm repeats as badly."""
+_FAR = 0.1  # of the typical distance of the positions that arms reach: no arm repeats as badly
 _FACTORS = {1000.0: "m", 10.0: "cm", 25.4: "inches", 0.001: "thousandths of the column's unit"}
 _NEAR = 0.02
 _FrameChoice = Literal["auto", "stated", "found"]

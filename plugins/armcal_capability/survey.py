@@ -43,12 +43,10 @@ _RULES = (SECTION, "plan")
 _MEND = "Write for example set: {arms.arm.model.rows.1.d_mm: 10}; entries of a list count from 0."
 ORIENTATIONS = np.vstack([np.eye(3), -np.eye(3)])
 """Directions of the base frame that the tool's axis points along, for the score."""
-MOST_IN_AREA = 500_000
-"""Cells of an area: each is searched for."""
+MOST_IN_AREA = 500_000  # cells of an area: each is searched for
 _WORTH_COMPILING = 20_000
 """From this many postures on, waiting for the compiler costs less than CasADi's interpreter does."""
-_LENGTH = 0.1
-"""Metres that a radian counts for, where a tool's place and direction are taken together."""
+_LENGTH = 0.1  # metres that a radian counts for, where a tool's place and direction are taken together
 _MOST_STEPS, _LONGEST = 60, 0.4  # of a search; rad or m in one step
 _ARRIVED_M = 1e-5
 _PROGRESS, _PATIENCE = 0.8, 6  # a search that comes no nearer than by this factor in so many steps is given up

@@ -27,8 +27,7 @@ _AGAIN = "Extract the file from the robot again."
 _UNKNOWN = "Check units (m, rad), or use a URDF of the arm itself."
 _NEAR_M, _NEAR_RAD = 0.02, 0.1
 """A frame as near to its nominal one stays where it is; another is shifted along its axis, and turned about it."""
-_ALONG = 0.9
-"""Cosine to an axis beyond which a direction says too little of what is across it."""
+_ALONG = 0.9  # cosine to an axis beyond which a direction says too little of what is across it
 _UR_JOINTS = ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", *(f"wrist_{i}_joint" for i in (1, 2, 3)))
 _UR_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 

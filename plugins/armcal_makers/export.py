@@ -39,8 +39,7 @@ from armcal_makers.arms import (
     tips,
 )
 
-TOLERANCE = 1e-9
-"""m and rad."""
+TOLERANCE = 1e-9  # m and rad
 _NOTHING = 1e-7
 
 
