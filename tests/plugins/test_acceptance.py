@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from armcal.calibration.intervals import PredictionRecord
 from armcal.cli.main import cli
 from armcal_capability import acceptance as of
 from click.testing import CliRunner, Result
@@ -269,6 +271,20 @@ def test_a_calibration_stands_beside_its_nominal_arm_in_every_file(config: Path,
     page = (tmp_path / "out" / "acceptance.html").read_text()
     assert "<script" not in page and "http" not in page.replace("http-equiv", "")
     assert "ISO 9283 asks for 30" in page and "ISO 9283 asks for 30" in " ".join(done.stdout.split())
+
+
+def test_records_are_read_as_the_calibrations_data_was(config: Path, tmp_path: Path) -> None:
+    made = exact_calibration(config, {"arm.mdh.a1": 0.301, "arm.mdh.a2": 0.1995})
+    kept = PredictionRecord(entries=(), covariance=(), columns={"q1_deg": "J1", "q2_deg": "J2", "cycle": "visit"})
+    named = replace(made, record=made.record.model_copy(update={"prediction": kept}))
+    calibration, names, told = store(named, tmp_path / "c.yaml"), {"q1_deg": "J1", "cycle": "visit"}, []
+    for own in ({}, names):
+        rows = [{own.get(key, key): value for key, value in row.items()} for row in rows_of()]
+        records = written(tmp_path / "records.csv", rows)
+        done = armcal("acceptance", calibration, records, "--out", tmp_path / "out", "--frame", "stated")
+        assert done.exit_code == 0, done.output
+        told.append(json.loads((tmp_path / "out" / "acceptance.json").read_text())["figures"])
+    assert told[0] == told[1] and len(told[0]) > 10
 
 
 def _without(column: str) -> Callable[[Rows], Rows]:
