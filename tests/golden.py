@@ -223,7 +223,7 @@ def _columns(rows: Sequence[Mapping[str, str]]) -> Iterator[tuple[str, Leaf]]:
         except ValueError:
             yield name, _joined(cells)
             continue
-        if name == "time_s" and 1.7e9 < np.nanmax(numbers) < 1.89e9:  # the machine's clock; simulated ones begin in 2030
+        if name == "time_s" and 1.7e9 < np.nanmax(numbers) < 1.89e9:  # of the machine; simulated ones are later
             continue
         decimals = max(len(cell.partition(".")[2]) if "e" not in cell else 16 for cell in cells)
         yield name, _sums(numbers, decimals)
