@@ -308,44 +308,6 @@ def test_counts_that_stand_too_near_are_not_had() -> None:
     assert commands.reasons[0] == "all commands found that reach it are too near to something"
 
 
-def test_held_joints_stay_exactly_where_they_are() -> None:
-    found = with_options("five", Options(held=("q2", "q4")))
-    at = drawn(found, 8, seed=3)
-    moved = at + np.random.default_rng(1).uniform(-0.2, 0.2, at.shape) * np.array([1, 0, 1, 0, 1])
-    commands = found.solve(of(found, moved), at)
-    assert commands.reached.all()
-    assert (commands.joint_angles[:, [1, 3]] == at[:, [1, 3]]).all()
-    path = found.follow(of(found, at[0] + np.linspace(0, 0.3, 5)[:, None] * np.array([1, 0, 1, 0, 1])), at[0])
-    assert path.reached.all()
-    assert (path.joint_angles[:, [1, 3]] == at[0, [1, 3]]).all()
-    far = found.solve(of(found, at[:1] + np.array([0, 1.5, 0, 0, 0])), at[0])
-    assert (far.joint_angles[:, [1, 3]] == at[0, [1, 3]]).all()
-
-
-def test_held_joints_must_be_told_where_and_may_be_there() -> None:
-    found = with_options("three", Options(held=("q2",), limits={"q2": (-1.0, 1.0)}))
-    targets = of(found, np.array([[0.3, 0.5, -0.4]]))
-    for ask in (found.solve, found.follow, found.postures):
-        with pytest.raises(ValueError, match="q2 shall stay, and no start says where"):
-            ask(targets)
-    for ask in (found.solve, found.follow):
-        with pytest.raises(ValueError, match="q2 shall stay where the start has it, and that is beyond its limits"):
-            ask(targets, np.array([0.0, 1.5, 0.0]))
-    for held, said in ((("elbow",), "no joint is called 'elbow'"), (("q1", "q2", "q3"), "none is left to move")):
-        with pytest.raises(ValueError, match=said):
-            with_options("rigid", Options(held=held))
-
-
-def test_a_held_joint_is_held_too_where_a_position_alone_is_asked() -> None:
-    """With q1 held the position is out of the arm's plane: it is not said that it could be had."""
-    found = with_options("three", Options(held=("q1",)))
-    start = np.array([0.0, 0.5, -0.4])
-    tools = found.forward(np.array([[1.2, 0.5, -0.4]]))
-    commands = found.solve(found.targets(tools[:, :3, 3], tools[:, :3, :3]), start)
-    assert not commands.reached[0]
-    assert "the position can be reached" not in commands.reasons[0]
-
-
 # -- which of many -------------------------------------------------------------------------------------------------
 
 
@@ -546,17 +508,6 @@ def test_a_place_out_of_reach_does_not_end_a_path() -> None:
     assert "out of reach" in commands.reasons[4]
 
 
-def test_postures_are_different_and_all_reach() -> None:
-    found = compensator("rigid")
-    targets = of(found, np.array([[0.3, 0.6, -0.8]]))
-    ways = found.postures(targets).T
-    assert len(ways) >= 2
-    tools = found.forward(ways)
-    assert np.abs(tools[:, :3, 3] - targets.positions).max() < 2 * NEAR_M
-    apart = [np.abs(one - two).max() for i, one in enumerate(ways) for two in ways[:i]]
-    assert min(apart) > 1e-3
-
-
 # -- counts --------------------------------------------------------------------------------------------------------
 
 
@@ -636,16 +587,14 @@ def test_commands_between_two_counts_go_where_the_effect_puts_them(falling: bool
         assert np.abs(found._set(commands.T).T[:, joint] - set_angles(found, commands)[:, joint]).max() < 1e-12
 
 
-def test_counts_stay_within_limits_and_held_joints_are_only_rounded() -> None:
+def test_counts_stay_within_limits() -> None:
     limits = {"q1": (0.0, 0.4), "q2": (-1.0, 1.0)}
-    found = with_options("servos", Options(limits=limits, held=("q3",)))
+    found = with_options("servos", Options(limits=limits))
     start = np.array([0.2, 0.1, 0.7])
     edge = np.array([[0.4, 0.5, 0.7], [0.0, 1.0, 0.7], [0.2, -1.0, 0.7]])
     commands = found.solve(found.targets(found.exact(edge, acting(found, 3))[:, :3, 3]), start)
     assert commands.reached.all()
     assert within(found, commands)
-    nearest = set_angles(found, np.array([[0.0, 0.0, 0.7]]))[0, 2]
-    assert commands.joint_angles[:, 2] == pytest.approx(nearest, abs=1e-12)
 
 
 def test_many_joints_without_servos_cost_nothing() -> None:

@@ -15,7 +15,7 @@ from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
 from armcal_online.mission.mission import MissionPlan, before_launch
 from armcal_online.sources.source import Incoming
-from armcal_online.tracking.decisions import Health
+from armcal_online.tracking.health import Health
 from armcal_online.tracking.recalibrator import Recalibrator
 from online_arm import AXES, JOINTS, World, begun, calibration, told
 

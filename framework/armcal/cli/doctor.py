@@ -55,8 +55,8 @@ def doctor(as_json: bool) -> None:
     works = findings[-1].state == "ok"
     broken = ", ".join(finding.subject for finding in findings if finding.state in ("warning", "fault"))
     if as_json:
-        content = {**JSON_SCHEMA, "works": works, "findings": [finding._asdict() for finding in findings]}
-        click.echo(json.dumps(content, indent=2))
+        listed = [finding._asdict() for finding in findings]
+        click.echo(json.dumps({**JSON_SCHEMA, "works": works, "findings": listed}, indent=2))
     elif works:
         click.echo(f"\nArms can be calibrated here; what does not work: {broken}." if broken else "\nEverything works.")
     if not works:
@@ -93,8 +93,7 @@ def examine() -> Iterator[Finding]:
     with tempfile.TemporaryDirectory(prefix="armcal-doctor-") as place:  # the run's own verdict ends it where it is off
         _, fault = in_child("from armcal.cli.main import main; main()", "demo", "--out", f"{place}/demo")
     text = f"a simulated arm cannot be calibrated: {fault}" if fault else "a simulated arm was calibrated"
-    hint = "Mend what is marked above first." if fault else ""
-    yield Finding("main job", "calibrate", "fault" if fault else "ok", text, hint)
+    yield Finding("main job", "calibrate", *(("fault", text, "Mend what is marked above.") if fault else ("ok", text)))
 
 
 def in_child(code: str, *arguments: str, longest_s: float = 120.0) -> tuple[str, str]:

@@ -195,9 +195,10 @@ def _ladder(result: StudyResult) -> Figure:
 
 def _by_group(result: StudyResult) -> Figure:
     """Mean error at each group, by variant and by what it was trained at."""
+    few = len(result.groups) <= _FEW_GROUPS
     rows = {
         f"{variant}, {_trained(trained, result)}": [
-            (c.errors.mean, "solid" if c.seen else "hollow", c.judged) for c in cells
+            (c.errors.mean, "solid" if c.seen else "hollow", c.judged if few else "") for c in cells
         ]
         for (variant, trained), cells in _rows(result).items()
     }

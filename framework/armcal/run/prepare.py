@@ -195,14 +195,16 @@ def label_of(experiment: Experiment) -> str | None:
     return next((label[0] for label in labels if label), None)
 
 
-def labels_of(experiment: Experiment, dataset: Dataset) -> tuple[str, ...]:
-    """Which group each record belongs to.
+def labels_of(
+    experiment: Experiment, dataset: Dataset, label: str | None = None, where: Location | None = None
+) -> tuple[str, ...]:
+    """Which group each record belongs to, by the configured column or another ``label`` (``where`` that is asked for).
 
     Raises:
         ConfigError: no column separates groups.
         DataError: records are grouped by payload, and none states one.
     """
-    label = label_of(experiment)
+    label = label or label_of(experiment)
     if label == PAYLOAD and not (dataset.has(PAYLOAD) or label in dataset.extra):
         raise DataError(
             "no column states what hung on the tool.",
@@ -212,7 +214,7 @@ def labels_of(experiment: Experiment, dataset: Dataset) -> tuple[str, ...]:
     if label is None or not (label in dataset.extra or label == PAYLOAD):
         raise ConfigError(
             f"found no column {label or 'of groups'} in the records; they have {', '.join(dataset.extra) or 'none'}.",
-            where=experiment.source.where(("validation",)),
+            where=where or experiment.source.where(("validation",)),
             hint=f"Name a text column of the data, or {PAYLOAD}: group_by: NAME.",
         )
     return group_texts(dataset, label)

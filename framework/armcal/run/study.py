@@ -102,8 +102,8 @@ class Study:
             experiment = _naming(name, partial(Experiment.of, source, data, registry))
             # Without the split that a run would make, a study draws its own folds; nothing is compiled before
             # everything is known to be solvable.
-            chosen: dict[str, Any] = {"validation": ValidationSettings(group_by=settings.group_by)}
-            experiments[name] = replace(experiment, settings=experiment.settings.model_copy(update=chosen))
+            chosen = experiment.settings.model_copy(update={"validation": ValidationSettings()})
+            experiments[name] = replace(experiment, settings=chosen)
         return cls(str(read.base.data.get("name") or Path(path).stem), read.base, settings, experiments)
 
     def prepare(self, progress: Progress = no_progress) -> dict[str, Prepared]:
@@ -215,7 +215,8 @@ def compare(
         ready = study.prepare(progress)
         some, first = next(iter(ready.values())), next(iter(study.experiments.values()))
         dataset, poses = some.dataset, first.poses(some.dataset)
-        labels = () if settings.group_by is None else labels_of(first, dataset)
+        where = study.source.where(("study", "group_by"))
+        labels = () if settings.group_by is None else labels_of(first, dataset, settings.group_by, where)
         groups = _groups(labels, dataset, settings)
         for name, own in ready.items():
             for rows in groups.values():

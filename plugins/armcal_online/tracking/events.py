@@ -9,7 +9,8 @@ import numpy as np
 from armcal.estimate.online import Linearised
 
 from armcal_online.sources.source import Incoming
-from armcal_online.tracking.decisions import LEVEL_ADVICE, LEVELS, Decision, Health, advice, per_cent, sure
+from armcal_online.tracking.decisions import LEVEL_ADVICE, LEVELS, Decision, advice, per_cent, sure
+from armcal_online.tracking.health import Health
 from armcal_online.tracking.hypotheses import CAUSES, LINK, Recent, Steps, spoken
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.sizes import SHOWN, TipError

@@ -10,15 +10,8 @@ from scipy.special import logsumexp
 
 from armcal_online.tracking import sentences
 from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.decisions import (
-    EXPLAINED,
-    Decision,
-    Health,
-    improbability,
-    log_odds_of,
-    many_outliers,
-    nis_limit,
-)
+from armcal_online.tracking.decisions import EXPLAINED, Decision, log_odds_of
+from armcal_online.tracking.health import Health, improbability, many_outliers, nis_limit
 from armcal_online.tracking.hypotheses import GRADUAL, LEAST_RECORDS, Explanation, Hypothesis, Steps, is_enough, pairs
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.sizes import Size, rate_of, size_of

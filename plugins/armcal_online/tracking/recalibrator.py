@@ -27,7 +27,8 @@ from armcal_online.evaluator import identity
 from armcal_online.sources.source import Incoming
 from armcal_online.tracking import events
 from armcal_online.tracking.belief import Belief, most_likely
-from armcal_online.tracking.decisions import EXPLAINED, Decision, nis_limit
+from armcal_online.tracking.decisions import EXPLAINED, Decision
+from armcal_online.tracking.health import nis_limit
 from armcal_online.tracking.hypotheses import GRADUAL, Recent, find_steps, hypotheses, slow_changes
 from armcal_online.tracking.judge import Judge
 from armcal_online.tracking.net import Net

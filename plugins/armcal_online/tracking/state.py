@@ -16,7 +16,8 @@ from armcal.errors import DataError
 from armcal.estimate.online import Gaussian, OnlineEstimator, kalman_update
 
 from armcal_online.tracking.belief import Belief, most_likely
-from armcal_online.tracking.decisions import Decision, Health
+from armcal_online.tracking.decisions import Decision
+from armcal_online.tracking.health import Health
 from armcal_online.tracking.hypotheses import Candidate, Recent
 from armcal_online.tracking.refit import NetState
 from armcal_online.tracking.settings import ClockSettings

@@ -16,7 +16,7 @@ from armcal.base.se3 import evaluated
 from armcal.calibration.compensation.counts import Rounding, ServoCounts
 from armcal.calibration.compensation.finder import Allowed, Finder, Seeds
 from armcal.calibration.compensation.path import PathFinder, with_sides
-from armcal.calibration.compensation.reach import Reach, check_held, command_limits, held_joints, reach_of, why_not
+from armcal.calibration.compensation.reach import Reach, command_limits, reach_of, why_not
 from armcal.calibration.compensation.redundancy import Descent
 from armcal.calibration.compensation.request import Commands, Options, Targets
 from armcal.calibration.compensation.search import Rows, Solutions, Solver
@@ -60,7 +60,6 @@ class Compensator:
         self.expression, self.options = expression, options or Options()
         coupled = partial(within_couplings, [expression.arm]) if expression.arm.couplings else None
         self._allowed = (lambda q: allowed(q) & coupled(q)) if allowed and coupled else allowed or coupled
-        self._held = held_joints(expression, self.options.held)
         self.limits = command_limits(expression, self.options.limits)
         self.reach: Reach = reach_of(expression.arm, parameters, self.limits, expression.tool_T_point)
         self._equilibrium = Equilibrium(expression, choice)
@@ -118,10 +117,8 @@ class Compensator:
                 commands that are found are taken.
 
         Raises:
-            ValueError: joints are to be held, and nothing says where or it is beyond their limits; or another number of
-                commands.
+            ValueError: another number of commands.
         """
-        check_held(self.joints, self._held, self.limits, start)
         record = self._record(targets)
         towards = None if start is None else self._commanded(start, len(targets))
         if towards is None or not self._tells_approach or targets.approach.any():
@@ -141,7 +138,6 @@ class Compensator:
         Raises:
             ValueError: as of ``solve``.
         """
-        check_held(self.joints, self._held, self.limits, start)
         if not len(targets):
             return replace(self.solve(targets, start), moves=np.zeros((0, len(self.joints))))
         record = self._record(targets)
@@ -150,16 +146,6 @@ class Compensator:
         path = finder(record, _goal(targets), at)
         record[len(self.joints) : 2 * len(self.joints)] = path.approach
         return replace(self._commands(record, targets, path.solutions), moves=path.moves.T)
-
-    def postures(self, target: Targets) -> Array:
-        """Different commands (n x ways) that have a target (one), in the postures that are found.
-
-        Raises:
-            ValueError: joints are to be held, and nothing can say where.
-        """
-        check_held(self.joints, self._held, self.limits, None)
-        finder = PathFinder(self._kind(target).finder, len(self.joints), self._tells_approach)
-        return finder.beginnings(self._record(target), _goal(target))
 
     def onward(self, targets: Targets, at: Array) -> Commands:
         """Commands for targets straight on from others (N x n): no other posture is looked for."""
@@ -233,7 +219,7 @@ class Compensator:
     def _found(self, record: Array, targets: Targets, start: Array | None) -> Solutions:
         """Exact commands, as redundancy asks."""
         goal, kind = _goal(targets), self._kind(targets)
-        choice = len(self.joints) - len(self._held) > (3 if targets.rotations is None else 6)
+        choice = len(self.joints) > (3 if targets.rotations is None else 6)
         if self.options.redundancy == "nearest":
             return kind.finder(record, goal) if start is None else kind.finder.onward(record, goal, start)
 
@@ -315,7 +301,7 @@ class _TargetKind:
     def solver(self) -> Solver:
         arm, options = self._arm, self._arm.options
         tolerance, length = (options.reach_m, options.reach_rad), arm._seeds.spread / 2
-        return Solver(arm.expression, arm.limits, self._turns, length, tolerance, arm._held, arm._choice)
+        return Solver(arm.expression, arm.limits, self._turns, length, tolerance, arm._choice)
 
     @cached_property
     def finder(self) -> Finder:

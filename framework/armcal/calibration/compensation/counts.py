@@ -56,14 +56,13 @@ class ServoCounts:
                 made[i] = _piecewise(counts[i] * clock.tick, table.pulses[order], table.angles[order])
         return made
 
-    def near(self, commands: Array, limits: Array, held: tuple[int, ...] = ()) -> tuple[Counts, Array]:
+    def near(self, commands: Array, limits: Array) -> tuple[Counts, Array]:
         """Counts to either side of commands (n x N), and what they make (n x o x N each; rad).
 
-        None beyond the limits (n x 2), where the nearest stands in, and none beside the nearest of ``held`` joints.
+        None beyond the limits (n x 2), where the nearest stands in.
         """
         middle = self.counts(commands)
         moved = np.where(middle[:, None, :] == 0, 0, self._offsets[None, :, None])
-        moved[list(held)] = 0
         counts = middle[:, None, :] + moved
         exact = np.repeat(commands[:, None, :], len(self._offsets), axis=1)
         shape = (len(commands), -1)
@@ -156,7 +155,7 @@ class Rounding:
         slopes = self._slope(record, solutions.states[:, part])[0].reshape(joints, len(self._weights), count)
         weighted = slopes.transpose(2, 1, 0) * self._weights[None, :, None]
         left = self._left(self._equilibrium(record, solutions.states[:, part]).base_T_tool, targets, part)
-        near = self._counts.near(exact, self._solver.limits, self._solver.held)
+        near = self._counts.near(exact, self._solver.limits)
         counts, commands = self._counts.best(near, exact, weighted, left * self._weights[:, None])
         tried = np.repeat(record, TRIED, axis=1)
         tried[:joints] = commands.reshape(joints, -1)

@@ -42,7 +42,7 @@ class Finder:
     """Searches of one solver from many starts."""
 
     def __init__(self, solver: Solver, seeds: Seeds, allowed: Allowed | None) -> None:
-        self._solver, self._seeds, self._allowed, self._held = solver, seeds, allowed, solver.held
+        self._solver, self._seeds, self._allowed = solver, seeds, allowed
 
     def __call__(
         self, record: Array, target: Array, start: Array | None = None, score: Score | None = None
@@ -68,7 +68,7 @@ class Finder:
                 self._round(record, target, todo, picks, solutions, score, start)
             lost = lost[~solutions.there[lost]]
             used += wide
-        self._nearest(record, target, lost, solutions, start)
+        self._nearest(record, target, lost, solutions)
         return solutions
 
     def spread(self, record: Array, target: Array) -> Solutions:
@@ -127,7 +127,7 @@ class Finder:
     def towards(self, record: Array, target: Array, preferred: Array, solutions: Solutions) -> None:
         """As near to preferred commands (n x N) as the targets allow, in place; only those that are reached."""
         at = np.flatnonzero(solutions.there)
-        goal = Goal(with_commands(record, solutions.commands), solutions.states, target, preferred, self._held)
+        goal = Goal(with_commands(record, solutions.commands), solutions.states, target, preferred)
         attempt = self._solver(goal.subset(at), PREFERRED)
         nearer = _apart(attempt.commands, preferred[:, at]) < _apart(solutions.commands[:, at], preferred[:, at])
         good = np.flatnonzero(attempt.there & nearer & self._may(attempt.commands))
@@ -136,7 +136,7 @@ class Finder:
     def _direct(self, record: Array, target: Array, at: Array, towards: Array | None = None) -> Solutions:
         """One search from commands (n x N), near to preferred ones where there are any: what it reaches."""
         solutions = self._nothing(record.shape[1])
-        goal = Goal(with_commands(record, at), np.zeros_like(solutions.states), target, towards, self._held)
+        goal = Goal(with_commands(record, at), np.zeros_like(solutions.states), target, towards)
         attempt = self._solver(goal, QUICK if towards is None else PREFERRED)
         good = np.flatnonzero(attempt.there & self._may(attempt.commands))
         solutions.replace(good, attempt.subset(good))
@@ -168,7 +168,7 @@ class Finder:
         if start is not None and score is not None:
             first = np.arange(0, len(rows), wide)
             commands[:, first], states[:, first] = start[:, todo], 0.0
-        attempt = self._solver(self._goal(record, target, rows, commands, states, start))
+        attempt = self._solver(self._goal(record, target, rows, commands, states))
         good = attempt.there & self._may(attempt.commands)
         left = attempt.distances + self._solver.length * attempt.turns
         value = left if score is None else score(attempt.commands, attempt.states, rows)
@@ -181,7 +181,7 @@ class Finder:
         closer = ~had & (left[near] < solutions.distances[todo] + self._solver.length * solutions.turns[todo])
         solutions.put(todo[closer], attempt, near[closer])
 
-    def _nearest(self, record: Array, target: Array, lost: Rows, solutions: Solutions, start: Array | None) -> None:
+    def _nearest(self, record: Array, target: Array, lost: Rows, solutions: Solutions) -> None:
         """Of targets that were not reached, the commands that come nearest; a longer search reaches some after all."""
         wide = min(_NEAREST_STARTS, self._seeds.commands.shape[1] - 1)
         for todo in _chunks(lost, wide + 1):
@@ -190,20 +190,15 @@ class Finder:
             commands = np.concatenate([solutions.commands[:, todo, None], self._seeds.commands[:, picks]], axis=2)
             states = np.concatenate([solutions.states[:, todo, None], self._seeds.states[:, picks]], axis=2)
             commands, states = (part.reshape(len(part), len(rows)) for part in (commands, states))
-            attempt = self._solver(self._goal(record, target, rows, commands, states, start), NEAREST)
+            attempt = self._solver(self._goal(record, target, rows, commands, states), NEAREST)
             left = attempt.distances + self._solver.length * attempt.turns
             left = np.where(self._may(attempt.commands), left, np.inf)
             best = left.reshape(-1, wide + 1).argmin(axis=1) + np.arange(len(todo)) * (wide + 1)
             solutions.put(todo, attempt, best)
             solutions.there[todo] = attempt.there[best] & np.isfinite(left[best])  # a longer search may arrive
 
-    def _goal(
-        self, record: Array, target: Array, rows: Rows, commands: Array, states: Array, start: Array | None
-    ) -> Goal:
-        if self._held and start is not None:
-            held = list(self._held)
-            commands[held] = start[held][:, rows]
-        return Goal(with_commands(chosen_of(record, rows), commands), states, chosen_of(target, rows), None, self._held)
+    def _goal(self, record: Array, target: Array, rows: Rows, commands: Array, states: Array) -> Goal:
+        return Goal(with_commands(chosen_of(record, rows), commands), states, chosen_of(target, rows))
 
     def _nothing(self, count: int) -> Solutions:
         return Solutions.nothing(len(self._solver.limits), len(self._seeds.states), count)

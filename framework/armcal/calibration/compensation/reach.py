@@ -7,42 +7,13 @@ import casadi as ca
 import numpy as np
 
 from armcal.arm.assembly import Arm
-from armcal.arm.joints import Limits, joint_limits, unknown_joint
+from armcal.arm.joints import Limits, joint_limits
 from armcal.base.arrays import Array, Mask
 from armcal.base.parameters import Parameters
 from armcal.base.se3 import Transform, evaluated, identity
 from armcal.calibration.compensation.request import Targets
 from armcal.calibration.compensation.search import Rows, Solutions
 from armcal.calibration.tool_expression import ToolExpression
-
-
-def held_joints(expression: ToolExpression, names: Sequence[str]) -> tuple[int, ...]:
-    """Places of joints that shall not move.
-
-    Raises:
-        ValueError: there is no such joint, or none is left to move.
-    """
-    if fault := unknown_joint(names, expression.joints):
-        raise ValueError(fault)
-    if len(set(names)) == len(expression.joints):
-        raise ValueError("all joints shall stay: none is left to move")
-    return tuple(expression.joints.index(name) for name in dict.fromkeys(names))
-
-
-def check_held(joints: Sequence[str], held: Sequence[int], limits: Array, start: Array | None) -> None:
-    """Joints that shall stay must be told where (n or N x n), and may be there.
-
-    Raises:
-        ValueError: nothing says where, or it is beyond their limits (n x 2).
-    """
-    if not held:
-        return
-    if start is None:
-        raise ValueError(f"{', '.join(joints[i] for i in held)} shall stay, and no start says where")
-    for i in held:
-        stays = np.atleast_2d(np.asarray(start, dtype=float))[:, i]
-        if (stays < limits[i, 0]).any() or (stays > limits[i, 1]).any():
-            raise ValueError(f"{joints[i]} shall stay where the start has it, and that is beyond its limits")
 
 
 def command_limits(expression: ToolExpression, stated: Mapping[str, Limits]) -> Array:

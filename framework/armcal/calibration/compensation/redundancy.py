@@ -71,9 +71,7 @@ class Descent:
             if not (trust > _LEAST).any():
                 break
             step = self._step(record, commands, states, trust)
-            attempt = self._solver(
-                Goal(with_commands(record, commands + step), states, target, None, self._solver.held)
-            )
+            attempt = self._solver(Goal(with_commands(record, commands + step), states, target))
             new = self.score(record, attempt.commands, attempt.states)
             good = attempt.there & (new < value * (1 - 1e-9))
             if allowed is not None:
@@ -96,7 +94,6 @@ class Descent:
         at = commands.T
         stuck = ((at <= low) & (pull < 0)) | ((at >= high) & (pull > 0))
         free = np.where(stuck, 0.0, 1.0)
-        free[:, list(self._solver.held)] = 0.0
         n, k = held.shape[2], held.shape[1]
         square = np.einsum("nki,nkj->nij", slope, slope) * free[:, :, None] * free[:, None, :]
         size = np.maximum(np.trace(square, axis1=1, axis2=2), 1e-300)[:, None, None]

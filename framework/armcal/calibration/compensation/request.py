@@ -108,7 +108,6 @@ class Options:
         limits: lowest and highest command by joint (rad or m), instead of the model's.
         redundancy: which of many commands: nearest to the start, stiffest against a force at the tool, with the least
             sag, or the coolest (least torque).
-        held: joints that stay where the arm comes from.
         reach_m: targets of this size count as had (m).
         reach_rad: and of this size of turn (rad).
         seed: of the random starts.
@@ -119,7 +118,6 @@ class Options:
 
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     redundancy: Redundancy = "nearest"
-    held: tuple[str, ...] = ()
     reach_m: float = 1e-9
     reach_rad: float = 1e-8
     seed: int = 0

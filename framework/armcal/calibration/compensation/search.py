@@ -33,12 +33,11 @@ class Goal:
     state: Array  # n_d x N; where the search starts
     target: Array  # position, and where turns count the rotation column by column (3 or 12 x N)
     towards: Array | None = None
-    held: tuple[int, ...] = ()  # joints that stay where the search starts, by index
 
     def subset(self, rows: Rows) -> Goal:
         towards = None if self.towards is None else chosen_of(self.towards, rows)
         record, state, target = (chosen_of(array, rows) for array in (self.record, self.state, self.target))
-        return Goal(record, state, target, towards, self.held)
+        return Goal(record, state, target, towards)
 
 
 @dataclass(frozen=True)
@@ -136,15 +135,13 @@ class Search:
         for (name, array), size in zip(given.items(), self._sizes, strict=True):
             if array.shape != (size, count):
                 raise ValueError(f"found {name} of the shape {array.shape}, expected {(size, count)}")
-        held = np.zeros(joints)
-        held[list(goal.held)] = 1.0
         stated = (manner.damping, manner.patience, manner.steps, near.metres, near.radians, near.rest)
-        settings = np.concatenate([stated, [goal.towards is not None], *self._limits.T, held])
+        settings = np.concatenate([stated, [goal.towards is not None], *self._limits.T])
         progress = np.zeros((places["end"].stop, count))
         begun = np.minimum(np.maximum(goal.record[:joints], self._limits[:, :1]), self._limits[:, 1:])
         progress[places["commands"]] = progress[places["best_commands"]] = begun
         progress[places["state"]] = progress[places["best_state"]] = goal.state
-        progress[places["free"]], progress[places["damping"]] = 1 - held[:, None], FIRST_DAMPING
+        progress[places["free"]], progress[places["damping"]] = 1.0, FIRST_DAMPING
         progress[places["distance"].start : places["milestone"].stop] = np.inf
         self._iteration.iterate(progress, settings, goal.record, goal.target, towards)
         best, (distances, turns) = progress[places["best_commands"]], progress[places["distance"].start :][:2]
@@ -159,7 +156,6 @@ class Solver:
         limits: n x 2 (rad or m).
         turns: whether rotations count.
         length: how many metres a radian counts for.
-        held: joints that stay where searches start, by index.
     """
 
     def __init__(
@@ -169,11 +165,10 @@ class Solver:
         turns: bool,
         length: float,
         tolerance: tuple[float, float],
-        held: tuple[int, ...],
         choice: EvaluatorChoice = "auto",
     ) -> None:
         """Targets are reached within tolerances in m and rad."""
-        self.length, self.turns, self.limits, self.held = length, turns, limits, held
+        self.length, self.turns, self.limits = length, turns, limits
         self._near = Near(*tolerance, _REST)
         self._exact = Search(expression, slopes(expression), limits, turns, length, choice)
         rough = slopes(expression, rough=True) if expression.state.numel() else None

@@ -31,7 +31,7 @@ _NEAR_PREFERRED = 1e-4  # Preferred commands are reached when they move no joint
 _WILD = 2.0  # A deflection beyond this (rad or m) is started anew
 _FINITE = 1e300
 SETTINGS = ("damping", "patience", "steps", "metres", "radians", "rest", "preferred")
-"""Of a search; after them come the lowest and the highest command of each joint, and whether it is held."""
+"""Of a search; after them come the lowest and the highest command of each joint."""
 REACHED = 2.0  # How a search ends that reaches its target; others end with 1, and go on at 0
 
 
@@ -125,7 +125,7 @@ def search_function(expression: ToolExpression, own_slopes: Slopes, turns: bool,
     are commands to come near to where that is ``preferred``. A radian counts as ``length`` metres.
     """
     joints, states = len(expression.joints), expression.state.numel()
-    settings, progress = ca.SX.sym("settings", len(SETTINGS) + 3 * joints), progress_places(joints, states)
+    settings, progress = ca.SX.sym("settings", len(SETTINGS) + 2 * joints), progress_places(joints, states)
     target, towards = ca.SX.sym("target", 12 if turns else 3), ca.SX.sym("towards", joints)
     before = ca.SX.sym("progress", progress["end"].stop)
     search = _Search(joints, settings, {name: before[place] for name, place in progress.items()})
@@ -153,7 +153,7 @@ class _Search:
 
     def __init__(self, joints: int, settings: Expression, now: Mapping[str, Expression]) -> None:
         self.stated = dict(zip(SETTINGS, ca.vertsplit(settings[: len(SETTINGS)]), strict=True))
-        self._low, self._high, self._held = ca.vertsplit(settings[len(SETTINGS) :], joints)
+        self._low, self._high = ca.vertsplit(settings[len(SETTINGS) :], joints)
         self.now = now
 
     def judged(
@@ -205,8 +205,7 @@ class _Search:
         commands = self.now["commands"]
         from_low = ca.logic_and(commands <= self._low, pull > least)
         from_high = ca.logic_and(commands >= self._high, pull < -least)
-        stuck = ca.logic_and(self.now["free"] == 0, self._held == 0)
-        return ca.logic_and(stuck, ca.logic_or(from_low, from_high))
+        return ca.logic_and(self.now["free"] == 0, ca.logic_or(from_low, from_high))
 
 
 def _any(conditions: Expression) -> Expression:
