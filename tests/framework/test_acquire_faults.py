@@ -141,6 +141,7 @@ def test_random_troubles_never_make_the_arm_unsafe(
     judge(run, seed, undisturbed)
 
 
+@pytest.mark.slow
 def test_an_arm_that_is_driven_too_fast_is_seen(tmp_path: Path) -> None:
     fast = BenchRun(tmp_path, (*SETS, "bench.acquisition.rate_deg_per_s=30"))
     with fast.simulated() as clock:

@@ -79,7 +79,8 @@ class TestAFrameThatIsNotTheArms:
         assert arm.servos.read_text() == arm.kind["servos"]
         assert {file.name for file in arm.out.iterdir()} == {"observations.jsonl.before-1"}
 
-    @pytest.mark.parametrize("joint", [pytest.param("turn", marks=pytest.mark.slow), "lift"])
+    @pytest.mark.slow
+    @pytest.mark.parametrize("joint", ["turn", "lift"])
     def test_sweeps_of_a_servo_that_turns_the_other_way_are_in_the_right_units(
         self, tmp_path: Path, joint: str
     ) -> None:

@@ -142,6 +142,7 @@ def test_what_is_accepted_by_hand_is_used_or_refused_without_a_traceback(
     assert 0 < taken < len(seeds)
 
 
+@pytest.mark.slow
 def test_an_edit_on_purpose_is_checked_noted_and_said_until_the_next_run(calibration: Path, tmp_path: Path) -> None:
     content = yaml.safe_load(calibration.read_text())
     entry = next(entry for entry in content["parameters"] if entry["name"] == "arm.mdh.base_z")

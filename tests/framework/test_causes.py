@@ -140,6 +140,7 @@ def test_what_is_not_among_the_causes_is_not_given_the_name_of_one(smooth):
     assert "is not noise: other records predict it" in said(found)
 
 
+@pytest.mark.slow
 def test_in_short_nothing_is_left_only_where_no_function_of_the_pose_is(smooth):
     found = smooth
     solved = {"verdict": SimpleNamespace(converged=True), "identifiability": SimpleNamespace(undetermined=())}

@@ -76,6 +76,7 @@ def test_records_without_a_declared_column_are_refused(wooden: Path, command: st
     assert "records.csv:1" in told and "humidity, which the effect arm.wood reads" in " ".join(told.split())
 
 
+@pytest.mark.slow
 def test_a_pose_without_it_is_refused_by_an_effect_that_cannot_do_without(wooden: Path) -> None:
     armcal("run", "arm.yaml", "--out", "run", "--parallel", "1")
     (wooden / "poses.csv").write_text("q1_deg,q2_deg,q3_deg\n10,20,30\n")

@@ -49,6 +49,7 @@ def noise(size: float):
     return lambda points: points + size * np.random.default_rng(3).normal(size=points.shape)
 
 
+@pytest.mark.slow
 def test_an_error_beyond_3_percent_of_the_reach_is_bad(tmp_path: Path) -> None:
     code, verdict = ran(tmp_path, "measurements.tracker.noise_mm=12", change=noise(12))
     assert code == 3 and "% of the arm's reach: the values do not describe this arm" in bad(verdict)

@@ -31,6 +31,7 @@ def hidden(problem, records, estimate, dataset):
     return hidden_payload(problem, records, estimate, dataset, Motion.of(problem, estimate.values, records, dataset))
 
 
+@pytest.mark.slow
 def test_its_deviation_is_how_fast_the_misfit_grows_with_an_assumed_payload(lrm) -> None:
     sums, step = [], 0.01
     for mass in (0.0, step, 2 * step):

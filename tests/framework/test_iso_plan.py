@@ -81,6 +81,7 @@ def test_the_poses_are_on_the_diagonals_a_tenth_of_their_length_from_the_corners
     assert np.allclose(np.sort(sides), 0.8 * size * np.sqrt([1, 1, 2, 2])), "a rectangle, P2 to P5 round it"
 
 
+@pytest.mark.slow
 def test_the_commands_bring_the_tool_to_the_poses_turned_one_way_within_limits(
     planned: tuple[dict, list[dict[str, str]]],
 ) -> None:

@@ -35,6 +35,8 @@ from click.testing import CliRunner, Result
 
 from tests.mission_decisions import occurrences, verdicts
 
+pytestmark = pytest.mark.slow
+
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "mission.yaml"
 SLIP = {"kind": "slip", "day": 0.6, "joint": "arm.q3", "changes": {"arm.mdh.theta3": "14.4 deg"}}
 SWAP = {"kind": "swap", "day": 1.5, "joint": "arm.q2", "changes": {"arm.mdh.theta2": "-3 deg"}}

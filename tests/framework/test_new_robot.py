@@ -218,7 +218,7 @@ def test_a_robots_files_can_be_used_whatever_it_is_called(name: str, here: Path)
 
 
 @pytest.mark.parametrize("convention", ["standard", "modified"])
-@pytest.mark.quick("modified")
+@pytest.mark.slow
 def test_a_scara_slides_in_either_convention(convention: str, here: Path) -> None:
     rows = [
         f"name,type,{HEADER},lower_deg,upper_deg,lower_mm,upper_mm",

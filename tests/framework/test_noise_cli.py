@@ -149,6 +149,7 @@ def test_plugins_hear_of_records_that_were_set_aside(spoilt, rejected):
     assert {told["record_id"] for event, told in heard if event == "armcal_record_rejected"} == wrong
 
 
+@pytest.mark.slow
 def test_components_reach_every_output(repository, tmp_path):
     data = repository / "configs" / "lrm_arm" / "demo.csv"
     told, shown = run(repository, data, tmp_path / "out", "noise.estimate=true", "validation.folds=0")
@@ -195,6 +196,7 @@ def test_bad_settings_are_refused_at_their_place(repository, tmp_path, override,
     assert said in done.output and override.partition("=")[0] in done.output
 
 
+@pytest.mark.slow
 def test_the_report_escapes_what_a_suspicious_record_is_called(rejected):
     result = rejected[0]
     odd = replace(result.noise.suspicious[0], record_id="<b>x</b>")

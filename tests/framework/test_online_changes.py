@@ -230,7 +230,8 @@ def test_a_slipped_joint_is_named_and_recovered(seeds: int, outliers: float) -> 
     assert soon >= (0.95 if seeds > 1 else 0.8)
 
 
-@pytest.mark.parametrize("seeds", [1, pytest.param(6, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seeds", [1, 6])
 def test_two_joints_that_slip_at_once_are_both_named(seeds: int) -> None:
     """Within five records; a refit of the last 40 records would need 39 to 42."""
     found = []

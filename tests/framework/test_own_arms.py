@@ -218,6 +218,7 @@ class TestUncheckedWiring:
             worst = clock.ask({"state": True})["worst"]["limits"]
         assert worst["joint"] == "b" and math.degrees(worst["value"]) == pytest.approx(85, abs=1)
 
+    @pytest.mark.slow
     def test_a_check_outlasts_armcals_own_changes_and_no_others(self, calibrated: OwnArm) -> None:
         plan, servos = calibrated.plan((0, 0, 0)), calibrated.servos.read_text()
         record = calibrated.folder / "servos.yaml.checked"

@@ -154,6 +154,7 @@ evaluator: interpreted
 """
 
 
+@pytest.mark.slow
 def test_a_body_whose_turn_on_the_tool_is_held_is_named(tmp_path: Path) -> None:
     """29 deg of unseen orientation passed, and 21 mm where 3 mm had been aligned."""
     (tmp_path / "arm.yaml").write_text(POSES, encoding="utf-8")

@@ -52,6 +52,7 @@ def said(found: ResidualStructure) -> str:
     return " ".join(finding.whole for finding in findings)
 
 
+@pytest.mark.slow
 def test_no_drift_is_advised_for_a_function_of_the_pose_along_a_path(tmp_path: Path) -> None:
     base, cause = experiment(tmp_path), CAUSES["a third harmonic"]
     found = left(base, cause, recording(base, cause, 0, along_a_path(0)))

@@ -323,6 +323,7 @@ def test_the_recording_that_is_kept_gives_the_residuals_of_the_run(recording: Pa
             assert left == pytest.approx(float(row[f"d{axis}_mm"]), abs=2e-6)
 
 
+@pytest.mark.slow
 def test_a_new_recording_is_predicted_at_rest_and_with_wider_intervals(recording: Path) -> None:
     _, within = predicted(recording, "--recording", "calibrated")
     result, new = predicted(recording)

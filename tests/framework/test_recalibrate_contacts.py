@@ -10,6 +10,8 @@ import pytest
 from armcal.cli.main import cli
 from click.testing import CliRunner
 
+pytestmark = pytest.mark.slow
+
 BALL = Path(__file__).resolve().parents[2] / "configs" / "ball"
 
 

@@ -33,6 +33,8 @@ from click.testing import CliRunner, Result
 from fake_recalibrator import FakeRecalibrator
 from recalibrations import Listed, PowerCutError, made, run, stepping, steps
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 DEMO = ROOT / "configs" / "lrm_arm" / "demo.yaml"
 SETTINGS = RecalibrateSettings(evaluator="interpreted", process_noise={"arm.mdh.theta*": "0.1 deg in 30 d"})

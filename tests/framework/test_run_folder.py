@@ -27,6 +27,7 @@ OURS = ("notes.txt", "table.csv", "page.html", "result.yaml")
 CALLS = ("rename", "mkdir", "rmdir", "unlink", "fsync", "open", "chmod", "rmtree", "change_places")
 
 
+@pytest.mark.slow
 def test_a_run_asks_nothing_of_the_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A full one ended in a traceback after the fit, and nothing was written."""
 

@@ -92,6 +92,7 @@ def test_parameters_that_place_the_arm_are_known_by_what_they_move(anywhere: Pre
     assert placing.stands_anywhere and placing.basis.shape == (3, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_the_start_follows_the_frame(anywhere: Prepared, seed: int) -> None:
     """From any frame the nominal arm lies as near to the positions as it can."""

@@ -398,6 +398,7 @@ def test_by_the_score_the_choice_of_the_arms_authors_is_the_best_of_the_designs(
     assert min(scores, key=lambda name: scores[name]) == "45 deg"
 
 
+@pytest.mark.slow
 def test_areas_csv_has_each_cell(studied: tuple[Path, dict]) -> None:
     out, told = studied
     rows = list(csv.DictReader((out / "areas.csv").open()))

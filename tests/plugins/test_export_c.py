@@ -304,6 +304,7 @@ def test_slopes_column_by_column_are_the_same(arms, monkeypatch, tmp_path):
         np.testing.assert_allclose(other.jacobian(record)[2], compiled.jacobian(record)[2], rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_counts_are_those_of_the_board(arms):
     _, compiled = arms("counts and heat")
     table, clock = compiled.expression.servos["q2"]

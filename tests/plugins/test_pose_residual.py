@@ -103,6 +103,7 @@ def test_what_is_learned_leaves_the_parameters_where_the_fit_has_them(tmp_path):
     assert [own.sd for own in run.calibration.record.parameters] == [own.sd for own in plain]
 
 
+@pytest.mark.slow
 def test_poses_beyond_the_records_are_flagged_and_what_was_learned_of_a_joint_is_not_added_beyond_its_angles(tmp_path):
     run, angles = learned_run(), [[20, 20, 20], [170, 20, 20], [170, 170, 20]]
     rows = [f"{i},{','.join(map(str, row))}" for i, row in enumerate(angles)]
@@ -348,6 +349,7 @@ def test_errors_that_depend_on_the_load_are_learned_and_hold_on_unseen_records()
         run.calibration.forward(np.zeros(3))
 
 
+@pytest.mark.slow
 def test_a_server_asks_for_the_load_that_was_learned(monkeypatch):
     monkeypatch.setattr("armcal_serve.loaded._TRIES", 1)
     content = (loaded_run().folder / "run/calibration.yaml").read_text()

@@ -24,6 +24,8 @@ from armcal_camera.export import FramesSettings, HandEyeExporter
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[3]
 DEMO = ROOT / "configs" / "camera" / "demo.yaml"
 SHARED = ROOT.parent / "shared" / "data" / "camera"

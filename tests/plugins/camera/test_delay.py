@@ -56,6 +56,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_joints_that_are_late_are_late_by_so_much(recorded: Path) -> None:
     estimate = estimated(Experiment.load(recorded / "late.yaml"))
     names = estimate.parameters.coordinate_names

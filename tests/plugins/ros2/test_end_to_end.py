@@ -49,6 +49,7 @@ def test_a_recording_gives_the_calibration_of_the_table(tour: bags.Tour) -> None
     assert errors["bag"] < 0.12e-3 and errors["bag"] < errors["table"]
 
 
+@pytest.mark.slow
 def test_a_frame_that_is_computed_from_joints_is_named(tmp_path: Path) -> None:
     """What robot_state_publisher publishes is the nominal arm: nothing is measured."""
     tour = bags.made_tour(tmp_path, rests=30)

@@ -208,6 +208,7 @@ def test_a_configuration_without_a_servo_bus_is_refused(tmp_path):
     assert "range" in refusal(called("check", config))
 
 
+@pytest.mark.slow
 def test_calibrated_zeros_go_into_the_servos(tmp_path):
     """Afterwards each servo reports the angle at which its joint truly stands."""
     true = {"shoulder_pan": 4.4, "shoulder_lift": 6.2, "elbow_flex": -4.7, "wrist_flex": 5.6, "wrist_roll": -7.3}
