@@ -227,6 +227,7 @@ class TestRehearsal:
         assert np.all(np.abs(data.column("arm.approach.q1")) == 1)
         assert len(positions(data)) == 4
 
+    @pytest.mark.slow
     def test_they_say_which_board_and_which_configuration(self, folder: Path) -> None:
         rows = list(csv.DictReader((folder / "dataset.csv").open()))
         summary = json.loads((folder / "summary.json").read_text())

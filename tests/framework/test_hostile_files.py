@@ -46,6 +46,7 @@ def found(tmp_path: Path) -> Path:
 # -- names are data ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_name_with_brackets_and_escapes_is_shown_and_steers_nothing(tmp_path: Path) -> None:
     shutil.copytree(BALL, tmp_path / "ball")
     text = (BALL / "demo.yaml").read_text(encoding="utf-8").partition("\n")[2]

@@ -98,6 +98,7 @@ def test_the_commands_bring_the_tool_to_the_poses_turned_one_way_within_limits(
     assert max((turns[0].inv() * turn).magnitude() for turn in turns) < 1e-6
 
 
+@pytest.mark.slow
 def test_single_poses_are_come_to_along_each_axis_and_joints_from_the_sides_that_the_table_states(
     planned: tuple[dict, list[dict[str, str]]],
 ) -> None:

@@ -58,7 +58,7 @@ def test_joints_that_turn_as_commanded_are_right_and_only_those_are_driven(tmp_p
     assert "(shoulder_pan, shoulder_lift, elbow_flex, wrist_flex, wrist_roll: changed" in real, "it was a simulated one"
 
 
-@pytest.mark.quick("changes2-elbow_flex stands +13")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "says"),
     [

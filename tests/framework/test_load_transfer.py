@@ -17,6 +17,8 @@ from armcal.run.study import Study, compare
 from armcal.run.study_result import StudyResult
 from click.testing import CliRunner, Result
 
+pytestmark = pytest.mark.slow
+
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 STUDY = """
 extends: load_transfer.yaml

@@ -277,7 +277,7 @@ def _moved(urdf, x):
 # ---------------------------------------------------------------- the published figures
 
 
-@pytest.mark.quick("kinova-left")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "trained"), [pytest.param(*k, marks=[] if k in POLISHED else SLOW) for k in PUBLISHED]
 )

@@ -13,6 +13,8 @@ from armcal_online.tracking.start import FilterSetup
 from online_arm import STATES, Filtered, World, begun, begun_setup, nees, random_walk, settings, told
 from scipy.stats import chi2
 
+pytestmark = pytest.mark.slow
+
 UPDATES = 300
 
 

@@ -67,6 +67,7 @@ def _run(recalibrator: Recalibrator, arm: World, count: int) -> list[dict]:
     return [event for k in range(count) for event in recalibrator.take(arm.record(), first + k + 1)]
 
 
+@pytest.mark.slow
 def test_a_filter_that_is_stuck_is_taken_over_by_a_refit(monkeypatch: pytest.MonkeyPatch) -> None:
     recalibrator, arm = _blind(begun(), monkeypatch), World.drawn(5, outliers=0.05)
     _run(recalibrator, arm, 20)

@@ -299,6 +299,7 @@ class TestWhatIsMissingIsNoSuccess:
         assert again.exit_code == 1  # nor is it one when it is asked again
         assert clock.ask({"state": True})["offences"] == {}
 
+    @pytest.mark.slow
     def test_a_calibration_of_which_some_tables_could_not_be_told(self, calibrated: OwnArm) -> None:
         """One joint was measured; what there is is fitted for all three."""
         done = calibrated.armcal("servo", "--out", calibrated.out, "--evaluate")

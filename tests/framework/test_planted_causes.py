@@ -18,6 +18,7 @@ SEEDS = 8
 QUICK = ("a held twist alpha2", "a target that moved", "a link that grew")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", QUICK)
 def test_what_was_held_or_moved_is_named_and_what_grew_is_no_drift_of_a_joint(tmp_path: Path, name: str) -> None:
     base, cause = experiment(tmp_path), CAUSES[name]

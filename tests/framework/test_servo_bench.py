@@ -19,6 +19,8 @@ from click.testing import CliRunner
 from tests.bench_runs import bench_served_by_the_command, free_port
 from tests.servo_fakes import config_in
 
+pytestmark = pytest.mark.slow
+
 ARMCAL = [sys.executable, "-m", "armcal.cli"]
 JOINTS = ("q3", "q5")
 

@@ -105,6 +105,7 @@ def test_the_start_follows_the_frame(anywhere: Prepared, seed: int) -> None:
     assert not start.warnings
 
 
+@pytest.mark.slow
 def test_a_start_that_is_near_enough_is_kept(anywhere: Prepared) -> None:
     """So that what is published of the nominal arm stays."""
     assert not anywhere.start.taken

@@ -128,6 +128,7 @@ def _until(holds: Callable[[], bool], seconds: float = 15.0) -> bool:
     return holds()
 
 
+@pytest.mark.slow
 def test_connections_that_trickle_bytes_shut_nobody_out(served: Served) -> None:
     """All places are taken by requests without an end, again and again."""
     trickles = []

@@ -216,6 +216,7 @@ def test_what_is_out_of_reach_leaves_the_nearest_commands_within_the_limits(arms
     assert (status, outcome.steps) == (NOT_REACHED, 0)
 
 
+@pytest.mark.slow
 def test_one_step_is_newtons(arms):
     _, compiled = arms("elastic")
     record = records_of(compiled, 1, 19)[0]

@@ -23,6 +23,8 @@ from armcal_online.mission.simulator import (
 )
 from scipy.spatial.transform import Rotation
 
+pytestmark = pytest.mark.slow
+
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "mission.yaml"
 MOON = np.array([0.0, 0.0, -1.62])
 TIP = [f"tracker.{axis}" for axis in "xyz"]

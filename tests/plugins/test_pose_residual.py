@@ -142,6 +142,7 @@ def test_gains_by_chance_alone_are_seldom_harm():
     assert 0.01 < np.mean(harmed) < 0.045
 
 
+@pytest.mark.slow
 def test_the_report_says_where_it_acts_and_how_much():
     run = learned_run()
     calibration, commands = run.calibration, Experiment.load(run.folder / "run.yaml").read()
@@ -204,6 +205,7 @@ def test_c_code_stands_where_the_calibration_does(tmp_path):
         np.testing.assert_allclose(pose, calibration.forward(angles)[0, :3], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_formats_that_cannot_hold_it_say_so_and_how_far_that_moves_the_tool(tmp_path):
     calibration = learned_run().folder / "run/calibration.yaml"
     said = armcal("export", calibration, "--format", "json", "--out", tmp_path / "arm.json", "--json")
