@@ -145,6 +145,7 @@ def test_a_prediction_without_the_payload_its_calibration_had_is_refused(tmp_pat
     refused(check("statics.payload_g=-5"), "payload", "below zero")
 
 
+@pytest.mark.slow
 def test_grams_called_kilograms_are_warned_of() -> None:
     warned(
         check("statics.payload_g=100000"),

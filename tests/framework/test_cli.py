@@ -194,6 +194,7 @@ def test_json_is_one_document(said: Result) -> None:
     assert json.loads(said.stdout)["folder"].endswith("run")
 
 
+@pytest.mark.slow
 def test_verbose_says_how_long_each_stage_took_and_plain_does_not(said: Result, again: Result) -> None:
     for word in ("fit: ", "build: ", "evaluated by: "):
         assert word in said.stderr and word not in again.stderr

@@ -72,6 +72,7 @@ def recorded(here: Path, cell: Cell) -> None:
     armcal("simulate", "arm.yaml", "--out", "records.csv")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cell", [FORCE, TORQUE], ids=["force", "torque"])
 def test_readings_go_through_every_command_in_their_unit(place: Path, cell: Cell) -> None:
     recorded(place, cell)

@@ -196,6 +196,7 @@ def test_a_prediction_says_when_it_lacks_what_the_calibration_knew(tilted: Path)
     assert "warning" not in predict(tilted, tilted / "poses.csv").output
 
 
+@pytest.mark.slow
 def test_a_prediction_refuses_half_a_gravity_vector(tilted: Path) -> None:
     text = (tilted / "poses.csv").read_text().replace("gravity_x_m_s2", "remark_x", 1)
     (tilted / "half.csv").write_text(text)

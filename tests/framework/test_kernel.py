@@ -773,6 +773,7 @@ def test_a_new_library_is_tried_in_a_process_of_its_own(tmp_path, monkeypatch, b
     assert len(list(tmp_path.iterdir())) == is_kept, "what does not pass leaves nothing behind"
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_a_miscompiled_kernel_of_the_arm_is_not_used(lrm, tmp_path, monkeypatch):
     """A compiler that gets one function wrong: the arm is evaluated by the interpreter, with the right numbers."""

@@ -91,6 +91,7 @@ def irb(folder: Path, every: int, free: str, noise: float = 0.03) -> RunResult:
     return ran(folder, config, poses="\n".join([lines[0], *lines[1::every]]))
 
 
+@pytest.mark.slow
 def test_three_targets_that_nobody_configured_are_placed_before_errors_are_called_nominal(tmp_path: Path) -> None:
     """Of three targets one was placed, and the nominal arm was 178.8 mm off."""
     result = irb(tmp_path, 16, '"arm.mdh.a[2-3]"')

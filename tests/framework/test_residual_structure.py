@@ -140,6 +140,7 @@ def moving(lrm, late_s, seed, deg_s=5.0, **how):
     return recording(lrm, 100, seed, lambda q, came: late_s * rates.T, **columns, **how)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("late_s", "size"), [(0.1, "late"), (-0.02, "early")])
 def test_late_joints_of_an_arm_that_moved_are_named_with_their_delay(lrm, late_s, size):
     """Within a tenth; other rates, of an arm that stood where it was read, are no delay."""

@@ -124,6 +124,7 @@ def test_after_a_kill_too(command: list[str], ended: Path, tmp_path: Path) -> No
     assert reply["to"] == events(ended, "decision")[0]["last_good"]["sequence"]
 
 
+@pytest.mark.slow
 def test_what_cannot_be_rolled_back_is_refused_and_nothing_changes(ended: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(ended, tmp_path / "out")
     before, kept = records(folder), {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}

@@ -287,7 +287,7 @@ def test_poses_to_measure_next_move_a_joint_that_stood_still(tmp_path: Path, lim
 
 
 @pytest.mark.parametrize("free", ["[]", "[arm.spring.k1]"])
-@pytest.mark.quick("[]")
+@pytest.mark.slow
 def test_a_run_with_nothing_or_little_free_still_ends_in_a_report(tmp_path: Path, free: str) -> None:
     run = verdict(tmp_path / "run", f"parameters.free={free}", "validation.folds=0")
     told = [each["text"] for each in run["verdict"]["findings"]]

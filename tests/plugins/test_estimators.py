@@ -497,6 +497,7 @@ def test_fewer_equations_than_parameters_are_refused(lrm):
 # ---------------------------------------------------------------- how sure
 
 
+@pytest.mark.slow
 def test_deviations_are_those_of_the_oracles_differences(lrm):
     q, measured = simulated(oracle.published(), 80, 21)
     problem, records, start = posed(lrm, FEW, q, measured)
