@@ -22,9 +22,11 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 QUICK = ("validation.folds=0", "evaluator=interpreted")
 
 
-def ran(folder: Path, *settings: str, change=None) -> tuple[int, dict]:
+def ran(folder: Path, *settings: str, change=None, shuffled: bool = False) -> tuple[int, dict]:
     """The exit code and the verdict of the demonstration's run; ``change`` gets positions (N x 3, mm) to measure."""
     lines = [line.split(",") for line in (CONFIGS / "demo.csv").read_text().splitlines()]
+    if shuffled:
+        lines[1:] = [lines[1 + row] for row in np.random.default_rng(5).permutation(len(lines) - 1)]
     places = [lines[0].index(f"{axis}_mm") for axis in "xyz"]
     points = np.array([[float(line[place]) for place in places] for line in lines[1:]])
     for line, point in zip(lines[1:], points if change is None else change(points), strict=True):
@@ -74,11 +76,21 @@ def test_the_stated_noise_grades_no_fit(tmp_path: Path) -> None:
 @pytest.mark.parametrize("stated", [0.1, 0.5, 1.0])
 def test_a_jump_that_makes_a_third_of_the_error_is_bad(tmp_path: Path, stated: float) -> None:
     """The tracker was bumped by 5 mm in the middle: 1 % of the reach; the mean of both halves is no arm."""
-    moved = 5 * (np.arange(200) >= 100)[:, None]
-    code, verdict = ran(tmp_path, f"measurements.tracker.noise_mm={stated}", change=lambda points: points + moved)
+    moved, noise_mm = 5 * (np.arange(200) >= 100)[:, None], f"measurements.tracker.noise_mm={stated}"
+    code, verdict = ran(tmp_path, noise_mm, change=lambda points: points + moved, shuffled=True)
     assert code == 3 and "contradict" in bad(verdict)
-    told = next(f for f in verdict["findings"] if f["grade"] == "bad")
-    assert "moved" in told["action"]
+    found = next(f for f in verdict["findings"] if f["grade"] == "bad")
+    assert "moved" in found["action"]
+
+
+@pytest.mark.slow
+def test_a_jump_in_records_sorted_by_a_joint_is_bad_and_may_be_either(tmp_path: Path) -> None:
+    """The demonstration's rows are sorted by q1: what jumps half way may be a jump or an error of q1's own."""
+    moved = 5 * (np.arange(200) >= 100)[:, None]
+    code, verdict = ran(tmp_path, "measurements.tracker.noise_mm=0.5", change=lambda points: points + moved)
+    jump = next(f for f in verdict["findings"] if "jumps there as a whole" in f["text"])
+    assert code == 3 and "the model misses it" in bad(verdict) and "contradict" not in bad(verdict)
+    assert "do not identify which" in jump["text"] and "repeat some of the first poses" in jump["action"]
 
 
 @pytest.mark.slow
