@@ -11,7 +11,7 @@ import pytest
 from armcal.arm.assembly import only_arm
 from armcal.cli.main import cli
 from armcal.errors import ConfigError
-from armcal.run.iso_plan import corners_about, points_about
+from armcal.run.iso_plan import CORNERS, POINTS
 from click.testing import CliRunner, Result
 from scipy.spatial.transform import Rotation
 
@@ -71,7 +71,7 @@ def test_the_one_arm_of_a_system_or_a_sentence() -> None:
 
 def test_the_poses_are_on_the_diagonals_a_tenth_of_their_length_from_the_corners() -> None:
     centre, size = np.array([0.3, -0.2, 0.5]), 0.4
-    points, corners = points_about(centre[None], size)[0], corners_about(centre[None], size)[0]
+    points, corners = centre + size * POINTS, centre + size * CORNERS
     assert np.allclose(points[0], centre)
     diagonal = size * np.sqrt(3)
     from_corner = np.linalg.norm(points[1:, None] - corners, axis=2).min(axis=1)

@@ -16,7 +16,7 @@ from armcal.estimate.identifiability import Measure
 from armcal.measure.csv_writer import write_csv
 from armcal.planning.criterion import GOALS
 from armcal.run.experiment import Experiment
-from armcal.run.iso_plan import NAMES, make_iso_plan
+from armcal.run.iso_plan import NAMES, POINTS, make_iso_plan
 from armcal.run.plan import PlanResult, make_plan
 from armcal.run.plan_poses import counts_text, stated_beyond
 from armcal.run.settings import PlanSettings
@@ -199,12 +199,17 @@ def _show_iso_plan(
 ) -> None:
     """Plan the test in a cube of this size (m; None: the largest), write it to ``out`` and show it."""
     began = time.perf_counter()
-    plan = make_iso_plan(experiment, size, options["cycles"], options["directions"], options["calibration"])
-    write_csv(out, plan.dataset, experiment.request(measured=False).channels)
-    cube, turned = plan.cube, None
+    cube, dataset, warnings = make_iso_plan(
+        experiment, size, options["cycles"], options["directions"], options["calibration"]
+    )
+    write_csv(out, dataset, experiment.request(measured=False).channels)
+    turned = None
     if cube.rotation is not None:
         turned = Rotation.from_matrix(cube.rotation).as_euler("xyz", degrees=True).tolist()
-    centre, poses = (cube.centre * _MM).tolist(), dict(zip(NAMES, (cube.points * _MM).tolist(), strict=True))
+    centre, poses = (
+        (cube.centre * _MM).tolist(),
+        dict(zip(NAMES, ((cube.centre + cube.size * POINTS) * _MM).tolist(), strict=True)),
+    )
     console.result(
         {
             "experiment": experiment.name,
@@ -212,14 +217,13 @@ def _show_iso_plan(
             "tool_rpy_deg": turned,
             "poses": poses,
             "cycles": options["cycles"],
-            "visits": len(plan.dataset),
-            "directions": list(dict.fromkeys(plan.dataset.extra["direction"])),
-            "largest_joint_motion_rad_or_m": plan.motion,
-            "warnings": list(plan.warnings),
+            "visits": len(dataset),
+            "directions": list(dict.fromkeys(dataset.extra["direction"])),
+            "warnings": list(warnings),
             "out": str(out),
         }
     )
-    for text in plan.warnings:
+    for text in warnings:
         console.warn(text)
     at, angles = (", ".join(f"{number:.1f}" for number in numbers) for numbers in (centre, turned or ()))
     console.line(
@@ -228,6 +232,6 @@ def _show_iso_plan(
     )
     rows = ((name, *(f"{coordinate:.1f}" for coordinate in place)) for name, place in poses.items())
     console.table("Poses of the tool, mm, base frame", ("pose", "x", "y", "z"), rows)
-    visits = f"{len(plan.dataset)} visits in {options['cycles']} cycles"
+    visits = f"{len(dataset)} visits in {options['cycles']} cycles"
     console.line(f"{visits}: {out}  ({time.perf_counter() - began:.1f} s)")
     console.line("Measure each visit, add the columns of the instrument, and give the table to armcal acceptance.")
