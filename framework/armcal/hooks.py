@@ -7,7 +7,7 @@ A plugin is a Python module named by an entry point in the group ``armcal``. It 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Protocol
@@ -58,89 +58,37 @@ class ComponentKind:
     beside: tuple[str, ...] = ()
 
 
-@hookspec
-def armcal_register_models(register: Register) -> None:
-    """Arm models: the chain of joints, as an expression of its parameters."""
+REGISTRATIONS = {
+    "armcal_register_models": "Arm models: the chain of joints, as an expression of its parameters.",
+    "armcal_register_effects": "Joint effects: what stands between a joint's commanded and real displacement.",
+    "armcal_register_residuals": "Pose residuals: what the model leaves of a tool's pose, learned from records.",
+    "armcal_register_measurements": "Measurements: what an instrument or a contact reads in one record, or in two.",
+    "armcal_register_readers": "Readers: datasets from files.",
+    "armcal_register_estimators": "Batch estimators: all records at once.",
+    "armcal_register_online_estimators": "Online estimators: one record at a time.",
+    "armcal_register_simulators": "Simulators: datasets from a stated truth.",
+    "armcal_register_exporters": "Exporters: a calibrated arm as a file of another program.",
+    "armcal_register_links": "Links: what carries bytes to a servo board.",
+    "armcal_register_devices": "Devices: what moves joints, over a link.",
+    "armcal_register_trackers": "Live trackers: where bodies are, frame by frame.",
+    "armcal_register_joint_streams": "Live joint readings of arms that are guided by hand.",
+    "armcal_register_cameras": "Live cameras: what they see while an arm stands.",
+    "armcal_register_benches": "Simulated benches: what stands in for board, arm and tracker in a rehearsal.",
+    "armcal_register_commands": "Commands: what ``armcal NAME`` runs, a click command, imported when it is called.",
+    "armcal_register_report_sections": "Report sections: what a plugin adds to ``report.html`` of each run.",
+}
+"""The hooks that register components, ``def HOOK(register: Register) -> None``, and what each announces."""
 
 
-@hookspec
-def armcal_register_effects(register: Register) -> None:
-    """Joint effects: what stands between the commanded and the real displacement of a joint."""
+def _specified(hook: str, announced: str) -> Callable[[Register], None]:
+    def specification(register: Register) -> None: ...
+
+    specification.__name__ = specification.__qualname__ = hook
+    specification.__doc__ = announced
+    return hookspec(specification)
 
 
-@hookspec
-def armcal_register_residuals(register: Register) -> None:
-    """Pose residuals: what the physical model leaves of a tool's pose, learned from records."""
-
-
-@hookspec
-def armcal_register_measurements(register: Register) -> None:
-    """Measurements: what an instrument or a contact says of the arm in one record, or in two."""
-
-
-@hookspec
-def armcal_register_readers(register: Register) -> None:
-    """Readers: datasets from files."""
-
-
-@hookspec
-def armcal_register_estimators(register: Register) -> None:
-    """Batch estimators: all records at once."""
-
-
-@hookspec
-def armcal_register_online_estimators(register: Register) -> None:
-    """Online estimators: one record at a time."""
-
-
-@hookspec
-def armcal_register_simulators(register: Register) -> None:
-    """Simulators: datasets from a stated truth."""
-
-
-@hookspec
-def armcal_register_exporters(register: Register) -> None:
-    """Exporters: a calibrated arm as a file of another program."""
-
-
-@hookspec
-def armcal_register_links(register: Register) -> None:
-    """Links: what carries bytes to a servo board."""
-
-
-@hookspec
-def armcal_register_devices(register: Register) -> None:
-    """Devices: what moves joints, over a link."""
-
-
-@hookspec
-def armcal_register_trackers(register: Register) -> None:
-    """Live trackers: where bodies are, frame by frame."""
-
-
-@hookspec
-def armcal_register_joint_streams(register: Register) -> None:
-    """Live joint readings of arms that are guided by hand."""
-
-
-@hookspec
-def armcal_register_cameras(register: Register) -> None:
-    """Live cameras: what they see while an arm stands."""
-
-
-@hookspec
-def armcal_register_benches(register: Register) -> None:
-    """Simulated benches: what stands in for board, arm and tracker in a rehearsal."""
-
-
-@hookspec
-def armcal_register_commands(register: Register) -> None:
-    """Commands: what ``armcal NAME`` runs, a click command that is imported when it is called."""
-
-
-@hookspec
-def armcal_register_report_sections(register: Register) -> None:
-    """Report sections: what a plugin adds to ``report.html`` of each run."""
+globals().update({hook: _specified(hook, announced) for hook, announced in REGISTRATIONS.items()})
 
 
 @hookspec
