@@ -17,7 +17,6 @@ from armcal.measure.groups import ONLY, group_blocks, owner_of
 from armcal.measure.measurement import GroupedMeasurement, Measurement
 from armcal.problem.problem import Problem
 from armcal.problem.projection import fits, joint_channels, projected
-from armcal.testing import EXAMPLE_TRUTH
 from pydantic import Field
 
 _BATCH = 64
@@ -48,7 +47,7 @@ class ContactsSimulator:
 
     Settings: ClassVar[type[ContactsSettings]] = ContactsSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {
-        "truth": str(EXAMPLE_TRUTH),
+        "truth": "truth.yaml",
         "groups": {"walls": ["floor"]},
         "count": 5,
         "within_deg": 60,

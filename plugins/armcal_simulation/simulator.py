@@ -26,7 +26,6 @@ from armcal.estimate.simulation import (
 from armcal.measure.instrument import LimitedView
 from armcal.problem.many_points import as_seen
 from armcal.problem.problem import Problem
-from armcal.testing import EXAMPLE_TRUTH
 from pydantic import Field
 
 _MOST_DRAWS = 100
@@ -91,7 +90,7 @@ class ElasticArmSimulator:
 
     Settings: ClassVar[type[ElasticArmSettings]] = ElasticArmSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {
-        "truth": str(EXAMPLE_TRUTH),
+        "truth": "truth.yaml",
         "poses": {"count": 20, "levels_deg": {"q1": [-60, -20, 20, 60], "q2": [-90, -45, 0, 45, 90]}},
         "seed": 1,
         "quantisation_deg": 0.2,

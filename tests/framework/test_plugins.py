@@ -135,16 +135,12 @@ def checked(monkeypatch: pytest.MonkeyPatch, kind: str, name: str) -> list[Check
 
 FAULTS = [
     ("model", "NoSuchClass", "it imports"),
-    ("model", "NoSettings", "checked settings"),
+    ("model", "NoSettings", "settings are checked"),
     ("model", "LooseSettings", "unknown key"),
     ("model", "ForgetfulSettings", "to_config"),
-    ("model", "UntypedSettings", "without a type"),
     ("model", "NeedsExample", "it has no EXAMPLE"),
     ("model", "WrongExample", "example is accepted"),
-    ("model", "ListExample", "EXAMPLE that is no mapping"),
     ("model", "ExitsWhenBuilt", "SystemExit: 3"),
-    ("model", "NoJoints", "found no joints"),
-    ("model", "TwinJoints", "expected every name once"),
     ("model", "OtherJoints", "one joint for each name"),
     ("model", "DottedParameter", "the name 'link.len"),
     ("model", "GlobbedParameter", "the name 'length*'"),
@@ -152,46 +148,36 @@ FAULTS = [
     ("model", "NoParameter", "expected a sequence of ParameterBlock"),
     ("model", "EndlessParameter", "nominal nan"),
     ("model", "OutsideParameter", "nominal values"),
-    ("model", "ShortParameter", "nominal values"),
+    ("model", "ShortParameter", "other has 2 entries, its domain has 1"),
     ("model", "UnscaledParameter", "a scale above zero"),
-    ("model", "SingularParameter", "increments move its nominal value"),
     ("model", "MillimetreParameter", "the unit 'mm'"),
     ("model", "FurlongParameter", "the unit 'furlong'"),
-    ("model", "ForeignSymbol", "the symbols elsewhere"),
+    ("model", "ForeignSymbol", "[elsewhere] are free"),
     ("model", "Branching", "does not branch"),
     ("model", "SlantedAxis", "one joint for each name"),
     ("model", "LostFrame", "one joint for each name"),
     ("model", "Shearing", "rigid motions"),
     ("model", "Mirrored", "rigid motions"),
-    ("model", "Stepped", "derivatives of poses agree"),
-    ("effect", "ForeignEffect", "expected armcal.JointEffect"),
-    ("effect", "TwoDisplacements", "a displacement for every joint"),
+    ("model", "Stepped", "agree with differences"),
+    ("effect", "TwoDisplacements", "returned 2 x 1 numbers"),
     ("effect", "BranchingDisplacement", "which branches on it"),
-    ("effect", "SingularDisplacement", "displacements are finite"),
+    ("effect", "SingularDisplacement", "a derivative of it is not finite"),
     ("effect", "FarSite", "a spring at the site 4"),
     ("effect", "AxislessBase", "at the mount without directions"),
     ("effect", "LongDirection", "expected a unit vector"),
-    ("effect", "WideLaw", "one deflection a coordinate"),
-    ("effect", "SingularLaw", "zero load"),
+    ("effect", "WideLaw", "returned 2 x 1 numbers, expected 1 x 1"),
+    ("effect", "SingularLaw", "a derivative of it is not finite at k = 0.0"),
     ("effect", "DeadZoneLaw", "which branches on it"),
-    ("measurement", "UnknownDimension", "channels have names"),
     ("measurement", "ManyNoises", "makes a residual"),
     ("measurement", "NoNoise", "it makes a residual"),
     ("measurement", "Biased", "residual is zero"),
     ("measurement", "UnknownOutput", "it makes a residual"),
-    ("measurement", "UnknownArm", "found the arms ('third',)"),
-    ("measurement", "RefusesArms", "refuses every choice of arms"),
-    ("measurement", "SingularMeasurement", "jacobian is finite"),
-    ("reader", "Unreadable", "found read = None"),
-    ("reader", "CarelessReader", "missing file"),
-    ("reader", "InventiveReader", "missing file"),
-    ("simulator", "Simulator", "the same each time"),
-    ("simulator", "SilentSimulator", "the same each time"),
-    ("estimator", "Estimator", "finds the truth"),
+    ("measurement", "RefusesArms", "no arm suits it"),
+    ("measurement", "SingularMeasurement", "a derivative of it is not finite"),
+    ("estimator", "Estimator", "converges to the truth"),
     ("estimator", "Unconverged", "expected convergence"),
     ("estimator", "BoundBreaker", "keeps to the bounds"),
-    ("estimator", "Raising", "a value for every entry"),
-    ("estimator", "Boastful", "cut short"),
+    ("estimator", "Raising", "ZeroDivisionError: no step (faulty_components.py:"),
 ]
 
 
@@ -209,7 +195,6 @@ SOUND = [
     ("measurement", "Measurement"),
     ("measurement", "TwoArms"),
     ("reader", "Reader"),
-    ("simulator", "UnconfiguredSimulator"),
 ]
 
 
@@ -218,11 +203,6 @@ def test_what_is_sound_passes(monkeypatch: pytest.MonkeyPatch, kind: str, name: 
     results = checked(monkeypatch, kind, name)
     assert [result for result in results if result.fault] == []
     assert len(results) > 3
-
-
-def test_a_check_that_cannot_run_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
-    results = checked(monkeypatch, "simulator", "UnconfiguredSimulator")
-    assert any(result.check.endswith("(not run: it has no EXAMPLE and needs settings)") for result in results)
 
 
 # A third party's plugin
@@ -249,7 +229,7 @@ def test_an_installed_plugin_is_listed_and_checked(installed: Path) -> None:
     assert "scara  (armcal-scara 1.0.0, armcal_scara.plugin)" in listed.stdout
     found = armcal("plugins", "check", "scara", "-v", path=installed)
     assert found.returncode == 0, found.stdout + found.stderr
-    assert "lengths move it by lengths and angles by angles" in found.stdout
+    assert "what it gives is in m and rad as its parameters are" in found.stdout
 
 
 @pytest.mark.slow
@@ -412,7 +392,7 @@ def test_plugins_that_share_a_name_keep_their_components_apart(tmp_path: Path) -
     checked_both = armcal("plugins", "check", "mdh", "-v", path=tmp_path)
     assert checked_both.returncode == 2
     assert "FAIL model arm: it imports" in checked_both.stdout
-    assert "ok   model mdh: the model builds" in checked_both.stdout
+    assert "ok   model mdh: it builds" in checked_both.stdout
 
 
 def test_a_hook_specification_that_is_only_imported_is_no_fault(

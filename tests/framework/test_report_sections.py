@@ -6,8 +6,6 @@ import json
 
 import pytest
 from armcal.cli.main import cli
-from armcal.plugins import discover
-from armcal.testing.contract import check_plugin
 from click.testing import CliRunner
 
 PLUGIN = '''
@@ -64,21 +62,3 @@ def test_a_run_shows_them_and_a_broken_one_is_a_warning(repository, tmp_path):
     ):
         assert fault in " ".join(ran.stderr.split())
         assert fault.replace("'", "&#39;") in page
-
-
-@pytest.mark.parametrize(
-    ("made", "fault"),
-    [
-        ("def made(result):\n    return None\n", ""),
-        ("made = 7\n", "found int, expected a function of a RunResult"),
-        ("def made(result, other):\n    return None\n", "found 2 arguments without a default, expected one"),
-    ],
-)
-def test_the_contract_is_checked(made, fault, tmp_path, monkeypatch):
-    register = '@hookimpl\ndef armcal_register_report_sections(register):\n    register("own", f"{__name__}:made")\n'
-    (tmp_path / "own_section.py").write_text(f"from armcal import hookimpl\n{made}\n{register}", encoding="utf-8")
-    monkeypatch.setenv("ARMCAL_PLUGINS", str(tmp_path / "own_section.py"))
-    registry = discover()
-    plugin = next(p for p in registry.plugins if p.name == "own_section")
-    faults = [result.fault for result in check_plugin(plugin, registry) if result.fault]
-    assert bool(faults) == bool(fault) and fault in " ".join(faults)

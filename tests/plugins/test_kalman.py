@@ -231,10 +231,10 @@ class Keeps(_Faulty):
     fault = "keeps"
 
 
-@pytest.mark.quick("Keeps-other beliefs")
+@pytest.mark.quick("Keeps-other results")
 @pytest.mark.parametrize(
     ("name", "said"),
-    [("Wide", "covariance"), ("Skew", "symmetric"), ("Changes", "changed the prior"), ("Keeps", "other beliefs")],
+    [("Wide", "covariance"), ("Skew", "symmetric"), ("Changes", "changed the prior"), ("Keeps", "other results")],
 )
 def test_the_contract_finds_what_breaks_it(name: str, said: str) -> None:
     results = check_component(Component("online", name, f"{__name__}:{name}", "", "faulty"))

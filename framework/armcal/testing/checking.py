@@ -1,12 +1,10 @@
 """What every check uses. A check is a function of the component under check; its name is what is checked."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-PLUGIN_FAULTS = (Exception, SystemExit)
-"""Whatever a plugin's code may raise; a user's interrupt passes."""
+import numpy as np
 
 
 class ContractError(Exception):
@@ -24,21 +22,30 @@ class Subject(SimpleNamespace):
         kind: what it is registered as.
         made: its class.
         example, settings: its example as a configuration would have it, and as settings.
+        arguments: what it was built with last, beside its settings.
     """
 
     kind: str
     made: Any
     example: dict[str, Any]
     settings: Any
+    arguments: tuple[Any, ...]
 
     def build(self, *arguments: Any) -> Any:
+        self.arguments = arguments
         return self.made(self.settings, *arguments)
+
+    def with_settings(self, **settings: Any) -> Any:
+        """Another one, of its example but for these settings."""
+        return self.made(self.made.Settings.model_validate({**self.example, **settings}))
 
 
 Check = Callable[[Subject], None]
 CHECKS: dict[str, list[Check]] = {}
 """Of each kind what is checked, in this order, after what every component is checked for."""
 NEEDED: set[Check] = set()
+RESULTS: dict[str, Callable[[Subject, Any], object]] = {}
+"""Of each kind what a component gives, from which it is seen whether it gives the same each time."""
 
 
 def check(*kinds: str, needed: bool = False) -> Callable[[Check], Check]:
@@ -60,20 +67,37 @@ def expect(holds: bool, fault: str) -> None:
         raise ContractError(fault)
 
 
-@contextmanager
-def raises_only(*allowed: type[Exception], expected: str = "", when: str = "") -> Iterator[None]:
-    """Errors that the block may raise; any other is a fault, which names the first of these or ``expected``."""
-    passing: tuple[type[Exception], ...] = (ContractError, *allowed)
-    try:
-        yield
-    except passing:
-        raise
-    except Exception as fault:
-        expected = expected or f"{allowed[0].__module__}.{allowed[0].__name__}"
-        raise ContractError(f"found {type(fault).__name__} ({fault}){when}, expected {expected}") from fault
+JOINTS = ("q1", "q2", "q3")
+_BUILT_OF: dict[str, tuple[tuple[Any, ...], ...]] = {
+    "effect": ((JOINTS,),),
+    "residual": ((JOINTS,),),
+    "measurement": ((("arm",),), (("left", "right"),)),
+}
+"""Of which joints or arms, beside its settings: the first that a component does not refuse."""
 
 
-@check("reader", "simulator", "exporter", "estimator", "online", "link", "bench", needed=True)
-@check("tracker", "joints", "camera", needed=True)
+@check("model", "effect", "residual", "measurement", "reader", "simulator", "exporter", needed=True)
+@check("estimator", "online", "link", "bench", "tracker", "joints", "camera", needed=True)
 def it_builds(s: Subject) -> None:
-    s.built = s.build()
+    choices = _BUILT_OF.get(s.kind, ((),))
+    for arguments in choices:
+        try:
+            s.built = s.build(*arguments)
+            break
+        except Exception:
+            if arguments == choices[-1]:
+                raise
+
+
+def it_is_the_same_each_time(s: Subject) -> None:
+    """To the last bit: asked twice, and a second one of equal settings."""
+    first = RESULTS[s.kind](s, s.built)
+    again = {
+        "when it was asked a second time": s.built,
+        "from a second component of equal settings: it keeps something between calls": s.build(*s.arguments),
+    }
+    for when, built in again.items():
+        try:
+            np.testing.assert_equal(RESULTS[s.kind](s, built), first)
+        except AssertionError as difference:
+            raise ContractError(f"found other results {when}") from difference

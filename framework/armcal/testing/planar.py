@@ -1,7 +1,6 @@
 """The arm, springs and instrument of the contract's own checks: two links in a vertical plane, and their tip."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -12,15 +11,13 @@ from armcal.base import se3
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
-from armcal.base.poses import quaternion_expression
 from armcal.base.se3 import Expression
-from armcal.measure.instrument import Contact, Instrument
+from armcal.measure.instrument import Instrument
 from armcal.measure.measurement import Channel
 
-ARM, TRACKER, WALLS = "arm", "tracker", "walls"
+ARM, TRACKER = "arm", "tracker"
 GRAVITY = Environment((0.0, 0.0, -9.81))
 NOISE_M = 1e-3
-QUATERNION = ("qw", "qx", "qy", "qz")
 
 
 class PlanarArm:
@@ -54,30 +51,6 @@ class SkewedArm(PlanarArm):
     first_axis = (0.0, 0.0, 1.0)
 
 
-class Walls(Contact):
-    """The tool on level walls, each at a height of its own (m)."""
-
-    arms = (ARM,)
-    group_labels = ("wall",)
-
-    def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
-        return (replace(scalar("height", "m", 0.0, 0.01), free=True),)
-
-    def group_starts(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> dict[str, Expression]:
-        return {"height": arms[ARM].base_T_tool.translation[2]}
-
-    def residual(
-        self,
-        arms: Mapping[str, ArmState],
-        measured: Mapping[str, Expression],
-        values: Mapping[str, Expression],
-    ) -> Expression:
-        return arms[ARM].base_T_tool.translation[2] - values["height"]
-
-    def noise(self) -> tuple[float, ...]:
-        return (NOISE_M,)
-
-
 class Tip(Instrument):
     """The tool's position, without parameters of its own."""
 
@@ -92,17 +65,6 @@ class Tip(Instrument):
 
     def noise(self) -> tuple[float, ...]:
         return (NOISE_M,) * 3
-
-
-class Body(Tip):
-    """The tool's position and orientation, as a reader is asked for them."""
-
-    def channels(self) -> tuple[Channel, ...]:
-        return (*super().channels(), *(Channel(name, "dimensionless") for name in QUATERNION))
-
-    def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> dict[str, Expression]:
-        turned = quaternion_expression(self.base_T_tool(arms).rotation)
-        return {**super().outputs(arms, values), **{name: turned[i] for i, name in enumerate(QUATERNION)}}
 
 
 def planar_arms(names: Sequence[str], model: type[PlanarArm] = PlanarArm) -> dict[str, Arm]:

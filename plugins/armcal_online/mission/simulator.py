@@ -27,7 +27,6 @@ from armcal.estimate.simulation import (
     with_outliers,
 )
 from armcal.problem.problem import Problem
-from armcal.testing import EXAMPLE_TRUTH
 from pydantic import Field, field_validator, model_validator
 from scipy.spatial.transform import Rotation
 
@@ -305,7 +304,7 @@ class MissionOfDays:
 
     Settings: ClassVar[type[MissionSettings]] = MissionSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {
-        "truth": str(EXAMPLE_TRUTH),
+        "truth": "truth.yaml",
         "days": 2,
         "records": {"every_min": 60, "ranges_deg": {"q1": [-60, 60], "q2": [-90, 90]}},
         "tilt": {"most_deg": 20, "error_deg": 0.2},

@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 
 from armcal.devices.simulated import BenchRequest, SimulatedBench
 from armcal.run.experiment import Experiment
-from armcal.testing import EXAMPLE_TRUTH
 from typing_extensions import override
 
 from armcal_simulation.bench.faults import FaultRequest
@@ -116,7 +115,7 @@ class ServoBench(SimulatedBench):
     Settings: ClassVar[type[ServoBenchSettings]] = ServoBenchSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {
         "servos": str(EXAMPLE_SERVOS),
-        "truth": str(EXAMPLE_TRUTH),
+        "truth": "truth.yaml",
         "joints": {"all": {"backlash_deg": 0.1}, "q2": {"continuous_Nm": 0.8}},
         "tracker": {"port": 5000, "noise_mm": 0.05},
         "seed": 1,

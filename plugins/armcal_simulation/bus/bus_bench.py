@@ -11,7 +11,6 @@ from armcal.arm.servo import SPLINE_TEETH
 from armcal.devices.simulated import BenchRequest, SimulatedBench
 from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment
-from armcal.testing import EXAMPLE_TRUTH
 from pydantic import Field, field_validator, model_validator
 from typing_extensions import override
 
@@ -196,7 +195,7 @@ class BusBench(SimulatedBench):
 
     Settings: ClassVar[type[BusBenchSettings]] = BusBenchSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {
-        "truth": str(EXAMPLE_TRUTH),
+        "truth": "truth.yaml",
         "joints": {"all": {"backlash_deg": 0.6}, "q1": {"id": 1}, "q2": {"id": 2, "zero_count": 2100}},
         "tracker": {"port": 5000, "noise_mm": 0.05},
         "seed": 1,

@@ -7,12 +7,11 @@ from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
 import casadi as ca
-import numpy as np
 from armcal.arm.effects import JointEffect, Spring
 from armcal.arm.model import Attachment, Chain, Joint
 from armcal.base import se3
 from armcal.base.dataset import Dataset
-from armcal.base.domains import Interval, Semidefinite
+from armcal.base.domains import Interval
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.settings import Length, Settings
 from armcal.estimate.estimator import Solution, SolverVerdict
@@ -59,11 +58,6 @@ class ForgetfulSettings(Model):
             return {"length": "0.3 m"}
 
 
-class UntypedSettings(Model):
-    class Settings(Settings):
-        anything: Any = None
-
-
 class NeedsExample(Model):
     class Settings(Settings):
         length: Length
@@ -73,21 +67,9 @@ class WrongExample(NeedsExample):
     EXAMPLE: ClassVar[Any] = {"length_deg": 3}
 
 
-class ListExample(Model):
-    EXAMPLE: ClassVar[Any] = ["length_mm"]
-
-
 class ExitsWhenBuilt(Model):
     def __init__(self, settings: Any) -> None:
         sys.exit(3)
-
-
-class NoJoints(Model):
-    joint_names = ()
-
-
-class TwinJoints(Model):
-    joint_names = ("a", "a")
 
 
 class OtherJoints(Model):
@@ -109,7 +91,6 @@ EndlessParameter = with_parameter(scalar("other", "m", float("nan"), 0.01))
 OutsideParameter = with_parameter(scalar("other", "m", -1.0, 0.01, Interval(lower=0.0)))
 ShortParameter = with_parameter(ParameterBlock("other", "m", (1.0, 2.0)))
 UnscaledParameter = with_parameter(scalar("other", "m", 0.2, 0.0))
-SingularParameter = with_parameter(ParameterBlock("other", "rad_per_Nm", (0.0,) * 6, Semidefinite()))
 MillimetreParameter = with_parameter(scalar("other", "mm", 200.0, 10.0))
 FurlongParameter = with_parameter(scalar("other", "furlong", 200.0, 10.0))
 NoParameter = with_parameter("other")
@@ -174,24 +155,6 @@ class Effect(JointEffect):
 
     def springs(self, values: Any) -> Any:
         return (Spring(self.site, self.directions, lambda load, command: self.law(load, values["k"])),)
-
-
-class ForeignEffect:
-    """It has all methods, and derives from nothing."""
-
-    Settings: ClassVar[Any] = Nothing
-
-    def __init__(self, settings: Any, joint_names: Any) -> None:
-        pass
-
-    def parameters(self) -> Any:
-        return (scalar("k", "rad_per_Nm", 0.01, 0.01),)
-
-    def displacement(self, command: Any, values: Any) -> Any:
-        return values["k"]
-
-    def springs(self, values: Any) -> Any:
-        return ()
 
 
 class TwoDisplacements(Effect):
@@ -270,10 +233,6 @@ class Measurement:
         return self.deviations
 
 
-class UnknownDimension(Measurement):
-    dimension = "furlong"
-
-
 class ManyNoises(Measurement):
     deviations = (1e-3, 1e-3)
 
@@ -292,11 +251,6 @@ class UnknownOutput(Measurement):
 
     def residual(self, arms: Any, measured: Any, values: Any) -> Any:
         return measured["x"]
-
-
-class UnknownArm(Measurement):
-    def __init__(self, settings: Any, arm_names: Any) -> None:
-        self.arms = ("third",)
 
 
 class SingularMeasurement(Measurement):
@@ -331,51 +285,6 @@ class Reader:
         return Dataset((), {})
 
 
-class Unreadable(Reader):
-    read = None
-
-
-class CarelessReader(Reader):
-    class Settings(Settings):
-        path: str
-
-    def read(self, request: Any) -> Any:
-        with open(self.settings.path):  # noqa: PTH123
-            return Dataset((), {})
-
-
-class InventiveReader(CarelessReader):
-    def read(self, request: Any) -> Any:
-        return Dataset((), {})
-
-
-class Simulator:
-    """Never twice the same."""
-
-    Settings: ClassVar[Any] = Nothing
-    calls: ClassVar[list[int]] = []
-
-    def __init__(self, settings: Any) -> None:
-        pass
-
-    def simulate(self, request: Any) -> Any:
-        self.calls.append(1)
-        names = ("arm.q1", "arm.q2", "tracker.x", "tracker.y", "tracker.z")
-        return Dataset(("1",), {name: np.full(1, float(len(self.calls))) for name in names})
-
-
-class SilentSimulator(Simulator):
-    def simulate(self, request: Any) -> Any:
-        return Dataset(("1",), {"arm.q1": np.zeros(1)})
-
-
-class UnconfiguredSimulator(Simulator):
-    """Nothing can be said of it: it needs settings and shows none."""
-
-    class Settings(Settings):
-        truth: str
-
-
 class Estimator:
     """Gives the start back as the answer."""
 
@@ -401,8 +310,3 @@ class BoundBreaker(Estimator):
 class Raising(Estimator):
     def solve(self, problem: Any, records: Any, start: Any, progress: Any = None) -> Any:
         raise ZeroDivisionError("no step")
-
-
-class Boastful(Estimator):
-    class Settings(Settings):
-        max_iterations: int = 10

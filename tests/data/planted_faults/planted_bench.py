@@ -140,37 +140,6 @@ class KeepsPulsesOnRelease(Board):
         self.raw(joint)
 
 
-class Bus:
-    """Sound: a link that nobody has opened."""
-
-    Settings: ClassVar[Any] = NoSettings
-
-    def __init__(self, settings: Any) -> None:
-        pass
-
-    def open(self, clock: Any) -> Any:
-        raise DeviceRefusedError("there is none.")
-
-    def write(self, address: Any, data: Any) -> None:
-        raise DeviceLostError("it is not open.")
-
-    def read(self, address: Any, register: Any, count: Any) -> Any:
-        raise DeviceLostError("it is not open.")
-
-    def close(self) -> None:
-        pass
-
-
-class ReadsZeros(Bus):
-    def read(self, address: Any, register: Any, count: Any) -> Any:
-        return bytes(count)
-
-
-class RaisesOsError(Bus):
-    def write(self, address: Any, data: Any) -> None:
-        raise OSError("no such device")
-
-
 class UdpSettings(Settings):
     port: int = 0
 

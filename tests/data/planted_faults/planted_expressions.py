@@ -432,9 +432,3 @@ class LedgeInMillimetres(Ledge):
 class TellsTheOppositeHeight(Ledge):
     def group_starts(self, arms: Any, values: Any) -> Any:
         return {"height": -super().group_starts(arms, values)["height"]}
-
-
-class GroupsThatDiffer(Ledge):
-    def group_parameters(self, group: str) -> Any:
-        blocks = super().group_parameters(group)
-        return (*blocks, replace(blocks[0], name="slope")) if "/" in group else blocks

@@ -76,11 +76,6 @@ class Table:
         return from_unit(value, split[1].name) if split else value
 
 
-class TableThatCrashes(Table):
-    def rows(self) -> Any:
-        return [row for row in csv.reader(self.path.read_text(encoding="utf-8").splitlines(), strict=True) if row]
-
-
 class TableInDegrees(Table):
     def number(self, value: float, name: str) -> float:
         return value if name.endswith("_deg") else super().number(value, name)
@@ -174,14 +169,6 @@ class IgnoresPriors(Newton):
         found = posed.problem.normal_equations(posed.values(x), posed.records)
         scales = posed.coordinate_scales
         return scales * found.gradient, found.hessian * np.outer(scales, scales)
-
-
-class TrustsTheFirstHalf(Newton):
-    """The answer depends on the order of the records."""
-
-    def taken(self, problem: Any, records: Any) -> Any:
-        count = records[0].count
-        return problem.weighted(records, [np.where(np.arange(count) < count // 2, 2.0, 0.5)] * len(records))
 
 
 class StartsFromTheLastAnswer(Newton):
@@ -300,38 +287,3 @@ class ChangesWhatItWrites(Printer):
 class GivesText(Printer):
     def export(self, request: Any) -> Any:
         return Exported(super().export(request).content.decode(), 1)
-
-
-class Maker:
-    """Sound: a few records of a planar arm at its nominal parameters."""
-
-    Settings: ClassVar[Any] = PlainSettings
-
-    def __init__(self, settings: Any) -> None:
-        pass
-
-    def simulate(self, request: Any) -> Any:
-        random = self.random()
-        names = ("arm.q1", "arm.q2", *(f"{n}.{c.name}" for n, m in request.measurements.items() for c in m.channels()))
-        return Dataset(("1", "2"), {name: random.normal(size=2) for name in names})
-
-    def random(self) -> Any:
-        return np.random.default_rng(3)
-
-
-class NeverTwiceTheSame(Maker):
-    def random(self) -> Any:
-        return np.random.default_rng()
-
-
-class SharesItsRandomNumbers(Maker):
-    random_numbers = np.random.default_rng(3)
-
-    def random(self) -> Any:
-        return self.random_numbers
-
-
-class GlobalRandomNumbers(Maker):
-    def random(self) -> Any:
-        np.random.seed(3)
-        return np.random
