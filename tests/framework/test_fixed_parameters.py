@@ -31,9 +31,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An arm whose target sits beside its last axis, with records of it."""
     place = tmp_path_factory.mktemp("fixed")
     (place / "rows.csv").write_text(ROWS, encoding="utf-8")
-    robot = replace(robot_of_rows("arm", "standard", read_rows(place / "rows.csv")), target=(0.08, 0.04, 0.06))
-    made = write_robot(robot, place / "arm", REGISTRY)
-    assert set(OFF_THE_AXIS) <= set(made.choice.kept)
+    robot = replace(
+        robot_of_rows("arm", "standard", read_rows(place / "rows.csv", discover())), target=(0.08, 0.04, 0.06)
+    )
+    choice = write_robot(robot, place / "arm", REGISTRY)
+    assert set(OFF_THE_AXIS) <= set(choice.kept)
     return place / "arm"
 
 

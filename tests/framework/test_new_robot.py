@@ -23,7 +23,7 @@ from armcal.run.pipeline import calibrate
 from armcal.run.prepare import Stopwatch, prepare
 from armcal.scaffold.plugin_files import number, word
 from armcal.scaffold.robot import RobotJoint, Row, read_rows, robot_of_rows, robot_of_urdf
-from armcal.scaffold.robot_files import RECORDS, SIMULATED, RobotFolder, _levels, write_robot
+from armcal.scaffold.robot_files import RECORDS, SIMULATED, _levels, write_robot
 from click.testing import CliRunner, Result
 from scaffolds import ROOT, commands_of, files_of, page
 
@@ -94,21 +94,22 @@ def test_the_calibration_is_nearer_to_the_truth_everywhere_than_the_drawing(here
 def test_first_runs_warn_by_chance_only_as_often_as_one_test_at_5_percent(here: Path, seeds: int) -> None:
     """Over seeds of the noise: each finding has a level of its own, and of a few records one run in five warns."""
     rows = read_rows(
-        here / table(here, f"{HEADER},mass_g,com_x_mm\n90,0,0,120,400,0\n0,200,0,0,900,-100\n0,160,0,0,500,-80\n")
+        here / table(here, f"{HEADER},mass_g,com_x_mm\n90,0,0,120,400,0\n0,200,0,0,900,-100\n0,160,0,0,500,-80\n"),
+        REGISTRY,
     )
-    made = write_robot(replace(robot_of_rows("arm", "standard", rows), up=(0, 0, 1)), here / "arm", REGISTRY)
-    warned = [seed for seed in range(1, seeds + 1) if warnings_of_a_first_run(made, seed)]
+    write_robot(replace(robot_of_rows("arm", "standard", rows), up=(0, 0, 1)), here / "arm", REGISTRY)
+    warned = [seed for seed in range(1, seeds + 1) if warnings_of_a_first_run(here / "arm", seed)]
     assert len(warned) <= 1, warned
 
 
-def warnings_of_a_first_run(made: RobotFolder, seed: int) -> list[str]:
+def warnings_of_a_first_run(folder: Path, seed: int) -> list[str]:
     """What the calibration of its simulated records warns of, their noise drawn from a seed."""
     seeded = f"simulation.seed={seed}"
     ran = CliRunner().invoke(
-        cli, ["simulate", str(made.folder / SIMULATED), "--set", seeded, "--out", str(made.folder / RECORDS)]
+        cli, ["simulate", str(folder / SIMULATED), "--set", seeded, "--out", str(folder / RECORDS)]
     )
     assert ran.exit_code == 0, ran.output
-    verdict = calibrate(Experiment.load(made.folder / SIMULATED, registry=REGISTRY)).verdict
+    verdict = calibrate(Experiment.load(folder / SIMULATED, registry=REGISTRY)).verdict
     return [finding.text for finding in verdict.findings if finding.grade in ("bad", "warning")]
 
 
@@ -117,20 +118,20 @@ def warnings_of_a_first_run(made: RobotFolder, seed: int) -> list[str]:
 
 @pytest.mark.slow
 def test_nothing_that_is_free_is_redundant_or_unknown(here: Path) -> None:
-    rows = read_rows(here / table(here, files_of(PAGE)["arm5.csv"]))
-    made = write_robot(robot_of_rows("arm5", "standard", rows), here / "arm5", REGISTRY)
+    rows = read_rows(here / table(here, files_of(PAGE)["arm5.csv"]), REGISTRY)
+    choice = write_robot(robot_of_rows("arm5", "standard", rows), here / "arm5", REGISTRY)
     experiment = Experiment.load(here / "arm5" / "simulated.yaml", registry=REGISTRY)
     ready = prepare(experiment, Stopwatch())
     assert not [text for text in ready.warnings if "determine" in text]
-    assert {block.name for block in ready.problem.parameters.free} == set(made.choice.kept)
+    assert {block.name for block in ready.problem.parameters.free} == set(choice.kept)
     # Six of the base, four a joint less two of the last, three of the target and its gauge; springs 2 to 4 are loaded.
-    assert {"arm.mdh.base_x", "arm.mdh.base_rz", "tracker.target_z", "arm.mdh.after2_ry"} <= set(made.choice.kept)
-    assert {"arm.mdh.theta1", "arm.mdh.d1", "arm.spring.k1"} <= {dropped.name for dropped in made.choice.redundant}
-    assert {"arm.spring.k2", "arm.spring.k3"} <= set(made.choice.kept)
+    assert {"arm.mdh.base_x", "arm.mdh.base_rz", "tracker.target_z", "arm.mdh.after2_ry"} <= set(choice.kept)
+    assert {"arm.mdh.theta1", "arm.mdh.d1", "arm.spring.k1"} <= {dropped.name for dropped in choice.redundant}
+    assert {"arm.spring.k2", "arm.spring.k3"} <= set(choice.kept)
 
 
 def test_the_rows_are_those_of_the_table(here: Path) -> None:
-    rows = read_rows(here / table(here, files_of(PAGE)["arm5.csv"]))
+    rows = read_rows(here / table(here, files_of(PAGE)["arm5.csv"]), REGISTRY)
     write_robot(robot_of_rows("arm5", "standard", rows), here / "arm5", REGISTRY)
     told = yaml.safe_load((here / "arm5" / "arm.yaml").read_text(encoding="utf-8"))["arms"]["arm"]
     lines = [line.split(",") for line in files_of(PAGE)["arm5.csv"].splitlines()[1:]]
@@ -157,7 +158,7 @@ def test_units_names_and_kinds_of_a_table(here: Path) -> None:
         "revolute,2,3.141592653589793,0.2,0,0,,,,,1.5\n"
         "prismatic,quill,0,0,0,0,,,0,150,\n"
     )
-    rows = read_rows(here / table(here, b"\xef\xbb\xbf" + text.encode()))
+    rows = read_rows(here / table(here, b"\xef\xbb\xbf" + text.encode()), REGISTRY)
     assert [row.joint.name for row in rows] == ["q1", "q2", "quill"]
     assert [row.joint.turns for row in rows] == [True, True, False]
     assert (rows[0].a, rows[0].d, rows[1].alpha) == pytest.approx((0.25, 0.3, math.pi))
@@ -398,10 +399,10 @@ def test_a_target_off_the_last_axis_is_stated_and_estimated(here: Path) -> None:
 def test_a_target_that_was_not_stated_is_taken_to_sit_beside_the_last_axis(here: Path) -> None:
     """Then all is free that a target beside the axis shows, as where its place was stated."""
     rows = robot_of_rows(
-        "arm", "standard", read_rows(here / table(here, f"{HEADER}\n90,0,0,90\n90,160,0,0\n0,0,0,90\n"))
+        "arm", "standard", read_rows(here / table(here, f"{HEADER}\n90,0,0,90\n90,160,0,0\n0,0,0,90\n"), REGISTRY)
     )
     places = {"unstated": None, "beside": (0.03, -0.012, 0.055), "on": (0.0, 0.0, 0.055)}
-    free = {n: set(write_robot(replace(rows, target=at), here / n, REGISTRY).choice.kept) for n, at in places.items()}
+    free = {n: set(write_robot(replace(rows, target=at), here / n, REGISTRY).kept) for n, at in places.items()}
     assert free["unstated"] == free["beside"]
     assert free["beside"] - free["on"] == {"arm.mdh.alpha2", "arm.mdh.a2"}
 
@@ -418,31 +419,34 @@ TABLES = {
     "a column without its unit": ("alpha,a_mm,theta_deg,d_mm\n0,1,2,3\n", ":1, alpha: alpha has no unit. Write alpha_"),
     "another unit": ("alpha_mm,a_mm,theta_deg,d_mm\n", ":1, alpha_mm: alpha_mm has a unit of length"),
     "a missing column": ("alpha_deg,a_mm,theta_deg\n", "found no column for d, expected d_m or d_cm or d_mm"),
-    "a misspelt column": (f"{HEADER},masss_g\n", "Did you mean mass_g?"),
+    "a misspelt column": (
+        f"{HEADER},masss_g\n0,1,2,3,4\n",
+        "masss_g: found the column 'masss_g', expected some of name, joint, type,",
+    ),
     "a column twice": (f"{HEADER},a_m\n", ":1, a_mm: found both a_m and a_mm"),
     "another delimiter": (HEADER.replace(",", ";") + "\n", ":1: found ';' between the columns"),
-    "NaN": (f"{HEADER}\n0,1,2,3\n0,1,nan,3\n", ":3, theta_deg: found 'nan', expected a number"),
-    "infinity": (f"{HEADER}\n0,1,2,3\n0,inf,0,3\n", ":3, a_mm: found 'inf', expected a number"),
-    "too much": (f"{HEADER}\n0,1,2,3\n1e300,1,0,3\n", ":3, alpha_deg: found 1e300 deg, expected an arm's angle"),
-    "an empty cell": (f"{HEADER}\n0,1,,3\n", ":2, theta_deg: found nothing"),
+    "NaN": (f"{HEADER}\n0,1,2,3\n0,1,nan,3\n", ":3: theta_deg is empty or NaN. Write a number, 0 for none."),
+    "infinity": (f"{HEADER}\n0,1,2,3\n0,inf,0,3\n", ":3: a_mm is infinite"),
+    "too much": (f"{HEADER}\n0,1,2,3\n1e300,1,0,3\n", ":3, alpha: found 1e+300 deg, expected an arm's angle"),
+    "an empty cell": (f"{HEADER}\n0,1,,3\n0,1,2,3\n", ":2: theta_deg is empty or NaN"),
     "a text": (f"{HEADER}\n0,1,2 deg,3\n", ":2, theta_deg: found '2 deg'"),
     "a decimal comma": (f'{HEADER}\n0,"1,5",2,3\n', ":2, a_mm: found '1,5', a decimal comma"),
     "one row": (f"{HEADER}\n0,1,2,3\n", ":2: found 1 joint, expected 2 to 20"),
-    "no row": (f"{HEADER}\n", "found 0 joints"),
+    "no row": (f"{HEADER}\n", "found a header and no records"),
     "a short line": (f"{HEADER}\n0,1,2,3\n0,1,2\n", ":3: found 3 cells, expected 4"),
     "a long line": (f"{HEADER}\n0,1,2,3,4\n", ":2: found 5 cells, expected 4"),
     "an open quote": (f'{HEADER}\n0,1,"2,3\n', "not CSV"),
     "no UTF-8": (f"{HEADER}\n0,1,2,".encode() + b"\xff\n", ":2: found the byte 0xff"),
     "NUL": (f"{HEADER}\n0,1,2,\0\n", ":2: found a NUL byte"),
     "nothing": ("", "it is empty"),
-    "limits the wrong way": (f"{HEADER},lower_deg,upper_deg\n0,1,2,3,9,-9\n", ":2, lower_deg: found no lower limit"),
-    "half of the limits": (f"{HEADER},lower_deg,upper_deg\n0,1,2,3,9,\n", ":2, lower_deg: found no lower limit"),
+    "limits the wrong way": (f"{HEADER},lower_deg,upper_deg\n0,1,2,3,9,-9\n", ":2, lower angle: found no lower limit"),
+    "half of the limits": (f"{HEADER},lower_deg,upper_deg\n0,1,2,3,9,\n", ":2, lower angle: found no lower limit"),
     "limits of the other kind": (
         f"{HEADER},type,lower_deg,upper_deg\n0,1,2,3,prismatic,0,9\n",
-        ":2, lower_deg: found a limit of angle, and the joint slides",
+        ":2, lower angle: found a limit of angle, and the joint slides. Write them under lower_m or",
     ),
     "an unknown type": (f"{HEADER},type\n0,1,2,3,ball\n", ":2, type: found 'ball'"),
-    "a mass below zero": (f"{HEADER},mass_g\n0,1,2,3,-1\n", ":2, mass_g: found a mass below zero"),
+    "a mass below zero": (f"{HEADER},mass_g\n0,1,2,3,-1\n", ":2, mass: found a mass below zero"),
     "a name twice": (f"{HEADER},name\n0,1,2,3,a\n0,1,2,3,a\n", ":3: found the joint name 'a', a second time"),
     "a name that is taken": (f"{HEADER},name\n0,1,2,3,a\n0,1,2,3,x\n", ":3: found the joint name 'x'"),
     "a name like a unit": (f"{HEADER},name\n0,1,2,3,a_mm\n0,1,2,3,b\n", ":2: found the joint name 'a_mm'"),
@@ -454,7 +458,7 @@ TABLES = {
 def test_a_faulty_table_is_refused_with_its_place(fault: str, here: Path) -> None:
     text, told = TABLES[fault]
     with pytest.raises(InputError) as refused:
-        read_rows(here / table(here, text))
+        read_rows(here / table(here, text), REGISTRY)
     assert told in str(refused.value)
     assert "rows.csv" in str(refused.value)
     assert refused.value.hint

@@ -23,7 +23,7 @@ from armcal.scaffold.robot import (
     robot_of_rows,
     robot_of_urdf,
 )
-from armcal.scaffold.robot_files import try_out, write_robot
+from armcal.scaffold.robot_files import NOISE_ALONE_MM, RESULTS, try_out, write_robot
 
 CONVENTIONS: dict[str, Convention] = {"standard": "standard", "modified": "craig"}
 SKELETONS = {path.stem: path for path in sorted(Path(scaffold.__file__).with_name("skeletons").glob("*.csv"))}
@@ -50,24 +50,24 @@ def begin(console: Console, name: str, source: Source, folder: Path) -> None:
     robot = _robot(robot_name(name), source, registry)
     up = direction(source.up) if source.up else robot.up
     robot = replace(robot, up=up, target=place(source.target) if source.target else robot.target)
-    made = write_robot(replace(robot, widths=_widths(source)), folder, registry)
+    choice = write_robot(replace(robot, widths=_widths(source)), folder, registry)
     with console.progress() as progress:
-        trial = try_out(made, registry, command_line(), progress)
+        trial = try_out(folder, registry, command_line(), progress)
     content = {
         "robot": robot.name,
-        "out": str(made.folder),
-        "free": list(made.choice.kept),
-        "redundant": [dropped.name for dropped in made.choice.redundant],
+        "out": str(folder),
+        "free": list(choice.kept),
+        "redundant": [dropped.name for dropped in choice.redundant],
         "holdout_nominal_mm": trial.nominal_mm,
         "holdout_calibrated_mm": trial.calibrated_mm,
-        "noise_alone_mm": trial.noise_mm,
+        "noise_alone_mm": NOISE_ALONE_MM,
         "verdict": trial.result.verdict.headline,
         "works": not trial.fault,
     }
     console.result(content)
     for text in trial.result.warnings:
         console.warn(text)
-    console.line(f"{robot.name}: {len(robot.joints)} joints, {len(made.choice.kept)} free parameters, in {made.folder}")
+    console.line(f"{robot.name}: {len(robot.joints)} joints, {len(choice.kept)} free parameters, in {folder}")
     if robot.name in SKELETONS and not (source.dh or source.urdf):
         console.line(f"{robot.name} is a skeleton of round numbers: correct arm.yaml, or begin with --urdf FILE")
     assumed = [joint.name for joint in robot.joints if joint.assumed]
@@ -75,15 +75,15 @@ def begin(console: Console, name: str, source: Source, folder: Path) -> None:
         console.line(f"limits were assumed for {', '.join(assumed)}: correct them in plan.yaml before the arm moves")
     console.line(
         f"held-out tips of simulated records: nominal {trial.nominal_mm:.3f} mm, calibrated "
-        f"{trial.calibrated_mm:.3f} mm (the noise alone: {trial.noise_mm:.3f} mm)"
+        f"{trial.calibrated_mm:.3f} mm (the noise alone: {NOISE_ALONE_MM:.3f} mm)"
     )
     findings = [f for f in trial.result.verdict.findings if f.grade in ("bad", "warning")]
     for finding in findings:
         console.line(f"{finding.grade}: {finding.text}")
     console.line(trial.result.verdict.headline)
-    console.line(f"report: {trial.results / 'report.html'}; next: {made.folder / 'README.md'}")
+    console.line(f"report: {folder / RESULTS / 'report.html'}; next: {folder / 'README.md'}")
     if trial.fault:
-        say(f"armcal: {made.folder}: the calibration of simulated records failed: {trial.fault}.", err=True)
+        say(f"armcal: {folder}: the calibration of simulated records failed: {trial.fault}.", err=True)
         sys.exit(EXIT_FAULT if trial.result.estimate.verdict.converged else EXIT_NOT_CONVERGED)
 
 
@@ -107,7 +107,7 @@ def _robot(name: str, source: Source, registry: PluginRegistry) -> Robot:
     if source.urdf:
         return robot_of_urdf(name, source.urdf, source.tip, registry)
     if not source.dh and name in SKELETONS:
-        return robot_of_rows(name, "standard", read_rows(SKELETONS[name]))
+        return robot_of_rows(name, "standard", read_rows(SKELETONS[name], registry))
     if not source.dh:
         raise ConfigError(
             f"found no description of the robot {name}, expected a file of it, or the name of a known skeleton "
@@ -120,7 +120,7 @@ def _robot(name: str, source: Source, registry: PluginRegistry) -> Robot:
             hint="Give --convention standard, Rot_z(theta) Trans_z(d) Trans_x(a) Rot_x(alpha), or modified, "
             "Rot_x(alpha) Trans_x(a) Rot_z(theta) Trans_z(d).",
         )
-    return robot_of_rows(name, CONVENTIONS[source.convention], read_rows(source.dh))
+    return robot_of_rows(name, CONVENTIONS[source.convention], read_rows(source.dh, registry))
 
 
 def direction(text: str) -> tuple[float, float, float]:

@@ -10,7 +10,6 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -20,27 +19,24 @@ from armcal.hooks import KINDS as HOOKS
 from armcal.io.plain_files import writing
 from armcal.plugins import PluginRegistry
 
-LONGEST = 20
-"""Characters; lines with a longer name would no longer fit the width that the plugin's own linter asks for."""
+LONGEST = 20  # characters; lines with a longer name would not fit the width that the plugin's linter asks for
 PREFIX = "armcal_"
 _PLUGIN = re.compile(r"[a-z][a-z0-9_]*")
 
 
 TEMPLATES = Path(__file__).with_name("templates")
-SUFFIX = ".j2"
 _PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _YAML_WORDS = frozenset({"y", "n", "yes", "no", "on", "off", "true", "false", "null"})
 _DIGITS = 12
 
 
 def rendered(folder: str, context: Mapping[str, Any]) -> dict[str, str]:
-    root = TEMPLATES / folder
-    names = [path.relative_to(root).as_posix() for path in sorted(root.rglob(f"*{SUFFIX}"))]
-    return {name.removesuffix(SUFFIX): rendered_file(f"{folder}/{name}", context) for name in names}
+    """All templates of a folder, by the paths of what they make there."""
+    names = [path.relative_to(TEMPLATES / folder).as_posix() for path in sorted((TEMPLATES / folder).rglob("*.j2"))]
+    return {name.removesuffix(".j2"): rendered_file(f"{folder}/{name}", context) for name in names}
 
 
 def rendered_file(template: str, context: Mapping[str, Any]) -> str:
-    """One template, by its path below all."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -49,7 +45,6 @@ def rendered_file(template: str, context: Mapping[str, Any]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
-        autoescape=False,
     )
     environment.filters |= {"word": word, "number": number}
     return environment.get_template(template).render(context)
@@ -110,8 +105,8 @@ def plugin_name(text: str, registry: PluginRegistry) -> str:
     for component in registry.components:
         if component.name == name:
             taken = f"the plugin {component.plugin!r} offers the {component.kind} {name!r} already"
-    if not taken and importlib.util.find_spec(PREFIX + name) is not None:
-        taken = f"a package {PREFIX}{name} is installed already"
+    if importlib.util.find_spec(PREFIX + name) is not None:
+        taken = taken or f"a package {PREFIX}{name} is installed already"
     if taken:
         raise InputError(f"{taken}.", hint="Choose another name; `armcal plugins list` shows those that are taken.")
     return name
@@ -125,30 +120,20 @@ def check_length(text: str, name: str) -> None:
         )
 
 
-_EXAMPLES: Mapping[str, str] = MappingProxyType(
-    {
-        "model": "an arm whose joints all turn about parallel axes",
-        "effect": "the error of a gear, once a turn of one of its wheels",
-        "measurement": "the distance of the tip from a fixed point, read by a draw wire",
-        "estimator": "least squares by SciPy's trust region method",
-        "reader": "records from a file of JSON objects, one a line",
-        "device": "servos on a board that takes pulses in microseconds",
-        "exporter": "every parameter of a calibrated arm as plain text",
-    }
-)
-"""What the component of each kind is."""
+_EXAMPLES = {  # what the component of each kind is
+    "model": "an arm whose joints all turn about parallel axes",
+    "effect": "the error of a gear, once a turn of one of its wheels",
+    "measurement": "the distance of the tip from a fixed point, read by a draw wire",
+    "estimator": "least squares by SciPy's trust region method",
+    "reader": "records from a file of JSON objects, one a line",
+    "device": "servos on a board that takes pulses in microseconds",
+    "exporter": "every parameter of a calibrated arm as plain text",
+}
 KINDS = tuple(_EXAMPLES)
 
 
 def write_plugin(name: str, kind: str, folder: Path, package: bool = False) -> tuple[str, ...]:
-    """Write a plugin; gives the files by their place in the folder.
-
-    Args:
-        name: of plugin and component, as ``plugin_name`` gives it.
-        kind: one of ``KINDS``.
-        folder: to be made.
-        package: whether it is to be installed, with a registration that imports nothing heavy; else one file.
-    """
+    """Write a plugin, one file or a package to be installed; gives the files by their place in the folder."""
     own, title = PREFIX + name, "".join(part.capitalize() for part in name.split("_"))
     context = {
         "name": name,

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Rotation
 from armcal.base.parameters import Parameters
@@ -32,8 +31,7 @@ from armcal.run.result import RunResult
 from armcal.scaffold.plugin_files import number, rendered, staged, write_texts
 from armcal.scaffold.robot import Robot, RobotJoint, Unit
 
-MOST_UNCERTAIN = 0.5
-"""In typical scales: what the declared noise leaves less certain than this is held."""
+MOST_UNCERTAIN = 0.5  # in typical scales: what the declared noise leaves less certain is fixed
 SIMULATED, RECORDS = "simulated.yaml", "simulated.csv"
 NOISE_MM, NOISE_SEED = 0.1, 4
 GRAVITY_M_S2 = 9.81
@@ -43,33 +41,28 @@ _NEARLY_HALF_A_TURN = 3.0
 RECORDS_MADE = 600
 """Of so many, chance makes one verdict in twenty warn; of 100 to 200 it is one in five, for each finding has a level of
 its own."""
-
-
 RESULTS = "runs/simulated"
-MOST_ERROR = 1.5
-"""Times what the noise alone makes: a calibration that misses held-out tips by more has not found the arm."""
-_MEAN_LENGTH = math.sqrt(8 / math.pi)
-"""Of three independent normal numbers of unit variance."""
+MOST_ERROR = 1.5  # times what the noise alone makes: what misses held-out tips by more has not found the arm
+NOISE_ALONE_MM = NOISE_MM * math.sqrt(8 / math.pi)  # mean length of three independent normal numbers
+SEED = 1
+LENGTH_SD_M, ANGLE_SD_RAD = 0.001, 0.003
+SAG_RAD = 0.002  # what a joint gives under half the moment that the arm's whole weight has at its full reach
+UNSTATED_TARGET = {"tracker.target_x": 0.06, "tracker.target_y": -0.04, "tracker.target_z": 0.03}
+"""Of the reach: where a target sits whose place was not stated. Most sit beside the last axis, and show more there."""
+_MOST_SD = 2.0
+_SPRING = (0.5, 1.5)
+_UNITS = frozenset({"m", "rad", "rad_per_Nm"})
 
 
-@dataclass(frozen=True)
-class RobotFolder:
-    """What was written: where, and the parameters chosen."""
-
-    folder: Path
-    choice: MinimalSet
-
-
-def write_robot(robot: Robot, folder: Path, registry: PluginRegistry) -> RobotFolder:
-    """Write a new robot's folder, with simulated records of it."""
+def write_robot(robot: Robot, folder: Path, registry: PluginRegistry) -> MinimalSet:
+    """Write a new robot's folder, with simulated records of it; gives the parameters chosen."""
     with staged(folder) as place:
         try:
-            chosen = _fill(place, robot, registry)
+            return _fill(place, robot, registry)
         except InputError as fault:
             text = str(fault).replace(str(place.resolve()), str(folder)).replace(str(place), str(folder))
             reason = f"the files of {robot.name} would be refused: {text}"  # nobody sees them, as they are not kept
             raise InputError(reason, hint="Correct what they are made from.") from fault
-    return RobotFolder(folder, chosen)
 
 
 def _fill(place: Path, robot: Robot, registry: PluginRegistry) -> MinimalSet:
@@ -86,7 +79,8 @@ def _fill(place: Path, robot: Robot, registry: PluginRegistry) -> MinimalSet:
     commands = {f"arm.{j.name}": random.uniform(*j.limits, _TRIED_POSES) for j in robot.joints}
     poses = Dataset(tuple(str(i) for i in range(_TRIED_POSES)), commands)
     exact = measured_without_noise(experiment.simulation_request, poses)
-    reach = _reach(np.array([exact[f"tracker.{axis}"] for axis in "xyz"]))
+    tips = np.array([exact[f"tracker.{axis}"] for axis in "xyz"])
+    reach = float(np.linalg.norm(tips - tips.mean(axis=1, keepdims=True), axis=0).max())  # from the middle of all
     if not reach > _SMALLEST_REACH_M:
         raise InputError(
             f"in all poses the tip stays within {1000 * reach:.3g} mm.",
@@ -159,13 +153,11 @@ def _levels(joint: RobotJoint) -> list[str]:
 
 @dataclass(frozen=True)
 class Trial:
-    """How the calibration went: tip errors on held-out records (mm), and what the noise alone would make."""
+    """How the calibration went, and tip errors on held-out records (mm)."""
 
     result: RunResult
-    results: Path
     nominal_mm: float
     calibrated_mm: float
-    noise_mm: float
 
     @property
     def fault(self) -> str:
@@ -174,39 +166,21 @@ class Trial:
         bad = [finding.text for finding in self.result.verdict.findings if finding.grade == "bad"]
         if not verdict.converged:
             return f"{verdict.name} did not converge ({verdict.status})"
-        if bad:
-            return bad[0]
-        if not self.calibrated_mm <= MOST_ERROR * self.noise_mm:
-            return (
-                f"the error at held-out tips is {self.calibrated_mm:.3f} mm, and the noise alone makes "
-                f"{self.noise_mm:.3f} mm"
-            )
-        return ""
+        if bad or self.calibrated_mm <= MOST_ERROR * NOISE_ALONE_MM:
+            return bad[0] if bad else ""
+        error = f"the error at held-out tips is {self.calibrated_mm:.3f} mm"
+        return f"{error}, and the noise alone makes {NOISE_ALONE_MM:.3f} mm"
 
 
-def try_out(made: RobotFolder, registry: PluginRegistry, command: str = "", progress: Progress = no_progress) -> Trial:
+def try_out(folder: Path, registry: PluginRegistry, command: str = "", progress: Progress = no_progress) -> Trial:
     """Calibrate on the simulated records, as ``armcal run`` does."""
-    watch, folder = Stopwatch(), made.folder / RESULTS
-    experiment = Experiment.load(made.folder / SIMULATED, registry=registry)
+    watch, experiment = Stopwatch(), Experiment.load(folder / SIMULATED, registry=registry)
     result = calibrate(experiment, command, progress, watch)
     result.seconds["total"] = watch.total()
     sections = plugin_sections(result, registry)
-    outputs.write(result, experiment, folder, partial(render, sections=sections))
-    table = result.table
-    held = (table.nominal["holdout"].mean, table.calibrated["holdout"].mean)
-    nominal, calibrated = (math.nan if error is None else error for error in held)
-    return Trial(result, folder, nominal, calibrated, NOISE_MM * _MEAN_LENGTH)
-
-
-SEED = 1
-LENGTH_SD_M, ANGLE_SD_RAD = 0.001, 0.003
-SAG_RAD = 0.002
-"""What a joint gives under half the moment that the arm's whole weight has at its full reach."""
-UNSTATED_TARGET = {"tracker.target_x": 0.06, "tracker.target_y": -0.04, "tracker.target_z": 0.03}
-"""Of the reach: where a target sits whose place was not stated. Most sit beside the last axis, and show more there."""
-_MOST_SD = 2.0
-_SPRING = (0.5, 1.5)
-_UNITS = frozenset({"m", "rad", "rad_per_Nm"})
+    outputs.write(result, experiment, folder / RESULTS, partial(render, sections=sections))
+    held_out = (of["holdout"].mean for of in (result.table.nominal, result.table.calibrated))
+    return Trial(result, *(math.nan if error is None else error for error in held_out))
 
 
 def _candidates(parameters: Parameters) -> tuple[str, ...]:
@@ -226,11 +200,8 @@ def _made_up(
 ) -> dict[str, float]:
     """True values (SI) of every candidate that is one number; a rotation stays as it was stated.
 
-    Args:
-        parameters: of the robot, with their nominal values.
-        load_Nm: the moment of its whole weight at its full reach; 0 if its masses are not known.
-        target: how far parameters of the target are off beside that (m).
-        widths: of the priors, by unit: errors are no larger.
+    A joint bears ``load_Nm``, the moment of the arm's whole weight at its full reach; 0 if its masses are not known.
+    Parameters of the target are off by ``target`` (m) beside that. Errors are no larger than the priors' ``widths``.
     """
     random = np.random.default_rng(SEED)
     deviations = {"m": min(LENGTH_SD_M, 1e-3 * widths["mm"]), "rad": min(ANGLE_SD_RAD, math.radians(widths["deg"]))}
@@ -253,9 +224,3 @@ def _as_text(parameters: Parameters, values: Mapping[str, float]) -> dict[str, s
         factor, unit = shown_unit(parameters[name].unit)
         lines[name] = f"{number(float(f'{factor * value:.6g}'))} {unit}"
     return lines
-
-
-def _reach(tips: Array) -> float:
-    """How far a tip comes from the middle of where it goes (3 x N, m)."""
-    middle = tips.mean(axis=1, keepdims=True)
-    return float(np.linalg.norm(tips - middle, axis=0).max())
