@@ -22,8 +22,6 @@ from armcal.plugins import PluginRegistry
 LONGEST = 20  # characters; lines with a longer name would not fit the width that the plugin's linter asks for
 PREFIX = "armcal_"
 _PLUGIN = re.compile(r"[a-z][a-z0-9_]*")
-
-
 TEMPLATES = Path(__file__).with_name("templates")
 _PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _YAML_WORDS = frozenset({"y", "n", "yes", "no", "on", "off", "true", "false", "null"})
@@ -99,12 +97,9 @@ def plugin_name(text: str, registry: PluginRegistry) -> str:
             f"found the name {text!r}, expected a Python name of small letters, digits, - and _.",
             hint="Begin with a letter, as in draw-wire.",
         )
-    taken = ""
-    if any(plugin.name == name for plugin in registry.plugins):
-        taken = f"a plugin is called {name!r} already"
-    for component in registry.components:
-        if component.name == name:
-            taken = f"the plugin {component.plugin!r} offers the {component.kind} {name!r} already"
+    taken = next((f"a plugin is called {name!r} already" for plugin in registry.plugins if plugin.name == name), "")
+    for own in (component for component in registry.components if component.name == name):
+        taken = f"the plugin {own.plugin!r} offers the {own.kind} {name!r} already"
     if importlib.util.find_spec(PREFIX + name) is not None:
         taken = taken or f"a package {PREFIX}{name} is installed already"
     if taken:

@@ -6,7 +6,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal
 
 from pydantic import ValidationError
@@ -33,9 +32,8 @@ Unit = Literal["mm", "deg"]
 FEWEST_JOINTS, MOST_JOINTS = 2, 20
 ASSUMED_TURN: Range = (-math.radians(120), math.radians(120))  # limits of joints of which none are stated
 ASSUMED_TRAVEL: Range = (0.0, 0.2)
-MOST = MappingProxyType({"angle": 4 * math.pi, "length": 100.0, "mass": 1e5})
-"""Sizes (rad, m, kg) beyond which a number is in another unit than it says."""
-WIDTHS: Mapping[Unit, float] = MappingProxyType({"mm": 10.0, "deg": 2.0})
+MOST = {"angle": 4 * math.pi, "length": 100.0, "mass": 1e5}  # beyond it (rad, m, kg) a number is in another unit
+WIDTHS: Mapping[Unit, float] = {"mm": 10.0, "deg": 2.0}
 _PARALLEL = 0.02
 
 
@@ -89,10 +87,12 @@ class Robot:
     target: tuple[float, float, float] | None = None  # the tracker's, in the tool's frame (m); None if not stated
 
 
-def with_tilts(convention: Convention, rows: tuple[Row, ...]) -> tuple[Row, ...]:
-    """The rows, those between parallel axes marked: there rows alone cannot express every small tilt. [Hayati1983]
+def robot_of_rows(name: str, convention: Convention, rows: tuple[Row, ...]) -> Robot:
+    """A robot of Denavit-Hartenberg rows.
 
-    ``alpha`` lies between a joint and the next one, in Craig's convention between it and the one before.
+    Where its base stands and where the target sits are known least, so these are preferred to the rows beside them.
+    Rows between parallel axes are marked: there rows alone cannot express every small tilt. [Hayati1983] ``alpha`` lies
+    between a joint and the next one, in Craig's convention between it and the one before.
     """
 
     def is_parallel(index: int) -> bool:
@@ -100,15 +100,7 @@ def with_tilts(convention: Convention, rows: tuple[Row, ...]) -> tuple[Row, ...]
         both = 0 <= other < len(rows) and rows[index].joint.turns and rows[other].joint.turns
         return both and abs(math.sin(rows[index].alpha)) < _PARALLEL
 
-    return tuple(replace(row, tilts=is_parallel(index)) for index, row in enumerate(rows))
-
-
-def robot_of_rows(name: str, convention: Convention, rows: tuple[Row, ...]) -> Robot:
-    """A robot of Denavit-Hartenberg rows.
-
-    Where its base stands and where the target sits are known least, so these are preferred to the rows beside them.
-    """
-    rows = with_tilts(convention, rows)
+    rows = tuple(replace(row, tilts=is_parallel(index)) for index, row in enumerate(rows))
     of_rows = (("arm.mdh.theta*",), ("arm.mdh.a[0-9]*", "arm.mdh.d[0-9]*"), ("arm.mdh.alpha*", "arm.mdh.*_ry"))
     priors: dict[str, Unit] = dict.fromkeys(("arm.mdh.theta*", "arm.mdh.alpha*"), "deg")
     priors |= dict.fromkeys(("arm.mdh.after*_ry", "arm.mdh.before*_ry"), "deg")
