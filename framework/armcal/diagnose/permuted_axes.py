@@ -53,8 +53,10 @@ from armcal.problem.rigid_alignment import (
 MUCH_BETTER = 3.0  # A permutation leaves so many times less than the data as they stand
 FITS, MISSES = 0.15, 0.01
 """Of the spread of the positions: what a right reading leaves at most to first order, what is worth a look."""
-_EXPLAINS, _FAR_BETTER, _NOISE = (0.05, 0.08), 10.0, 3.0
-"""What it leaves at most once fitted: times the noise, or of the spread, the more the worse the data as given fit."""
+_NOISE, _EXPLAINS = 3.0, (0.05, MUCH_BETTER)
+"""What it leaves at most once fitted: times the noise; of the spread, and so many times less than the data as given."""
+_HOPELESS, _EXPLAINS_HOPELESS = 0.1, (0.08, 1.8)
+"""The same where no parameters mend what is given, of the spread: a model that lacks much may leave half of that."""
 _FITTED, _FIT_STEPS, _FIT_DAMPING, _FARTHEST, _DETERMINED = 5, 25, 1e-3, 8.0, 1e-3
 _MOST_RECORDS = 300
 _EQUATIONS = 2.0  # So many numbers a parameter are needed to separate readings
@@ -249,8 +251,8 @@ def _explained(
         measured = reading.measured
         left = reading.left if measured is None else _fitted(problem, records, seen, reading.read_as, measured)
         spread = kept_spread(seen.measured if measured is None else measured, seen.measured)
-        near = max(_NOISE * noise, spread * float(np.clip(worse / _FAR_BETTER, *_EXPLAINS)))
-        if left <= min(near, spread * worse / MUCH_BETTER):
+        share, better = _EXPLAINS if worse <= _HOPELESS else _EXPLAINS_HOPELESS
+        if left <= min(max(_NOISE * noise, share * spread), spread * worse / better):
             explained.append((reading, left))
     return explained
 
