@@ -46,7 +46,6 @@ class FakeRecalibrator:
     def __init__(self, differs=0.0, settings=None):
         self.request = request()
         self.settings = settings or RecalibrateSettings(output={"calibration_every_records": 10})
-        self.evaluator = {"name": "fake"}
         self.ids = hashlib.sha256().hexdigest()
         self.total = 0.1 + differs
         self.count = 0
@@ -97,7 +96,7 @@ def setup(folder, pace=None, stream=None, **given):
     if not calibration.exists():
         calibration.parent.mkdir(parents=True, exist_ok=True)
         calibration.write_text(CALIBRATION)
-    pace = pace or Pace(calibration_gap_s=0.0, status_s=0.05, checkpoint_records=25, digest_records=7)
+    pace = pace or Pace(calibration_gap_s=0.0, status_s=0.05, checkpoint_records=25)
     return Setup(Path(folder), calibration, StandardOutput(stream), pace, **given)
 
 

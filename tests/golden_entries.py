@@ -679,9 +679,8 @@ ENTRIES: tuple[Entry, ...] = (
         killed_after(25, f"{KEPT} --follow"),
         KEPT,
         decisions,
-        "replay {out}/kept --json",
         "control {out}/kept rollback good --json",
-        reads=["decisions.json", "calibration.yaml", "2.out", "3.out", "kept/calibration.yaml"],
+        reads=["decisions.json", "calibration.yaml", "2.out", "kept/calibration.yaml"],
         needs=["lrm-demo"],
     ),
     *(

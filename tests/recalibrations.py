@@ -11,9 +11,8 @@ from typing import Any
 
 from armcal.io.journal.files import FileLayer
 from armcal.io.journal.reader import read_entries, read_until
-from armcal_online.running.loop import Recalibration
+from armcal_online.running.loop import Recalibration, StateReplayer
 from armcal_online.running.session import opened
-from armcal_online.running.state_replayer import StateReplayer
 from armcal_online.sources.source import Incoming
 from fake_recalibrator import HEADER, FakeRecalibrator, row, setup
 
@@ -71,14 +70,14 @@ def taken(folder: Path) -> list[str]:
 
 
 def replayed(folder: Path) -> FakeRecalibrator:
-    """What the journal makes of it from its first entry on, each noted state compared."""
+    """What the journal makes of it from its first entry on, each checkpoint compared."""
     fake = FakeRecalibrator()
     replayer = StateReplayer(fake, partial(read_until, folder / "journal"))
     first, *others = read_entries(folder / "journal")
     replayer.restore(first.content, first.sequence)
     for entry in others:
         if entry.kind == "checkpoint":
-            assert entry.content["digest"] == fake.digest(), entry.sequence
+            assert entry.content["state"] == fake.snapshot(), entry.sequence
         else:
             replayer.apply(entry.sequence, entry.kind, entry.content)
     return fake

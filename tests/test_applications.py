@@ -17,7 +17,7 @@ APPLICATIONS = {
     "lerobot": {"lerobot"},
     "makers": {"maker"},
     "servobus": {"bus"},
-    "online": {"control", "mission", "recalibrate", "replay", "watch"},
+    "online": {"control", "mission", "recalibrate", "watch"},
     "ros2": {"bag"},
     "serve": {"serve"},
 }

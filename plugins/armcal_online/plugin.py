@@ -5,7 +5,6 @@ from armcal.hooks import Register, hookimpl
 _COMMANDS = {
     "recalibrate": ("recalibrate:recalibrate", "Keep a calibration true, record by record, as they come."),
     "control": ("control:control", "Query or command a running recalibration."),
-    "replay": ("replay:replay_command", "Make every state of a recalibration again from its journal."),
     "watch": ("watch:watch", "Show a recalibration live, in the browser or the terminal."),
     "mission": ("mission:mission", "Simulate a mission, recalibrate over it, compare that with its truth."),
 }

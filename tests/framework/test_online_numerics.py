@@ -177,15 +177,15 @@ def test_a_time_that_is_no_number_counts_as_none(warm) -> None:
     assert np.isfinite(recalibrator.state.belief.gaussian.covariance).all()
 
 
-def _steadily(recalibrator: Recalibrator, fresh: dict, count: int) -> tuple[str, list[int]]:
-    """The digest after so many records with outliers, 15 s apart, and memory in use at tenths of them."""
+def _steadily(recalibrator: Recalibrator, fresh: dict, count: int) -> tuple[dict, list[int]]:
+    """The state after so many records with outliers, 15 s apart, and memory in use at tenths of them."""
     recalibrator.restore(fresh)
     arm, used = World.drawn(21, outliers=0.02), []
     for sequence in range(1, count + 1):
         recalibrator.take(arm.record(seconds=15.0), sequence)
         if sequence % (count // 10) == 0 and tracemalloc.is_tracing():
             used.append(tracemalloc.get_traced_memory()[0])
-    return recalibrator.digest(), used
+    return recalibrator.snapshot(), used
 
 
 @pytest.mark.slow
@@ -196,13 +196,13 @@ def test_days_need_no_more_memory_and_come_out_the_same_twice(count: int) -> Non
     fresh = recalibrator.snapshot()
     tracemalloc.start()
     try:
-        digest, used = _steadily(recalibrator, fresh, count)
+        state, used = _steadily(recalibrator, fresh, count)
     finally:
         tracemalloc.stop()
     print(f"\n{count} records: memory {[round(u / 1024) for u in used]} KiB at tenths of them")
     full = max(1, math.ceil(10 * REMEMBERED / count) - 1)  # from then on the oldest is forgotten
     assert used[-1] <= 1.05 * used[full]
-    assert _steadily(recalibrator, fresh, count)[0] == digest
+    assert _steadily(recalibrator, fresh, count)[0] == state
 
 
 RUNS = {"extended": {"type": "extended"}, "window": {"type": "window", "records": 6}}
@@ -215,21 +215,21 @@ def test_a_restored_state_goes_on_as_if_nothing_had_been(estimator: str, every: 
     """At such records of a run in which a joint slips: a snapshot as a journal keeps it, taken up by another."""
     given = settings(estimator=RUNS[estimator])
     one, other, arm = begun(given), begun(given), World.drawn(31, outliers=0.05)
-    records, snapshots, digests, decided = [], [], [], 0
+    records, snapshots, states, decided = [], [], [], 0
     for sequence in range(1, 41):
         if sequence == 22:
             arm.moved("arm.mdh.theta2", math.radians(8))
         snapshots.append(json.dumps(one.snapshot()))
         records.append(arm.record())
         decided += len(told(one.take(records[-1], sequence), "decision"))
-        digests.append(one.digest())
+        states.append(json.dumps(one.snapshot()))
     assert decided
     for k, kept in list(enumerate(snapshots))[::every]:
         other.restore(json.loads(kept))
         far = len(records) if k in (21, 22, 24) else min(k + 3, len(records))
         for i in range(k, far):
             other.take(Incoming.from_dict(json.loads(json.dumps(records[i].as_dict()))), i + 1)
-            assert other.digest() == digests[i], (k, i)
+            assert json.dumps(other.snapshot()) == states[i], (k, i)
 
 
 @pytest.mark.slow

@@ -151,7 +151,7 @@ def test_a_restored_state_goes_on_with_its_evidence() -> None:
     other.restore(session.snapshot())
     record = arm.record()
     assert session.take(record, 30) == other.take(record, 30)
-    assert session.digest() == other.digest() and len(session.state.slow.tracks) == 1
+    assert session.snapshot() == other.snapshot() and len(session.state.slow.tracks) == 1
 
 
 def test_where_no_step_of_a_joint_can_be_followed_errors_that_neighbours_share_pass_on_all_the_same() -> None:

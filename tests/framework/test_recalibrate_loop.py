@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import shutil
 import time
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import pytest
 from armcal.errors import InputError
@@ -16,7 +14,6 @@ from armcal.io.journal.reader import read_entries
 from armcal_online.commands.recalibrate import open_source
 from armcal_online.running.loop import Pace, Recalibration
 from armcal_online.running.session import opened
-from armcal_online.running.state_replayer import ReplayDiffersError
 from armcal_online.sources.row_parser import RowParser
 from armcal_online.sources.source import Incoming
 from armcal_online.tracking.settings import RecalibrateSettings
@@ -71,51 +68,6 @@ def test_a_power_cut_changes_no_bit(tmp_path: Path, cuts: list[int]) -> None:
     assert [e["resumed"] for e in events(folder) if e["event"] == "started"] == [False, *[True] * len(cuts)]
     again = run(folder, Listed(made(1, 121)))
     assert again.digest() == fake.digest()
-
-
-def test_another_state_than_was_noted_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = tmp_path / "out"
-    with pytest.raises(PowerCutError):
-        run(folder, Listed(made(1, 20), cut=True))
-    before, take = (folder / "calibration.yaml").read_bytes(), FakeRecalibrator.take
-
-    def other(self: FakeRecalibrator, incoming: Incoming, sequence: int) -> Any:
-        self.total += 1e-13
-        return take(self, incoming, sequence)
-
-    monkeypatch.setattr(FakeRecalibrator, "take", other)
-    with pytest.raises(ReplayDiffersError, match=r"journal: after entry \d+ the state is .* expected .* was noted"):
-        run(folder, Listed(made(1, 21)))
-    assert (folder / "calibration.yaml").read_bytes() == before
-
-
-def test_an_update_of_armcal_goes_on_where_it_was_though_the_last_bits_differ(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "out"
-    with pytest.raises(PowerCutError):
-        run(folder, Listed(made(1, 20), cut=True))
-    copy = shutil.copytree(folder, tmp_path / "copy")
-    shutil.copy(tmp_path / "out.start.yaml", tmp_path / "copy.start.yaml")
-    take = FakeRecalibrator.take
-
-    def other(self: FakeRecalibrator, incoming: Incoming, sequence: int) -> Any:
-        self.total += 1e-13
-        return take(self, incoming, sequence)
-
-    monkeypatch.setattr(FakeRecalibrator, "take", other)
-    begin = FakeRecalibrator.__init__
-
-    def updated(self: FakeRecalibrator, **given: Any) -> None:
-        begin(self, **given)
-        self.evaluator = {"name": "the next"}
-
-    monkeypatch.setattr(FakeRecalibrator, "__init__", updated)
-    assert run(folder, Listed(made(1, 30))).count == 29
-    assert any("Another evaluator" in event.get("sentence", "") for event in events(folder))
-    with stepping(copy, Listed([])) as (going, fake):
-        going.roll_back(next(e for e in read_entries(folder / "journal") if e.kind == "record").sequence)
-        assert fake.count == 1
 
 
 def test_damage_before_the_newest_checkpoint_is_told_and_stops_nothing(tmp_path: Path) -> None:
@@ -209,7 +161,7 @@ def test_a_pause_outlasts_a_restart(tmp_path: Path) -> None:
         assert fake.count == 3
 
 
-def test_a_rollback_restores_every_bit_and_a_replay_does_the_same(tmp_path: Path) -> None:
+def test_a_rollback_restores_every_bit_and_so_does_its_journal(tmp_path: Path) -> None:
     folder, states = tmp_path / "out", {}
     with stepping(folder, Listed(made(1, 120), cut=True)) as (going, fake):
         loop = going
@@ -284,7 +236,7 @@ def test_a_crash_is_told_to_whoever_watches_and_raised(tmp_path: Path, monkeypat
 
 
 def test_the_pace_of_what_is_written(tmp_path: Path) -> None:
-    pace = Pace(status_s=1e9, checkpoint_records=10, digest_records=1000)
+    pace = Pace(status_s=1e9, checkpoint_records=10)
     settings = RecalibrateSettings(output={"calibration_every_records": 1000, "calibration_every_s": 1e9})
     folder = tmp_path / "out"
     run(folder, Listed(made(1, 20)), settings, pace=pace)

@@ -17,7 +17,7 @@ from armcal.base.dataset import Dataset
 from armcal.errors import DataError, InputError
 from armcal.io.lines import LineCutter
 from armcal_online.commands.recalibrate import open_source
-from armcal_online.running.state_replayer import MAX_FILES, Progress
+from armcal_online.running.loop import MAX_FILES, Progress
 from armcal_online.sources.csv_file import CsvFile
 from armcal_online.sources.folder import Folder
 from armcal_online.sources.row_parser import RowParser

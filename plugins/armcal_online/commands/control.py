@@ -33,7 +33,7 @@ def control(console: Console, folder: Path, command: str, values: tuple[str, ...
     if command == "rollback":
         request["to"] = _target(values)
         if not is_running(folder):
-            from armcal_online.running.replay import roll_back_ended  # late: no other command builds the arm
+            from armcal_online.running.session import roll_back_ended  # late: no other command builds the arm
 
             _show(console, roll_back_ended(folder, request["to"], console.registry()))
             return

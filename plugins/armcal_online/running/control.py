@@ -11,8 +11,7 @@ from armcal.io.journal.reader import read_entries
 from armcal.io.json_server import Answer, JsonServer
 from armcal.io.unix_socket import short_address
 
-from armcal_online.running.loop import Recalibration
-from armcal_online.running.state_replayer import RECORD
+from armcal_online.running.loop import RECORD, Recalibration
 
 SOCKET = "control.sock"
 GOOD = "good"  # in place of a sequence number: that of the last good record
@@ -53,7 +52,7 @@ def ask(folder: Path, request: Mapping[str, Any], timeout_s: float = 30.0) -> di
             with connection.makefile("rb") as replies:
                 reply = json.loads(replies.readline())
     except TimeoutError as fault:
-        hint = "It may be busy with a long replay; ask again."
+        hint = "It may be busy with a long roll-back; ask again."
         raise InputError(f"no answer within {timeout_s:g} s.", where=where, hint=hint) from fault
     except (OSError, ValueError) as fault:
         hint = "Start it with `armcal recalibrate`, or give the folder it was given as --out."

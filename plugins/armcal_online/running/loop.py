@@ -1,24 +1,179 @@
 """The loop of a recalibration: a record is journalled, acknowledged, used and reported, one at a time."""
 
+from __future__ import annotations
+
+import json
 import os
 import time
-from collections.abc import Mapping
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 from armcal.base.config_text import finite
+from armcal.errors import ArmcalError, DataError, Location
 from armcal.io.journal.journal import Journal, JournalFullError
+from armcal.io.journal.segment import Entry
 from armcal.io.json_server import JsonServer
 from armcal.io.signals import Signals
 
 from armcal_online.running.outputs import Outputs
-from armcal_online.running.state_replayer import DECISION, NOTED, PAUSE, RECORD, RESUME, ROLLBACK, StateReplayer
-from armcal_online.sources.source import Incoming, Source
+from armcal_online.sources.source import THROUGH, Incoming, Source
 from armcal_online.tracking.recalibrator import Recalibrator
 
 WAIT_S = 0.1  # how long a source is waited for before control and signals are looked at again
+MAX_FILES = 2000  # so many files are remembered one by one; of the others, that all up to a name were taken
+RECENT = 256  # so many records are remembered, so that one that is sent again counts once
+
+STARTED, RECORD, ROLLBACK, PAUSE, RESUME = "started", "record", "rollback", "pause", "resume"  # Kinds of entries
+NOTED = ("decision", "level")  # events that are entries too
+Event = dict[str, Any]
+Reach = Callable[[int], tuple[Entry, tuple[Entry, ...]]]
+"""The last checkpoint at or before a sequence number, and the entries after it up to that number."""
+
+
+@dataclass
+class Progress:
+    """Rows taken by file, the records taken last, and whether records are passed over."""
+
+    records: int = 0  # how many records were journalled, from the beginning
+    paused: bool = False  # whether records are passed over
+    rows: dict[str, int] = field(default_factory=dict)  # the last one taken, by file
+    through: str = ""  # all files up to this name were taken
+    recent: dict[str, int] = field(default_factory=dict)  # sequence numbers of the last records of streams
+
+    @property
+    def positions(self) -> dict[str, int]:
+        return {**self.rows, **({THROUGH + self.through: 0} if self.through else {})}
+
+    def take(self, incoming: Incoming, sequence: int) -> None:
+        """A record was journalled."""
+        self.records += 1
+        if incoming.source_key:
+            key = incoming.source_key
+            self.rows[key] = max(self.rows.get(key, 0), incoming.source_row)
+            if len(self.rows) > MAX_FILES:
+                first = min(self.rows)
+                del self.rows[first]
+                self.through = max(self.through, first)
+        elif not incoming.fault:
+            self.recent[_mark(incoming)] = sequence
+            if len(self.recent) > RECENT:
+                del self.recent[next(iter(self.recent))]
+
+    def repeated(self, incoming: Incoming) -> int | None:
+        """Under which sequence number the same record of a stream was taken not long ago."""
+        return None if incoming.source_key or incoming.fault else self.recent.get(_mark(incoming))
+
+    def as_dict(self) -> dict[str, Any]:
+        return {
+            "records": self.records,
+            "paused": self.paused,
+            "positions": dict(self.rows),
+            "through": self.through,
+            "recent": dict(self.recent),
+        }
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> Progress:
+        """What ``as_dict`` wrote."""
+        rows, recent = dict(content["positions"]), dict(content["recent"])
+        return cls(int(content["records"]), bool(content["paused"]), rows, str(content["through"]), recent)
+
+
+def _mark(incoming: Incoming) -> str:
+    content = incoming.as_dict()
+    numbers = json.dumps([content["channels"], content["labels"]], sort_keys=True)
+    return f"{crc32(numbers.encode()):08x} {incoming.record_id}"
+
+
+@contextmanager
+def parsing(sequence: int, journal: str = "the journal") -> Iterator[None]:
+    """Around the reading of an entry whose checksum is right.
+
+    Raises:
+        DataError: it is not what this version writes there.
+    """
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as fault:
+        raise DataError(
+            f"entry {sequence} is whole, but none that this version writes ({type(fault).__name__}: {fault}).",
+            where=Location(journal or None),
+            hint="Read it with the version of armcal that wrote it, or begin a new --out from its calibration.yaml.",
+        ) from fault
+
+
+class StateReplayer:
+    """A session and how far its source was taken, moved on by journal entries, in the field and after a restart.
+
+    Everything that changes the estimate goes through ``apply``, with what was journalled and nothing else.
+    """
+
+    def __init__(self, session: Recalibrator, reach: Reach, journal_name: str = "") -> None:
+        self._session, self._reach, self._name = session, reach, journal_name
+        self._initial = session.snapshot()
+        self.progress = Progress()
+
+    def checkpoint(self) -> dict[str, Any]:
+        return {"state": self._session.snapshot(), "progress": self.progress.as_dict()}
+
+    def restore(self, checkpoint: Mapping[str, Any] | None, sequence: int) -> None:
+        """Take up the state of a checkpoint; without one, that of the beginning."""
+        if checkpoint is None:
+            self._session.restore(self._initial)
+            self.progress = Progress()
+            return
+        with parsing(sequence, self._name):
+            progress = Progress.from_dict(checkpoint["progress"])
+            self._session.restore(checkpoint["state"])
+        self.progress = progress
+
+    def apply(self, sequence: int, kind: str, content: Mapping[str, Any]) -> tuple[Event, ...]:
+        """Do what an entry says; the events of it.
+
+        Raises:
+            DataError: a rollback goes to where the journal no longer reaches.
+        """
+        if kind == RECORD:
+            with parsing(sequence, self._name):
+                incoming = Incoming.from_dict(content)
+            self.progress.take(incoming, sequence)
+            why = "The recalibration is paused."
+            if not self.progress.paused:
+                try:
+                    return self._session.take(incoming, sequence)
+                except ArmcalError as fault:
+                    why = f"It could not be used: {fault}"
+            event = {"event": RECORD, "sequence": sequence, "id": incoming.record_id, "at": incoming.arrived}
+            return ({**event, "verdict": "ignored", "why": why},)
+        if kind in (PAUSE, RESUME):
+            self.progress.paused = kind == PAUSE
+        elif kind == ROLLBACK:
+            with parsing(sequence, self._name):
+                to = int(content["to"])
+            self.go_back(to)
+        return ()
+
+    def go_back(self, sequence: int) -> None:
+        """The estimate as it was after an entry; how far the source was taken stays.
+
+        Raises:
+            DataError: the journal does not reach there; nothing is changed.
+        """
+        before = self._session.snapshot()
+        try:
+            checkpoint, entries = self._reach(sequence)
+            earlier = StateReplayer(self._session, self._reach, self._name)
+            earlier._initial = self._initial
+            earlier.restore(checkpoint.content, checkpoint.sequence)
+            for entry in entries:
+                earlier.apply(entry.sequence, entry.kind, entry.content)
+        except BaseException:
+            self._session.restore(before)
+            raise
 
 
 @dataclass(frozen=True)
@@ -32,7 +187,6 @@ class Pace:
     calibration_gap_s: float = 1.0
     status_s: float = 1.0
     checkpoint_records: int = 1000
-    digest_records: int = 100
 
 
 class Recalibration:
@@ -58,7 +212,7 @@ class Recalibration:
         self._source, self._journal, self.session = source, journal, session
         self._state_replayer, self._outputs, self._control, self._pace = state_replayer, outputs, control, pace
         self._is_written = False
-        self._since_calibration = self._since_digest = 0
+        self._since_calibration = 0
         self._since_checkpoint = since_checkpoint
         self._calibrated = self._status_written = -float("inf")
         self.sequence = journal.sequence
@@ -158,7 +312,7 @@ class Recalibration:
         before = self.session.snapshot()
         self._state_replayer.go_back(sequence)
         try:
-            self.sequence = self._journal.record(ROLLBACK, {"to": sequence, "digest": self.session.digest()})
+            self.sequence = self._journal.record(ROLLBACK, {"to": sequence})
         except BaseException:
             self.session.restore(before)
             raise
@@ -197,16 +351,11 @@ class Recalibration:
         events = self._state_replayer.apply(self.sequence, RECORD, content)
         self._since_calibration += 1
         self._since_checkpoint += 1
-        self._since_digest += 1
         for event in events:
             self._outputs.event(event)
-        # Decisions are noted, with the state that they led to, for a replay to be compared with.
-        noted = [finite(event) for event in events if event["event"] in NOTED]
-        if noted or self._since_digest >= self._pace.digest_records:
-            self._since_digest = 0
-            note = {"after": self.sequence, "digest": self.session.digest(), "events": noted}
-            self._journal.note(DECISION, note)
-        if any(event["event"] == "decision" for event in noted):
+            if event["event"] in NOTED:
+                self._journal.note(event["event"], finite(event))
+        if any(event["event"] == "decision" for event in events):
             self.write_calibration()
 
     def _command(self, kind: str) -> None:

@@ -9,20 +9,23 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from armcal.errors import DataError, InputError, Location
+import yaml
+from armcal.calibration.calibration import Calibration
+from armcal.errors import ConfigError, DataError, InputError, Location, PluginError
 from armcal.io.folder import check_folder
 from armcal.io.journal.files import REAL_FILES, FileLayer
 from armcal.io.journal.journal import Journal, JournalLimits
-from armcal.io.journal.reader import read_until, verify
+from armcal.io.journal.reader import read_newest, read_until, verify
 from armcal.io.lines import StandardOutput
+from armcal.plugins import PluginRegistry
 
 from armcal_online.event_file import EARLIER, EVENTS, EventFile
-from armcal_online.running.control import SOCKET, answer, control_server
-from armcal_online.running.loop import Pace, Recalibration
+from armcal_online.running.control import GOOD, SOCKET, answer, control_server, entry_named, rolled_back
+from armcal_online.running.loop import STARTED, Pace, Recalibration, StateReplayer
 from armcal_online.running.outputs import CALIBRATION, RESERVE, STATUS, Outputs
-from armcal_online.running.state_replayer import STARTED, StateReplayer
-from armcal_online.sources.source import Source
+from armcal_online.sources.source import Incoming, Source
 from armcal_online.tracking.recalibrator import Recalibrator
+from armcal_online.tracking.settings import load_settings
 
 JOURNAL = "journal"
 _REPLACED = (CALIBRATION, STATUS, RESERVE)
@@ -59,7 +62,7 @@ def opened(setup: Setup, session: Recalibrator, source: Source) -> Iterator[Reca
 
     Raises:
         InputError: the folder is another's, is in use, or belongs to another calibration or other settings.
-        DataError: the journal is damaged, or going through it again gives another state.
+        DataError: the journal is damaged.
     """
     folder, sizes = setup.folder / JOURNAL, session.settings.journal
     with ExitStack() as stack:
@@ -72,15 +75,12 @@ def opened(setup: Setup, session: Recalibrator, source: Source) -> Iterator[Reca
         source.resume(state_replayer.progress.positions)
         outputs = Outputs(setup.folder, setup.stream, EventFile(setup.folder), setup.files)
         stack.callback(outputs.close)
-        sequence = journal.record(STARTED, {"at": time.time(), "resumed": resumed, "evaluator": header["evaluator"]})
+        sequence = journal.record(STARTED, {"at": time.time(), "resumed": resumed})
         content = {"sequence": sequence, "at": time.time(), "resumed": resumed, "calibration": header["path"]}
         outputs.event({**session.started_event(resumed), **content})
         cut = journal.recovered.cut
         if cut is not None:
             outputs.alarm(cut.sentence)
-        before = journal.recovered.header.get("evaluator", header["evaluator"])
-        if before != header["evaluator"]:
-            outputs.alarm("Another evaluator than before is used: a replay has to go over from one to the other here.")
         try:
             verify(folder, setup.files)
         except DataError as fault:
@@ -95,9 +95,9 @@ def opened(setup: Setup, session: Recalibrator, source: Source) -> Iterator[Reca
 
 
 def _header(setup: Setup, session: Recalibrator) -> dict[str, Any]:
-    """All that a replay needs besides the entries. The folder must not replace the calibration to begin from."""
+    """All that a roll-back needs besides the entries. The folder must not replace the calibration to begin from."""
     if setup.kept is not None:
-        return {**setup.kept, "evaluator": dict(session.evaluator)}
+        return dict(setup.kept)
     if setup.calibration.resolve() == (setup.folder / CALIBRATION).resolve():
         raise InputError(
             "the calibration to begin from would be replaced by the updated one.",
@@ -112,7 +112,6 @@ def _header(setup: Setup, session: Recalibrator) -> dict[str, Any]:
         "text": text.decode("utf-8", errors="replace"),
         "path": str(setup.calibration),
         "settings": {key: value for key, value in session.settings.to_config().items() if key not in _NOT_DECIDING},
-        "evaluator": dict(session.evaluator),
     }
 
 
@@ -130,10 +129,71 @@ def _recover(setup: Setup, journal: Journal, state_replayer: StateReplayer, head
                 hint="Give what it was begun with, or a new --out (perhaps from a copy of its calibration.yaml).",
             )
     state_replayer.restore(recovered.checkpoint, recovered.checkpoint_sequence)
-    # Another version gives other last bits: no reason for a rover to stand still after an update.
-    state_replayer.is_exact = recovered.header.get("evaluator") == header["evaluator"]
     for entry in recovered.entries:
         state_replayer.apply(entry.sequence, entry.kind, entry.content)
-    if not state_replayer.is_exact:
-        journal.checkpoint(state_replayer.checkpoint())
     return True
+
+
+class _NoRecords(Source):
+    keeps_records = True
+    ended = True
+
+    def incoming(self, wait_s: float) -> Incoming | None:
+        return None
+
+
+def roll_back_ended(folder: Path, to: int | str, registry: PluginRegistry) -> Mapping[str, Any]:
+    """Set the estimate in the folder of a recalibration that does not run back; see ``rolled_back``.
+
+    Raises:
+        InputError: there is no journal, it is in use, or there is nothing to go back to.
+        DataError: the journal is damaged, or does not reach there.
+    """
+    journal = folder / JOURNAL
+    if not journal.is_dir():
+        hint = "Give the folder that armcal recalibrate was given as --out."
+        raise InputError("there is no journal of a recalibration.", where=Location(str(folder)), hint=hint)
+    kept = verify(journal)
+    if isinstance(to, str) and to != GOOD:
+        to = entry_named(journal, to)
+    if isinstance(to, int) and not kept.first_sequence < to <= kept.last_sequence:
+        raise InputError(
+            f"found no entry {to}; the journal goes from {kept.first_sequence + 1} to {kept.last_sequence}.",
+            where=Location("rollback"),
+            hint="Give the sequence number of an entry that is kept.",
+        )
+    newest = read_newest(journal).segment
+    assert newest is not None
+    setup = Setup(
+        folder=folder,
+        calibration=Path(str(newest.header.get("path", ""))),
+        limits=JournalLimits(total_bytes=1 << 62),  # nothing of the past goes for this
+        kept=newest.header,
+    )
+    with opened(setup, _kept_session(newest.header, journal, registry), _NoRecords()) as loop:
+        reply = rolled_back(loop, to)
+        loop.finishing = "The estimate was set back after the end."
+        loop.run()
+    return reply
+
+
+def _kept_session(header: Mapping[str, Any], journal: Path, registry: PluginRegistry) -> Recalibrator:
+    """By the calibration and the settings that a journal keeps.
+
+    Raises:
+        DataError: the journal does not keep the calibration, or not as it was.
+        ConfigError, PluginError: it is none that this version takes; the journal is named.
+    """
+    text = header.get("text")
+    if not isinstance(text, str) or hashlib.sha256(text.encode()).hexdigest() != header.get("calibration"):
+        hint = "Take another copy of the journal, or begin a new --out from its calibration.yaml."
+        raise DataError("the journal does not hold its calibration whole.", where=Location(str(journal)), hint=hint)
+    try:
+        stated = yaml.safe_dump(dict(header.get("settings") or {}))
+        settings = load_settings(Path("journal.yaml"), (), stated.encode())
+        return Recalibrator(Calibration.load(CALIBRATION, registry, content=text.encode()), settings, registry)
+    except (ConfigError, PluginError) as fault:
+        where = Location(str(journal), field=fault.where.field if fault.where else None)
+        again = "Roll back with the version of armcal that wrote it, or take another copy of the journal."
+        hint = fault.hint if isinstance(fault, PluginError) else again
+        raise type(fault)(fault.message, where=where, hint=hint) from fault

@@ -23,7 +23,6 @@ from armcal.estimate.online import Linearised, OnlineEstimator, normalised_innov
 from armcal.measure.reader import ReadRequest
 from armcal.plugins import PluginRegistry, discover
 
-from armcal_online.evaluator import identity
 from armcal_online.sources.source import Incoming
 from armcal_online.tracking import events
 from armcal_online.tracking.belief import Belief, most_likely
@@ -84,11 +83,6 @@ class Recalibrator:
     @property
     def request(self) -> ReadRequest:
         return self.setup.request
-
-    @property
-    def evaluator(self) -> dict[str, Any]:
-        """What evaluates it: with the same, a replay gives the same bits."""
-        return identity(self.setup.problem, self._estimator)
 
     @property
     def values(self) -> Array:
@@ -286,12 +280,9 @@ class Recalibrator:
             raise DataError(
                 f"found a state of {count} numbers in the journal, expected {expected} by the calibration and its "
                 "settings.",
-                hint="Replay with the calibration and settings of the journal.",
+                hint="Go on with the calibration and settings of the journal.",
             )
         self.state = state
-
-    def digest(self) -> str:
-        return self.state.digest()
 
     def calibration_text(self) -> str:
         state = self.state

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import base64
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from types import UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -151,20 +149,6 @@ class State:
         if set(state.counts) != {"accepted", "rejected", "ignored"}:
             raise ValueError(f"counts of {', '.join(state.counts)}")
         return state
-
-    def digest(self) -> str:
-        """A hash of the belief and how it is judged, to the last bit."""
-        gaussian = self.belief.gaussian
-        hashed = hashlib.sha256()
-        for array in (self.belief.origin, gaussian.mean, gaussian.covariance):
-            hashed.update(array.astype("<f8").tobytes())
-        rest = [asdict(self.health), dict(self.counts), asdict(self.clock), self.sequence, self.drifted]
-        hashed.update(json.dumps(rest, sort_keys=True).encode())
-        if self.net.taken:
-            hashed.update(json.dumps(_encoded(self.net), sort_keys=True).encode())
-        if self.slow.tracks or self.slow.trend is not None:
-            hashed.update(json.dumps(_encoded(self.slow), sort_keys=True).encode())
-        return hashed.hexdigest()[:16]
 
 
 def remembering(state: State, arrival: Arrival) -> State:
