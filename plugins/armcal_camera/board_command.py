@@ -13,7 +13,7 @@ import yaml
 from armcal.base.arrays import Array
 from armcal.cli.common import Console, speaking
 from armcal.errors import InputError
-from armcal.io.file_set import write_new, write_over
+from armcal.io.plain_files import write_new, write_over
 from pydantic import ValidationError
 
 from armcal_camera.board import Aprilgrid, Board, BoardFile, Charuco, Chessboard, Tag, dark_rectangles, outline

@@ -32,9 +32,8 @@ from armcal.base.units import from_unit
 from armcal.errors import DataError, Location
 from armcal.functions.compiler import cache_directory
 from armcal.io.cells import CellFault, read_cell
-from armcal.io.file_set import write_over
 from armcal.io.parallel import Automatic, Report
-from armcal.io.plain_files import input_bytes, refuse, text_of
+from armcal.io.plain_files import input_bytes, refuse, text_of, write_over
 from armcal.measure.reader import ReadRequest
 from pydantic import Field, model_validator
 

@@ -156,7 +156,7 @@ def compare(console: Console, dataset: Path, second: Path | None, out: Path | No
     console.result(content)
     show_compare(console, content)
     if out is not None:
-        from armcal.io.file_set import write_over
+        from armcal.io.plain_files import write_over
 
         write_over({out: page(content, command_line()).encode()})
         console.line(f"page: {out}")

@@ -16,8 +16,7 @@ from typing import Any, Literal, NoReturn
 
 from armcal.arm.servo import TOOTH_DEG, teeth_text
 from armcal.errors import DataError, Location
-from armcal.io.file_set import write_new, write_over
-from armcal.io.plain_files import input_bytes, text_of
+from armcal.io.plain_files import input_bytes, text_of, write_new, write_over
 
 _WITHIN_DEG = 2.0
 _FULL_TURN = ("wrist_roll", "forearm_roll", "wrist_rotate", "wheel")

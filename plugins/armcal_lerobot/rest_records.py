@@ -19,7 +19,7 @@ from armcal.config.system import build_system
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, DataError, InputError, Location
 from armcal.io.cells import csv_text
-from armcal.io.file_set import write_over
+from armcal.io.plain_files import write_over
 from armcal.measure.rests import StillSettings, rests
 from armcal.plugins import PluginRegistry, library
 

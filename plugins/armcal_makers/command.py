@@ -9,8 +9,7 @@ from armcal.calibration.exporter import POSES
 from armcal.calibration.rigid_chain import RigidChain, RigidJoint, turn_between
 from armcal.cli.common import FILE, Console, spare_inputs, speaking
 from armcal.errors import InputError
-from armcal.io.file_set import write_new, write_over
-from armcal.io.plain_files import check_output, input_bytes, text_of
+from armcal.io.plain_files import check_output, input_bytes, text_of, write_new, write_over
 
 from armcal_makers.arms import MakersArm, at_zero, differences, read_kinematics, tips
 

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import yaml
 from armcal.errors import DataError, Location
-from armcal.io.file_set import require_new, write_new
-from armcal.io.plain_files import refuse
+from armcal.io.plain_files import refuse, require_new, write_new
 from numpy.typing import NDArray
 
 from armcal_ros2.bag import Bag, Stamps, nanoseconds

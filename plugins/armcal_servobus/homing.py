@@ -14,7 +14,7 @@ from armcal.arm.servo import teeth_text
 from armcal.cli.common import FILE, Console
 from armcal.devices.device import DeviceError
 from armcal.errors import InputError, Location
-from armcal.io.file_set import write_new
+from armcal.io.plain_files import write_new
 
 from armcal_servobus.bus import Bus
 from armcal_servobus.configured import on_config, opened

@@ -8,7 +8,7 @@ import click
 from armcal.calibration.calibration import accept as accepted
 from armcal.calibration.calibration_file import sealed
 from armcal.cli.common import FILE, Console, speaking
-from armcal.io.file_set import write_over
+from armcal.io.plain_files import write_over
 
 
 @click.group()

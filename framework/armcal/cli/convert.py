@@ -21,7 +21,7 @@ from armcal.calibration.convert import (
 from armcal.calibration.rigid_chain import rigid_chain
 from armcal.cli.common import FILE, Console, arm, spare_inputs, speaking
 from armcal.errors import ArmcalError, PluginError
-from armcal.io.file_set import write_over
+from armcal.io.plain_files import write_over
 from armcal.plugins import PluginRegistry
 
 LARGEST = 1e-9  # m and rad: a conversion that is further off is not written

@@ -6,8 +6,7 @@ import click
 
 from armcal.cli.common import FILE, Console, speaking, unwritten
 from armcal.errors import InputError, Location
-from armcal.io.file_set import write_new
-from armcal.io.plain_files import writing
+from armcal.io.plain_files import write_new, writing
 from armcal.version import SOURCES
 
 _CONFIG = "demo.yaml"

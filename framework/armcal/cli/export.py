@@ -26,8 +26,7 @@ from armcal.config.validate import validate
 from armcal.config.yaml_nodes import Node, Origin, assignment, set_at
 from armcal.config.yaml_source import Reader, as_source
 from armcal.errors import ConfigError, InputError, Location, PluginError
-from armcal.io.file_set import require_new, write_new, write_over
-from armcal.io.plain_files import check_output, writing
+from armcal.io.plain_files import check_output, require_new, write_new, write_over, writing
 
 S = TypeVar("S", bound=Settings)
 

@@ -1,14 +1,15 @@
-"""Regular files alone: of a stated size where they are read, and never a link or a device where one is written."""
+"""Regular files alone: of a stated size where they are read; whole, and never through a link, where one is written."""
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from stat import S_ISDIR, S_ISLNK, S_ISREG
 from typing import BinaryIO, NoReturn
 
 from armcal.errors import DataError, InputError, Location
 
+STAGED = ".armcal-"  # how names of files begin that are not in their place yet
 _UNITS = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
 
 
@@ -123,3 +124,91 @@ def check_output(path: Path, refusal: type[InputError] = DataError) -> None:
         where=Location(str(path)),
         hint="Give the path of the file itself.",
     )
+
+
+def make_folder(folder: Path) -> None:
+    """The folder and those above it, durable; nothing if it is there. Raises OSError."""
+    missing = [place for place in (folder, *folder.parents) if not place.is_dir()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for place in reversed(missing):
+        sync_folder(place.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in a folder durable, or raise OSError."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_durably(path: Path, content: bytes) -> None:
+    """Write a file that nobody reads yet, or raise OSError and leave none."""
+    try:
+        with path.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Put a file in place so that a power loss leaves the earlier one or this one, whole.
+
+    Raises:
+        OSError: it could not be; the earlier file is as it was.
+    """
+    staged = path.with_name(f"{STAGED}{path.name}")
+    write_durably(staged, content)
+    try:
+        os.replace(staged, path)
+    except BaseException:
+        staged.unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)
+
+
+def write_new(files: Mapping[Path, bytes]) -> None:
+    """Write files where none are.
+
+    Raises:
+        InputError: one is there already, or cannot be written; then none is written.
+    """
+    require_new(list(files))
+    write_over(files)
+
+
+def write_over(files: Mapping[Path, bytes]) -> None:
+    """Write files, over those that are there, once all of them are on the disk beside their places.
+
+    Raises:
+        InputError: one cannot be written; as long as that was for want of room, none is.
+    """
+    staged: dict[Path, Path] = {}
+    place = Path()
+    try:
+        for place in files:
+            check_output(place, InputError)
+        for place, content in files.items():
+            staged[place] = place.with_name(f"{STAGED}{place.name}")
+            write_durably(staged[place], content)
+        for place, ready in staged.items():
+            os.replace(ready, place)
+    except OSError as fault:
+        hint = "Give --out a place that can be written."
+        raise InputError(f"it cannot be written ({fault.strerror}).", where=Location(str(place)), hint=hint) from fault
+    finally:
+        for left in staged.values():
+            with suppress(OSError):
+                left.unlink(missing_ok=True)
+
+
+def require_new(paths: Sequence[Path]) -> None:
+    """Raise InputError if any of the files is there."""
+    for path in paths:
+        if os.path.lexists(path):
+            hint = "Give another --out, or --force to overwrite it."
+            raise InputError("it is there already.", where=Location(str(path)), hint=hint)

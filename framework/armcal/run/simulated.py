@@ -10,8 +10,8 @@ from armcal.errors import ConfigError
 from armcal.estimate.estimator import Progress
 from armcal.estimate.simulation import TruthfulSimulator
 from armcal.estimate.start import carriers_of
-from armcal.io.file_set import write_over
 from armcal.io.folder import check_folder
+from armcal.io.plain_files import write_over
 from armcal.measure.instrument import Rendering
 from armcal.measure.measurement import borrowed_names
 from armcal.problem.problem import Problem

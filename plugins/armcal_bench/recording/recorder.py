@@ -11,7 +11,7 @@ from armcal.devices.clock import Clock
 from armcal.devices.line_source import refused_lines_text
 from armcal.devices.live import JointSample, JointStream, LiveCamera, Shot, refused_by, shot_of, shots_of
 from armcal.errors import InputError
-from armcal.io.file_set import write_over
+from armcal.io.plain_files import write_over
 from armcal.measure.environment import warn_beyond_limits
 
 from armcal_bench.bench import Bench
