@@ -119,7 +119,7 @@ def test_a_joint_turns_no_faster_than_is_set(desk):
 @pytest.mark.quick("sts3215")
 def test_they_are_found(desk):
     protocol = desk.servos[0].table.protocol
-    bus = Bus(BusSettings.model_validate({"port": desk.path, "protocol": protocol, "reply_ms": 10}))
+    bus = Bus(BusSettings.model_validate({"port": desk.path, "protocol": protocol, "reply_ms": 60}))
     there = list(find(bus, (desk.baud,), range(4)))
     assert [(servo.id, servo.model_name) for servo in there] == [
         (1, desk.servos[0].table.name),
