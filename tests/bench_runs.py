@@ -19,7 +19,7 @@ from armcal.cli.main import cli
 from armcal.devices.clock import SimulatedClock
 from armcal.devices.simulated import CLOCK, BenchRequest
 from armcal.errors import ArmcalError, InputError
-from armcal.io.journal.journal import Journal
+from armcal.io.journal import KeptJournal, has_journal
 from armcal.run.experiment import Experiment
 from armcal_bench.acquisition.preparation import Prepared, prepare
 from armcal_bench.acquisition.rehearsal import overrides_for
@@ -109,7 +109,7 @@ class BenchRun:
 
     def acquire(self, asked: Callable[[], bool] = lambda: False, prepared: Prepared | None = None) -> Outcome:
         """Begin or go on."""
-        there = (self.out / "journal").is_dir()
+        there = has_journal(self.out)
         options = RunOptions(
             self.out, "resume" if there else "anew", asked, lambda start: True, lambda progress: None, True
         )
@@ -136,13 +136,13 @@ class BenchRun:
 
     def progress(self) -> Progress:
         """By the journal."""
-        with Journal.open(self.out / "journal", {}) as journal:
-            return progress_of(journal.recovered.entries)
+        with KeptJournal(self.out) as journal:
+            return progress_of(journal.entries())
 
     def entries(self, kind: str) -> list[Any]:
         """Of the journal, of a kind."""
-        with Journal.open(self.out / "journal", {}) as journal:
-            return [entry.content for entry in journal.recovered.entries if entry.kind == kind]
+        with KeptJournal(self.out) as journal:
+            return [entry.content for entry in journal.entries() if entry.kind == kind]
 
     def measured(self) -> Dataset:
         """As the data are written."""

@@ -13,10 +13,9 @@ import sys
 import time
 from pathlib import Path
 
-from armcal.io.journal.journal import Journal, JournalLimits
-from armcal.io.journal.reader import read_entries, verify
+from armcal.io.journal import Journal, KeptJournal
 
-LIMITS = JournalLimits(segment_bytes=4000, total_bytes=60_000)
+LIMIT = 200_000
 
 
 def content(life: int, number: int) -> dict:
@@ -27,15 +26,15 @@ def content(life: int, number: int) -> dict:
 
 def live(folder: Path, life: int, tell: int) -> None:
     """Append until killed; a line for each acknowledged entry."""
-    with Journal.open(folder, {"life": life}, limits=LIMITS) as journal:
+    with Journal(folder, {"life": life}, LIMIT) as journal:
         number = 0
         while True:
             sequence = journal.record("record", content(life, number))
             os.write(tell, b"%d %d\n" % (sequence, number))
             journal.note("decision", content(life, -number))
             number += 1
-            if journal.wants_checkpoint:
-                journal.checkpoint(content(life, number))
+            if number % 20 == 0:
+                journal.put_checkpoint(content(life, number))
 
 
 def kill_once(folder: Path, life: int, rng: random.Random) -> int:
@@ -57,7 +56,8 @@ def kill_once(folder: Path, life: int, rng: random.Random) -> int:
     assert os.WIFSIGNALED(status), f"the writer of life {life} ended by itself"
     with lines:
         said = [tuple(map(int, line.split())) for line in (*said, *lines)]
-    found = {entry.sequence: entry for entry in read_entries(folder)} if said else {}
+    with KeptJournal(folder) as journal:
+        found = {entry.sequence: entry for entry in journal.entries()}
     # A writer that had the processor for long has filled more than the journal keeps: its oldest entries went.
     oldest = min(found, default=0)
     assert not said or said[-1][0] in found, f"life {life}: its last acknowledged entry is lost"
@@ -71,7 +71,9 @@ def main(folder: str, kills: str, seed: str) -> None:
     """Print the count of acknowledged entries."""
     rng = random.Random(int(seed))
     total = sum(kill_once(Path(folder), life, rng) for life in range(int(kills)))
-    print(total, verify(Path(folder)).segments)
+    with KeptJournal(Path(folder)) as journal:
+        journal.verify()
+    print(total)
 
 
 if __name__ == "__main__":

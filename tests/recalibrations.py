@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
+import resource
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from armcal.io.journal.files import FileLayer
-from armcal.io.journal.reader import read_entries, read_until
+import pytest
+from armcal.io import plain_files
+from armcal.io.journal import JOURNAL, Entry, KeptJournal
 from armcal_online.running.loop import Recalibration, StateReplayer
 from armcal_online.running.session import opened
 from armcal_online.sources.source import Incoming
@@ -65,21 +66,27 @@ def run(folder: Path, source: Any, settings: Any = None, **given: Any) -> FakeRe
     return fake
 
 
+def entries(folder: Path) -> list[Entry]:
+    with KeptJournal(folder) as journal:
+        return list(journal.entries())
+
+
 def taken(folder: Path) -> list[str]:
-    return [e.content["id"] for e in read_entries(folder / "journal") if e.kind == "record"]
+    return [e.content["id"] for e in entries(folder) if e.kind == "record"]
 
 
 def replayed(folder: Path) -> FakeRecalibrator:
     """What the journal makes of it from its first entry on, each checkpoint compared."""
     fake = FakeRecalibrator()
-    replayer = StateReplayer(fake, partial(read_until, folder / "journal"))
-    first, *others = read_entries(folder / "journal")
-    replayer.restore(first.content, first.sequence)
-    for entry in others:
-        if entry.kind == "checkpoint":
-            assert entry.content["state"] == fake.snapshot(), entry.sequence
-        else:
+    with KeptJournal(folder) as journal:
+        replayer = StateReplayer(fake, journal.until)
+        first, _ = journal.until(1)
+        assert first.sequence == 0
+        replayer.restore(first.content, 0)
+        for entry in journal.entries():
             replayer.apply(entry.sequence, entry.kind, entry.content)
+            if (checkpoint := journal.until(entry.sequence)[0]).sequence == entry.sequence:
+                assert checkpoint.content["state"] == fake.snapshot(), entry.sequence
     return fake
 
 
@@ -103,15 +110,26 @@ def steps(going: Recalibration, count: int) -> None:
         going.step(0.0)
 
 
-class FullFiles(FileLayer):
-    """Files on a disk that fills up."""
+class FullDisk:
+    """Files on a disk that fills up: those whose name has one of these parts find no room."""
 
-    def __init__(self) -> None:
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.full: set[str] = set()
+        self._write = plain_files.write_durably
+        patch.setattr(plain_files, "write_durably", self._written)
 
-    def write(self, descriptor: int, data: bytes) -> None:
-        name = str(Path(f"/proc/self/fd/{descriptor}").readlink())
-        if any(part in name for part in self.full):
-            super().write(descriptor, data[: len(data) // 2])
+    def _written(self, path: Path, content: bytes) -> None:
+        if any(part in path.name for part in self.full):
             raise OSError(28, "No space left on device")
-        super().write(descriptor, data)
+        self._write(path, content)
+
+
+@contextmanager
+def limited(folder: Path) -> Iterator[None]:
+    """No file may be larger than a journal is by now."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, ((folder / f"{JOURNAL}-wal").stat().st_size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -6,7 +6,8 @@ import json
 import os
 import shutil
 import signal
-from collections.abc import Callable
+import sqlite3
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +15,10 @@ from typing import Any
 
 import numpy as np
 from armcal.devices.clock import SimulatedClock
+from armcal.io.journal import JOURNAL, Journal
 from armcal.run.experiment import Experiment
 from armcal_bench.acquisition.rehearsal import overrides_for
-from armcal_bench.servo.record import NAME, Record
+from armcal_bench.servo.record import Record
 from armcal_bench.servo.session import Conversation, evaluated, measure
 from armcal_bench.servo.setup import Setup
 
@@ -104,5 +106,20 @@ class ServoRun:
         return [entry for entry in Record(self.out).entries if entry["kind"] == kind]
 
     def rows(self) -> list[dict[str, Any]]:
-        """The record, line by line."""
-        return [json.loads(line) for line in (self.out / NAME).read_text().splitlines()]
+        """The record, entry by entry."""
+        return [dict(entry) for entry in Record(self.out).entries]
+
+
+def put_rows(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """A record of these entries in place of what is there, right or wrong."""
+    (folder / JOURNAL).unlink(missing_ok=True)
+    with Journal(folder, {}) as journal:
+        for _ in rows:
+            journal.record("record", 0)
+    with sqlite3.connect(folder / JOURNAL) as database:
+        for number, row in enumerate(rows, start=1):
+            kind = row.get("kind")
+            content = {key: value for key, value in row.items() if key != "kind"}
+            values = kind if isinstance(kind, str) else json.dumps(kind), json.dumps(content), number
+            database.execute("UPDATE entry SET kind = ?, content = ? WHERE sequence = ?", values)
+    database.close()

@@ -16,7 +16,7 @@ from armcal.base.arrays import Array
 from armcal.devices.device import MeasuringDevice, measured_angles, open_device
 from armcal.devices.wiring import WiringRecord
 from armcal.errors import ConfigError
-from armcal.io.journal.journal import Journal
+from armcal.io.journal import KeptJournal
 from armcal.run.experiment import Experiment
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -139,8 +139,8 @@ def check_joints(
                 break
     prepared = prepare(experiment, _written(plan, list(here), poses))
     drive(prepared, plan, folder / "run")
-    with Journal.open(folder / "run" / "journal", {}) as journal:
-        measured = {name: pose_of(record) for name, record in progress_of(journal.recovered.entries).measured.items()}
+    with KeptJournal(folder / "run") as journal:
+        measured = {name: pose_of(record) for name, record in progress_of(journal.entries()).measured.items()}
     commanded = dict(zip(prepared.plan.ids, prepared.scheduler.poses, strict=True))
     check = _judged(experiment, list(here), commanded, measured)
     far = {joint for joint, zero in check.zeros.items() if zero.is_far}

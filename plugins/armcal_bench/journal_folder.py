@@ -1,16 +1,14 @@
 """The folder of a measuring run or a recording: its journal is begun, or gone on with."""
 
-import shutil
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-from armcal.errors import ArmcalError, InputError, Location
+from armcal.errors import InputError, Location
 from armcal.io.folder import check_folder
-from armcal.io.journal.journal import Journal
+from armcal.io.journal import Journal, has_journal
 
-JOURNAL = "journal"
 Start = Literal["anew", "resume"]
 
 
@@ -31,27 +29,21 @@ def opened_journal(
     Raises:
         InputError: there is a journal and ``start`` is not to resume it, or there is none to resume; or it was begun
             with another header.
-        JournalDamagedError: it cannot be read.
+        DataError: it cannot be read.
     """
     where = Location(str(folder))
-    try:
-        there = (folder / JOURNAL).is_dir()
-    except OSError as fault:
-        hint = "Give a folder that can be written."
-        raise InputError(f"it cannot be used ({fault.strerror}).", where=where, hint=hint) from fault
-    if there and start == "anew" and _began_nothing(folder / JOURNAL):
-        shutil.rmtree(folder / JOURNAL)
-        there = False
-    if there and start == "anew":
-        raise InputError(f"it holds a {noun} already.", where=where, hint="Give another --out, or go on by --resume.")
-    if start == "resume" and not there:
+    is_there = has_journal(folder)
+    if start == "resume" and not is_there:
         raise InputError(f"it holds no {noun} to resume.", where=where, hint="Leave --resume out to begin one.")
-    if not there:
+    if not is_there:
         check_folder(folder, ours)
-    with Journal.open(folder / JOURNAL, header) as journal:
+    with Journal(folder, header) as journal:
+        if start == "anew" and not journal.is_new:  # a run that was refused before anything moved left an empty one
+            hint = "Give another --out, or go on by --resume."
+            raise InputError(f"it holds a {noun} already.", where=where, hint=hint)
         for key, name in same.items():
-            begun, now = journal.recovered.header.get(key), header[key]
-            if journal.recovered.header and begun != now:
+            begun, now = journal.header.get(key), header[key]
+            if begun != now:
                 lists = (
                     f" ({', '.join(begun) or 'none'}, now {', '.join(now) or 'none'})"
                     if isinstance(begun, list)
@@ -60,10 +52,3 @@ def opened_journal(
                 hint = f"Give the {name} that it was begun with, or another --out."
                 raise InputError(f"it was begun with another {name}{lists}.", where=where, hint=hint)
         yield journal
-
-
-def _began_nothing(folder: Path) -> bool:
-    """Whether a journal has no entries: its run was refused before anything moved. One in use or damaged is kept."""
-    with suppress(ArmcalError), Journal.open(folder, {}) as journal:
-        return not journal.recovered.entries and journal.recovered.checkpoint is None
-    return False

@@ -10,6 +10,7 @@ import pytest
 from armcal.devices.clock import SimulatedClock
 from armcal.devices.device import DeviceLostError, DeviceRefusedError
 from armcal.devices.serial_port import SerialPort, SerialPortSettings
+from armcal.io.journal import Journal, KeptJournal, has_journal
 
 from tests.bench_runs import BenchRun, positions
 
@@ -139,6 +140,39 @@ def test_random_troubles_never_make_the_arm_unsafe(
     run: BenchRun, undisturbed: dict[str, np.ndarray], seed: int
 ) -> None:
     judge(run, seed, undisturbed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [6, 60])
+def test_kills_lose_nothing_that_was_acknowledged(
+    run: BenchRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kills: int
+) -> None:
+    """Killed again and again, each time gone on with; a run that came to its end is begun anew."""
+    told, write, random, done = tmp_path / "told", Journal.record, np.random.default_rng(60), 0
+
+    def recorded(journal: Journal, kind: str, content: Any) -> int:
+        number = write(journal, kind, content)
+        with told.open("a") as file:
+            file.write(f"{number} {kind}\n")
+        return number
+
+    monkeypatch.setattr(Journal, "record", recorded)
+    while done < kills:
+        run.clean()
+        told.write_text("")
+        with run.simulated() as clock:
+            while done < kills and run.acquire_until_killed(int(random.integers(3, 250))):
+                done += 1
+                if has_journal(run.out):
+                    with KeptJournal(run.out) as journal:
+                        found = {f"{entry.sequence} {entry.kind}" for entry in journal.entries()}
+                    said = told.read_text().splitlines()
+                    assert len(set(said)) == len(said) and found >= set(said), done
+                clock.ask({"advance": 12.0})
+            ending = run.acquire().ending
+            assert ending.how == "done" and clock.ask({"state": True})["offences"] == {}, ending
+        measured = [content["pose"] for content in run.entries("measured")]
+        assert len(set(measured)) == len(measured)
 
 
 @pytest.mark.slow

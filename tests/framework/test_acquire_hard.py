@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import math
+import resource
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
@@ -19,7 +20,7 @@ from armcal.config.servo_file import load_servo_file
 from armcal.devices.clock import SimulatedClock
 from armcal.devices.device import DeviceError, DeviceRefusedError
 from armcal.errors import ArmcalError, InputError
-from armcal.io.journal.journal import Journal, JournalFailedError, JournalFullError
+from armcal.io.journal import Journal, JournalFailedError, JournalFullError
 from armcal.io.json_server import JsonServer
 from armcal.run.experiment import Experiment
 from armcal_bench.acquisition.drive import Drive, PathPlanner
@@ -178,22 +179,22 @@ class TestJournalThatFails:
         assert sorted(measured) == sorted(undisturbed)
 
     @pytest.mark.slow
-    def test_a_real_disk_that_is_full(self, run: BenchRun, monkeypatch: pytest.MonkeyPatch) -> None:
-        from armcal.io.journal.files import REAL_FILES
+    def test_a_limit_of_file_size(self, run: BenchRun, monkeypatch: pytest.MonkeyPatch) -> None:
+        write, calls, unlimited = Journal.record, [0], resource.getrlimit(resource.RLIMIT_FSIZE)
 
-        write, calls = type(REAL_FILES).write, [0]
-
-        def full(files: Any, descriptor: int, data: bytes) -> None:
+        def limited(journal: Journal, kind: str, content: Any) -> int:
             calls[0] += 1
-            if calls[0] > 40:
-                raise OSError(errno.ENOSPC, "no space left on the device")
-            write(files, descriptor, data)
+            if calls[0] == 40:
+                size = journal.path.with_name(f"{journal.path.name}-wal").stat().st_size
+                resource.setrlimit(resource.RLIMIT_FSIZE, (size, unlimited[1]))
+            return write(journal, kind, content)
 
         with run.simulated() as clock:
             with monkeypatch.context() as patch:
-                patch.setattr(type(REAL_FILES), "write", full)
-                with pytest.raises(ArmcalError, match=r"room|journal"):
+                patch.setattr(Journal, "record", limited)
+                with pytest.raises(JournalFullError, match="no room for an entry"):
                     run.acquire()
+            resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
             assert is_let_go(clock.ask({"state": True}))
             assert run.acquire().ending.how == "done"
 

@@ -77,7 +77,7 @@ class TestAFrameThatIsNotTheArms:
             targets = {joint: state["target_rad"] for joint, state in clock.ask({"state": True})["joints"].items()}
         assert targets == pytest.approx({"a": 0.0, "b": math.radians(30), "c": math.radians(20)}, abs=0.01)
         assert arm.servos.read_text() == arm.kind["servos"]
-        assert {file.name for file in arm.out.iterdir()} == {"observations.jsonl.before-1"}
+        assert {file.name for file in arm.out.iterdir()} == {"journal.sqlite.before-1"}
 
     @pytest.mark.slow
     @pytest.mark.parametrize("joint", ["turn", "lift"])

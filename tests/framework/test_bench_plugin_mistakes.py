@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from armcal import plugins
 from armcal.cli.main import cli
+from armcal.io.journal import KeptJournal, has_journal
 from armcal_bench.bench import Bench
 
 from tests.bench_fakes import FakeClock
@@ -319,8 +320,11 @@ def mistaken(method: str, statement: str) -> str:
 
 def kept(folder: Path) -> list[str]:
     """What a folder holds of what was measured, a line each; of poses and postures their data."""
-    if (lines := folder / "observations.jsonl").exists():
-        return [line for line in lines.read_text().splitlines() if '"kind": "pose"' in line]
+    if has_journal(folder):
+        with KeptJournal(folder) as journal:
+            poses = [repr(entry.content) for entry in journal.entries() if entry.kind == "pose"]
+        if poses:
+            return poses
     data = folder / "dataset.csv"
     return data.read_text().splitlines()[1:] if data.exists() else []
 

@@ -1,4 +1,4 @@
-"""The journal as its users meet it: round trips, reopening, rotation, limits, refusals, one writer, kills."""
+"""The journal: what it acknowledged outlasts kills, full disks and limits of file size, and others read meanwhile."""
 
 from __future__ import annotations
 
@@ -6,310 +6,334 @@ import json
 import math
 import os
 import random
-import struct
+import shutil
+import sqlite3
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from armcal.errors import DataError, InputError
-from armcal.io.journal.files import FileLayer, write_whole
-from armcal.io.journal.journal import Journal, JournalLimits
-from armcal.io.journal.reader import read_entries, read_newest, read_segments, read_until, verify
+from armcal.errors import ArmcalError, DataError, InputError
+from armcal.io.journal import JOURNAL, JOURNAL_FILES, Journal, JournalFailedError, JournalFullError, KeptJournal
+from journal_killer import content
 from soak import shares
 
-HEADER = {"software": "1.2.3", "evaluator": {"kernel": "abc"}}
-SMALL = JournalLimits(segment_bytes=600, total_bytes=4000)
 KILLER = Path(__file__).resolve().parents[1] / "journal_killer.py"
 
 
-def filled(folder: Path, count: int, limits: JournalLimits = SMALL) -> list[tuple[int, str, object]]:
-    """A journal of records, notes and checkpoints; what was written."""
-    written = []
-    with Journal.open(folder, HEADER, limits=limits) as journal:
+def kept(folder: Path) -> list[tuple[int, str, object]]:
+    with KeptJournal(folder) as journal:
+        return [(entry.sequence, entry.kind, entry.content) for entry in journal.entries()]
+
+
+def written(folder: Path, count: int) -> None:
+    with Journal(folder, {"made": "here"}) as journal:
         for number in range(count):
-            written.append((journal.record("record", {"x": number / 7}), "record", {"x": number / 7}))
-            written.append((journal.note("decision", [number]), "decision", [number]))
-            if journal.wants_checkpoint:
-                written.append((journal.checkpoint({"n": number}), "checkpoint", {"n": number}))
-    return written
+            journal.record("record", {"n": number})
 
 
-def said(entries) -> list[tuple[int, str, object]]:
-    return [(entry.sequence, entry.kind, entry.content) for entry in entries]
+def files_in(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
 
 
-def test_what_is_written_is_read_again(tmp_path: Path) -> None:
-    content = {"a": [1, -2.5, True, None, "ä\n\0\ud800"], "b": {"": {}, "c": [[], 10**40]}}
-    with Journal.open(tmp_path / "deep" / "journal", HEADER) as journal:
-        assert journal.recovered.checkpoint is None and journal.recovered.entries == ()
-        sequence = journal.record("record", content)
-        assert journal.sequence == sequence
-    with Journal.open(tmp_path / "deep" / "journal", {}) as journal:
-        assert said(journal.recovered.entries) == [(sequence, "record", content)]
-        assert journal.recovered.header == HEADER
-        assert journal.recovered.cut is None
-        assert type(journal.recovered.entries[0].content["a"][2]) is bool
+def test_what_is_written_is_read_again_and_a_closed_journal_is_one_file(tmp_path: Path) -> None:
+    with Journal(tmp_path / "a" / "b", {"made": "here"}) as journal:
+        assert journal.is_new and journal.sequence == 0 and journal.checkpoint is None
+        assert (journal.record("record", {"x": (1, 2)}), journal.note("level", None)) == (1, 2)
+        assert journal.record("é", []) == 3
+        assert files_in(journal.folder) == {*JOURNAL_FILES[:3], JOURNAL_FILES[4]}
+    assert kept(tmp_path / "a" / "b") == [(1, "record", {"x": [1, 2]}), (2, "level", None), (3, "é", [])]
+    assert files_in(tmp_path / "a" / "b") == {JOURNAL}
+    with Journal(tmp_path / "a" / "b", {"made": "there"}) as journal:
+        assert not journal.is_new and journal.header == {"made": "here"} and journal.record("record", 1) == 4
 
 
 def test_floats_come_back_bit_for_bit(tmp_path: Path) -> None:
-    rng = random.Random(1)
-    values = [struct.unpack("<d", rng.randbytes(8))[0] for _ in range(3000)]
-    values = [v for v in values if math.isfinite(v)] + [0.0, -0.0, 5e-324, 0.1, 1e22, sys.float_info.max, 1.0]
-    with Journal.open(tmp_path, {}) as journal:
-        journal.record("record", values)
-    (found,) = (entry.content for entry in read_entries(tmp_path) if entry.kind == "record")
-    assert [struct.pack("<d", v) for v in found] == [struct.pack("<d", v) for v in values]
-    assert all(type(v) is float for v in found)
+    chance = random.Random(1)
+    numbers = [chance.uniform(-1, 1) * 10.0 ** chance.randint(-300, 300) for _ in range(300)]
+    numbers += [0.0, -0.0, 5e-324, 1.7976931348623157e308, 0.1 + 0.2]
+    with Journal(tmp_path, {}) as journal:
+        journal.record("record", numbers)
+        journal.put_checkpoint(numbers)
+        assert journal.checkpoint is not None
+        assert list(map(repr, journal.checkpoint.content)) == list(map(repr, numbers))
+    assert list(map(repr, kept(tmp_path)[0][2])) == list(map(repr, numbers))  # type: ignore[call-overload]
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, [1, {"x": math.nan}]])
-def test_numbers_that_are_not_finite_are_refused_and_leave_no_trace(tmp_path: Path, bad: object) -> None:
-    with Journal.open(tmp_path, {}) as journal:
-        before = journal.sequence
-        for write in (
-            lambda: journal.record("record", bad),
-            lambda: journal.note("n", bad),
-            lambda: journal.checkpoint(bad),
-        ):
-            with pytest.raises(ValueError):
+@pytest.mark.parametrize("bad", [math.nan, math.inf, [1, {"x": math.nan}], {1, 2}, b"x"])
+def test_what_is_no_json_is_refused_and_leaves_no_trace(tmp_path: Path, bad: object) -> None:
+    with Journal(tmp_path, {}) as journal:
+        for write in (lambda: journal.record("record", bad), lambda: journal.put_checkpoint(bad)):
+            with pytest.raises((ValueError, TypeError)):
                 write()
-        assert journal.record("record", 1) == before + 1
-    assert said(read_entries(tmp_path))[1:] == [(before + 1, "record", 1)]
+        assert journal.record("record", 1) == 1
 
 
-def nested(depth: int) -> object:
-    return [nested(depth - 1)] if depth else 1
+def test_every_entry_is_reached_from_the_checkpoint_before_it(tmp_path: Path) -> None:
+    with Journal(tmp_path, {}) as journal:
+        journal.put_checkpoint(0)
+        for number in range(1, 31):
+            assert journal.record("record", number) == number
+            if number % 7 == 0:
+                journal.put_checkpoint(number)
+        for number in range(1, 31):
+            checkpoint, entries = journal.until(number)
+            assert checkpoint.content == number - number % 7
+            assert [entry.content for entry in entries] == list(range(checkpoint.content + 1, number + 1))
+        for wrong in (-1, 0, 31, 10**9):
+            with pytest.raises(InputError, match=rf"found no entry {wrong}; the journal goes from 1 to 30"):
+                journal.until(wrong)
 
 
-@pytest.mark.parametrize("bad", [{1: 2}, {None: 1}, nested(200)])
-def test_what_json_would_change_or_not_read_is_refused(tmp_path: Path, bad: object) -> None:
-    circle: list = []
-    circle.append(circle)
-    with Journal.open(tmp_path, {}) as journal:
-        for content in (bad, circle):
-            with pytest.raises(ValueError):
-                journal.record("record", content)
-        with pytest.raises(TypeError):
-            journal.record("record", b"bytes")
-        for kind in ("header", "checkpoint", ""):
-            with pytest.raises(ValueError):
-                journal.record(kind, 1)
+def test_the_oldest_go_where_there_would_be_more_than_may_be(tmp_path: Path) -> None:
+    with Journal(tmp_path, {}, total_bytes=200_000) as journal:
+        for number in range(1, 3001):
+            journal.note("record", {"x": [number / 7] * 20})
+            if number % 100 == 0:
+                journal.put_checkpoint({"n": number, "x": [0.1] * 500})
+        assert (tmp_path / JOURNAL).stat().st_size < 600_000
+        numbers = [entry.sequence for entry in journal.entries()]
+        assert numbers == list(range(numbers[0], 3001)) and 200 < len(numbers) < 1200
+        assert journal.until(numbers[0])[0].content["n"] == numbers[0]
+        with pytest.raises(InputError, match=f"goes from {numbers[0]} to 3000"):
+            journal.until(numbers[0] - 1)
+        journal.verify()
 
 
-def test_reopening_goes_on_from_the_newest_checkpoint(tmp_path: Path) -> None:
-    written = filled(tmp_path, 30)
-    last = max(i for i, (_, kind, _) in enumerate(written) if kind == "checkpoint")
-    with Journal.open(tmp_path, HEADER, limits=SMALL) as journal:
-        assert (journal.recovered.checkpoint_sequence, journal.recovered.checkpoint) == (
-            written[last][0],
-            written[last][2],
-        )
-        assert said(journal.recovered.entries) == written[last + 1 :]
-        assert journal.record("record", "more") == written[-1][0] + 1
-    found = said(read_entries(tmp_path))
-    assert found[-1] == (written[-1][0] + 1, "record", "more")
-    assert [entry for entry in found if entry in written] == found[:-1] == written[-len(found) + 1 :]
-
-
-def test_a_segment_rotates_when_it_is_full_and_the_oldest_go(tmp_path: Path) -> None:
-    sizes, largest = [], 0
-    with Journal.open(tmp_path, HEADER, limits=SMALL) as journal:
-        for number in range(400):
-            journal.record("record", {"x": number})
-            if journal.wants_checkpoint:
-                journal.checkpoint({"n": number})
-                sizes.append(sum(path.stat().st_size for path in tmp_path.glob("journal-*.log")))
-            largest = max(largest, *(path.stat().st_size for path in tmp_path.glob("journal-*.log")))
-    assert largest < SMALL.segment_bytes + 400
-    assert max(sizes) <= SMALL.total_bytes and len(sizes) > 20
-    found = verify(tmp_path)
-    assert found.segments >= 3 and found.last_sequence == journal_end(tmp_path) and found.first_sequence > 100
-    assert sorted(path.name for path in tmp_path.iterdir() if "journal" not in path.name) == ["lock"]
-
-
-def journal_end(folder: Path) -> int:
-    return max(entry.sequence for entry in read_entries(folder))
-
-
-def test_a_state_larger_than_all_limits_is_kept(tmp_path: Path) -> None:
-    state = ["x" * 100] * 100
-    with Journal.open(tmp_path, {}, limits=JournalLimits(1000, 2000)) as journal:
-        for _ in range(4):
-            journal.checkpoint(state)
-            assert not journal.wants_checkpoint
-            journal.record("record", 1)
-    assert [path.name for path in tmp_path.glob("journal-*")] == ["journal-00000005.log"]
-    with Journal.open(tmp_path, {}) as journal:
-        assert journal.recovered.checkpoint == state and len(journal.recovered.entries) == 1
-
-
-def test_every_sequence_number_is_reached_from_the_checkpoint_before_it(tmp_path: Path) -> None:
-    written = {sequence: (kind, content) for sequence, kind, content in filled(tmp_path, 30)}
-    kept = [entry.sequence for entry in read_entries(tmp_path)]
-    for sequence in kept:
-        checkpoint, entries = read_until(tmp_path, sequence)
-        chain = [checkpoint, *entries]
-        assert chain[-1].sequence == sequence and [e.kind for e in chain].count("checkpoint") == 1
-        assert [e.sequence for e in chain] == list(range(checkpoint.sequence, sequence + 1))
-        assert all(written[e.sequence] == (e.kind, e.content) for e in chain)
-    for sequence in (0, kept[0] - 1, kept[-1] + 1):
-        with pytest.raises(
-            InputError, match=f"found no entry {sequence}; the journal goes from {kept[0]} to {kept[-1]}"
-        ):
-            read_until(tmp_path, sequence)
-
-
-def test_an_entry_says_where_it_stands_and_standard_tools_read_it(tmp_path: Path) -> None:
-    filled(tmp_path, 20)
-    for entry in read_entries(tmp_path):
-        line = (tmp_path / f"journal-{entry.segment:08d}.log").read_bytes()[entry.offset :].split(b"\n")[0]
-        assert int(line[:16], 16) == entry.sequence
-        assert json.loads(line[35:])["content"] == entry.content
+def test_a_state_larger_than_the_limit_is_kept(tmp_path: Path) -> None:
+    with Journal(tmp_path, {}, total_bytes=65536) as journal:
+        for number in range(3):
+            journal.record("record", number)
+            journal.put_checkpoint("x" * 100_000 + str(number))
+        assert journal.checkpoint is not None and journal.checkpoint.content.endswith("x2")
+        assert [entry.content for entry in journal.entries()] == [2]
 
 
 def test_a_second_writer_is_told_who_the_first_is(tmp_path: Path) -> None:
-    with Journal.open(tmp_path, {}) as journal:
+    with Journal(tmp_path, {}) as journal:
+        with pytest.raises(InputError, match=rf"process {os.getpid()} writes this journal already"):
+            Journal(tmp_path, {})
+        assert journal.record("record", 1) == 1
+    written(tmp_path, 1)
+
+
+def test_it_is_read_and_backed_up_while_another_process_writes_it(tmp_path: Path) -> None:
+    """Half a million bytes at a time, or all: what is read has every entry up to its last."""
+    folder, ends = tmp_path / "journal", threading.Event()
+    code = f"import journal_killer, os; journal_killer.live(journal_killer.Path({str(folder)!r}), 3, os.dup(1))"
+    writer = subprocess.Popen([sys.executable, "-c", code], cwd=KILLER.parent, stdout=subprocess.PIPE)
+    assert writer.stdout is not None
+    acknowledged: list[int] = []
+
+    def hear() -> None:
+        assert writer.stdout is not None
+        for line in writer.stdout:
+            acknowledged.append(int(line.split()[0]))
+        ends.set()
+
+    listener = threading.Thread(target=hear)
+    listener.start()
+    try:
+        for turn in range(20):
+            while len(acknowledged) < 30 * (turn + 1) and writer.poll() is None:
+                ends.wait(0.01)
+            before = acknowledged[-1]
+            found = kept(folder)
+            assert [number for number, _, _ in found] == list(range(found[0][0], found[-1][0] + 1))
+            assert found[-1][0] >= before
+            copy = tmp_path / "copy" / JOURNAL
+            copy.parent.mkdir(exist_ok=True)
+            copy.unlink(missing_ok=True)
+            source, target = sqlite3.connect(f"file:{folder / JOURNAL}?mode=ro", uri=True), sqlite3.connect(copy)
+            source.backup(target, pages=50 if turn % 2 else -1)
+            target.close()
+            source.close()
+            with KeptJournal(copy.parent) as journal:
+                journal.verify()
+                assert journal.sequence >= before
+    finally:
+        writer.kill()
+        writer.wait()
+        listener.join()
+    assert kept(folder)[-1][0] >= acknowledged[-1]
+
+
+@pytest.mark.parametrize("lives", [range(20), *shares(20, 200, 3)])
+def test_kills_at_random_moments_lose_nothing_acknowledged(tmp_path: Path, lives: range) -> None:
+    kills, seed = str(len(lives)), str(lives.start)
+    done = subprocess.run(
+        [sys.executable, str(KILLER), str(tmp_path), kills, seed], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout.split()[0]) > len(lives)
+
+
+LIMITED = """
+import json, resource, sys
+from pathlib import Path
+from armcal.io.journal import Journal, JournalFullError
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
+with Journal(Path(sys.argv[1]), {}) as journal:
+    full = 0
+    for number in range(1000):
+        try:
+            print(journal.record("record", {"n": number, "x": "x" * 1000}), number, flush=True)
+        except JournalFullError as fault:
+            full += 1
+            if full == 3:
+                sys.exit(str(fault))
+"""
+
+
+@pytest.mark.parametrize("limit", [100_000, 250_001])
+def test_a_limit_of_file_size_refuses_entries_and_keeps_all_that_were_acknowledged(tmp_path: Path, limit: int) -> None:
+    command = [sys.executable, "-c", LIMITED, str(tmp_path / "out"), str(limit)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert "there is no room for an entry" in done.stderr and "Traceback" not in done.stderr
+    said = [tuple(map(int, line.split())) for line in done.stdout.splitlines()]
+    assert len(said) > limit / 10_000
+    assert [(number, entry["n"]) for number, _, entry in kept(tmp_path / "out")] == said  # type: ignore[index]
+    with Journal(tmp_path / "out", {}) as journal:
+        journal.verify()
+        assert journal.record("record", 1) == said[-1][0] + 1
+
+
+@pytest.fixture()
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 1 MiB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    given = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", place]
+    if subprocess.run(given, capture_output=True, check=False).returncode:
+        pytest.skip("no tmpfs can be mounted here")
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", "-l", place], check=True)
+
+
+def test_a_full_disk_refuses_entries_keeps_all_that_were_acknowledged_and_goes_on_when_there_is_room(
+    small_disk: Path,
+) -> None:
+    folder, said = small_disk / "out", []
+    filler = small_disk / "filler"
+    filler.write_bytes(b"x" * 400_000)
+    with Journal(folder, {}) as journal:
+        with pytest.raises(JournalFullError, match=r"no room for an entry.*Make room on the disk"):
+            while True:
+                said.append(journal.record("record", {"x": "x" * 3000}))
+        for _ in range(3):
+            with pytest.raises(JournalFullError):
+                journal.put_checkpoint("x" * 100_000)
+        assert [entry.sequence for entry in journal.entries()] == said and len(said) > 20
+        filler.unlink()
+        assert journal.record("record", {"x": "x" * 3000}) == said[-1] + 1
+    assert len(kept(folder)) == len(said) + 1
+    filler.write_bytes(b"x" * (shutil.disk_usage(small_disk).free // 4096 * 4096))
+    with pytest.raises(JournalFullError, match="Make room on the disk"):
+        Journal(folder, {})
+    assert len(kept(folder)) == len(said) + 1
+
+
+def test_one_that_another_program_holds_locked_takes_nothing_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("armcal.io.journal._WAIT_S", 0.1)
+    with Journal(tmp_path, {}) as journal:
         journal.record("record", 1)
-        with pytest.raises(InputError, match=f"process {os.getpid()} writes this journal already") as refused:
-            Journal.open(tmp_path, {})
-        assert refused.value.exit_code == 2
-        assert journal_end(tmp_path) == journal.sequence, "reading needs no lock"
-        assert journal.record("record", 2) == journal.sequence
-    Journal.open(tmp_path, {}).close()
+        other = sqlite3.connect(tmp_path / JOURNAL, isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")
+        for _ in range(2):
+            with pytest.raises(JournalFailedError, match=r"database is locked.*a program that holds the file locked"):
+                journal.record("record", 2)
+        other.close()
+    assert [content for _, _, content in kept(tmp_path)] == [1]
 
 
-def test_a_closed_journal_takes_nothing(tmp_path: Path) -> None:
-    journal = Journal.open(tmp_path, {})
-    journal.close()
-    journal.close()
-    with pytest.raises(ValueError, match="closed"):
-        journal.record("record", 1)
-
-
-def test_places_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
+def test_places_that_hold_none_or_cannot_be_written_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
-    (tmp_path / "taken" / "journal-00000001.log").mkdir(parents=True)
-    for place in (tmp_path / "file", tmp_path / "file" / "journal", tmp_path / "taken"):
-        with pytest.raises(InputError) as refused:
-            Journal.open(place, {})
-        assert refused.value.exit_code == 2 and refused.value.hint
+    for place in (tmp_path / "file", tmp_path / "file" / "within", Path("/proc/nothing")):
+        with pytest.raises(InputError, match="cannot be written"):
+            Journal(place, {})
+        with pytest.raises(DataError, match="there is no journal here"):
+            KeptJournal(place)
     assert (tmp_path / "file").read_text() == "mine"
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_without_permission_is_refused(tmp_path: Path) -> None:
-    filled(tmp_path, 5)
-    tmp_path.chmod(0o500)
-    try:
-        with pytest.raises(InputError, match="cannot be written"):
-            Journal.open(tmp_path, {})
-        assert verify(tmp_path).entries == 10
-    finally:
-        tmp_path.chmod(0o700)
+def test_a_closed_journal_and_that_of_a_killed_writer_are_read_where_nothing_can_be_written(tmp_path: Path) -> None:
+    subprocess.run([sys.executable, str(KILLER), str(tmp_path / "killed"), "1", "5"], check=True, capture_output=True)
+    written(tmp_path / "closed", 3)
+    for name in ("killed", "closed"):
+        before = {path: path.read_bytes() for path in sorted((tmp_path / name).iterdir())}
+        (tmp_path / name).chmod(0o555)
+        assert kept(tmp_path / name)
+        (tmp_path / name).chmod(0o755)
+        assert {path: path.read_bytes() for path in sorted((tmp_path / name).iterdir()) if "shm" not in path.name} == {
+            path: data for path, data in before.items() if "shm" not in path.name
+        }
 
 
-def test_an_empty_folder_is_no_journal_and_becomes_one(tmp_path: Path) -> None:
-    for place in (tmp_path, tmp_path / "none"):
-        with pytest.raises(DataError, match="there is no journal here"):
-            verify(place)
-    assert read_newest(tmp_path).segment is None
-    Journal.open(tmp_path, {}).close()
-    assert verify(tmp_path).entries == 0
+def test_what_is_no_journal_of_this_version_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
+    written(tmp_path / "later", 2)
+    with sqlite3.connect(tmp_path / "later" / JOURNAL) as database:
+        database.execute("PRAGMA user_version = 9")
+    database.close()
+    (tmp_path / "other").mkdir()
+    with sqlite3.connect(tmp_path / "other" / JOURNAL) as database:
+        database.execute("CREATE TABLE mine (x)")
+    database.close()
+    (tmp_path / "text").mkdir()
+    (tmp_path / "text" / JOURNAL).write_text("what I wrote\n" * 100)
+    (tmp_path / "before" / "journal").mkdir(parents=True)
+    (tmp_path / "before" / "journal" / "journal-00000001.log").write_text("0000000000000001 ...")
+    for name, words in (
+        ("later", "found journal format 9, expected 2"),
+        ("other", "a database of another program"),
+        ("text", "not a database"),
+        ("before", r"an earlier version of armcal \(journal/journal-00000001.log\). Go on with that version"),
+    ):
+        before = {path: path.read_bytes() for path in (tmp_path / name).rglob("*") if path.is_file()}
+        for opened in (lambda name=name: Journal(tmp_path / name, {}), lambda name=name: KeptJournal(tmp_path / name)):
+            with pytest.raises(ArmcalError, match=words):
+                opened()
+        assert {path: path.read_bytes() for path in (tmp_path / name).rglob("*") if path.is_file()} == before
 
 
-def test_files_of_others_are_left_alone(tmp_path: Path) -> None:
-    names = ["notes.txt", "journal-1.log", "journal-00000001.log.gz", "journal-abcdefgh.log", "xjournal-00000009.log"]
-    for name in [*names, "journal-٠٠٠٠٠٠٠٩.log"]:
-        (tmp_path / name).write_text("not ours")
-    filled(tmp_path, 40)
-    assert verify(tmp_path).segments > 2
-    assert all((tmp_path / name).read_text() == "not ours" for name in names)
+def test_one_that_was_never_begun_in_whole_is_begun(tmp_path: Path) -> None:
+    (tmp_path / JOURNAL).write_bytes(b"")
+    with pytest.raises(DataError, match="never begun"):
+        KeptJournal(tmp_path)
+    written(tmp_path, 1)
+    assert len(kept(tmp_path)) == 1
 
 
-def test_a_reader_changes_nothing(tmp_path: Path) -> None:
-    filled(tmp_path, 20)
-    newest = max(tmp_path.glob("journal-*"))
-    newest.write_bytes(newest.read_bytes()[:-5])
-    before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in tmp_path.iterdir()}
-    cut = verify(tmp_path).cut
-    assert cut is not None and cut.kept is None and "may have been" in cut.sentence
-    assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in tmp_path.iterdir()} == before
-
-
-def test_a_journal_is_read_while_it_is_written(tmp_path: Path) -> None:
-    with Journal.open(tmp_path, {}, limits=SMALL) as journal:
+@pytest.mark.parametrize("seeds", [range(40), *shares(40, 1000, 2)])
+def test_damaged_bytes_are_read_as_they_were_or_end_with_a_sentence(tmp_path: Path, seeds: range) -> None:
+    with Journal(tmp_path, {}) as journal:
         for number in range(60):
-            reading = read_segments(tmp_path)
-            first = next(reading)
-            sequence = journal.record("record", number)
-            if journal.wants_checkpoint:
-                sequence = journal.checkpoint(number)
-            later = [first.link.sequence, *(segment.link.sequence for segment in reading)]
-            assert later[-1] in (sequence - 2, sequence - 1, sequence) or later[-1] >= sequence - 3
-            assert verify(tmp_path).last_sequence == sequence
-
-
-def test_a_segment_that_is_gone_is_damage(tmp_path: Path) -> None:
-    filled(tmp_path, 40)
-    paths = sorted(tmp_path.glob("journal-*.log"))
-    paths[1].unlink()
-    with pytest.raises(DataError, match="the file is missing") as damage:
-        verify(tmp_path)
-    assert damage.value.good_entries > 0
-    Journal.open(tmp_path, {}).close()  # what it needs is there
-
-
-def test_another_format_is_refused(tmp_path: Path) -> None:
-    from armcal.io.journal.frames import encode_frame, payload_of
-
-    header = {"kind": "header", "format": 2, "segment": 1, "previous": "00000000", "content": {}}
-    (tmp_path / "journal-00000001.log").write_bytes(encode_frame(1, payload_of(header), 0)[0])
-    with pytest.raises(DataError, match="found journal format 2, expected 1"):
-        Journal.open(tmp_path, {})
-
-
-def test_a_journal_that_another_appends_to_stops(tmp_path: Path) -> None:
-    with Journal.open(tmp_path, {}) as journal:
-        journal.record("record", 1)
-        with (tmp_path / "journal-00000001.log").open("ab") as file:
-            file.write(b"me too\n")
-        with pytest.raises(Exception, match="changed by another"):
-            journal.record("record", 2)
-    with pytest.raises(DataError, match="damaged at byte"):
-        Journal.open(tmp_path, {})
-
-
-def test_a_journal_whose_folder_is_removed_stops(tmp_path: Path) -> None:
-    with Journal.open(tmp_path / "j", {}) as journal:
-        journal.record("record", 1)
-        (tmp_path / "j" / "journal-00000001.log").unlink()
-        with pytest.raises(Exception, match="takes no more entries"):
-            journal.record("record", 2)
-
-
-@pytest.mark.slow
-def test_short_writes_are_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = os.write
-    monkeypatch.setattr(os, "write", lambda descriptor, data: real(descriptor, bytes(data[:7])))
-    written = filled(tmp_path, 10)
-    assert said(read_entries(tmp_path))[-5:] == written[-5:]
-
-
-def test_a_file_is_put_in_place_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    files, path = FileLayer(), tmp_path / "calibration.yaml"
-    write_whole(files, path, b"first")
-    (tmp_path / "calibration.yaml.new").write_bytes(b"left by a kill")
-    write_whole(files, path, b"2nd")
-    assert path.read_bytes() == b"2nd"
-
-    def full(descriptor: int, data: bytes) -> int:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "write", full)
-    with pytest.raises(OSError, match="No space"):
-        write_whole(files, path, b"third")
-    assert path.read_bytes() == b"2nd" and [p.name for p in tmp_path.iterdir()] == ["calibration.yaml"]
+            journal.record("record", content(1, number))
+    whole = (tmp_path / JOURNAL).read_bytes()
+    for seed in seeds:
+        chance, bad = random.Random(seed), bytearray(whole)
+        at = chance.randrange(200 if chance.random() < 0.3 else len(bad))
+        match chance.randrange(3):
+            case 0:
+                bad[at] ^= 1 << chance.randrange(8)
+            case 1:
+                bad[at : at + 4096] = bytes(len(bad[at : at + 4096]))
+            case _:
+                del bad[at:]
+        (tmp_path / JOURNAL).write_bytes(bad)
+        for opened in (lambda: KeptJournal(tmp_path), lambda: Journal(tmp_path, {})):
+            try:
+                with opened() as journal:
+                    for entry in journal.entries():
+                        json.dumps(entry.content)
+                    assert journal.checkpoint is None
+            except (DataError, InputError, JournalFailedError) as fault:
+                assert JOURNAL in str(fault) and len(str(fault)) > 60
 
 
 @pytest.mark.slow
@@ -320,10 +344,10 @@ def test_memory_stays_flat(tmp_path: Path) -> None:
     def go_on(journal: Journal, count: int) -> None:
         for number in range(count):
             journal.note("record", {"x": [number / 3] * 20})
-            if journal.wants_checkpoint:
-                journal.checkpoint([0.5] * 100)
+            if number % 100 == 0:
+                journal.put_checkpoint([0.5] * 100)
 
-    with Journal.open(tmp_path, {}, limits=JournalLimits(20_000, 100_000)) as journal:
+    with Journal(tmp_path, {}, total_bytes=100_000) as journal:
         go_on(journal, 1000)
         tracemalloc.start()
         go_on(journal, 100)
@@ -332,14 +356,3 @@ def test_memory_stays_flat(tmp_path: Path) -> None:
         grown = tracemalloc.get_traced_memory()[0] - before
         tracemalloc.stop()
     assert grown < 10_000
-
-
-@pytest.mark.parametrize("lives", [range(100), *shares(100, 2000, 3)])
-def test_kills_at_random_moments_lose_nothing_acknowledged(tmp_path: Path, lives: range) -> None:
-    """A killed process leaves its writes in the cache of the system; power loss is in test_journal_faults.py."""
-    kills, seed = str(len(lives)), str(lives.start)
-    done = subprocess.run(
-        [sys.executable, str(KILLER), str(tmp_path), kills, seed], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert int(done.stdout.split()[0]) > len(lives)

@@ -14,8 +14,10 @@ import pytest
 import yaml
 from armcal.devices.clock import SimulatedClock
 from armcal_bench.acquisition.tracker_monitor import Waits
+from armcal_bench.servo.record import Record
 
 from tests.own_arms import POST, POST_SERVOS, TOWER, TOWER_SERVOS, OwnArm, said_by
+from tests.servo_runs import put_rows
 
 FEW = ("bench.servo.joints=[c]", "bench.servo.step_deg=80")
 """A calibration of a few poses."""
@@ -43,7 +45,7 @@ def post(tmp_path: Path) -> Iterator[Bench]:
 
 
 def lines(out: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (out / "observations.jsonl").read_text().splitlines()]
+    return [dict(entry) for entry in Record(out).entries]
 
 
 class TestARefusedRunLeavesNothing:
@@ -69,12 +71,13 @@ class TestARefusedRunLeavesNothing:
         servo = {"board": "only", "channel": 2, "oscillator_hz": 25e6, "prescale": 121}
         servo |= {"angles": [-1.7, 0.0, 1.7], "pulses": [6e-4, 1.5e-3, 2.4e-3]}
         begun = {"kind": "begun", "servos": {"c": servo}, "base": {"a": 0.5, "b": 0.2, "c": -0.4}}
-        (arm.out / "observations.jsonl").write_text(json.dumps(begun) + "\n")
+        put_rows(arm.out, [begun])
         again = arm.armcal("servo", "--out", arm.out, "--yes", "--keep", sets=FEW)
         assert again.exit_code == 0, again.output
-        assert "kept as observations.jsonl.before-1" in again.output and "begins anew" in again.output
+        assert "kept as journal.sqlite.before-1" in again.output and "begins anew" in again.output
         assert math.degrees(lines(arm.out)[0]["base"]["b"]) == pytest.approx(30)
-        assert json.loads((arm.out / "observations.jsonl.before-1").read_text())["base"]["a"] == 0.5
+        (arm.out / "journal.sqlite.before-1").replace(arm.out / "journal.sqlite")
+        assert lines(arm.out)[0]["base"]["a"] == 0.5
 
     def test_measurements_of_another_base_pose_are_never_gone_on_with(self, post: Bench) -> None:
         """Guided ones neither: what is measured later is judged by the base pose that the record names."""
@@ -82,8 +85,8 @@ class TestARefusedRunLeavesNothing:
         stopped = arm.armcal("servo", "--guided", "--out", arm.out, "--yes", sets=FEW)  # by the end of its input
         assert stopped.exit_code == 4, stopped.output
         said = {"joint": "c", "target": 0.0, "came": 1, "at": 1.9e9, "counts": 307, "angle": 0.0, "sd": 0.01}
-        with (arm.out / "observations.jsonl").open("a") as record:
-            record.write(json.dumps({"kind": "angle", **said}) + "\n")
+        with Record(arm.out) as record:
+            record.append("angle", said)
         before = lines(arm.out)
         refused = arm.armcal("servo", "--out", arm.out, "--yes", sets=(*FEW, "bench.servo.base={b: -20 deg}"))
         assert refused.exit_code == 2 and "begun with another base pose" in refused.output

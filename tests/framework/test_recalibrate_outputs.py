@@ -13,17 +13,15 @@ from armcal.base.config_text import as_line
 from armcal.io.lines import StandardOutput
 from armcal_online.event_file import EventFile
 from armcal_online.running.outputs import Outputs
-from recalibrations import (
-    FullFiles,
-)
+from recalibrations import FullDisk
 
 
 def test_on_a_full_disk_the_calibration_stays_whole_and_no_event_is_dropped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("armcal_online.running.outputs.RETRY_S", 0.0)
-    files, out = FullFiles(), BytesIO()
-    outputs = Outputs(tmp_path, StandardOutput(out), EventFile(tmp_path), files)
+    files, out = FullDisk(monkeypatch), BytesIO()
+    outputs = Outputs(tmp_path, StandardOutput(out), EventFile(tmp_path))
     assert outputs.calibration("one")
     outputs.event({"event": "record"})
     files.full = {"calibration", "status"}

@@ -96,13 +96,9 @@ def killed(tmp_path: Path, kills: int, rows: int) -> None:
 
 
 @pytest.mark.slow
-def test_fifty_kills_lose_nothing_and_repeat_nothing(tmp_path: Path) -> None:
-    killed(tmp_path, 50, 600)
-
-
-@pytest.mark.slow
-def test_a_thousand_kills_lose_nothing_and_repeat_nothing(tmp_path: Path) -> None:
-    killed(tmp_path, 1000, 12000)
+@pytest.mark.parametrize("kills", [50, 200])
+def test_kills_lose_nothing_and_repeat_nothing(tmp_path: Path, kills: int) -> None:
+    killed(tmp_path, kills, 12 * kills)
 
 
 @pytest.mark.slow

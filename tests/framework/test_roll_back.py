@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 import yaml
 from armcal.cli.main import cli
-from armcal.io.journal.reader import read_entries
 from click.testing import CliRunner, Result
+from recalibrations import taken
 
 ROOT = Path(__file__).resolve().parents[2]
 POSES = ROOT / "configs" / "lrm_arm" / "demo.csv"
@@ -58,10 +58,6 @@ def events(folder: Path, kind: str) -> list[dict[str, Any]]:
     return [event for event in told if event["event"] == kind]
 
 
-def records(folder: Path) -> list[str]:
-    return [entry.content["id"] for entry in read_entries(folder / "journal") if entry.kind == "record"]
-
-
 def written(path: Path) -> dict[str, Any]:
     loaded: dict[str, Any] = yaml.safe_load(path.read_text())
     return {key: value for key, value in loaded.items() if key != "created"}
@@ -69,19 +65,19 @@ def written(path: Path) -> dict[str, Any]:
 
 def check_rolled_back(command: list[str], folder: Path, tmp_path: Path) -> dict[str, Any]:
     """Roll back to the last good record: what the records up to there make, apart from it, stands in the folder."""
-    before, kept = records(folder), written(folder / "calibration.yaml")
+    before, kept = taken(folder), written(folder / "calibration.yaml")
     done = armcal("control", folder, "rollback", "good")
     assert done.exit_code == 0, done.output
     reply: dict[str, Any] = json.loads(done.stdout)
-    taken = [e["id"] for e in events(folder, "record") if e["sequence"] <= reply["to"]]
+    names = [e["id"] for e in events(folder, "record") if e["sequence"] <= reply["to"]]
     header, *rows = Path(command[3]).read_text().splitlines()
-    (tmp_path / "until.csv").write_text("\n".join([header, *rows[: len(taken)]]) + "\n")
+    (tmp_path / "until.csv").write_text("\n".join([header, *rows[: len(names)]]) + "\n")
     again = armcal(*[tmp_path / "until.csv" if part == command[3] else part for part in command], tmp_path / "until")
     assert again.exit_code == 0, again.output
     back = written(folder / "calibration.yaml")
     assert back == written(tmp_path / "until" / "calibration.yaml") and back["parameters"] != kept["parameters"]
     assert back["recalibrated"]["sequence"] == reply["to"] and back["recalibrated"]["level"] == "nominal"
-    assert records(folder) == before
+    assert taken(folder) == before
     return reply
 
 
@@ -114,7 +110,7 @@ def test_after_a_kill_too(command: list[str], ended: Path, tmp_path: Path) -> No
     process = subprocess.Popen(started, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         deadline = time.monotonic() + 120
-        while not (folder / "journal").is_dir() or len(records(folder)) < GOOD + SLIPPED:
+        while not (folder / "journal.sqlite").exists() or len(taken(folder)) < GOOD + SLIPPED:
             assert time.monotonic() < deadline and process.poll() is None
             time.sleep(0.2)
     finally:
@@ -128,7 +124,7 @@ def test_after_a_kill_too(command: list[str], ended: Path, tmp_path: Path) -> No
 @pytest.mark.slow
 def test_what_cannot_be_rolled_back_is_refused_and_nothing_changes(ended: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(ended, tmp_path / "out")
-    before, kept = records(folder), {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+    before, kept = taken(folder), {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
     for to, words in (
         ("99999", "99999"),
         ("1.5", "rollback good"),
@@ -138,7 +134,7 @@ def test_what_cannot_be_rolled_back_is_refused_and_nothing_changes(ended: Path, 
     ):
         refused = armcal("control", folder, "rollback", *filter(None, [to]))
         assert refused.exit_code == 2 and words in refused.stderr and "Traceback" not in refused.output
-    assert records(folder) == before
+    assert taken(folder) == before
     assert {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()} == kept
     (tmp_path / "empty").mkdir()
     for nowhere in (tmp_path / "empty", tmp_path / "none"):

@@ -14,6 +14,8 @@ from contextlib import contextmanager
 import pytest
 import yaml
 from armcal.cli.main import cli
+from armcal.errors import DataError
+from armcal_bench.servo.record import Record
 from click.testing import CliRunner
 
 from tests.bench_runs import bench_served_by_the_command, free_port
@@ -77,21 +79,28 @@ def calibrated(bench):
     return armcal("servo", bench, "--out", out, "--yes", "--json"), out
 
 
+def observed(out):
+    try:
+        return Record(out).entries
+    except DataError:  # it was only just made
+        return ()
+
+
 @pytest.mark.slow
 def test_interrupted_it_holds_and_keeps_what_it_measured(bench, tmp_path):
     words = ["servo", bench, "--out", tmp_path / "out", "--yes", "--keep"]
     first = subprocess.Popen([*ARMCAL, *map(str, words)], stderr=subprocess.PIPE, text=True)
-    record, until = tmp_path / "out" / "observations.jsonl", time.monotonic() + 60
-    while (not record.exists() or record.read_text().count("\n") < 8) and time.monotonic() < until:
+    until = time.monotonic() + 60
+    while len(observed(tmp_path / "out")) < 8 and time.monotonic() < until:
         time.sleep(0.02)
     first.send_signal(signal.SIGINT)
     said = first.communicate(timeout=60)[1]
     assert first.returncode == 4 and "The arm holds" in said
-    kept = record.read_text()
+    kept = observed(tmp_path / "out")
     done = armcal(*words)
     assert done.exit_code == 0, done.stderr
-    assert record.read_text().startswith(kept)
-    rows = [json.loads(line) for line in record.read_text().splitlines()]
+    rows = observed(tmp_path / "out")
+    assert rows[: len(kept)] == kept
     keys = [(r["joint"], r["counts"], r["came"]) for r in rows if r["kind"] == "pose"]
     assert len(keys) == len(set(keys)) and {k[0] for k in keys} == set(JOINTS)
 

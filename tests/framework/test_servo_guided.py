@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import termios
 import threading
@@ -15,7 +14,7 @@ from armcal.errors import DataError, InputError
 from armcal_bench.acquisition.tracker_monitor import StopRequested
 from armcal_bench.keys import QUIT, WishKeys, WishLines, wishes_from
 from armcal_bench.servo.outputs import improved
-from armcal_bench.servo.record import NAME, Record
+from armcal_bench.servo.record import Record
 from armcal_bench.servo.session import Conversation, evaluated, measure
 
 from tests.servo_fakes import config_in, setup_on
@@ -110,8 +109,6 @@ def test_stopped_after_any_angle_and_given_again_it_finds_the_same(tmp_path, mon
         with pytest.raises(StopRequested):
             measure(setup, folder, talk(Person(device, quit_after=cut)), "guided")
         assert observed(folder) == whole[:cut]
-        with (folder / NAME).open("ab") as file:
-            file.write(b'{"kind": "angle", "joint": "q')  # the host died in the middle of a line
         measure(setup, folder, talk(Person(device)), "guided")
         assert observed(folder) == whole
         assert (
@@ -120,11 +117,17 @@ def test_stopped_after_any_angle_and_given_again_it_finds_the_same(tmp_path, mon
         )
 
 
-def test_a_line_that_is_no_observation_is_refused_with_its_place(tmp_path):
-    record = Record(tmp_path)
-    record.append("begun", {"servos": {"q1": STATED}, "base": {"q1": 0.0}})
-    record.path.write_bytes(record.path.read_bytes() + b"what\n" + record.path.read_bytes())
-    with pytest.raises(DataError, match=r"observations.jsonl:2"):
+def test_an_entry_that_is_no_observation_is_refused_with_its_place(tmp_path):
+    with Record(tmp_path) as record:
+        record.append("begun", {"servos": {"q1": STATED}, "base": {"q1": 0.0}})
+        record.append("what", {})
+    with pytest.raises(DataError, match=r"journal.sqlite: entry 2: .*delete from entry where sequence = 2"):
+        Record(tmp_path)
+
+
+def test_observations_of_an_earlier_version_are_named(tmp_path):
+    (tmp_path / "observations.jsonl").write_text('{"kind": "begun"}\n')
+    with pytest.raises(InputError, match=r"observations of an earlier version of armcal \(observations.jsonl\)"):
         Record(tmp_path)
 
 
@@ -215,7 +218,7 @@ def test_lines_from_a_pipe_and_its_end():
 def test_every_line_of_the_record_is_json_that_says_its_kind(tmp_path, monkeypatch):
     setup, device, _ = setup_on(monkeypatch, config_in(tmp_path, SERVO))
     measure(setup, tmp_path / "out", talk(Person(device)), "guided")
-    lines = [json.loads(line) for line in (tmp_path / "out" / NAME).read_text().splitlines()]
+    lines = Record(tmp_path / "out").entries
     assert lines[0]["kind"] == "begun" and {line["kind"] for line in lines[1:]} == {"angle"}
 
 

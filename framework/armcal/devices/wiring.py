@@ -19,7 +19,7 @@ from armcal.config.servo_file import ServoFile, digest, load_servo_file
 from armcal.config.yaml_source import ConfigSource
 from armcal.devices.device import JointDevice, MeasuringDevice
 from armcal.errors import InputError, Location
-from armcal.io.journal.files import REAL_FILES, write_whole
+from armcal.io.plain_files import write_whole
 
 _WRONG = ""
 """In the place of the fingerprint of a servo that did not do what was commanded."""
@@ -141,7 +141,7 @@ class WiringRecord:
 
     def _write(self, entries: Mapping[str, Any]) -> None:
         try:
-            write_whole(REAL_FILES, self.path, (json.dumps(entries, indent=2) + "\n").encode())
+            write_whole(self.path, (json.dumps(entries, indent=2) + "\n").encode())
         except OSError as fault:
             raise InputError(
                 f"it cannot be written ({fault.strerror}), so that what was checked is not known later.",

@@ -1,7 +1,7 @@
 """The journal of a measuring run, what the run has done by it, and the dataset and summary that are left behind."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -13,20 +13,17 @@ from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.devices.device import DeviceIdentity
 from armcal.errors import ConfigError
-from armcal.io.journal.files import REAL_FILES, write_whole
-from armcal.io.journal.journal import Journal, JournalFailedError, JournalFullError
-from armcal.io.journal.segment import Entry
+from armcal.io.journal import JOURNAL_FILES, Entry, Journal, JournalFailedError, JournalFullError
+from armcal.io.plain_files import write_whole
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
 from scipy.spatial.transform import Rotation
-
-from armcal_bench.journal_folder import JOURNAL
 
 STARTED, ENERGISED, GOING, HERE = "started", "energised", "going", "here"
 MEASURED, LEFT_OUT, NOTICE, ENDED = "measured", "left_out", "told", "ended"  # Kinds of entries
 DATASET, SUMMARY = "dataset.csv", "summary.json"
 BENCH = "bench"  # Of a rehearsal: where its simulated bench lives
-OURS = (DATASET, SUMMARY, JOURNAL, BENCH)
+OURS = (DATASET, SUMMARY, *JOURNAL_FILES, BENCH)
 _POSITION, _QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 
 
@@ -76,7 +73,7 @@ class Progress:
         return "done", some if left_out else "all poses are measured"
 
 
-def progress_of(entries: tuple[Entry, ...]) -> Progress:
+def progress_of(entries: Iterable[Entry]) -> Progress:
     progress = Progress()
     for entry in entries:
         progress = progress.after(entry.kind, entry.content)
@@ -93,8 +90,8 @@ class RunLog:
 
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
-        self.progress = progress_of(journal.recovered.entries)
-        started = [entry.content for entry in journal.recovered.entries if entry.kind == STARTED]
+        self.progress = progress_of(journal.entries())
+        started = [entry.content for entry in journal.entries() if entry.kind == STARTED]
         self.identity = DeviceIdentity(started[-1]["name"], started[0]["device"]) if started else None
         self._failed = False
 
@@ -199,4 +196,4 @@ def write_outputs(folder: Path, experiment: Experiment, progress: Progress, summ
         DataError: they cannot be written.
     """
     write_measured(folder, experiment, progress, summary["digests"])
-    write_whole(REAL_FILES, folder / SUMMARY, (json.dumps(summary, indent=2) + "\n").encode())
+    write_whole(folder / SUMMARY, (json.dumps(summary, indent=2) + "\n").encode())

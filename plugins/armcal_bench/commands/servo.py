@@ -15,6 +15,7 @@ from armcal.cli.console import say
 from armcal.devices.device import DeviceError
 from armcal.devices.wiring import WiringRecord, servo_file_of
 from armcal.errors import EXIT_FAULT, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
+from armcal.io.journal import JOURNAL
 from armcal.io.signals import Signals
 
 from armcal_bench.acquisition.preparation import Prepared
@@ -25,7 +26,6 @@ from armcal_bench.joint_check import check_joints
 from armcal_bench.keys import wishes_from
 from armcal_bench.servo.outcome import Outcome
 from armcal_bench.servo.outputs import improved, results, write_results, write_servo_file
-from armcal_bench.servo.record import NAME
 from armcal_bench.servo.session import Conversation, adapter_of, evaluated, measure, park, tried
 from armcal_bench.servo.setup import Setup
 from armcal_bench.servo.trial import Verdict, swapped
@@ -173,4 +173,4 @@ def _show(console: Console, outcome: Outcome, content: Mapping[str, Any]) -> Non
             console.line(text)
     for sentence in content["findings"]:
         console.line(sentence)
-    console.detail(f"{len(outcome.task.observations)} angles, in {NAME}.")
+    console.detail(f"{len(outcome.task.observations)} angles, in {JOURNAL}.")

@@ -8,16 +8,15 @@ from typing import Any
 
 import numpy as np
 from armcal.base.dataset import Dataset
-from armcal.io.journal.journal import Journal
+from armcal.io.journal import JOURNAL_FILES, Journal
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
 
-from armcal_bench.journal_folder import JOURNAL
 from armcal_bench.recording.window import Mean
 
 DATASET = "dataset.csv"
 IMAGES = "images"
-OURS = (DATASET, JOURNAL, IMAGES)
+OURS = (DATASET, *JOURNAL_FILES, IMAGES)
 CAPTURED, UNDONE = "captured", "undone"  # Kinds of entries
 
 
@@ -56,7 +55,7 @@ class RecordingLog:
         self._postures: dict[str, Posture] = {}
         self.last: Posture | None = None
         self._count = 0
-        for entry in journal.recovered.entries:
+        for entry in journal.entries():
             if entry.kind == CAPTURED:
                 self._take(Posture(**entry.content))
             elif entry.kind == UNDONE:

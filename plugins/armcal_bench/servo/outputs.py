@@ -22,8 +22,7 @@ from armcal.config.servo_file import (
     servo_file_text,
 )
 from armcal.errors import ConfigError
-from armcal.io.journal.files import REAL_FILES, write_whole
-from armcal.io.plain_files import writing
+from armcal.io.plain_files import write_whole, writing
 
 from armcal_bench.servo.outcome import Outcome
 from armcal_bench.servo.problem import FittedServo
@@ -293,8 +292,8 @@ def write_servo_file(path: Path, file: ServoFile) -> Path | None:
         if text == before:
             return None
         kept = next_name(path)
-        write_whole(REAL_FILES, kept, before)
-        write_whole(REAL_FILES, path, text)
+        write_whole(kept, before)
+        write_whole(path, text)
     return kept
 
 
@@ -304,7 +303,7 @@ def _text_of(path: Path, before: str, file: ServoFile) -> str:
     if text is not None:
         tried = path.with_name(f".{path.name}.new")
         try:
-            write_whole(REAL_FILES, tried, text.encode())
+            write_whole(tried, text.encode())
             if load_servo_file(tried) == file:
                 return text
         except ConfigError:
@@ -362,7 +361,7 @@ def write_results(folder: Path, summary: Mapping[str, Any]) -> None:
         InputError: the folder cannot be written.
     """
     with writing(folder, "Give another --out."):
-        write_whole(REAL_FILES, folder / RESULTS, (json.dumps(summary, indent=2, allow_nan=False) + "\n").encode())
+        write_whole(folder / RESULTS, (json.dumps(summary, indent=2, allow_nan=False) + "\n").encode())
 
 
 def _servo(servo: FittedServo, outcome: Outcome, changed: ServoFile) -> dict[str, Any]:

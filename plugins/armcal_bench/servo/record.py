@@ -1,6 +1,6 @@
-"""All that was observed, a JSON object a line, each on disk before anything else happens.
+"""All that was observed, each entry of the journal on disk before anything else happens.
 
-Lines are checked when they are read: one that was damaged must not become a table.
+Entries are checked when they are read: one that was damaged must not become a table.
 """
 
 import json
@@ -8,22 +8,22 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import TracebackType
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from armcal.arm.servo import COUNTS, PulseClock, PulseTable
 from armcal.devices.device import DeviceIdentity
 from armcal.errors import DataError, InputError, Location
-from armcal.io.journal.files import REAL_FILES, opened
+from armcal.io.journal import JOURNAL, Entry, Journal, KeptJournal, has_journal
 from armcal.io.plain_files import writing
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from armcal_bench.servo.problem import KnownBoard, KnownServo
 from armcal_bench.servo.setup import Setup
 
-NAME = "observations.jsonl"
-_HINT = "Give --out a writable folder."
-BEGUN, POSE, ANGLE, LEFT_OUT = "begun", "pose", "angle", "left_out"  # Kinds of lines
+_LINES_BEFORE = "observations.jsonl"  # what versions before had in the journal's place
+BEGUN, POSE, ANGLE, LEFT_OUT = "begun", "pose", "angle", "left_out"  # Kinds of entries
 
 _ROTATION_OFF = 1e-6
 
@@ -105,39 +105,33 @@ _LINES: TypeAdapter[_Line] = TypeAdapter(Annotated[_Begun | _Pose | _Angle | _Le
 
 
 class Record:
-    """The lines of a folder's record; a last line that was cut short is cut off.
+    """The observations in a folder's journal; what is there is read and checked at once, and written to when needed.
 
     Raises:
-        DataError: another line is not one of ours, or damaged.
-        InputError: the folder cannot be written.
+        DataError: an entry is not one of ours, or damaged.
+        InputError: it is of an earlier version, or cannot be read.
     """
 
     def __init__(self, folder: Path) -> None:
-        self.path = folder / NAME
-        with writing(folder, _HINT):
-            REAL_FILES.make_folder(folder)
-            whole = self.path.read_bytes() if self.path.exists() else b""
-            kept = whole[: whole.rfind(b"\n") + 1]
-            if kept != whole:
-                with opened(REAL_FILES, self.path) as descriptor:
-                    REAL_FILES.truncate(descriptor, len(kept))
-                    REAL_FILES.sync(descriptor)
+        self.folder, self.path = folder, folder / JOURNAL
+        self._journal: Journal | None = None
         self._entries: list[Mapping[str, Any]] = []
-        for number, line in enumerate(kept.splitlines(), start=1):
-            damage = ""
-            try:
-                is_beginning = isinstance(_LINES.validate_json(line), _Begun)
-            except ValidationError:
-                damage = "a line that is no observation, or a damaged one"
-            else:
-                if number == 1 and not is_beginning:
-                    damage = "a first line that does not say by which tables it was begun"
-                elif number > 1 and is_beginning:
-                    damage = "a second beginning"
-            if damage:
-                hint = "Give another --out." if number == 1 else "Give another --out, or remove this line."
-                raise DataError(f"found {damage}.", where=Location(str(self.path), line=number), hint=hint)
-            self._entries.append(json.loads(line))
+        if has_journal(folder):
+            with KeptJournal(folder) as journal:
+                for number, entry in enumerate(journal.entries(), start=1):
+                    self._entries.append(_checked(self.path, number, entry))
+        elif (folder / _LINES_BEFORE).exists():
+            text = f"it holds the observations of an earlier version of armcal ({_LINES_BEFORE})."
+            hint = "Go on, or evaluate them, with that version; or give another --out."
+            raise InputError(text, where=Location(str(folder)), hint=hint)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._close()
 
     @property
     def entries(self) -> tuple[Mapping[str, Any], ...]:
@@ -145,7 +139,7 @@ class Record:
 
     @property
     def begun(self) -> Mapping[str, Any] | None:
-        """The first line; None where there is none."""
+        """The first entry; None where there is none."""
         return self._entries[0] if self._entries else None
 
     @property
@@ -153,32 +147,51 @@ class Record:
         return len(self._entries) > 1
 
     def set_aside(self) -> Path:
-        """Keep the file under another name, which is given, and be empty.
+        """Keep the journal under another name, which is given, and be empty.
 
         Raises:
-            InputError: it cannot be renamed.
+            InputError: it cannot be renamed, or another process writes it.
         """
+        self._opened()
+        self._close()
         kept = next_name(self.path)
-        with writing(self.path, _HINT):
-            REAL_FILES.rename(self.path, kept)
+        with writing(self.path, "Give --out a writable folder."):
+            self.path.rename(kept)
         self._entries = []
         return kept
 
     def append(self, kind: str, values: Mapping[str, Any]) -> None:
-        """One more line, durable when this returns.
+        """One more entry, durable when this returns; see ``Journal`` for what it raises."""
+        self._opened().record(kind, dict(values))
+        self._entries.append({"kind": kind, **values})
 
-        Raises:
-            InputError: it cannot be written.
-        """
-        entry = {"kind": kind, **values}
-        is_first = not self.path.exists()
-        with writing(self.path, _HINT):
-            with opened(REAL_FILES, self.path) as descriptor:
-                REAL_FILES.write(descriptor, json.dumps(entry, allow_nan=False).encode() + b"\n")
-                REAL_FILES.sync(descriptor)
-            if is_first:
-                REAL_FILES.sync_folder(self.path.parent)
-        self._entries.append(entry)
+    def _opened(self) -> Journal:
+        if self._journal is None:
+            self._journal = Journal(self.folder, {})
+        return self._journal
+
+    def _close(self) -> None:
+        if self._journal is not None:
+            self._journal.close()
+        self._journal = None
+
+
+def _checked(path: Path, number: int, entry: Entry) -> Mapping[str, Any]:
+    damage, content = "", {"kind": entry.kind, **(entry.content if isinstance(entry.content, dict) else {})}
+    try:
+        is_beginning = isinstance(_LINES.validate_json(json.dumps(content)), _Begun)
+    except ValidationError:
+        damage = "an entry that is no observation, or a damaged one"
+    else:
+        if number == 1 and not is_beginning:
+            damage = "a first entry that does not say by which tables it was begun"
+        elif number > 1 and is_beginning:
+            damage = "a second beginning"
+    if damage:
+        remove = f'sqlite3 {path} "delete from entry where sequence = {entry.sequence}"'
+        hint = "Give another --out." if number == 1 else f"Give another --out, or remove it: {remove}"
+        raise DataError(f"entry {entry.sequence}: found {damage}.", where=Location(str(path)), hint=hint)
+    return content
 
 
 def next_name(path: Path) -> Path:
@@ -190,7 +203,7 @@ def next_name(path: Path) -> Path:
 
 
 def begin(setup: Setup, record: Record, device: DeviceIdentity | None, say: Callable[[str], None]) -> None:
-    """The first line of a record: by which tables and in which base pose it is measured.
+    """The first entry of a record: by which tables and in which base pose it is measured.
 
     It is written when nothing is left that could refuse the run. One that stands there without a measurement after it
     is of a run that measured nothing, and must not be taken for this run's.

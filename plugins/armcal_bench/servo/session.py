@@ -349,8 +349,11 @@ def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
         StopRequested: it was stopped before its end; the arm holds, and what was measured is kept.
         DeviceError: the device is gone; what was measured is kept.
     """
-    record = Record(folder)
-    with setup.bench.clock() as clock, _opened(setup, clock, talk, record) as (mover, identity):
+    with (
+        Record(folder) as record,
+        setup.bench.clock() as clock,
+        _opened(setup, clock, talk, record) as (mover, identity),
+    ):
         if how == "guided":
             begin(setup, record, identity, talk.say)
             with talk.wishes() as wishes:

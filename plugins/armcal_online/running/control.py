@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from armcal.errors import InputError, Location
-from armcal.io.journal.reader import read_entries
+from armcal.io.journal import KeptJournal
 from armcal.io.json_server import Answer, JsonServer
 from armcal.io.unix_socket import short_address
 
@@ -97,7 +97,7 @@ def rolled_back(recalibration: Recalibration, to: Any) -> Mapping[str, Any]:
             raise InputError("no record was good yet.", where=Location("rollback"), hint=hint)
         to = good["sequence"]
     elif isinstance(to, str):
-        to = entry_named(recalibration.journal_folder, to)
+        to = entry_named(recalibration.journal, to)
     if isinstance(to, bool) or not isinstance(to, int) or to < 0:
         hint = f"Give the sequence number of a record, which every event has, or {GOOD} for the last good record."
         raise InputError(f"found {to!r}, expected a sequence number.", where=Location("to"), hint=hint)
@@ -106,14 +106,14 @@ def rolled_back(recalibration: Recalibration, to: Any) -> Mapping[str, Any]:
     return {"sentence": f"{sentence} {again}", "to": to, "before": before, **recalibration.status()}
 
 
-def entry_named(journal: Path, name: str) -> int:
+def entry_named(journal: KeptJournal, name: str) -> int:
     """The entry of the last record of a name that a journal keeps.
 
     Raises:
         InputError: it keeps none.
         DataError: it is damaged.
     """
-    named = [e.sequence for e in read_entries(journal) if e.kind == RECORD and e.content.get("id") == name]
+    named = [e.sequence for e in journal.entries() if e.kind == RECORD and e.content.get("id") == name]
     if not named:
         hint = "Give an entry's number or a record's name, as events have them, or the last good record: rollback good."
         raise InputError(f"found no record {name!r} in the journal.", where=Location("rollback"), hint=hint)

@@ -8,14 +8,12 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 from zlib import crc32
 
 from armcal.base.config_text import finite
 from armcal.errors import ArmcalError, DataError, Location
-from armcal.io.journal.journal import Journal, JournalFullError
-from armcal.io.journal.segment import Entry
+from armcal.io.journal import Entry, Journal, JournalFullError
 from armcal.io.json_server import JsonServer
 from armcal.io.signals import Signals
 
@@ -219,8 +217,8 @@ class Recalibration:
         self.finishing = ""
 
     @property
-    def journal_folder(self) -> Path:
-        return self._journal.folder
+    def journal(self) -> Journal:
+        return self._journal
 
     @property
     def paused(self) -> bool:
@@ -279,9 +277,7 @@ class Recalibration:
             self._take(incoming)
         elif self._source.ended:
             self.finishing = "The source has ended."
-        if self._since_checkpoint and (
-            self._journal.wants_checkpoint or self._since_checkpoint >= self._pace.checkpoint_records
-        ):
+        if self._since_checkpoint >= self._pace.checkpoint_records:
             self._checkpoint()
         now, output = time.monotonic(), self.session.settings.output
         enough = self._since_calibration >= output.calibration_every_records
@@ -364,7 +360,7 @@ class Recalibration:
         self._outputs.event({"event": "control", "sequence": self.sequence, "at": time.time(), "command": kind})
 
     def _checkpoint(self) -> None:
-        self._journal.checkpoint(self._state_replayer.checkpoint())
+        self._journal.put_checkpoint(self._state_replayer.checkpoint())
         self._since_checkpoint = 0
 
     def _write_status(self) -> None:

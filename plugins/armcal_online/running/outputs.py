@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from armcal.base.config_text import as_line
-from armcal.io.journal.files import REAL_FILES, FileLayer, write_whole
 from armcal.io.lines import StandardOutput
+from armcal.io.plain_files import write_whole
 
 from armcal_online.event_file import EventFile
 
@@ -35,8 +35,8 @@ class Outputs:
     On a full disk a reserve has room for the last calibration and status; what has none is tried again later.
     """
 
-    def __init__(self, folder: Path, stream: StandardOutput, events: EventFile, files: FileLayer = REAL_FILES) -> None:
-        self._folder, self._stream, self._events, self._files = folder, stream, events, files
+    def __init__(self, folder: Path, stream: StandardOutput, events: EventFile) -> None:
+        self._folder, self._stream, self._events = folder, stream, events
         self._silent_until: dict[str, float] = {}
         self._troubled: set[str] = set()
 
@@ -51,19 +51,19 @@ class Outputs:
 
     def status(self, status: Mapping[str, Any]) -> None:
         data = as_line(status).encode() + b"\n"
-        self._attempt("status", lambda: write_whole(self._files, self._folder / STATUS, data))
+        self._attempt("status", lambda: write_whole(self._folder / STATUS, data))
 
     def calibration(self, text: str) -> bool:
         """The updated calibration, in place of the one before; whether that went well."""
         return self._attempt("calibration", lambda: self._replace_calibration(text.encode()))
 
     def _replace_calibration(self, data: bytes) -> None:
-        write_whole(self._files, self.calibration_path, data)
+        write_whole(self.calibration_path, data)
         reserve = self._folder / RESERVE
         with contextlib.suppress(OSError):
             # Somewhat larger than the calibration: the next one can be written in its place.
-            if not reserve.exists() or self._files.size(reserve) < len(data):
-                write_whole(self._files, reserve, b"\0" * (len(data) + len(data) // 4 + 4096))
+            if not reserve.exists() or reserve.stat().st_size < len(data):
+                write_whole(reserve, b"\0" * (len(data) + len(data) // 4 + 4096))
 
     def rotate(self) -> None:
         with contextlib.suppress(OSError):
@@ -78,7 +78,7 @@ class Outputs:
     def make_room(self) -> None:
         self.retry()
         with contextlib.suppress(OSError):
-            self._files.remove(self._folder / RESERVE)
+            (self._folder / RESERVE).unlink()
 
     def close(self) -> None:
         self._events.close()

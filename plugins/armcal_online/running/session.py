@@ -5,7 +5,6 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,7 @@ import yaml
 from armcal.calibration.calibration import Calibration
 from armcal.errors import ConfigError, DataError, InputError, Location, PluginError
 from armcal.io.folder import check_folder
-from armcal.io.journal.files import REAL_FILES, FileLayer
-from armcal.io.journal.journal import Journal, JournalLimits
-from armcal.io.journal.reader import read_newest, read_until, verify
+from armcal.io.journal import JOURNAL_FILES, Entry, Journal, KeptJournal, has_journal
 from armcal.io.lines import StandardOutput
 from armcal.plugins import PluginRegistry
 
@@ -27,9 +24,7 @@ from armcal_online.sources.source import Incoming, Source
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import load_settings
 
-JOURNAL = "journal"
-_REPLACED = (CALIBRATION, STATUS, RESERVE)
-OURS = (JOURNAL, EVENTS, EARLIER, SOCKET, *_REPLACED, *(f"{name}.new" for name in _REPLACED))
+OURS = (*JOURNAL_FILES, EVENTS, EARLIER, SOCKET, CALIBRATION, STATUS, RESERVE)
 
 _NOT_DECIDING = ("output", "journal")
 """Settings on which no decision hangs: they may differ when a recalibration is gone on with."""
@@ -49,8 +44,7 @@ class Setup:
     calibration: Path  # the file it begins from
     stream: StandardOutput = field(default_factory=lambda: StandardOutput(None))
     pace: Pace = field(default_factory=Pace)  # how often other things are
-    limits: JournalLimits | None = None  # how large the journal may grow; None: as the settings have it
-    files: FileLayer = REAL_FILES
+    total_bytes: int | None = None  # how large the journal may grow; None: as the settings have it
     kept: Mapping[str, Any] | None = None
 
 
@@ -64,30 +58,20 @@ def opened(setup: Setup, session: Recalibrator, source: Source) -> Iterator[Reca
         InputError: the folder is another's, is in use, or belongs to another calibration or other settings.
         DataError: the journal is damaged.
     """
-    folder, sizes = setup.folder / JOURNAL, session.settings.journal
     with ExitStack() as stack:
         stack.callback(source.close)
         header = _header(setup, session)
-        limits = setup.limits or JournalLimits(sizes.segment_bytes, sizes.total_bytes)
-        journal = stack.enter_context(Journal.open(folder, header, files=setup.files, limits=limits))
-        state_replayer = StateReplayer(session, partial(read_until, folder), str(folder))
-        resumed = _recover(setup, journal, state_replayer, header)
+        total = setup.total_bytes or session.settings.journal.total_bytes
+        journal = stack.enter_context(Journal(setup.folder, header, total))
+        state_replayer = StateReplayer(session, journal.until, str(journal.path))
+        left = _recover(setup, journal, state_replayer, header)
         source.resume(state_replayer.progress.positions)
-        outputs = Outputs(setup.folder, setup.stream, EventFile(setup.folder), setup.files)
+        outputs = Outputs(setup.folder, setup.stream, EventFile(setup.folder))
         stack.callback(outputs.close)
+        resumed = not journal.is_new
         sequence = journal.record(STARTED, {"at": time.time(), "resumed": resumed})
         content = {"sequence": sequence, "at": time.time(), "resumed": resumed, "calibration": header["path"]}
         outputs.event({**session.started_event(resumed), **content})
-        cut = journal.recovered.cut
-        if cut is not None:
-            outputs.alarm(cut.sentence)
-        try:
-            verify(folder, setup.files)
-        except DataError as fault:
-            # The newest checkpoint was checked: the estimate goes on from it.
-            text = "The estimate is not touched by it: only what lies before is out of reach."
-            outputs.alarm(f"{fault.message} {text}")
-        left = len(journal.recovered.entries) if resumed else 0
         control = control_server(setup.folder, lambda request: answer(recalibration, request))
         stack.callback(control.close)
         recalibration = Recalibration(source, journal, session, state_replayer, outputs, control, setup.pace, left)
@@ -104,7 +88,7 @@ def _header(setup: Setup, session: Recalibrator) -> dict[str, Any]:
             where=Location(str(setup.calibration)),
             hint="Copy it elsewhere first, or give another --out.",
         )
-    if not (setup.folder / JOURNAL).is_dir():
+    if not has_journal(setup.folder):
         check_folder(setup.folder, OURS)
     text = setup.calibration.read_bytes()
     return {
@@ -115,23 +99,23 @@ def _header(setup: Setup, session: Recalibrator) -> dict[str, Any]:
     }
 
 
-def _recover(setup: Setup, journal: Journal, state_replayer: StateReplayer, header: Mapping[str, Any]) -> bool:
-    """Take up the newest state; whether there was one."""
-    recovered = journal.recovered
-    if not recovered.header:
-        journal.checkpoint(state_replayer.checkpoint())
-        return False
+def _recover(setup: Setup, journal: Journal, state_replayer: StateReplayer, header: Mapping[str, Any]) -> int:
+    """Take up the newest state; how many entries came after its checkpoint."""
+    if journal.is_new:
+        journal.put_checkpoint(state_replayer.checkpoint())
+        return 0
     for key in _DECIDING:
-        if recovered.header.get(key) != header[key]:
+        if journal.header.get(key) != header[key]:
             raise InputError(
                 f"it was begun with {'another calibration' if key == 'calibration' else 'other settings'}.",
                 where=Location(str(setup.folder)),
                 hint="Give what it was begun with, or a new --out (perhaps from a copy of its calibration.yaml).",
             )
-    state_replayer.restore(recovered.checkpoint, recovered.checkpoint_sequence)
-    for entry in recovered.entries:
+    checkpoint = journal.checkpoint or Entry(0, "checkpoint", None)
+    state_replayer.restore(checkpoint.content, checkpoint.sequence)
+    for entry in journal.entries(checkpoint.sequence):
         state_replayer.apply(entry.sequence, entry.kind, entry.content)
-    return True
+    return journal.sequence - checkpoint.sequence
 
 
 class _NoRecords(Source):
@@ -149,28 +133,19 @@ def roll_back_ended(folder: Path, to: int | str, registry: PluginRegistry) -> Ma
         InputError: there is no journal, it is in use, or there is nothing to go back to.
         DataError: the journal is damaged, or does not reach there.
     """
-    journal = folder / JOURNAL
-    if not journal.is_dir():
-        hint = "Give the folder that armcal recalibrate was given as --out."
-        raise InputError("there is no journal of a recalibration.", where=Location(str(folder)), hint=hint)
-    kept = verify(journal)
-    if isinstance(to, str) and to != GOOD:
-        to = entry_named(journal, to)
-    if isinstance(to, int) and not kept.first_sequence < to <= kept.last_sequence:
-        raise InputError(
-            f"found no entry {to}; the journal goes from {kept.first_sequence + 1} to {kept.last_sequence}.",
-            where=Location("rollback"),
-            hint="Give the sequence number of an entry that is kept.",
-        )
-    newest = read_newest(journal).segment
-    assert newest is not None
+    with KeptJournal(folder) as journal:
+        if isinstance(to, str) and to != GOOD:
+            to = entry_named(journal, to)
+        if isinstance(to, int):
+            journal.until(to)
+        header = journal.header
     setup = Setup(
         folder=folder,
-        calibration=Path(str(newest.header.get("path", ""))),
-        limits=JournalLimits(total_bytes=1 << 62),  # nothing of the past goes for this
-        kept=newest.header,
+        calibration=Path(str(header.get("path", ""))),
+        total_bytes=1 << 62,  # nothing of the past goes for this
+        kept=header,
     )
-    with opened(setup, _kept_session(newest.header, journal, registry), _NoRecords()) as loop:
+    with opened(setup, _kept_session(header, journal.path, registry), _NoRecords()) as loop:
         reply = rolled_back(loop, to)
         loop.finishing = "The estimate was set back after the end."
         loop.run()

@@ -107,9 +107,8 @@ class OutputSettings(Settings):
 
 
 class JournalSettings(Settings):
-    """Bytes in a segment of the journal, and in all of them together."""
+    """Bytes of the journal: the oldest records go where there would be more."""
 
-    segment_bytes: Annotated[int, Field(ge=4096)] = 4 * 1024**2
     total_bytes: Annotated[int, Field(ge=65536)] = 64 * 1024**2
 
 

@@ -1,1 +1,0 @@
-"""The durable journal: what was acknowledged outlives kills and power cuts."""
