@@ -81,7 +81,7 @@ def opened(setup: Setup, session: Recalibrator, source: Source) -> Iterator[Reca
 def _header(setup: Setup, session: Recalibrator) -> dict[str, Any]:
     """All that a roll-back needs besides the entries. The folder must not replace the calibration to begin from."""
     if setup.kept is not None:
-        return dict(setup.kept)
+        return {"path": "", **setup.kept}
     if setup.calibration.resolve() == (setup.folder / CALIBRATION).resolve():
         raise InputError(
             "the calibration to begin from would be replaced by the updated one.",
@@ -159,12 +159,14 @@ def _kept_session(header: Mapping[str, Any], journal: Path, registry: PluginRegi
         DataError: the journal does not keep the calibration, or not as it was.
         ConfigError, PluginError: it is none that this version takes; the journal is named.
     """
-    text = header.get("text")
-    if not isinstance(text, str) or hashlib.sha256(text.encode()).hexdigest() != header.get("calibration"):
+    text, kept = header.get("text"), header.get("settings")
+    is_whole = isinstance(text, str) and hashlib.sha256(text.encode()).hexdigest() == header.get("calibration")
+    if not isinstance(text, str) or not is_whole or not isinstance(kept, dict):
+        what = "settings" if is_whole else "calibration"
         hint = "Take another copy of the journal, or begin a new --out from its calibration.yaml."
-        raise DataError("the journal does not hold its calibration whole.", where=Location(str(journal)), hint=hint)
+        raise DataError(f"the journal does not hold its {what} whole.", where=Location(str(journal)), hint=hint)
     try:
-        stated = yaml.safe_dump(dict(header.get("settings") or {}))
+        stated = yaml.safe_dump(kept)
         settings = load_settings(Path("journal.yaml"), (), stated.encode())
         return Recalibrator(Calibration.load(CALIBRATION, registry, content=text.encode()), settings, registry)
     except (ConfigError, PluginError) as fault:
