@@ -16,7 +16,8 @@ from armcal.cli.main import cli
 from armcal.errors import InputError
 from armcal.io.json_server import MOST_CLIENTS, JsonServer
 from armcal.io.unix_socket import short_address
-from armcal_online.running.control import SOCKET, answer, ask, control_server
+from armcal_online.running.control import answer, ask, control_server
+from armcal_online.running.situation import SOCKET
 from click.testing import CliRunner
 
 

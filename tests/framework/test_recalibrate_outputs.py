@@ -9,9 +9,7 @@ from io import BytesIO
 from pathlib import Path
 
 import pytest
-from armcal.base.config_text import as_line
 from armcal.io.lines import StandardOutput
-from armcal_online.event_file import EventFile
 from armcal_online.running.outputs import Outputs
 from recalibrations import FullDisk
 
@@ -21,7 +19,7 @@ def test_on_a_full_disk_the_calibration_stays_whole_and_no_event_is_dropped(
 ) -> None:
     monkeypatch.setattr("armcal_online.running.outputs.RETRY_S", 0.0)
     files, out = FullDisk(monkeypatch), BytesIO()
-    outputs = Outputs(tmp_path, StandardOutput(out), EventFile(tmp_path))
+    outputs = Outputs(tmp_path, StandardOutput(out))
     assert outputs.calibration("one")
     outputs.event({"event": "record"})
     files.full = {"calibration", "status"}
@@ -44,7 +42,7 @@ def test_on_a_full_disk_the_calibration_stays_whole_and_no_event_is_dropped(
 def test_events_that_cannot_be_written_to_a_file_still_go_to_standard_output(tmp_path: Path) -> None:
     (tmp_path / "events.jsonl").symlink_to("/dev/full")
     out = BytesIO()
-    outputs = Outputs(tmp_path, StandardOutput(out), EventFile(tmp_path))
+    outputs = Outputs(tmp_path, StandardOutput(out))
     for i in range(5):
         outputs.event({"event": "record", "n": i})
     told = [json.loads(line) for line in out.getvalue().splitlines()]
@@ -53,21 +51,27 @@ def test_events_that_cannot_be_written_to_a_file_still_go_to_standard_output(tmp
     outputs.close()
 
 
-def test_the_file_of_events_is_kept_short_and_half_a_line_is_ended(tmp_path: Path) -> None:
+def test_the_file_of_events_is_kept_short_and_half_a_line_is_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("armcal_online.running.outputs.EVENT_BYTES", 1000)
     (tmp_path / "events.jsonl").write_text('{"event": "rec')
-    file = EventFile(tmp_path, max_bytes=1000)
-    for i in range(200):
-        file.write(as_line({"event": "record", "n": i}))
-    file.close()
-    assert (tmp_path / "events.jsonl").stat().st_size <= 1000 >= (tmp_path / "events.1.jsonl").stat().st_size
-    lines = [(tmp_path / name).read_text().splitlines() for name in ("events.1.jsonl", "events.jsonl")]
+    outputs = Outputs(tmp_path, StandardOutput(None))
+    outputs.event({"event": "record", "n": 0, "text": "100 %s"})
+    first = (tmp_path / "events.jsonl").read_text().splitlines()
+    assert first[0] == '{"event": "rec' and json.loads(first[1])["text"] == "100 %s"
+    for i in range(1, 200):
+        outputs.event({"event": "record", "n": i})
+    outputs.close()
+    assert (tmp_path / "events.jsonl").stat().st_size <= 1000 >= (tmp_path / "events.jsonl.1").stat().st_size
+    lines = [(tmp_path / name).read_text().splitlines() for name in ("events.jsonl.1", "events.jsonl")]
     assert json.loads(lines[1][-1])["n"] == 199 and json.loads(lines[1][0])["n"] == json.loads(lines[0][-1])["n"] + 1
 
 
 def test_a_reader_that_sleeps_loses_lines_and_is_told_so(tmp_path: Path) -> None:
     reading, writing = os.pipe()
     with os.fdopen(writing, "wb", buffering=0) as stream, os.fdopen(reading, "rb", buffering=0) as reader:
-        outputs = Outputs(tmp_path, StandardOutput(stream, patience_s=0.05), EventFile(tmp_path))
+        outputs = Outputs(tmp_path, StandardOutput(stream, patience_s=0.05))
         for i in range(3000):
             outputs.event({"event": "record", "n": i, "text": "x" * 100})
         got = reader.read(10**6)

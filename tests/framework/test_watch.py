@@ -1,409 +1,494 @@
-"""Watching a recalibration: files that rotate and break, who may look, the stream, and a real browser."""
+"""A watched recalibration: what to do, how far off, since when, where to roll back to, and whether it runs at all."""
 
 from __future__ import annotations
 
 import http.client
-import io
 import json
-import math
-import os
-import random
-import shutil
+import re
+import socket
 import subprocess
 import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-import numpy as np
 import pytest
-import yaml
-from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
-from armcal.io.lines import MAX_LINE_BYTES
-from armcal_online.event_file import EventFile, EventTail
-from armcal_online.watch.estimates import Thinned
-from armcal_online.watch.events import LONGEST_TEXT, message_of, number, parsed, record_of, text
-from armcal_online.watch.feed import Feed
-from armcal_online.watch.history import OLDER_ACCEPTED, OLDER_OTHERS, RECENT_RECORDS, History
-from armcal_online.watch.shape import Shape, drawing_of
-from armcal_online.watch.terminal import line, picture
+from armcal.errors import InputError
+from armcal_online.commands.watch import WatchServer, is_loopback, newest_events, page
+from armcal_online.running.situation import AFTER_THE_END, SOCKET, Situation, present
+from browser import CHROMIUM, Browser
 from click.testing import CliRunner
-from rich.console import Console
-from watching import SLIP, append, made_up, made_up_folder, written
 
 ROOT = Path(__file__).resolve().parents[2]
-HOSTILE = "</script><script>document.title='taken'</script><img src=x onerror=\"document.title='taken'\">"
+START = 1.93e9
+ASK = "Stop the arm's work. Roll back to record r9."
+GOOD = {"sequence": 9, "id": "r9", "at": START + 9 * 900}
+HOSTILE = "</script><script>document.title='taken'</script><img src=x onerror=\"document.title='taken'\">\x1b[2J"
 
 
-@pytest.fixture(scope="module")
-def calibration(demo_calibration: Path) -> Path:
-    """A real one, of the shipped demonstration."""
-    return demo_calibration
+def record(n: int, off_mm: float = 1.0, level: str = "nominal", **given: Any) -> dict[str, Any]:
+    residual = [off_mm, 0.0, 0.0]
+    return {
+        **{"event": "record", "sequence": n, "id": f"r{n}", "at": START + 900 * n, "verdict": "accepted", "nis": 3.0},
+        **{"limit": 16.3, "dof": 3, "level": level, "residual_mm": residual, "inputs": {"arm.q1": 0.1}, **given},
+    }
 
 
-# Files
+def decision(n: int, kind: str, level: str, do: str, **given: Any) -> dict[str, Any]:
+    return {
+        **{"event": "decision", "sequence": n, "at": START + 900 * n, "kind": kind, "level": level, "do": do},
+        **{"what": f"It is {kind}.", "since": n - 1, "since_id": f"r{n - 1}", "since_at": START + 900 * (n - 1)},
+        **{"sure_percent": 99.99, "tip_error_mm": 46.2, "confirm": "Look again.", "last_good": GOOD},
+        **{"sentence": f"It is {kind}, in full.", **given},
+    }
 
 
-def all_lines(tail: EventTail) -> list[str]:
-    found: list[str] = []
-    while lines := tail.lines():
-        found += [line.decode() for line in lines]
-    return found
+def level(n: int, before: str, after: str, do: str = "") -> dict[str, Any]:
+    return {
+        **{"event": "level", "sequence": n, "at": START + 900 * n, "from": before, "to": after, "do": do},
+        **{"since_id": f"r{n}", "last_good": GOOD, "sentence": f"From {before} to {after}."},
+    }
 
 
-def test_half_a_line_waits_for_its_end(tmp_path: Path) -> None:
-    tail = EventTail(tmp_path)
-    assert all_lines(tail) == []
-    append(tmp_path / "events.jsonl", '{"event": "rec')
-    assert all_lines(tail) == []
-    append(tmp_path / "events.jsonl", 'ord"}\n\n{"a"')
-    assert all_lines(tail) == ['{"event": "record"}']
-    append(tmp_path / "events.jsonl", ": 1}\n")
-    assert all_lines(tail) == ['{"a": 1}']
+BEFORE = tuple(record(n) for n in range(1, 10))
+LOST = (
+    *BEFORE,
+    *(record(n, 80.0, verdict="rejected") for n in (10, 11)),
+    *(decision(11, "model_no_longer_fits", "lost", ASK), level(11, "nominal", "lost", "Stop.")),
+    *(record(n, 60.0 + n, "lost", verdict="rejected") for n in range(12, 15)),
+)
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_nothing_is_lost_or_doubled_over_many_rotations(tmp_path: Path, seed: int) -> None:
-    """By the writer itself, read at moments of chance, at least once in each file's time."""
-    chance, writer, tail = random.Random(seed), EventFile(tmp_path, max_bytes=1000), EventTail(tmp_path)
-    found: list[str] = []
-    for n in range(2000):
-        writer.write(f"line {n} {'x' * chance.randrange(60)}")
-        if n % 7 == 0 or chance.random() < 0.1:
-            found += all_lines(tail)
-    found += all_lines(tail)
-    assert [int(line.split()[1]) for line in found] == list(range(2000))
+def told(*events: dict[str, Any], at: str = "lost", good: Any = None) -> dict[str, Any]:
+    situation = Situation()
+    for event in events:
+        situation.take(event)
+    return situation.first_screen(at, good, Path("/data/my run"))
 
 
-def test_a_watcher_that_was_away_goes_on_with_what_is_left(tmp_path: Path) -> None:
-    writer, tail = EventFile(tmp_path, max_bytes=100), EventTail(tmp_path)
-    writer.write("line 0")
-    assert all_lines(tail) == ["line 0"]
-    for n in range(1, 200):
-        writer.write(f"line {n}")
-    left = (tmp_path / "events.1.jsonl").read_text() + (tmp_path / "events.jsonl").read_text()
-    assert all_lines(tail) == left.splitlines()
-    assert all_lines(EventTail(tmp_path)) == left.splitlines()
+# What is said
 
 
-def test_a_new_file_with_the_inode_number_of_the_read_one_does_not_hide_the_rotated_one(tmp_path: Path) -> None:
-    newest, tail = tmp_path / "events.jsonl", EventTail(tmp_path)
-    newest.write_text("read\n")
-    assert all_lines(tail) == ["read"]
-    (tmp_path / "events.1.jsonl").write_text("rotated\n")
-    newest.write_text("newest\n")  # in place: the number is the same for certain
-    assert all_lines(tail) == ["rotated", "newest"]
+def test_at_the_level_lost_it_says_stop_how_far_off_since_when_and_the_way_back() -> None:
+    now = told(*LOST)
+    assert now["do"] == ASK and now["confirm"] == "Look again."
+    assert now["what"] == "It is model_no_longer_fits. More than 99.9 % sure."
+    assert (now["off_mm"], now["off_of"], now["off_before_mm"]) == (73.0, 3, 46.2)
+    assert now["since"] == {"sequence": 10, "id": "r10", "at": START + 9000} and now["last_good"] == GOOD
+    assert now["rollback"] == "armcal control '/data/my run' rollback 9"
 
 
-def test_a_file_that_was_cut_or_written_anew_is_read_from_its_start(tmp_path: Path) -> None:
-    path, tail = tmp_path / "events.jsonl", EventTail(tmp_path)
-    path.write_text("one\ntwo\nthr")
-    assert all_lines(tail) == ["one", "two"]
-    path.write_text("1\n")  # shorter
-    assert all_lines(tail) == ["1"]
-    with path.open("r+") as file:
-        file.write("another and longer\n")  # in place, begins otherwise
-    assert all_lines(tail) == ["another and longer"]
-    path.unlink()
-    assert all_lines(tail) == []
-    path.write_text("new\n")
-    assert all_lines(tail) == ["new"]
+def test_a_later_decision_that_means_less_does_not_say_go_on() -> None:
+    """A level that is lost stays lost, whatever is decided after it."""
+    now = told(*LOST, decision(14, "joint_replaced", "watch", "Go on."))
+    assert now["do"] == ASK and now["since"]["id"] == "r10" and now["last_good"] == GOOD
 
 
-def test_a_newest_file_that_is_replaced_does_not_bring_the_rotated_one_back(tmp_path: Path) -> None:
-    (tmp_path / "events.1.jsonl").write_text("old\n")
-    (tmp_path / "events.jsonl").write_text("new\n")
-    tail = EventTail(tmp_path)
-    assert all_lines(tail) == ["old", "new"]
-    (tmp_path / "other").write_text("newer\n")
-    os.replace(tmp_path / "other", tmp_path / "events.jsonl")
-    assert all_lines(tail) == ["newer"]
+def test_trouble_began_with_its_first_record_whatever_the_last_decision_is_about() -> None:
+    later = decision(30, "model_no_longer_fits", "lost", ASK, last_good={"sequence": 25})
+    begun = (*LOST[:11], decision(11, "joint_slipped", "watch", "Go on."), level(11, "nominal", "watch"))
+    now = told(*begun, later, level(30, "watch", "lost"))
+    assert "model_no_longer_fits" in now["what"] and now["since"]["id"] == "r10" and now["last_good"] == GOOD
 
 
-def test_no_file_is_held_so_that_what_is_dropped_makes_room(tmp_path: Path) -> None:
-    made_up_folder(tmp_path, 20)
-    feed = Feed(tmp_path)
-    assert feed.step()
-    held = [str(link.readlink()) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
-    assert not [path for path in held if str(tmp_path) in path]
+def test_a_later_decision_about_earlier_records_says_that_trouble_began_with_them() -> None:
+    earlier = {"since": 5, "since_id": "r5", "since_at": START + 4500, "last_good": {"sequence": 4}}
+    now = told(*LOST, decision(14, "model_no_longer_fits", "lost", ASK, **earlier))
+    assert now["since"]["id"] == "r5" and now["last_good"] == {"sequence": 4} and now["rollback"].endswith(" 4")
 
 
-def test_a_line_without_end_is_passed_over_and_memory_stays_flat(tmp_path: Path) -> None:
-    path, tail = tmp_path / "events.jsonl", EventTail(tmp_path)
-    path.write_bytes(b"before\n" + b"x" * (3 * MAX_LINE_BYTES) + b"\nafter\n")
-    assert all_lines(tail) == ["before", "after"]
-    assert tail.too_long == 1
+def test_of_two_changes_at_once_both_are_said() -> None:
+    both = [decision(11, "joint_slipped", "watch", "Go on."), decision(11, "sensor_moved", "watch", "Measure anew.")]
+    now = told(*LOST[:11], *both, level(11, "nominal", "watch", "Go on."), at="watch")
+    assert now["do"] == "Go on. Measure anew." and now["confirm"] == "Look again."
+    assert "joint_slipped. More than" in now["what"] and "sensor_moved. More than" in now["what"]
 
 
-# What is kept
+def test_when_the_level_improves_the_advice_is_that_of_the_new_level_and_the_way_back_stays() -> None:
+    better = (*LOST, level(30, "lost", "suspect", "Take 10 records."))
+    now = told(*better, at="suspect")
+    assert now["do"] == "Take 10 records." and now["last_good"] == GOOD and "confirm" not in now
+    calm = (level(46, "suspect", "watch", "Take 16 records."), level(62, "watch", "nominal", "Go on."))
+    newest = {"sequence": 62, "id": "r62"}
+    now = told(*better, *calm, record(62, 1.5), at="nominal", good=newest)
+    assert now["do"] == "Go on." and now["last_good"] == newest and now["since"]["id"] == "r62"
+    assert now["earlier"] == "It is model_no_longer_fits, in full." and "what" not in now
 
 
-def test_thinning_keeps_the_newest_whole_and_the_rest_even() -> None:
-    kept: Thinned[int] = Thinned(100, 50)
-    for n in range(100_000):
-        kept.add(n)
-        assert len(kept) <= 150
-    known = list(kept)
-    assert known[-100:] == list(range(99_900, 100_000))
-    steps = np.diff(known[:-100])
-    assert len(set(steps.tolist())) == 1 and known[0] == 0 and len(steps) >= 24
+def test_a_rollback_ends_the_trouble() -> None:
+    back = {"event": "decision", "kind": "rollback", "sequence": 20, "to": 9, "level": "nominal", "last_good": GOOD}
+    events = (*LOST, {**back, "do": "Take 16 records.", "sentence": "The estimate was set back."})
+    now = told(*events, at="nominal", good=GOOD)
+    assert now["last_good"] == GOOD and now["do"] == "Take 16 records."
+    assert now["off_mm"] is None  # those before were judged by another estimate
+    assert told(*events, record(21, 1.25), at="nominal", good=GOOD)["off_mm"] == 1.25
 
 
-@pytest.mark.slow
-def test_memory_is_flat_however_long_it_goes_on() -> None:
-    history = History()
-    events = made_up(400)
-    sizes = {}
-    for n in range(1, 14_001):
-        event = events[1 + n % 380]
-        history.take({**event, "sequence": n} if event["event"] == "record" else event)
-        if n % 2000 == 0:
-            sizes[n] = len(json.dumps(history.state()))
-    state = history.state()
-    assert max(sizes.values()) < 1.25 * max(size for n, size in sizes.items() if n <= 6000)
-    assert len(state["records"]) <= RECENT_RECORDS * 1.5 + OLDER_ACCEPTED + OLDER_OTHERS
-    whole = [r for r in state["records"] if "why" in r]
-    assert len(whole) >= RECENT_RECORDS
-    assert [r["sequence"] for r in state["records"]] == sorted(r["sequence"] for r in state["records"])
+def test_without_a_decision_it_is_the_advice_of_the_level() -> None:
+    assert told(at="")["do"] == "Wait for the first record."
+    lost = told({"event": "level", "sequence": 2, "from": "nominal", "to": "lost"})
+    assert "the calibration that it began from" in lost["do"] and lost["rollback"] is None
 
 
-def test_the_state_says_what_the_events_said(tmp_path: Path) -> None:
-    feed = Feed(made_up_folder(tmp_path))
-    while feed.step():
-        pass
-    state = feed.state()
-    records = [e for e in made_up() if e["event"] == "record"]
-    for verdict in ("accepted", "rejected", "ignored"):
-        assert state["counts"][verdict] == sum(r["verdict"] == verdict for r in records)
-    assert state["level"] == "nominal" and state["level_sentence"] == "The slip is followed."
-    assert state["last"]["id"] == "p300"
-    assert state["last"]["nis"] == pytest.approx(records[-1]["nis"], rel=1e-6)
-    theta3 = [p["name"] for p in state["estimates"]["parameters"]].index("arm.mdh.theta3")
-    last = [e for e in made_up() if e["event"] == "estimate"][-1]["parameters"]["arm.mdh.theta3"]
-    start = made_up()[0]["parameters"][theta3]
-    row = state["estimates"]["rows"][-1]
-    assert row["change"][theta3] == pytest.approx(math.degrees(last[0] - start["value"]), rel=1e-5)
-    assert row["sd"][theta3] == pytest.approx(math.degrees(last[1]), rel=1e-3)
-    assert {p["unit"] for p in state["estimates"]["parameters"]} == {"deg", "mm", "deg/Nm"}
-    assert "joint_slipped" in [e.get("kind") for e in state["events"]]
-    assert state["written"]["sequence"] == SLIP + 4
+def test_one_that_goes_on_knows_what_was_before_and_one_that_begins_anew_does_not(tmp_path: Path) -> None:
+    written = "".join(json.dumps(event) + "\n" for event in LOST)
+    half = len(written) // 2
+    (tmp_path / "events.jsonl.1").write_text(written[:half])
+    (tmp_path / "events.jsonl").write_text(f'{written[half:]}[]\n{{"event": "record", "residual_mm": 3}}\n{{"half')
+    known = Situation.recovered(tmp_path)
+    now = known.first_screen("lost", None, tmp_path)
+    assert now["do"] == ASK and now["since"]["id"] == "r10" and now["last_good"] == GOOD
+    known.take({"event": "started", "sequence": 90, "resumed": True})
+    assert known.first_screen("lost", None, tmp_path)["do"] == ASK
+    known.take({"event": "started", "sequence": 0, "resumed": False})
+    assert known.first_screen("nominal", None, tmp_path)["do"] == "Go on."
 
 
-@pytest.mark.parametrize("source", ["calibration", "start"])
-def test_what_was_rotated_away_is_known_from_the_status_and_the_calibration_or_a_later_start(
-    tmp_path: Path, calibration: Path, source: str
+# Whether it runs
+
+
+@contextmanager
+def folder_of(place: Path, runs: bool, *events: dict[str, Any], **status: Any) -> Iterator[Path]:
+    """A folder as a recalibration leaves it; while it runs, its socket answers."""
+    place.mkdir(parents=True, exist_ok=True)
+    (place / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
+    situation = Situation.recovered(place)
+    counts = {"accepted": 1288, "rejected": 9, "ignored": 3}
+    whole = {
+        "level": "nominal",
+        "why": "All is well.",
+        "last_good": GOOD,
+        "counts": counts,
+        "at": time.time(),
+        **status,
+    }
+    whole["situation"] = situation.first_screen(whole["level"], whole["last_good"], place)
+    (place / "status.json").write_text(json.dumps(whole))
+    with ExitStack() as opened:
+        listener = opened.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
+        listener.bind(str(place / SOCKET))
+        if runs:
+            listener.listen(64)
+        yield place
+
+
+@pytest.mark.parametrize(
+    ("runs", "status", "life", "says"),
+    [
+        (True, {}, "running", ""),
+        (True, {"finished": True}, "running", ""),  # the one before ended; this one has not written yet
+        (False, {}, "killed", "was killed: no process answers here, and its last sign came at 20"),
+        (False, {"at": START}, "killed", "its last sign came at 2031-02-27 23:06:40 UTC. Nothing follows the arm"),
+        (True, {"at": 1.5e9}, "hangs", "hangs, or was killed: its last sign came at 2017-07-14"),
+        (False, {"finished": True, "at": START, "fault": "no room. Make room."}, "stopped", "UTC: no room. Make room."),
+        (False, {"finished": True, "at": START}, "ended", "has ended at 2031-02-27 23:06:40 UTC."),
+    ],
+)
+def test_what_no_longer_runs_is_never_shown_as_nominal_and_go_on(
+    tmp_path: Path, runs: bool, status: dict[str, Any], life: str, says: str
 ) -> None:
-    """A watcher that comes late knows neither the first records nor the event with the units."""
-    name = next(entry["name"] for entry in _entries(calibration) if entry["unit"] == "rad")
-    events = [
-        {"event": "estimate", "sequence": 900 + n, "parameters": {name: [0.1 + 0.01 * n, 0.02]}} for n in range(3)
-    ]
-    (tmp_path / "events.jsonl").write_text(written(events))
-    feed = Feed(tmp_path)
-    feed.step()
-    before = feed.state()
-    row = before["estimates"]["rows"][-1]
-    assert row["change"] == [pytest.approx(0.02)] and feed.state()["estimates"]["parameters"][0]["unit"] == ""
-    if source == "calibration":
-        shutil.copy(calibration, tmp_path / "calibration.yaml")
-    else:
-        listed = [{"name": name, "unit": "rad", "value": 0.12, "sd": 0.02}]
-        start = {"event": "started", "sequence": 903, "resumed": True, "parameters": listed}
-        append(tmp_path / "events.jsonl", written([start]))
-    counts = {"accepted": 890, "rejected": 9, "ignored": 3}
-    (tmp_path / "status.json").write_text(json.dumps({"level": "watch", "why": "Because.", "counts": counts}))
-    feed.step()
-    assert feed.state(before["place"])["whole"]  # pages begin anew, with the units
-    estimates = feed.state()["estimates"]
-    assert estimates["parameters"][0]["unit"] == "deg"
-    assert estimates["rows"][-1]["change"] == [pytest.approx(math.degrees(0.02), rel=1e-5)]
-    assert estimates["rows"][-1]["sd"] == [pytest.approx(math.degrees(0.02), rel=1e-3)]
-    assert feed.step() == []
-    console = Console(width=100)
-    with console.capture() as shown:
-        console.print(picture(feed.state()))
-    assert "890 accepted" in shown.get()
+    """Killed, stopped by a fault, ended or stuck, whatever it wrote last: since when, and what to do."""
+    with folder_of(tmp_path / "x", runs, *BEFORE, **status) as folder:
+        shown = CliRunner().invoke(cli, ["watch", str(folder), "--once"]).output
+        state = json.loads(CliRunner().invoke(cli, ["watch", str(folder), "--once", "--json"]).output)
+    assert state["life"] == life and says in (state["over"] or "")
+    assert ("Go on." in shown) == (life == "running") and (AFTER_THE_END in shown) == (life != "running")
+    assert ("(it was nominal)" in shown) == (life in ("killed", "stopped", "hangs"))
+    assert ("All is well." in shown) == (life in ("running", "ended"))
 
 
-def _entries(calibration: Path) -> list[dict[str, Any]]:
-    listed: list[dict[str, Any]] = yaml.safe_load(calibration.read_text())["parameters"]
-    return listed
+def test_a_folder_without_a_status_is_waited_for_and_half_a_status_is_none(tmp_path: Path) -> None:
+    assert present(tmp_path)["life"] == "waiting"
+    (tmp_path / "status.json").write_text('{"level": "nom')
+    assert present(tmp_path)["life"] == "waiting"
+    shown = CliRunner().invoke(cli, ["watch", str(tmp_path), "--once"])
+    assert shown.exit_code == 0 and "unknown, waiting" in shown.output and "Wait for the first record." in shown.output
 
 
-def test_a_new_start_forgets_and_one_that_goes_on_does_not() -> None:
-    history = History()
-    for event in made_up(50):
-        history.take(event)
-    again = {**made_up(1)[0], "resumed": True, "sequence": 51}
-    shifted = [{**p, "value": p["value"] + 0.01} for p in again["parameters"]]
-    assert "reset" not in [m["event"] for m in history.take({**again, "parameters": shifted})]
-    assert history.take(made_up(50)[3]) == []  # a record told a second time
-    state = history.state()
-    assert sum(state["counts"].values()) == 50
-    change = state["estimates"]["rows"][-1]["change"]
-    assert change[0] == pytest.approx(math.degrees(0.01), rel=1e-5)  # since the first start
-    assert history.take(made_up(1)[0])[0] == {"event": "reset"}
-    state = history.state()
-    assert sum(state["counts"].values()) == 0 and state["records"] == []
+ANSWERS = (ASK, "It is model_no_longer_fits.", "73 mm", "r10", "r9", "rollback 9")
 
 
-def test_what_is_not_an_event_is_counted_and_never_hurts() -> None:
-    chance, history = random.Random(1), History()
-    values: list[Any] = [None, True, 3, -1e400, 10**400, 1e400, "x" * 5000, [], [1], [1, 2, "3"], {}, {"a": []}, "nan"]
-    keys = sorted({key for event in made_up(200) for key in event})
-    for _ in range(5000):
-        event = {key: chance.choice(values) for key in chance.sample(keys, 12)}
-        event["event"] = chance.choice(["record", "estimate", "started", "level", "decision", "new", 5, None])
-        if event["event"] == "record":
-            event["verdict"] = chance.choice(["accepted", "rejected", "maybe"])
-        messages = history.take(event)
-        json.dumps(messages, allow_nan=False)
-        assert all(line(m) is None or isinstance(line(m), str) for m in messages)
-    for raw in (b"\xff\xfe", b"[1]", b"{", b'{"a": NaN', b"[" * 100_000, b'{"event": "record"', b"\x00" * 10):
-        assert parsed(raw) is None
-        history.take(parsed(raw))
-    assert history.unreadable == 7 and history.unknown > 0
-    json.dumps(history.state(), allow_nan=False)
-    Console(file=io.StringIO(), width=80).print(picture(_whole_state(history)))
+def test_the_state_printed_once_answers_everything(tmp_path: Path) -> None:
+    with folder_of(tmp_path / "x", False, *LOST, level="lost", finished=True, at=START) as folder:
+        shown = CliRunner().invoke(cli, ["watch", str(folder), "--once"]).output
+    for words in (*ANSWERS, "lost, ended", "has ended at 2031-02-27 23:06:40 UTC", "46 mm before this was decided"):
+        assert words in shown, words
 
 
-def _whole_state(history: History) -> dict[str, Any]:
-    """What a feed adds to a history."""
-    first = {"situation": history.situation("x", {}), "over_time": history.over_time(None)}
-    return {**history.state(), **first, "folder": "x", "waiting": None, "heard_s": 0.0, "status": {}}
-
-
-def test_numbers_that_json_cannot_hold_and_texts_that_act_on_terminals_are_made_harmless() -> None:
-    assert number(float("nan")) is None and number(10**400) is None and number(True) is None
-    assert text("\x1b[2Jred\x07\u202egnp") == "\ufffd[2Jred\ufffd\ufffdgnp"
-    assert text("two\nlines") == "two lines"
-    assert len(text("x" * 10_000) or "") == LONGEST_TEXT
-    told = message_of({"event": "decision", "sentence": "\x1b]0;title\x07"})
-    assert told is not None and "\x1b" not in str(line(told))
-    record = record_of({"event": "record", "verdict": "accepted", "id": "[bold red]x[/]", "nis": float("inf")})
-    assert record is not None and "nis" not in record
-    history = History()
-    history.take({"event": "record", "verdict": "accepted", "id": "[bold]\x1b[2Jx[/]"})
-    console = Console(width=100, force_terminal=True)
-    with console.capture() as shown:
-        console.print(picture(_whole_state(history)))
-    assert "[bold]" in shown.get() and "\x1b[2J" not in shown.get()
-
-
-# The arm
-
-
-def test_the_drawn_arm_ends_where_the_calibration_says(calibration: Path) -> None:
-    """Springs, effects and load included; its parts are as long in every pose."""
-    chance, draw, loaded = np.random.default_rng(2), drawing_of(calibration), Calibration.load(calibration)
-    angles = chance.uniform(-1.2, 1.2, (12, 6))
-    points = np.array([draw({f"arm.q{i + 1}": q for i, q in enumerate(row)})["arm"] for row in angles])
-    assert points.shape == (12, 9, 3) and np.all(points[:, 0] == 0)
-    tools = loaded.forward(angles)[:, :3, 3] * 1000
-    assert np.allclose(tools, points[:, -1], atol=0.02)
-    parts = np.linalg.norm(np.diff(points, axis=1), axis=2)
-    assert np.allclose(parts, parts[0], atol=0.03)
-    assert draw({"arm.q1": 0.0}) == {}
-
-
-def test_a_calibration_that_cannot_be_read_is_told_and_mended_ones_are_used(tmp_path: Path, calibration: Path) -> None:
-    shape, angles = Shape(tmp_path, every=10.0), {f"arm.q{i}": 0.1 for i in range(1, 7)}
-    assert shape.points(angles, None, 0.0) == {} and shape.fault is None
-    assert shape.points(angles, str(tmp_path / "gone.yaml"), 1.0) == {}
-    assert "arm" in shape.points(angles, str(calibration), 2.0)  # what it was started from
-    (tmp_path / "calibration.yaml").write_text("armcal_calibration: 1\n")
-    assert "arm" in shape.points(angles, str(calibration), 13.0)  # the earlier one is still drawn
-    assert shape.fault and "calibration.yaml" in shape.fault
-    shutil.copy(calibration, tmp_path / "calibration.yaml")
-    assert "arm" in shape.points(angles, None, 24.0) and shape.fault is None
+def test_the_newest_events_are_read_from_the_end_of_both_files(tmp_path: Path) -> None:
+    lines = [json.dumps(record(n, why="x" * 200)) for n in range(1, 4001)]
+    (tmp_path / "events.jsonl.1").write_text("\n".join(lines[:3900]) + "\n")
+    (tmp_path / "events.jsonl").write_text(
+        "\n".join([*lines[3900:], json.dumps(level(4000, "nominal", "lost")), '{"ev'])
+    )
+    found = newest_events(tmp_path)
+    assert [known["sequence"] for known in found["records"]] == [*range(3701, 4001)]
+    assert found["records"][0]["off_mm"] == 1.0 and "inputs" not in found["records"][0]
+    assert [event["to"] for event in found["listed"]] == ["lost"]
+    assert newest_events(tmp_path / "none") == {"records": [], "listed": []}
 
 
 # The command
 
 
-def test_the_present_state_is_printed_once(tmp_path: Path) -> None:
-    folder = made_up_folder(tmp_path / "dir")
-    shown = CliRunner().invoke(cli, ["watch", str(folder), "--once"])
-    assert shown.exit_code == 0, shown.output
-    for part in ("nominal", "288 accepted", "p300", "arm.mdh.theta3", "Joint 3 slipped"):
-        assert part in shown.output
-    state = json.loads(CliRunner().invoke(cli, ["watch", str(folder), "--once", "--json"]).output)
-    assert state["level"] == "nominal" and len(state["records"]) == 300
-    (tmp_path / "early").mkdir()
-    early = CliRunner().invoke(cli, ["watch", str(tmp_path / "early"), "--once"])
-    assert early.exit_code == 0 and "Waiting for a recalibration" in early.output
-    for more in (["--once"], [], ["--terminal"], ["--once", "--wait"]):
-        nowhere = CliRunner().invoke(cli, ["watch", str(tmp_path / "none"), *more])
-        assert nowhere.exit_code == 2 and "there is no such folder" in nowhere.stderr, more
+def test_bad_calls_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_text("")
+    for arguments, says in (
+        ([str(path)], "it is a file"),
+        ([str(tmp_path / "none")], "there is no such folder"),
+        ([str(tmp_path / "none"), "--once"], "there is no such folder"),
+        ([str(tmp_path), "--json"], "only for --once"),
+        ([str(tmp_path), "--port", "70000"], "70000"),
+        ([str(tmp_path), "--host", "no.such.host.invalid"], "cannot be listened on"),
+    ):
+        result = CliRunner().invoke(cli, ["watch", *arguments])
+        assert result.exit_code == 2 and says in result.stderr, arguments
 
 
-def test_what_has_finished_is_not_shown_as_if_it_went_on(tmp_path: Path) -> None:
-    folder, said = made_up_folder(tmp_path / "dir", 20), "The recalibration has ended"
-    (folder / "status.json").write_text(json.dumps({"level": "nominal", "finished": False}))
-    going = CliRunner().invoke(cli, ["watch", str(folder), "--once"])
-    (folder / "status.json").write_text(json.dumps({"level": "nominal", "finished": True}))
-    over = CliRunner().invoke(cli, ["watch", str(folder), "--once"])
-    assert said not in going.output and said in over.output
-
-
-@pytest.mark.slow
-def test_a_calibration_that_is_nested_deeply_does_not_end_the_watcher(tmp_path: Path) -> None:
-    """In a process of its own: where the nesting is followed by recursion in C, the process is killed."""
-    (tmp_path / "events.jsonl").write_text(written([{"event": "estimate", "sequence": 9, "parameters": {"a": [1, 2]}}]))
-    for opening in ("[", "{a: "):
-        (tmp_path / "calibration.yaml").write_text("parameters: " + opening * 200_000)
-        command = [sys.executable, "-m", "armcal.cli", "watch", str(tmp_path), "--once", "--json"]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-        assert done.returncode == 0, done.stderr
-        assert json.loads(done.stdout)["estimates"]["parameters"][0]["name"] == "a"
-
-
-def test_a_watcher_that_draws_nothing_stays_light() -> None:
+def test_a_watcher_stays_light() -> None:
     heavy = ("numpy", "casadi", "yaml", "pydantic")
     script = f"import sys, armcal_online.commands.watch; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
 
-def test_bad_calls_are_told(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    path.write_text("")
-    for arguments in ([str(path)], [str(tmp_path), "--json"], [str(tmp_path), "--port", "70000"]):
-        result = CliRunner().invoke(cli, ["watch", *arguments])
-        assert result.exit_code == 2, arguments
-
-
 @pytest.mark.slow
 def test_the_command_serves_changes_nothing_and_ends_when_asked(tmp_path: Path) -> None:
-    folder = made_up_folder(tmp_path / "dir", 20)
-    before = {path.name: (path.stat().st_mtime_ns, path.stat().st_size) for path in folder.iterdir()}
-    command = [sys.executable, "-m", "armcal.cli", "watch", str(folder), "--port", "0"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    told = process.stdout.readline()
-    address = urlsplit(told.split()[-1])
-    connection = http.client.HTTPConnection(address.hostname or "", address.port, timeout=10)
-    connection.request("GET", "/")
-    assert b"armcal watch" in connection.getresponse().read()
-    process.terminate()
-    _, errors = process.communicate(timeout=20)
-    assert process.returncode == 0 and "Traceback" not in errors
-    assert {path.name: (path.stat().st_mtime_ns, path.stat().st_size) for path in folder.iterdir()} == before
+    with folder_of(tmp_path / "dir", True, *LOST, level="lost") as folder:
+        before = {path.name: (path.stat().st_mtime_ns, path.stat().st_size) for path in folder.iterdir()}
+        command = [sys.executable, "-m", "armcal.cli", "watch", str(folder), "--port", "0"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        address = urlsplit(process.stdout.readline().split()[-1])
+        connection = http.client.HTTPConnection(address.hostname or "", address.port, timeout=10)
+        connection.request("GET", "/")
+        assert b"armcal watch" in connection.getresponse().read()
+        process.terminate()
+        _, errors = process.communicate(timeout=20)
+        assert process.returncode == 0 and errors == ""
+        assert {path.name: (path.stat().st_mtime_ns, path.stat().st_size) for path in folder.iterdir()} == before
+
+
+# The server
+
+
+@contextmanager
+def serving(folder: Path, host: str = "127.0.0.1", port: int = 0) -> Iterator[WatchServer]:
+    with WatchServer(folder, host, port) as server:
+        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+        yield server
+        server.shutdown()
+
+
+def asked(server: WatchServer, path: str, method: str = "GET", **headers: str) -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=10)
+    connection.request(method, path, headers=headers)
+    answer = connection.getresponse()
+    return answer.status, answer.read()
+
+
+@pytest.mark.parametrize(
+    ("header", "allowed"),
+    [
+        ("localhost", True),
+        ("localhost:1234", True),
+        ("127.0.0.1:8642", True),
+        ("[::1]:8642", True),
+        ("LOCALHOST", True),
+        ("", False),
+        (None, False),
+        ("rebound.example", False),
+        ("127.0.0.1.rebound.example", False),
+        ("localhost:80@rebound.example", False),
+        ("[::1].rebound.example", False),
+        ("0.0.0.0", False),
+    ],
+)
+def test_on_this_machine_only_names_of_this_machine_are_answered(
+    tmp_path: Path, header: str | None, allowed: bool
+) -> None:
+    with WatchServer(tmp_path) as server:
+        assert server.allows(header, None) is allowed
+
+
+def test_beyond_this_machine_only_who_knows_the_token(tmp_path: Path) -> None:
+    with serving(tmp_path, "0.0.0.0") as server:
+        token = server.token
+        assert token and len(token) >= 32 and server.address.endswith(f"/?token={token}")
+        assert server.allows("anything.example", token)
+        for wrong in (None, "", token[:-1], token + "x", "\u00e9"):
+            assert not server.allows("localhost", wrong)
+        for path in ("/", "/state"):
+            assert asked(server, path)[0] == 403 and asked(server, f"{path}?token=wrong")[0] == 403
+        assert asked(server, f"/state?token={token}")[0] == 200
+    assert [is_loopback(h) for h in ("127.0.0.9", "::1", "localhost", "0.0.0.0", "::", "10.0.0.1", "example.org")] == [
+        *(True, True, True),
+        *(False, False, False, False),
+    ]
+
+
+def test_only_two_addresses_are_answered_and_nothing_can_be_written(tmp_path: Path) -> None:
+    with folder_of(tmp_path / "x", True, *LOST, level="lost") as folder, serving(folder) as server:
+        for path, status in {"/": 200, "/state": 200, "/events": 404, "/../etc/passwd": 404}.items():
+            assert asked(server, path)[0] == status
+        for method in ("POST", "PUT", "DELETE", "PATCH", "OPTIONS"):
+            assert asked(server, "/state", method)[0] == 501
+        for path in ("/", "/state"):
+            assert asked(server, path, Host="rebound.example")[0] == 403
+        state = json.loads(asked(server, "/state", Host="localhost:9")[1])
+        assert state["life"] == "running" and state["situation"]["do"] == ASK and len(state["records"]) == 14
+        with pytest.raises(InputError, match="another --port"):
+            WatchServer(folder, "127.0.0.1", server.server_address[1])
+
+
+def test_broken_requests_do_not_end_the_server(tmp_path: Path) -> None:
+    with serving(tmp_path) as server:
+        for raw in (
+            b"\r\n\r\n",
+            b"GET\r\n\r\n",
+            b"GET / HTTP/9.9\r\n\r\n",
+            b"\x16\x03\x01" * 50,
+            b"GET /" + b"a" * 70_000,
+        ):
+            with socket.create_connection(("127.0.0.1", server.server_address[1]), timeout=5) as client:
+                client.sendall(raw)
+                client.shutdown(socket.SHUT_WR)
+                try:
+                    while client.recv(65536):
+                        pass
+                except ConnectionResetError:
+                    pass
+        assert asked(server, "/")[0] == 200
+
+
+# The page
+
+
+def test_the_page_needs_nothing_from_elsewhere_and_its_policy_lets_nothing_in() -> None:
+    sent, policy = page()
+    html = sent.decode()
+    assert set(re.findall(r"https?://[^\s\"'`)]+", html)) == {"http://www.w3.org/2000/svg"}  # a name, not fetched
+    assert not re.search(r"\son\w+=|innerHTML|insertAdjacent|document\.write|\beval\b|style=\"|url\(", html)
+    assert policy.startswith("default-src 'none'") and "unsafe" not in policy
+    assert html.count("<script>") == html.count("</script>") == 1
 
 
 @pytest.mark.slow
-def test_where_there_is_no_terminal_it_is_a_line_an_event(tmp_path: Path) -> None:
-    folder = tmp_path / "dir"
-    command = [sys.executable, "-m", "armcal.cli", "watch", str(folder), "--terminal", "--wait"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stderr is not None and process.stdout is not None
-    assert "Waiting for a recalibration" in process.stderr.readline()
-    made_up_folder(folder, 20)
-    lines = [process.stdout.readline() for _ in range(22)]
-    assert "The recalibration started." in lines[0]
-    assert lines[1].startswith("record 1 (p1), 2027-01-15 08:00:15 UTC: accepted (NIS ")
-    assert "outlier: Record p17 is an outlier" in "".join(lines)
-    process.terminate()
-    process.communicate(timeout=20)
-    assert process.returncode == 0
+def test_the_wheel_holds_the_page(tmp_path: Path) -> None:
+    pytest.importorskip("hatchling")
+    import zipfile
+
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=120)
+    with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
+        assert "armcal_online/commands/watch.html" in wheel.namelist()
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    if CHROMIUM is None:
+        pytest.skip("no chromium is installed")
+    opened = Browser(tmp_path_factory.mktemp("browser"))
+    yield opened
+    opened.close()
+
+
+def content(browser: Browser, name: str) -> str:
+    return str(browser.value(f"document.getElementById({name!r}).innerText"))
+
+
+@pytest.mark.quick("1280-720")
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 720)])
+def test_the_first_screen_of_the_page_answers_everything(
+    browser: Browser, tmp_path: Path, width: int, height: int
+) -> None:
+    with folder_of(tmp_path / "run", True, *LOST, level="lost") as folder, serving(folder) as server:
+        browser.resize(width, height)
+        browser.requested.clear()
+        browser.open(server.address)
+        browser.wait_for("document.querySelectorAll('#events li').length")
+        for name, words in zip(("do", "what", "off", "since", "good", "rollback"), ANSWERS, strict=True):
+            bottom = browser.value(f"document.getElementById('{name}').getBoundingClientRect().bottom")
+            assert words in content(browser, name) and bottom <= height, (name, bottom)
+        assert (content(browser, "level"), content(browser, "life")) == ("lost", "live")
+        assert content(browser, "last") == "r14 rejected" and "1,288 accepted" in content(browser, "counts")
+        assert browser.value("document.querySelectorAll('#chart circle').length") == 14
+        assert browser.value("document.querySelectorAll('#chart circle.rejected').length") == 5
+        assert content(browser, "events").startswith("level lost") and "Confirm: Look again." in content(
+            browser, "events"
+        )
+        assert browser.value("document.documentElement.scrollWidth") <= width and browser.logged == []
+        host = urlsplit(server.address).netloc
+        assert {urlsplit(url).netloc for url in browser.requested if not url.startswith("data:")} == {host}
+
+
+@pytest.mark.slow
+def test_a_decision_shows_as_it_comes_and_a_process_that_dies_is_not_running(browser: Browser, tmp_path: Path) -> None:
+    with serving_lives(tmp_path / "run", browser) as (folder, server):
+        with folder_of(folder, True, *BEFORE):
+            browser.open(server.address)
+            browser.wait_for("document.getElementById('do').innerText === 'Go on.'")
+            assert browser.value("document.getElementById('back').hidden") and content(browser, "level") == "nominal"
+            (folder / SOCKET).unlink()
+            with folder_of(folder, True, *LOST, level="lost"):
+                browser.wait_for(f"document.getElementById('do').innerText === {json.dumps(ASK)}")
+                assert content(browser, "off") == "73 mm" and content(browser, "rollback").endswith("rollback 9")
+        browser.wait_for("document.getElementById('level').innerText === 'not running'", 20.0)
+        assert "The level was lost. The recalibration was killed: no process answers here" in content(browser, "over")
+        assert content(browser, "do") == f"{ASK} {AFTER_THE_END}" and content(browser, "life") == "not running"
+
+
+@contextmanager
+def serving_lives(folder: Path, browser: Browser) -> Iterator[tuple[Path, WatchServer]]:
+    folder.mkdir()
+    with serving(folder) as server:
+        browser.open(server.address)
+        browser.wait_for("document.getElementById('life').innerText === 'no record yet'")
+        yield folder, server
+
+
+@pytest.mark.slow
+def test_a_page_that_loses_its_server_says_so_and_comes_to_itself(browser: Browser, tmp_path: Path) -> None:
+    with folder_of(tmp_path / "run", True, *BEFORE) as folder:
+        with serving(folder) as server:
+            port = server.server_address[1]
+            browser.open(server.address)
+            browser.wait_for("document.getElementById('level').innerText === 'nominal'")
+        browser.wait_for("document.getElementById('life').innerText.startsWith('the watcher does not answer')")
+        assert content(browser, "level") == "unknown"
+        with serving(folder, port=port):
+            browser.wait_for("document.getElementById('level').innerText === 'nominal'")
+
+
+@pytest.mark.slow
+def test_the_page_works_with_a_token_and_says_so_without(browser: Browser, tmp_path: Path) -> None:
+    with folder_of(tmp_path / "run", True, *BEFORE) as folder, serving(folder, "0.0.0.0") as server:
+        at = f"http://127.0.0.1:{server.server_address[1]}/"
+        browser.open(f"{at}?token={server.token}")
+        browser.wait_for("document.getElementById('level').innerText === 'nominal'")
+        browser.open(at)
+        browser.wait_for("document.body.textContent.startsWith('Forbidden')")
+
+
+@pytest.mark.slow
+def test_hostile_text_is_shown_as_text(browser: Browser, tmp_path: Path) -> None:
+    good = {**GOOD, "id": HOSTILE}
+    hostile = dict.fromkeys(("confirm", "what", "why", "since_id", "sentence"), HOSTILE)
+    events = (record(3, 30.0, id=HOSTILE, why=HOSTILE), decision(4, "drift", "lost", HOSTILE, **hostile))
+    given = {"level": "lost", "last_good": good, "why": HOSTILE, "paused": HOSTILE, "process": HOSTILE}
+    with folder_of(tmp_path / HOSTILE[2:9], True, *events, **given) as folder, serving(folder) as server:
+        browser.open(server.address)
+        browser.wait_for("document.querySelectorAll('#events li').length")
+        for name in ("do", "what", "confirm", "since", "last", "events"):
+            assert HOSTILE[:90] in content(browser, name), name
+        assert browser.value("document.querySelectorAll('script').length") == 1
+        assert browser.value("document.querySelectorAll('img').length") == 0
+        assert browser.value("document.title") == "lost, armcal watch"
+        shown = CliRunner().invoke(cli, ["watch", str(folder), "--once"]).output
+        assert "\x1b" not in shown and "\\x1b[2J" in shown

@@ -10,9 +10,8 @@ from armcal.cli.common import Console, speaking
 from armcal.errors import InputError, Location
 from armcal.version import JSON_SCHEMA
 
-from armcal_online.running.control import GOOD, ask, is_running
-from armcal_online.running.outputs import STATUS
-from armcal_online.watch.events import parsed
+from armcal_online.running.control import GOOD, ask
+from armcal_online.running.situation import is_running, present
 
 _COMMANDS = ("status", "pause", "resume", "finish", "rollback")
 
@@ -32,14 +31,14 @@ def control(console: Console, folder: Path, command: str, values: tuple[str, ...
     request: dict[str, Any] = {"command": command}
     if command == "rollback":
         request["to"] = _target(values)
-        if not is_running(folder):
+        if is_running(folder) is False:
             from armcal_online.running.session import roll_back_ended  # late: no other command builds the arm
 
             _show(console, roll_back_ended(folder, request["to"], console.registry()))
             return
-    elif command == "status" and not is_running(folder) and (status := _last_status(folder)) is not None:
+    elif command == "status" and is_running(folder) is False and (last := present(folder))["life"] != "waiting":
         console.warn("no recalibration runs here: this is the last status that one wrote.")
-        _show(console, status)
+        _show(console, last)
         return
     elif values:
         text = f"found {' '.join(values)}, expected nothing more."
@@ -49,13 +48,6 @@ def control(console: Console, folder: Path, command: str, values: tuple[str, ...
         error = str(reply.get("error", "its answer cannot be understood."))
         raise InputError(error, hint="" if error.endswith((".", "?")) else "Ask `armcal control DIR status` first.")
     _show(console, reply)
-
-
-def _last_status(folder: Path) -> Mapping[str, Any] | None:
-    try:
-        return parsed((folder / STATUS).read_bytes())
-    except OSError:
-        return None
 
 
 def _show(console: Console, reply: Mapping[str, Any]) -> None:

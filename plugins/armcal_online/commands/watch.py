@@ -1,106 +1,245 @@
-"""``armcal watch``."""
+"""``armcal watch``: the status and the newest events of a recalibration, served with one page that shows them.
 
+On this machine every request is answered that uses one of its own names; from elsewhere it needs the token.
+"""
+
+import base64
+import hashlib
+import hmac
+import ipaddress
 import json
+import math
+import re
 import signal
+import socket
 import sys
-import threading
+from collections.abc import Mapping
+from functools import lru_cache
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib import resources
 from pathlib import Path
+from secrets import token_urlsafe
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
 import click
-from armcal.cli.console import Screen, output_fault, say
-from armcal.errors import InputError, Location
+from armcal.base.config_text import as_line
+from armcal.cli.console import say
+from armcal.errors import ArmcalError, InputError, Location
 from armcal.version import JSON_SCHEMA
 
-from armcal_online.watch.feed import Feed
+from armcal_online.running.situation import EARLIER, EVENTS, present, when
 
 DEFAULT_PORT = 8642
-_REFRESH = 1.0
+_TAIL_BYTES = 1 << 20  # of the events; all are in the files
+_MOST_LISTED, _MOST_RECORDS = 100, 300
+_PATIENCE_S = 10.0  # how long a client may take to send its request, or to take an answer
+_RECORD = ("sequence", "id", "at", "verdict", "why", "nis", "limit", "level")
+_LISTED = ("event", "sequence", "at", "kind", "to", "sentence", "do", "confirm", "why", "resumed")
 
 
 @click.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @click.option("--host", default="127.0.0.1", show_default=True, help="Listen there; beyond this machine with a token.")
 @click.option("--port", type=click.IntRange(0, 65535), default=DEFAULT_PORT, show_default=True, help="0: any free one.")
-@click.option("--terminal", is_flag=True, help="Show it in this terminal; lines where this is none.")
-@click.option("--wait", is_flag=True, help="Wait for a folder that is not there yet.")
 @click.option("--once", is_flag=True, help="Print the present state and end.")
 @click.option("--json", "as_json", is_flag=True, help="With --once: as JSON.")
-def watch(folder: Path, host: str, port: int, terminal: bool, wait: bool, once: bool, as_json: bool) -> None:
-    """Show a recalibration live: a page in the browser, or this terminal. DIR is its folder, which is only read."""
-    where, hint = Location(str(folder)), "Give what armcal recalibrate was given as --out"
-    if folder.exists() and not folder.is_dir():
-        raise InputError("it is a file, expected the folder of a recalibration.", where=where, hint=f"{hint}.")
-    if not folder.exists() and (once or not wait):
-        raise InputError("there is no such folder.", where=where, hint=f"{hint}; with --wait it is waited for.")
+def watch(folder: Path, host: str, port: int, once: bool, as_json: bool) -> None:
+    """Show a recalibration live, as a page in the browser. DIR is its folder, which is only read."""
+    where, hint = Location(str(folder)), "Give what armcal recalibrate was given as --out."
+    if not folder.is_dir():
+        wrong = "it is a file, expected the folder of a recalibration" if folder.exists() else "there is no such folder"
+        raise InputError(f"{wrong}.", where=where, hint=hint)
     if as_json and not once:
-        hint = "Programs follow events.jsonl in the folder itself."
+        hint = "Programs read status.json and events.jsonl in the folder itself."
         raise InputError("it is only for --once.", where=Location("--json"), hint=hint)
-    if once:
-        feed = Feed(folder)
-        while feed.step():
-            pass
-        if as_json:
-            click.echo(json.dumps({**JSON_SCHEMA, **feed.state()}, indent=2))
-            return
-        from armcal_online.watch.terminal import picture
-
-        console = Screen()
-        console.print(picture(feed.state(), console.width))
-        return
-    stop = threading.Event()
-    earlier = signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    try:
-        if terminal:
-            _terminal(Feed(folder), stop)
-        else:
-            _serve(folder, host, port, stop)
-    finally:
-        stop.set()
-        signal.signal(signal.SIGTERM, earlier)
+    now = present(folder)
+    if as_json:
+        click.echo(json.dumps({**JSON_SCHEMA, **now}, indent=2))
+    elif once:
+        for line in first_screen(now):
+            say(line)
+    else:
+        _serve(WatchServer(folder, host, port))
 
 
-def _terminal(feed: Feed, stop: threading.Event) -> None:
-    """A picture that is drawn again and again; a line an event where the output is no terminal."""
-    from rich.live import Live
+def _serve(server: "WatchServer") -> None:
+    def stop(*_: object) -> None:
+        raise SystemExit(0)
 
-    from armcal_online.watch.terminal import line, picture
-
-    console = Screen()
-    if console.is_terminal:
-        with Live(console=console, screen=True, auto_refresh=False) as live:
-            while not stop.is_set():
-                while feed.step():
-                    pass
-                live.update(picture(feed.state(), console.width), refresh=True)
-                stop.wait(_REFRESH)
-    shown: str | None = None
-    while not stop.is_set() and output_fault() is None:  # nobody reads lines after a fault
-        messages = feed.step()
-        for text in filter(None, map(line, messages)):
-            say(text)
-        standing = feed.waiting or feed.over
-        if standing and standing != shown:
-            say(standing, err=standing == feed.waiting)
-        shown = standing
-        if not messages:
-            sys.stdout.flush()
-            stop.wait(_REFRESH)
-
-
-def _serve(folder: Path, host: str, port: int, stop: threading.Event) -> None:
-    from armcal_online.watch.server import WatchServer
-    from armcal_online.watch.shape import Shape
-
-    feed = Feed(folder, Shape(folder))
-    with WatchServer(feed, host, port) as server:
-        threads = [threading.Thread(target=feed.follow, args=(stop,), daemon=True)]
-        threads.append(threading.Thread(target=server.serve_forever, daemon=True))
-        for thread in threads:
-            thread.start()
-        say(f"Watching {folder}: {server.address}")
+    earlier = signal.signal(signal.SIGTERM, stop)
+    with server:
+        say(f"Watching {server.folder}: {server.address}")
         sys.stdout.flush()
         try:
-            while not stop.wait(_REFRESH):
-                pass
+            server.serve_forever()
         finally:
-            server.shutdown()
+            signal.signal(signal.SIGTERM, earlier)
+
+
+def first_screen(now: Mapping[str, Any]) -> list[str]:
+    """The first screen as lines of text."""
+    screen, life, level = now["situation"], now["life"], now.get("level", "unknown")
+    gone = {"killed": "not running", "stopped": "not running", "hangs": "not answering"}.get(life)
+    size, before, of = _mm(screen.get("off_mm")), _mm(screen.get("off_before_mm")), screen.get("off_of")
+    readings = f"median of the last {of} readings from their predictions" if of != 1 else "the newest reading"
+    counts = now.get("counts") or {}
+    lines = {
+        "level": f"{gone} (it was {level})" if gone else f"{level}, {life}",
+        "do now": screen["do"],
+        "what": screen.get("what") or ("" if gone else now.get("why")),
+        "confirm": screen.get("confirm"),
+        "earlier": screen.get("earlier"),
+        "off now": size and f"{size} ({readings}){f'; {before} before this was decided' if before else ''}",
+        "since": _record(screen.get("since")),
+        "last good": _record(screen.get("last_good")),
+        "roll back": screen.get("rollback") if level != "nominal" else None,
+        "records": ", ".join(f"{count:,} {verdict}" for verdict, count in counts.items()),
+        "process": now["over"],
+    }
+    return [f"{name:<10} {words}" for name, words in lines.items() if words]
+
+
+def _mm(size: float | None) -> str:
+    return "" if size is None else f"{float(f'{size:.2g}'):g} mm"
+
+
+def _record(record: Mapping[str, Any] | None) -> str:
+    if not record:
+        return ""
+    at = record.get("at")
+    return ", ".join(filter(None, (record.get("id"), at and when(at), f"entry {record['sequence']}")))
+
+
+def newest_events(folder: Path) -> dict[str, list[dict[str, Any]]]:
+    """The end of the events, oldest first: ``records`` with how far off each was, and what else is ``listed``."""
+    tail = b""
+    for name in (EVENTS, EARLIER):
+        try:
+            with (folder / name).open("rb") as file:
+                room = _TAIL_BYTES - len(tail)
+                file.seek(max(file.seek(0, 2) - room, 0))
+                tail = file.read(room) + tail
+        except FileNotFoundError:
+            continue
+    records: list[dict[str, Any]] = []
+    listed: list[dict[str, Any]] = []
+    for line in tail.split(b"\n"):
+        try:
+            event = json.loads(line)
+            kind = event["event"]
+            if kind == "record":
+                known = {key: event[key] for key in _RECORD if key in event}
+                residual = event.get("residual_mm")
+                records.append(known | ({"off_mm": round(math.hypot(*residual), 4)} if residual else {}))
+            elif kind not in ("estimate", "calibration"):
+                listed.append({key: event[key] for key in _LISTED if key in event})
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+            continue  # half a line, at either end
+    return {"records": records[-_MOST_RECORDS:], "listed": listed[-_MOST_LISTED:]}
+
+
+def is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+@lru_cache
+def page() -> tuple[bytes, str]:
+    """The page, and the policy that lets no script and style in but its own."""
+    html = resources.files("armcal_online.commands").joinpath("watch.html").read_text(encoding="utf-8")
+    (style,), (script,) = (re.findall(f"<{tag}>(.*?)</{tag}>", html, re.DOTALL) for tag in ("style", "script"))
+    own = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (style, script)]
+    policy = f"default-src 'none'; style-src 'sha256-{own[0]}'; script-src 'sha256-{own[1]}'; connect-src 'self'; "
+    return html.encode(), policy + "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+
+
+class WatchServer(ThreadingHTTPServer):
+    """Serves a folder's state at an address.
+
+    Attributes:
+        token: demanded of every request; None on an address of this machine alone.
+
+    Raises:
+        InputError: the address cannot be listened on.
+    """
+
+    daemon_threads, block_on_close = True, False
+
+    def __init__(self, folder: Path, host: str = "127.0.0.1", port: int = 0) -> None:
+        self.folder, self.host = folder, host
+        self.token = None if is_loopback(host) else token_urlsafe(24)
+        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        try:
+            super().__init__((host, port), _Handler)
+        except (OSError, OverflowError) as fault:
+            raise InputError(
+                f"{host}, port {port}, cannot be listened on ({fault}).",
+                where=Location("--port"),
+                hint="Give another --port; 0 takes any free one.",
+            ) from fault
+
+    @property
+    def address(self) -> str:
+        host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{self.server_address[1]}/{f'?token={self.token}' if self.token else ''}"
+
+    def allows(self, host_header: str | None, token: str | None) -> bool:
+        """Judge a request by its Host header and its token.
+
+        Without a token the header must name this machine: a page of another site, whose name was made to point here,
+        is refused. The port may be any, since a tunnel may begin at another one.
+        """
+        if self.token is not None:
+            return hmac.compare_digest((token or "").encode(), self.token.encode())
+        named = re.fullmatch(r"(?:\[([^\]]+)\]|([^:\[]+))(?::[0-9]*)?", (host_header or "").strip().lower())
+        return named is not None and (named[1] or named[2]) in ("localhost", "127.0.0.1", "::1", self.host)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A client that went away is no fault."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: WatchServer
+    server_version, sys_version, timeout = "armcal", "", _PATIENCE_S
+
+    def do_GET(self) -> None:
+        """The page, or the state."""
+        address = urlsplit(self.path)
+        token = parse_qs(address.query).get("token", [None])[-1]
+        if not self.server.allows(self.headers.get("Host"), token):
+            self._answer(HTTPStatus.FORBIDDEN, b"Forbidden: wrong name or token in the address.\n")
+        elif address.path == "/":
+            self._answer(HTTPStatus.OK, page()[0], "text/html")
+        elif address.path == "/state":
+            try:
+                state = {**present(self.server.folder), **newest_events(self.server.folder), "parameters": None}
+            except (ArmcalError, OSError) as fault:
+                self._answer(HTTPStatus.INTERNAL_SERVER_ERROR, f"{fault}\n".encode())
+            else:
+                self._answer(HTTPStatus.OK, as_line(state).encode(), "application/json")
+        else:
+            self._answer(HTTPStatus.NOT_FOUND, b"Not found.\n")
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Nothing: a token would be in it."""
+
+    def _answer(self, status: HTTPStatus, body: bytes, kind: str = "text/plain") -> None:
+        self.send_response(status)
+        headers = {
+            "Content-Type": f"{kind}; charset=utf-8",
+            "Content-Length": str(len(body)),
+            "Content-Security-Policy": page()[1],
+            "Cache-Control": "no-store",
+            "Cross-Origin-Resource-Policy": "same-origin",
+            "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff",
+        }
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)

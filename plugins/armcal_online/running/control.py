@@ -12,8 +12,8 @@ from armcal.io.json_server import Answer, JsonServer
 from armcal.io.unix_socket import short_address
 
 from armcal_online.running.loop import RECORD, Recalibration
+from armcal_online.running.situation import SOCKET
 
-SOCKET = "control.sock"
 GOOD = "good"  # in place of a sequence number: that of the last good record
 COMMANDS = ("status", "pause", "resume", "rollback", "finish")
 
@@ -25,16 +25,6 @@ def control_server(folder: Path, answer: Answer) -> JsonServer:
         InputError: somebody else serves it, or it cannot be made.
     """
     return JsonServer(folder / SOCKET, "a recalibration is running here.", "Give another --out.", answer)
-
-
-def is_running(folder: Path) -> bool:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-        try:
-            with short_address(folder / SOCKET) as address:
-                connection.connect(address)
-        except OSError:
-            return False
-    return True
 
 
 def ask(folder: Path, request: Mapping[str, Any], timeout_s: float = 30.0) -> dict[str, Any]:

@@ -319,8 +319,10 @@ class Recalibration:
         return str(event["sentence"])
 
     def status(self) -> dict[str, Any]:
+        status = self.session.status()
         return {
-            **self.session.status(),
+            **status,
+            "situation": self._outputs.situation(status),
             "sequence": self.sequence,
             "records": self._state_replayer.progress.records,
             "paused": self.paused,

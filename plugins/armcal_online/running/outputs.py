@@ -1,22 +1,26 @@
 """Events, status and updated calibration of a recalibration. A fault in writing them never stops it."""
 
 import contextlib
+import logging
 import math
+import os
 import time
 from collections.abc import Callable, Mapping
+from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import Any
 
 from armcal.base.config_text import as_line
 from armcal.io.lines import StandardOutput
 from armcal.io.plain_files import write_whole
+from typing_extensions import override
 
-from armcal_online.event_file import EventFile
+from armcal_online.running.situation import EVENTS, STATUS, Situation
 
 CALIBRATION = "calibration.yaml"
-STATUS = "status.json"
 RESERVE = "calibration.reserve"
 """As much room as a calibration and a status need: the journal would take all that is left of a disk."""
+EVENT_BYTES = 4 * 1024**2  # of events.jsonl, whose older part is events.jsonl.1
 RETRY_S = 10.0  # what could not be written is tried again after so long
 _SENTENCES = {
     "events": ("The events are not written to a file ({}).", "The events are written to a file again."),
@@ -29,14 +33,35 @@ _SENTENCES = {
 """Of what is written: that it cannot be, and that it can again."""
 
 
+class _EventFile(RotatingFileHandler):
+    """``events.jsonl``, kept short, and not durable: the journal is. A fault in writing is raised."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, maxBytes=EVENT_BYTES, backupCount=1, encoding="utf-8", delay=True)
+        with contextlib.suppress(OSError), path.open("r+b") as file:
+            file.seek(-1, os.SEEK_END)
+            if file.read(1) != b"\n":
+                file.write(b"\n")  # half a line, of a process that was killed
+
+    def write(self, line: str) -> None:
+        self.emit(logging.makeLogRecord({"msg": line}))
+
+    @override
+    def handleError(self, record: logging.LogRecord) -> None:
+        """See above."""
+        raise
+
+
 class Outputs:
     """Events to standard output and ``events.jsonl``; ``status.json`` and ``calibration.yaml``, replaced whole.
 
     On a full disk a reserve has room for the last calibration and status; what has none is tried again later.
     """
 
-    def __init__(self, folder: Path, stream: StandardOutput, events: EventFile) -> None:
-        self._folder, self._stream, self._events = folder, stream, events
+    def __init__(self, folder: Path, stream: StandardOutput) -> None:
+        self._folder, self._stream = folder, stream
+        self._situation = Situation.recovered(folder)
+        self._events = _EventFile(folder / EVENTS)
         self._silent_until: dict[str, float] = {}
         self._troubled: set[str] = set()
 
@@ -45,6 +70,7 @@ class Outputs:
         return self._folder / CALIBRATION
 
     def event(self, event: Mapping[str, Any]) -> None:
+        self._situation.take(event)
         line = as_line(event)
         self._stream_line(line)
         self._attempt("events", lambda: self._events.write(line))
@@ -52,6 +78,10 @@ class Outputs:
     def status(self, status: Mapping[str, Any]) -> None:
         data = as_line(status).encode() + b"\n"
         self._attempt("status", lambda: write_whole(self._folder / STATUS, data))
+
+    def situation(self, status: Mapping[str, Any]) -> dict[str, Any]:
+        """What to do, how far off, since when, and the way back, at the level of a status."""
+        return self._situation.first_screen(str(status.get("level")), status.get("last_good"), self._folder)
 
     def calibration(self, text: str) -> bool:
         """The updated calibration, in place of the one before; whether that went well."""
@@ -67,7 +97,7 @@ class Outputs:
 
     def rotate(self) -> None:
         with contextlib.suppress(OSError):
-            self._events.rotate()
+            self._events.doRollover()
 
     def alarm(self, sentence: str) -> None:
         self.event({"event": "alarm", "at": time.time(), "sentence": sentence})
@@ -81,7 +111,8 @@ class Outputs:
             (self._folder / RESERVE).unlink()
 
     def close(self) -> None:
-        self._events.close()
+        with contextlib.suppress(OSError):
+            self._events.close()
 
     def _stream_line(self, line: str) -> None:
         lost = self._stream.lost

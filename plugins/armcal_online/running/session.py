@@ -16,10 +16,10 @@ from armcal.io.journal import JOURNAL_FILES, Entry, Journal, KeptJournal, has_jo
 from armcal.io.lines import StandardOutput
 from armcal.plugins import PluginRegistry
 
-from armcal_online.event_file import EARLIER, EVENTS, EventFile
-from armcal_online.running.control import GOOD, SOCKET, answer, control_server, entry_named, rolled_back
+from armcal_online.running.control import GOOD, answer, control_server, entry_named, rolled_back
 from armcal_online.running.loop import STARTED, Pace, Recalibration, StateReplayer
-from armcal_online.running.outputs import CALIBRATION, RESERVE, STATUS, Outputs
+from armcal_online.running.outputs import CALIBRATION, RESERVE, Outputs
+from armcal_online.running.situation import EARLIER, EVENTS, SOCKET, STATUS
 from armcal_online.sources.source import Incoming, Source
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import load_settings
@@ -66,7 +66,7 @@ def opened(setup: Setup, session: Recalibrator, source: Source) -> Iterator[Reca
         state_replayer = StateReplayer(session, journal.until, str(journal.path))
         left = _recover(setup, journal, state_replayer, header)
         source.resume(state_replayer.progress.positions)
-        outputs = Outputs(setup.folder, setup.stream, EventFile(setup.folder))
+        outputs = Outputs(setup.folder, setup.stream)
         stack.callback(outputs.close)
         resumed = not journal.is_new
         sequence = journal.record(STARTED, {"at": time.time(), "resumed": resumed})

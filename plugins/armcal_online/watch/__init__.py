@@ -1,1 +1,0 @@
-"""Watching a recalibration: a page in the browser, or a terminal. It only reads."""
