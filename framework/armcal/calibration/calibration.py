@@ -1,7 +1,7 @@
 """A calibration as a file: everything needed to use it, check it and go on from it."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -12,11 +12,12 @@ from armcal.base.arrays import Array
 from armcal.base.config_text import plain
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
+from armcal.base.se3 import identity
 from armcal.calibration.calibration_file import CalibrationFile, identity_of, lost_calibration, read_record
 from armcal.calibration.compensation.compensator import Compensator
 from armcal.calibration.compensation.request import Commands, Options
 from armcal.calibration.intervals import PlusMinus, Uncertainty
-from armcal.calibration.measured_point import Point, pointed
+from armcal.calibration.measured_point import Point, tool_point
 from armcal.calibration.physics import (
     SHARE,
     UNSTATED_M,
@@ -270,19 +271,32 @@ class Calibration:
         return self.uncertainty.plus_minus(commands, recording)
 
     def expression(
-        self, arm: str | None = None, conditions: Sequence[str] = (), point: Point = "tool"
+        self,
+        arm: str | None = None,
+        conditions: Sequence[str] = (),
+        point: Point = "tool",
+        tuned: Collection[str] = (),
+        like: ToolExpression | None = None,
     ) -> ToolExpression:
         """One arm (the first if no name is given) as expressions of commands, load and elastic state.
 
         ``point`` says what is where the tool's frame is: that frame itself, or the ``target`` that was measured.
+        ``tuned`` parameters are channels. ``like`` is such an expression of another calibration of the same arm: where
+        only tuned parameters differ, it and what was compiled for it serve on; else those that differ are tuned too.
 
         Raises:
             ValueError: no such arm.
             ConfigError: there is no such point, or no measurement reads the target.
         """
         system, name = self.system, self._named(arm)
-        tool_expression = arm_expression(system.arms[name], self.parameters, system.environment, conditions)
-        return pointed(tool_expression, point, system, self.parameters)
+        at = tool_point(point, system, name, self.parameters)
+        if like is not None:
+            retuned = like.retuned(self.parameters, at or identity())
+            if retuned is not None:
+                return retuned
+            tuned = {*tuned, *like.tuned, *like.differing(self.parameters)}
+        own = arm_expression(system.arms[name], self.parameters, system.environment, conditions, tuned)
+        return own if at is None else own.at(at)
 
     def compensator(
         self,

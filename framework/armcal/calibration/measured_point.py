@@ -13,7 +13,6 @@ from armcal.base.arrays import Array
 from armcal.base.parameters import Parameters
 from armcal.base.quaternions import rotation_matrix
 from armcal.base.se3 import Transform, evaluated
-from armcal.calibration.tool_expression import ToolExpression
 from armcal.config.system import System
 from armcal.errors import ConfigError
 from armcal.measure.measurement import Measurement
@@ -68,8 +67,8 @@ def measured_point(system: System, name: str, parameters: Parameters) -> Measure
     return None
 
 
-def pointed(expression: ToolExpression, point: Point, system: System, parameters: Parameters) -> ToolExpression:
-    """The arm with the measured target where the tool's frame is, if that is the point that arrives.
+def tool_point(point: Point, system: System, name: str, parameters: Parameters) -> Transform | None:
+    """Where the point that arrives is on the tool of an arm; None for the tool's frame itself.
 
     Raises:
         ConfigError: there is no such point, or no measurement reads it.
@@ -79,14 +78,14 @@ def pointed(expression: ToolExpression, point: Point, system: System, parameters
             f"found the point {point!r}.", hint=f"Expected one of {', '.join(map(repr, get_args(Point)))}."
         )
     if point == "tool":
-        return expression
-    target = measured_point(system, expression.name, parameters)
+        return None
+    target = measured_point(system, name, parameters)
     if target is None:
         raise ConfigError(
-            f"no measurement reads the place of a target on the tool of {expression.name!r} in the base frame.",
+            f"no measurement reads the place of a target on the tool of {name!r} in the base frame.",
             hint="Leave the point target out: then the tool frame's origin arrives.",
         )
-    return expression.at(target.transform)
+    return target.transform
 
 
 def _on_tool(

@@ -1,13 +1,14 @@
 """A calibrated arm as expressions: where its tool is, for what it is told and what acts on it.
 
 All parameters are numbers at their calibrated values; what remains are the commands, the approach, the load and the
-elastic state. From these come compensation, maps of what the arm can do, and code for other computers.
+elastic state. From these come compensation, maps of what the arm can do, and code for other computers. Who loads one
+calibration of an arm after another has some parameters *tuned*: these are channels too, and nothing is compiled again.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Self
+from typing import Any, Self, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -24,6 +25,7 @@ from armcal.base.se3 import Expression, Transform
 from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
 APPROACH = "approach."
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -31,10 +33,13 @@ class ToolExpression(ElasticPass):
     """One arm whose parameters are numbers.
 
     Attributes:
-        channels: of ``record``, in this order: the joints, ``approach.JOINT`` of each, LOAD_CHANNELS, conditions.
+        channels: of ``record``, in this order: the joints, ``approach.JOINT`` of each, LOAD_CHANNELS, conditions, tuned
+            parameters.
         record: symbols, one a channel (commands in rad or m, approaches -1 to 1, loads in SI, in the base frame).
         origins: of the mount and of each joint's frame in the base frame, at ``state`` (3x1 each; m).
         tool_T_point: the point of the tool that ``base_T_tool`` is of (constant); the tool itself unless ``at`` chose.
+        blocks: the numbers of each block of parameters, tuned or not.
+        functions: what was made of the expressions so far, by name; see ``made``.
     """
 
     name: str  # the arm's instance name
@@ -47,10 +52,54 @@ class ToolExpression(ElasticPass):
     efforts: Expression  # about or along the axes of all joints of the chain, at ``state`` (N m, N on sliding joints)
     servos: Mapping[str, tuple[PulseTable, PulseClock]]  # by commanded joint, which displacements can be set
     tool_T_point: Transform = field(default_factory=se3.identity)
+    conditions: tuple[str, ...] = ()
+    tuned: frozenset[str] = frozenset()  # blocks of parameters
+    blocks: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    functions: dict[Hashable, Any] = field(init=False, default_factory=dict, repr=False)
 
     def at(self, tool_T_point: Transform) -> Self:
         """The same arm, with another point of its tool (constant) where the tool's frame is."""
-        return replace(self, base_T_tool=self.base_T_tool @ tool_T_point, tool_T_point=tool_T_point)
+        if not self.tuned:
+            return replace(self, base_T_tool=self.base_T_tool @ tool_T_point, tool_T_point=tool_T_point)
+        symbols = ca.SX.sym("tool_T_point", len(_POINT))  # it may follow from parameters that are tuned
+        point = Transform(ca.reshape(symbols[:9], 3, 3), symbols[9:])
+        return replace(
+            self,
+            channels=(*self.channels, *_POINT),
+            record=ca.vertcat(self.record, symbols),
+            defaults=np.concatenate([self.defaults, _numbers_of(tool_T_point)]),
+            base_T_tool=self.base_T_tool @ point,
+            tool_T_point=tool_T_point,
+        )
+
+    def retuned(self, parameters: Parameters, tool_T_point: Transform) -> Self | None:
+        """The same at other values of its tuned parameters, with all functions that were made of it so far.
+
+        ``parameters`` are of a calibration of the same arm; None if a value differs that is a constant here.
+        """
+        blocks = _blocks(parameters)
+        if not self.tuned.issuperset(self.differing(parameters)):
+            return None
+        entries = {entry: value for name in self.tuned for entry, value in _entries(name, blocks[name])}
+        if _POINT[0] in self.channels:
+            entries |= dict(zip(_POINT, _numbers_of(tool_T_point), strict=True))
+        places = zip(self.channels, self.defaults, strict=True)
+        defaults = np.array([entries.get(channel, default) for channel, default in places])
+        retuned = replace(self, defaults=defaults, blocks=blocks, tool_T_point=tool_T_point)
+        retuned.functions.update(self.functions)
+        return retuned
+
+    def differing(self, parameters: Parameters) -> frozenset[str]:
+        """The blocks of parameters that have other values, tuned or not."""
+        blocks = _blocks(parameters)
+        return frozenset(n for n in blocks.keys() | self.blocks.keys() if blocks.get(n) != self.blocks.get(n))
+
+    def made(self, name: Hashable, make: Callable[[], Made]) -> Made:
+        """What depends on the expressions alone, made once: a function that serves the retuned ones too."""
+        if name not in self.functions:
+            self.functions[name] = make()
+        function: Made = self.functions[name]
+        return function
 
     @property
     def commands(self) -> Expression:
@@ -78,13 +127,33 @@ class ToolExpression(ElasticPass):
         return f"command {index + 1}"
 
 
+_POINT = tuple(f"tool_T_point[{i}]" for i in range(12))
+
+
+def _numbers_of(transform: Transform) -> Array:
+    parts = (ca.vec(ca.densify(transform.rotation)), ca.densify(transform.translation))
+    return se3.evaluated(ca.vertcat(*parts)).ravel()
+
+
+def _blocks(parameters: Parameters) -> dict[str, tuple[float, ...]]:
+    return {block.name: tuple(map(float, block.nominal)) for block in parameters.blocks if not block.nuisance}
+
+
+def _entries(name: str, numbers: Sequence[float]) -> list[tuple[str, float]]:
+    return [(f"parameter {name}[{i}]", number) for i, number in enumerate(numbers)]
+
+
 def arm_expression(
-    arm: Arm, parameters: Parameters, environment: Environment, conditions: Sequence[str] = ()
+    arm: Arm,
+    parameters: Parameters,
+    environment: Environment,
+    conditions: Sequence[str] = (),
+    tuned: Collection[str] = (),
 ) -> ToolExpression:
     """The expressions of an arm at the nominal values of ``parameters``, under what acts where nothing is said.
 
     ``conditions`` are those of the surroundings that will be told (``temperature``); others are taken as the effects
-    take what is not told.
+    take what is not told. The parameters that are ``tuned`` are channels of a record, as ``retuned`` needs it.
 
     Raises:
         ValueError: the arm does not change with a condition.
@@ -95,10 +164,15 @@ def arm_expression(
         raise ValueError(f"the arm {arm.name} does not change with {', '.join(idle)}; it changes with {known}")
     smooth, servos = _without_steps(arm)
     joints = tuple(arm.commanded)
-    channels = (*joints, *(APPROACH + joint for joint in joints), *LOAD_CHANNELS, *conditions)
+    blocks = _blocks(parameters)
+    symbolic = frozenset(tuned) & blocks.keys()
+    entries = dict(entry for name in blocks if name in symbolic for entry in _entries(name, blocks[name]))
+    channels = (*joints, *(APPROACH + joint for joint in joints), *LOAD_CHANNELS, *conditions, *entries)
     record = ca.SX.sym("record", len(channels))
     said = dict(zip(channels, ca.vertsplit(record), strict=True))
-    values = {block.name: ca.SX(list(block.nominal)) for block in parameters.blocks if not block.nuisance}
+    values = {name: ca.SX(list(numbers)) for name, numbers in blocks.items()}
+    for name in symbolic:
+        values[name] = ca.vertcat(*[said[entry] for entry, _ in _entries(name, blocks[name])])
     deflection = ca.SX.sym("deflection", smooth.deflection_size)
     inputs = ArmInputs(
         ca.vertcat(*smooth.joint_commands([said[joint] for joint in joints])),
@@ -107,7 +181,8 @@ def arm_expression(
         deflection,
         {name: said[name] for name in conditions},
     )
-    arm_state, stated = smooth.state(values, inputs), dict(zip(LOAD_CHANNELS, environment.acting, strict=True))
+    arm_state = smooth.state(values, inputs)
+    stated = entries | dict(zip(LOAD_CHANNELS, environment.acting, strict=True))
     return ToolExpression(
         name=arm.name,
         arm=smooth,
@@ -122,6 +197,9 @@ def arm_expression(
         origins=arm_state.origins,
         efforts=ca.densify(arm_state.efforts),
         servos=servos,
+        conditions=tuple(conditions),
+        tuned=symbolic,
+        blocks=blocks,
     )
 
 
@@ -153,7 +231,8 @@ class Equilibrium:
     def __init__(self, expression: ToolExpression, choice: EvaluatorChoice = "auto") -> None:
         self._size = expression.state.numel()
         many = partial(BatchFunction, sample=sample_inputs(expression), choice=choice)
-        self._evaluator = Evaluator(expression, expression.base_T_tool.matrix()[:3, :], many)
+        tool = expression.base_T_tool.matrix()[:3, :]
+        self._evaluator = expression.made(("tool", choice), lambda: Evaluator(expression, tool, many))
 
     def __call__(self, record: Array, state: Array | None = None) -> Standing:
         """Arms for records (channels x N), from states near or from none."""

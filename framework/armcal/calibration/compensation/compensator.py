@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property, partial
 
@@ -19,12 +19,13 @@ from armcal.calibration.compensation.path import PathFinder, with_sides
 from armcal.calibration.compensation.reach import Reach, command_limits, reach_of, why_not
 from armcal.calibration.compensation.redundancy import Descent
 from armcal.calibration.compensation.request import Commands, Options, Targets
-from armcal.calibration.compensation.search import Rows, Solutions, Solver
+from armcal.calibration.compensation.search import Rows, Solutions, Solver, chosen_of
 from armcal.calibration.rigid_chain import turn_between
 from armcal.calibration.tool_expression import APPROACH, Equilibrium, Standing, ToolExpression
 from armcal.functions.batch_function import EvaluatorChoice
 
 SEEDS = 512
+PART = 8  # Targets that a request of many is answered by at a time
 
 
 class Compensator:
@@ -140,12 +141,25 @@ class Compensator:
         """
         if not len(targets):
             return replace(self.solve(targets, start), moves=np.zeros((0, len(self.joints))))
-        record = self._record(targets)
+        return Commands.joined([part for part in self.following(targets, start) if part is not None])
+
+    def following(self, targets: Targets, start: Array | None = None) -> Iterator[Commands | None]:
+        """The same a little at a time, for who has others to attend to: None while it is sought, then part by part.
+
+        Raises:
+            ValueError: as of ``solve``.
+        """
+        record, path = self._record(targets), None
         finder = PathFinder(self._kind(targets).finder, len(self.joints), self._tells_approach)
         at = None if start is None else self._commanded(start, 1)[:, 0]
-        path = finder(record, _goal(targets), at)
+        for path in finder(record, _goal(targets), at):  # noqa: B007
+            yield None
+        assert path is not None
         record[len(self.joints) : 2 * len(self.joints)] = path.approach
-        return replace(self._commands(record, targets, path.solutions), moves=path.moves.T)
+        for first in range(0, len(targets), PART):
+            rows = np.arange(first, min(first + PART, len(targets)))
+            part = self._commands(chosen_of(record, rows), targets.subset(rows), path.solutions.subset(rows))
+            yield replace(part, moves=path.moves[:, rows].T)
 
     def onward(self, targets: Targets, at: Array) -> Commands:
         """Commands for targets straight on from others (N x n): no other posture is looked for."""
@@ -273,7 +287,7 @@ class Compensator:
         record = self.expression.records(np.zeros((joints, count)))
         record[joints : 2 * joints] = targets.approach
         record[2 * joints : 2 * joints + len(LOAD_CHANNELS)] = targets.acting
-        conditions = self.expression.channels[2 * joints + len(LOAD_CHANNELS) :]
+        conditions = self.expression.conditions
         if set(targets.conditions) != set(conditions):
             text, expected = (", ".join(names) or "nothing" for names in (targets.conditions, conditions))
             raise ValueError(f"found targets that tell {text} of the surroundings, expected {expected}")

@@ -134,7 +134,11 @@ class Rounding:
     ) -> None:
         """For the targets of a solver; joints that it holds are only rounded."""
         self._counts, self._equilibrium, self._solver = counts, equilibrium, solver
-        self._slope = BatchFunction(slope_function(expression, solver.turns), sample_inputs(expression), choice)
+
+        def slope() -> BatchFunction:
+            return BatchFunction(slope_function(expression, solver.turns), sample_inputs(expression), choice)
+
+        self._slope = expression.made(("slope", solver.turns, choice), slope)
         self._weights = np.array([1.0] * 3 + [solver.length] * (3 if solver.turns else 0))
 
     def __call__(

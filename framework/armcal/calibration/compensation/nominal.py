@@ -8,7 +8,7 @@ from armcal.base.arrays import Array
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.compensation.compensator import Compensator
 from armcal.calibration.compensation.request import Commands, Options, Targets
-from armcal.calibration.measured_point import Point, pointed
+from armcal.calibration.measured_point import Point, tool_point
 from armcal.calibration.rigid_chain import turn_between
 from armcal.calibration.tool_expression import arm_expression
 
@@ -26,8 +26,8 @@ def nominal_arm(calibration: Calibration, arm: str, point: Point, options: Optio
     """The arm as its controller has it: nominal parameters, rigid, without effects."""
     plain = replace(calibration.system.arms[arm], effects={}, masses=())
     nominal, system = calibration.nominal, calibration.system
-    expression = pointed(arm_expression(plain, nominal, system.environment), point, system, nominal)
-    return Compensator(expression, nominal, Options(limits=options.limits))
+    expression, at = arm_expression(plain, nominal, system.environment), tool_point(point, system, plain.name, nominal)
+    return Compensator(expression.at(at) if at else expression, nominal, Options(limits=options.limits))
 
 
 def sent(nominal: Compensator, targets: Targets, commands: Commands) -> Sent:

@@ -5,7 +5,7 @@ another, and a way with fewer and shorter jumps is the better one. The sides fro
 they move, and how they move may depend on these where there is backlash.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,14 +42,17 @@ class PathFinder:
         """``tells_approach``: whether it matters from where a joint comes."""
         self._finder, self._joints, self._tells_approach = finder, joints, tells_approach
 
-    def __call__(self, record: Array, target: Array, start: Array | None) -> Path:
-        """Follow targets (3 or 12 x N) under records (channels x N) from commands (n), or from wherever is best."""
+    def __call__(self, record: Array, target: Array, start: Array | None) -> Iterator[Path | None]:
+        """Follow targets (3 or 12 x N) under records (channels x N) from commands (n), or from wherever is best.
+
+        None after each target, for a caller that has others to attend to; the path at last.
+        """
         ways = self.beginnings(record, target) if start is None else start[:, None]
         count, wide = target.shape[1], ways.shape[1]
         solutions: list[Solutions] = []
         sides = np.zeros((count, self._joints, wide))
         moves = np.zeros((count, self._joints, wide))
-        at, side = ways, np.zeros_like(ways)
+        at, side, spoilt = ways, np.zeros_like(ways), np.zeros(wide, dtype=int)
         for i in range(count):
             rows = np.full(wide, i)
             if i == 0 and start is None:
@@ -59,18 +62,18 @@ class PathFinder:
                 moves[i], sides[i] = following.commands - at, side
             solutions.append(following)
             at = following.commands
-            jumps = (np.abs(moves[: i + 1]).max(axis=1) > _JUMP).sum(axis=0)
-            spoilt = jumps + sum(~candidates.there for candidates in solutions)
+            spoilt += (np.abs(moves[i]).max(axis=0) > _JUMP).astype(int) + ~following.there
             kept = np.asarray(spoilt == spoilt.min())
             if not kept.all():
                 solutions = [candidates.subset(kept) for candidates in solutions]
                 sides, moves, at, side = sides[:, :, kept], moves[:, :, kept], at[:, kept], side[:, kept]
-                wide = int(kept.sum())
+                wide, spoilt = int(kept.sum()), spoilt[kept]
+            yield None
         longest = np.abs(moves).max(axis=1)
         best = int((longest.max(axis=0) + longest.mean(axis=0)).argmin())
         columns = zip(*(vars(candidates).values() for candidates in solutions), strict=True)
         along = Solutions(*(np.stack([column[..., best] for column in part], axis=-1) for part in columns))
-        return Path(along, sides[:, :, best].T, moves[:, :, best].T)
+        yield Path(along, sides[:, :, best].T, moves[:, :, best].T)
 
     def beginnings(self, record: Array, target: Array) -> Array:
         """Commands in different postures that have the first target (n x ways); the nearest if there are none."""

@@ -38,21 +38,29 @@ def wanted_small(expression: ToolExpression, redundancy: Redundancy) -> Expressi
     return ca.vec(force_compliance(expression))
 
 
+def _function(
+    expression: ToolExpression, redundancy: Redundancy, turns: bool, choice: EvaluatorChoice
+) -> BatchFunction:
+    """(record, state) -> what is to be small, its slope by the commands, and that of the target."""
+    small = ca.densify(wanted_small(expression, redundancy))
+    own_slopes, count = slopes(expression), len(expression.joints)
+    by_commands = ca.jacobian(small, expression.record)[:, :count]
+    slope = by_commands + ca.mtimes(ca.jacobian(small, expression.state), own_slopes.state)
+    here = ca.reshape(own_slopes.corrected[:9], 3, 3) if turns else None
+    held = tool_error(own_slopes, own_slopes.corrected[9:], here)[1]
+    outputs = [small, ca.vec(ca.densify(slope)), ca.vec(ca.densify(held))]
+    function = ca.Function("redundancy", [expression.record, expression.state], outputs, {"cse": True})
+    return BatchFunction(function, sample_inputs(expression), choice)
+
+
 class Descent:
     """From commands that reach a target to better ones that reach it too."""
 
     def __init__(
         self, expression: ToolExpression, redundancy: Redundancy, solver: Solver, choice: EvaluatorChoice = "auto"
     ) -> None:
-        small = ca.densify(wanted_small(expression, redundancy))
-        own_slopes, count = slopes(expression), len(expression.joints)
-        by_commands = ca.jacobian(small, expression.record)[:, :count]
-        slope = by_commands + ca.mtimes(ca.jacobian(small, expression.state), own_slopes.state)
-        here = ca.reshape(own_slopes.corrected[:9], 3, 3) if solver.turns else None
-        held = tool_error(own_slopes, own_slopes.corrected[9:], here)[1]
-        outputs = [small, ca.vec(ca.densify(slope)), ca.vec(ca.densify(held))]
-        function = ca.Function("redundancy", [expression.record, expression.state], outputs, {"cse": True})
-        self._function = BatchFunction(function, sample_inputs(expression), choice)
+        name = ("redundancy", redundancy, solver.turns, choice)
+        self._function = expression.made(name, lambda: _function(expression, redundancy, solver.turns, choice))
         self._solver = solver
 
     def score(self, record: Array, commands: Array, states: Array) -> Array:

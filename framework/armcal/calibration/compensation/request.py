@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal, get_args
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,18 @@ class Targets:
     def __len__(self) -> int:
         return len(self.positions)
 
+    @classmethod
+    def joined(cls, parts: Sequence[Targets]) -> Targets:
+        """Those of several parts, one after another."""
+        first = parts[0]
+        return cls(
+            np.concatenate([part.positions for part in parts]),
+            None if first.rotations is None else np.concatenate([part.rotations for part in parts]),
+            np.concatenate([part.acting for part in parts], axis=1),
+            np.concatenate([part.approach for part in parts], axis=1),
+            {name: np.concatenate([part.conditions[name] for part in parts]) for name in first.conditions},
+        )
+
     def subset(self, rows: Indices) -> Targets:
         """Some of them."""
         turned = None if self.rotations is None else self.rotations[rows]
@@ -98,6 +110,18 @@ class Commands:
 
     def __len__(self) -> int:
         return len(self.joint_angles)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """Those of several parts of the targets, one after another."""
+        columns: dict[str, Any] = {
+            part.name: [getattr(commands, part.name) for commands in parts] for part in fields(cls)
+        }
+        whole: dict[str, Any] = {
+            name: None if column[0] is None else np.concatenate(column) for name, column in columns.items()
+        }
+        whole["joints"], whole["reasons"] = parts[0].joints, tuple(why for part in parts for why in part.reasons)
+        return cls(**whole)
 
 
 @dataclass(frozen=True)

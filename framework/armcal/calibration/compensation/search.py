@@ -10,7 +10,6 @@ from armcal.base.arrays import Array, Indices, Mask
 from armcal.calibration.compensation.step import (
     FIRST_DAMPING,
     REACHED,
-    Slopes,
     progress_places,
     search_function,
     slopes,
@@ -104,19 +103,25 @@ class Search:
     def __init__(
         self,
         expression: ToolExpression,
-        own_slopes: Slopes,
         limits: Array,
         turns: bool,
         length: float,
         choice: EvaluatorChoice = "auto",
+        rough: bool = False,
     ) -> None:
-        """Limits are n x 2 (rad or m); a radian counts as ``length`` metres."""
-        function = search_function(expression, own_slopes, turns, length)
-        random, record = np.random.default_rng(0), sample_inputs(expression)[0]
-        sample = [random.uniform(0.1, 0.3, (function.numel_in(i), 8)) for i in range(function.n_in())]
-        sample[1] = record
-        self._iteration = BatchFunction(function, sample, choice, iterated=True)
+        """Limits are n x 2 (rad or m); a radian counts as ``length`` metres; ``rough`` as of ``slopes``."""
+
+        def made() -> BatchFunction:
+            function = search_function(expression, slopes(expression, rough), turns)
+            random, record = np.random.default_rng(0), sample_inputs(expression)[0]
+            sample = [random.uniform(0.1, 0.3, (function.numel_in(i), 8)) for i in range(function.n_in())]
+            sample[1] = record
+            return BatchFunction(function, sample, choice, iterated=True)
+
+        self._iteration = expression.made(("search", turns, rough, choice), made)
         self._limits, self._places = limits, progress_places(len(limits), expression.state.numel())
+        self._length = length
+        function = self._iteration.function
         self._sizes = [*(function.numel_in(i) for i in (1, 2, 3)), expression.state.numel()]
 
     @property
@@ -136,7 +141,7 @@ class Search:
             if array.shape != (size, count):
                 raise ValueError(f"found {name} of the shape {array.shape}, expected {(size, count)}")
         stated = (manner.damping, manner.patience, manner.steps, near.metres, near.radians, near.rest)
-        settings = np.concatenate([stated, [goal.towards is not None], *self._limits.T])
+        settings = np.concatenate([stated, [goal.towards is not None, self._length], *self._limits.T])
         progress = np.zeros((places["end"].stop, count))
         begun = np.minimum(np.maximum(goal.record[:joints], self._limits[:, :1]), self._limits[:, 1:])
         progress[places["commands"]] = progress[places["best_commands"]] = begun
@@ -170,9 +175,9 @@ class Solver:
         """Targets are reached within tolerances in m and rad."""
         self.length, self.turns, self.limits = length, turns, limits
         self._near = Near(*tolerance, _REST)
-        self._exact = Search(expression, slopes(expression), limits, turns, length, choice)
-        rough = slopes(expression, rough=True) if expression.state.numel() else None
-        self._rough = None if rough is None else Search(expression, rough, limits, turns, length, choice)
+        parts = (expression, limits, turns, length, choice)
+        self._exact = Search(*parts)
+        self._rough = Search(*parts, rough=True) if expression.state.numel() else None
 
     def __call__(self, goal: Goal, manner: Manner = QUICK) -> Solutions:
         """Search from where the goal starts."""

@@ -30,8 +30,8 @@ _LONGEST = 0.4  # rad or m in one step
 _NEAR_PREFERRED = 1e-4  # Preferred commands are reached when they move no joint by more (rad or m)
 _WILD = 2.0  # A deflection beyond this (rad or m) is started anew
 _FINITE = 1e300
-SETTINGS = ("damping", "patience", "steps", "metres", "radians", "rest", "preferred")
-"""Of a search; after them come the lowest and the highest command of each joint."""
+SETTINGS = ("damping", "patience", "steps", "metres", "radians", "rest", "preferred", "length")
+"""Of a search (a radian counts as ``length`` metres); then the lowest and the highest command of each joint."""
 REACHED = 2.0  # How a search ends that reaches its target; others end with 1, and go on at 0
 
 
@@ -90,8 +90,8 @@ def tool_error(own_slopes: Slopes, position: Expression, rotation: Expression | 
     return ca.vertcat(away, _rotation_vector(here, rotation)), twists(own_slopes)
 
 
-def step_function(expression: ToolExpression, own_slopes: Slopes, turns: bool, length: float) -> ca.Function:
-    """(record, target, preference, free, damping, state) -> (step, state left, state moved, error, pull).
+def step_function(expression: ToolExpression, own_slopes: Slopes, turns: bool) -> ca.Function:
+    """(record, target, preference, free, damping, length, state) -> (step, state left, state moved, error, pull).
 
     ``target`` is a position (3; m) and, where the tool ``turns`` to one, a rotation (9, column by column);
     ``preference`` (n) moves the arm where the target does not care; ``free`` (n) is one for joints
@@ -102,11 +102,12 @@ def step_function(expression: ToolExpression, own_slopes: Slopes, turns: bool, l
     target = ca.SX.sym("target", 12 if turns else 3)
     preference, free, damping = ca.SX.sym("preference", count), ca.SX.sym("free", count), ca.SX.sym("damping")
     error, slope = tool_error(own_slopes, target[:3], ca.reshape(target[3:], 3, 3) if turns else None)
-    weight = ca.SX([1.0] * 3 + [length] * (error.numel() - 3))
+    length = ca.SX.sym("length")
+    weight = ca.vertcat(ca.SX.ones(3), *[length] * (error.numel() - 3))
     weighted = ca.diag(weight) @ slope
     step, pull = _step(weighted, weight * error, preference, free, damping)
     outputs = [step, own_slopes.left, ca.mtimes(own_slopes.state, step), error, pull]
-    inputs = [expression.record, target, preference, free, damping, expression.state]
+    inputs = [expression.record, target, preference, free, damping, length, expression.state]
     return ca.Function("compensation_step", inputs, [ca.densify(output) for output in outputs], {"cse": True})
 
 
@@ -118,11 +119,11 @@ def progress_places(joints: int, states: int) -> dict[str, slice]:
     return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
 
 
-def search_function(expression: ToolExpression, own_slopes: Slopes, turns: bool, length: float) -> ca.Function:
+def search_function(expression: ToolExpression, own_slopes: Slopes, turns: bool) -> ca.Function:
     """(settings, record, target, towards, progress) -> progress, one step on.
 
     ``target`` is a position (3; m) and, where the tool ``turns`` to one, a rotation (9, column by column); ``towards``
-    are commands to come near to where that is ``preferred``. A radian counts as ``length`` metres.
+    are commands to come near to where that is ``preferred``.
     """
     joints, states = len(expression.joints), expression.state.numel()
     settings, progress = ca.SX.sym("settings", len(SETTINGS) + 2 * joints), progress_places(joints, states)
@@ -133,10 +134,10 @@ def search_function(expression: ToolExpression, own_slopes: Slopes, turns: bool,
     preference = search.stated["preferred"] * (towards - now["commands"])
     preference *= _shortening(_largest(preference))  # as a whole: joint by joint it would point elsewhere
     record = ca.vertcat(now["commands"], expression.record[joints:])
-    one_step = step_function(expression, own_slopes, turns, length)
-    outputs = one_step(record, target, preference, now["free"], now["damping"], now["state"])
+    one_step, length = step_function(expression, own_slopes, turns), search.stated["length"]
+    outputs = one_step(record, target, preference, now["free"], now["damping"], length, now["state"])
     step, left, along, error, pull = outputs
-    after = search.judged(step, left, error, pull, length) | search.moved(step, left, along, pull)
+    after = search.judged(step, left, error, pull) | search.moved(step, left, along, pull)
     inputs = [settings, expression.record, target, towards, before]
     names = ["settings", "record", "target", "towards", "progress"]
     output = ca.densify(ca.vertcat(*[after[name] for name in progress]))
@@ -156,15 +157,13 @@ class _Search:
         self._low, self._high = ca.vertsplit(settings[len(SETTINGS) :], joints)
         self.now = now
 
-    def judged(
-        self, step: Expression, left: Expression, error: Expression, pull: Expression, length: float
-    ) -> dict[str, Expression]:
+    def judged(self, step: Expression, left: Expression, error: Expression, pull: Expression) -> dict[str, Expression]:
         """The best so far, and whether the search is at an end.
 
         Where commands are preferred, how far that moves the arm counts. What has reached its target need not be the
         best: an earlier step may have been better by this measure, and turned too far or not at rest.
         """
-        now, stated = self.now, self.stated
+        now, stated, length = self.now, self.stated, self.stated["length"]
         distance, turn, size = _norm(error[:3]), _norm(error[3:]), _largest(step)
         is_near = ca.logic_and(size <= _NEAR_PREFERRED, ca.logic_not(_any(self._pulled_back(pull, _NEAR_PREFERRED))))
         near = ca.logic_and(distance <= stated["metres"], turn <= stated["radians"])
