@@ -534,7 +534,7 @@ ENTRIES: tuple[Entry, ...] = (
     entry(
         "serve",
         "answers of the server, refusals among them",
-        typed("serve runs/lrm-demo/calibration.yaml --workers 1 --evaluator interpreted", ASKED + "\n"),
+        typed("serve runs/lrm-demo/calibration.yaml --evaluator interpreted", ASKED + "\n"),
         reads=["0.out"],
         needs=["lrm-demo"],
     ),

@@ -18,9 +18,9 @@ from typing import Any
 
 import yaml
 from armcal.calibration.calibration_file import identity_of, sealed
-from armcal_serve.answering import Answerer
+from armcal_serve.answers import Answerer
 from armcal_serve.client import Client
-from armcal_serve.loaded import Order, loaded
+from armcal_serve.loading import Loader, Order
 
 ROOT = Path(__file__).resolve().parents[1]
 LONG_S = 120.0
@@ -49,14 +49,24 @@ def sha256(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def made(text: str, arm: str = "", shown: str = "c.yaml") -> Answerer:
+def made(text: str, shown: str = "c.yaml", **order: Any) -> Answerer:
     """What answers by a calibration's text, in this process."""
-    return loaded(Order(shown, 1, sha256(text), arm, evaluator="interpreted"), text.encode())
+    return loaded(Loader(Order(shown, **{"evaluator": "interpreted", **order})), text)
+
+
+def loaded(loader: Loader, text: str) -> Answerer:
+    return loader.load(text.encode())[0]
 
 
 def ask(answerer: Answerer, **request: Any) -> dict[str, Any]:
     """The answer to a request."""
-    return dict(json.loads(answerer.answer(json.dumps(request).encode(), 0.0)))
+    return dict(json.loads(answered(answerer, json.dumps(request).encode())))
+
+
+def answered(answerer: Answerer, line: bytes) -> bytes:
+    *slices, answer = answerer.begin(line, 0.0)
+    assert not any(slices) and answer is not None
+    return answer
 
 
 def told(answerer: Answerer, **request: Any) -> dict[str, Any]:

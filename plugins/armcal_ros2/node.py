@@ -18,11 +18,11 @@ Port = Annotated[int, Field(ge=1, le=65535)]
 
 
 class NodeSettings(Settings):
-    """Which measurement feeds the recalibration (the only one unless said), and the ports of both programs."""
+    """Which measurement feeds the recalibration (the only one unless said), and where both programs listen."""
 
     measurement: str | None = None
     recalibrate_port: Port = 5005
-    serve_port: Port = 5006
+    serve_socket: str = "arm.sock"
 
 
 class Ros2NodeExporter:
@@ -63,12 +63,13 @@ class Ros2NodeExporter:
         kind = "PoseStamped" if is_pose else "PointStamped"
         words = {f"={key}": str(value) if value is is_pose else json.dumps(value) for key, value in constants.items()}
         words |= {
+            "=SERVE_SOCKET": json.dumps(s.serve_socket),
             "ARM": _comment(request.name),
             "EXPERIMENT": _comment(request.origin.experiment),
             "MEASURED": kind,
             "IMPORTED": kind if is_pose else f"{kind}, PoseStamped",
             "RECALIBRATE_PORT": str(s.recalibrate_port),
-            "SERVE_PORT": str(s.serve_port),
+            "SERVE_SOCKET": _comment(s.serve_socket),
         }
         text = _TEMPLATE.read_text(encoding="utf-8")
         for word, content in words.items():

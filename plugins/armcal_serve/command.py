@@ -1,10 +1,8 @@
 """``armcal serve``."""
 
-import os
 import sys
 import time
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,20 +16,15 @@ from armcal.functions.batch_function import EvaluatorChoice
 from armcal.io.lines import StandardOutput
 from armcal.io.signals import Signals
 
-from armcal_serve.order import Order
-from armcal_serve.protocol import Notify
-from armcal_serve.server import Opening, Server
-from armcal_serve.transports.datagrams import Datagrams
-from armcal_serve.transports.stream import StandardStreams
-from armcal_serve.transports.unix import UnixSocket
+from armcal_serve.loading import Order
+from armcal_serve.server import Notify, Server
 
-_ALWAYS = ("refused", "worker_lost", "missing", "status", "notice")  # Events that are written with --quiet too
+_ALWAYS = ("refused", "missing", "status", "notice")  # Events that are written with --quiet too
 
 
 @click.command()
 @click.argument("calibration", type=click.Path(path_type=Path))
 @click.option("--socket", "path", type=click.Path(path_type=Path), help="Answer at this Unix socket.")
-@click.option("--udp", "port", type=click.IntRange(0, 65535), help="Answer at this port of 127.0.0.1; 0: any free one.")
 @click.option("--within", type=click.Path(path_type=Path), help="A configuration whose plan has limits and clearance.")
 @click.option(
     "--redundancy",
@@ -41,17 +34,11 @@ _ALWAYS = ("refused", "worker_lost", "missing", "status", "notice")  # Events th
     help="Which of many commands.",
 )
 @click.option(
-    "--workers",
-    type=click.IntRange(1, 64),
-    default=None,
-    help="Processes that answer side by side [default: 2, or 1 on one processor].",
-)
-@click.option(
     "--evaluator",
     type=click.Choice(["compiled", "interpreted"]),
     default="compiled",
     show_default=True,
-    help="Compiled C where a compiler is found: answers come sooner, a new calibration some seconds later.",
+    help="Compiled C where a compiler is found: answers come sooner, the first start takes some seconds longer.",
 )
 @point
 @accept
@@ -60,10 +47,8 @@ def serve(
     console: Console,
     calibration: Path,
     path: Path | None,
-    port: int | None,
     within: Path | None,
     redundancy: Redundancy,
-    workers: int | None,
     evaluator: EvaluatorChoice,
     point: Point | None,
     accept: bool,
@@ -72,16 +57,13 @@ def serve(
 
     By default they come by standard input and answers go to standard output. The file may be replaced at any time.
     """
-    openings: list[Opening] = []
-    if path is not None:
-        openings.append(partial(UnixSocket, path))
-    if port is not None:
-        openings.append(partial(Datagrams, port))
-    if not openings:
-        if sys.__stdin__ is None or sys.__stdout__ is None:
-            text = "standard input or output is closed, expected requests by the one and a reader of the other."
-            raise InputError(text, hint="Open both, or give --socket or --udp.")
-        openings.append(partial(StandardStreams, sys.__stdin__.fileno(), sys.__stdout__.fileno()))
+    if path is None and (sys.__stdin__ is None or sys.__stdout__ is None):
+        text = "standard input or output is closed, expected requests by the one and a reader of the other."
+        raise InputError(text, hint="Open both, or give --socket.")
+    streams = None
+    if path is None:
+        assert sys.__stdin__ is not None and sys.__stdout__ is not None
+        streams = sys.__stdin__.fileno(), sys.__stdout__.fileno()
     order = Order(
         str(calibration),
         redundancy=redundancy,
@@ -91,7 +73,7 @@ def serve(
         accept=accept,
     )
     with Signals() as signals:
-        Server(order, workers or min(2, os.cpu_count() or 1), openings, _notifier(console)).run(signals)
+        Server(order, _notifier(console), path, streams).run(signals)
 
 
 def _notifier(console: Console) -> Notify:

@@ -1,34 +1,33 @@
-"""Requests to `armcal serve` and its answers, version 1: a JSON object each, with the units in the keys."""
+"""Requests to `armcal serve`, version 1: a JSON object a line, with the units in the keys; read and checked."""
 
+import difflib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, NotRequired
+from typing import Annotated, Any, Literal, NoReturn
 
-from armcal.base.config_text import as_line
 from armcal.base.settings import Acceleration3, Angle, Angle3, Force3, Length3, Mass, Settings, Temperature, Torque3
-from armcal.errors import ArmcalError
+from armcal.config.validate import validate
+from armcal.config.yaml_source import ConfigSource
+from armcal.errors import ArmcalError, DataError, InputError, Location
 from pydantic import Field, field_validator
-from typing_extensions import TypedDict  # pydantic checks no other before Python 3.12
 
 VERSION = 1
 MAX_LINE_BYTES = 256 * 1024  # A longer request is refused, and thrown away while it comes
 MAX_ROWS = 1000  # So many targets or postures may stand in one request
+_AT_ONCE = 32  # of them are checked
 _MAX_ID = 200
 _ABSOLUTE_ZERO_C = -273.15
+_EXAMPLE = '{"id": 1, "do": "status"}'
 
 Approach = Annotated[int, Field(ge=-1, le=1)]
 Joints = tuple[Angle, ...] | dict[str, Angle]  # Of one posture: in the arm's order, or by name
 Units = Literal["rad", "deg", "pulse_us", "counts"]
-Word = Literal["forward", "compensate", "status"]
 
 
 def _rows(value: Any) -> Any:
-    """One posture, or one target, is a list of one.
-
-    Raises:
-        ValueError: there are none, or too many.
-    """
+    """One posture, or one target, is a list of one."""
     if isinstance(value, dict) or (isinstance(value, list) and value and not isinstance(value[0], list | dict)):
         return [value]
     if isinstance(value, list) and not 0 < len(value) <= MAX_ROWS:
@@ -37,20 +36,15 @@ def _rows(value: Any) -> Any:
 
 
 class Acting(Settings):
-    """What acts on the arm; the calibration states what is left out.
-
-    Attributes:
-        force, torque: on the tool, in the base frame (N, N m).
-        temperature: of the arm (C), where it changes with that.
-        approach: from where joints come, by name or in the arm's order: -1, 0 (not known), 1.
-    """
+    """What acts on the arm; the calibration states what is left out."""
 
     payload: Annotated[Mass, Field(ge=0)] | None = None  # at the tool (kg)
     payload_com: Length3 | None = None  # its centre of mass, in the tool's frame (m)
     gravity: Acceleration3 | None = None  # in the base frame (m/s^2)
-    force: Force3 | None = None
-    torque: Torque3 | None = None
-    temperature: Annotated[Temperature, Field(ge=_ABSOLUTE_ZERO_C)] | None = None
+    force: Force3 | None = None  # on the tool, in the base frame (N)
+    torque: Torque3 | None = None  # N m
+    temperature: Annotated[Temperature, Field(ge=_ABSOLUTE_ZERO_C)] | None = None  # of an arm that changes with it
+    # From where joints come, by name or in the arm's order: -1, 0 (not known), 1.
     approach: tuple[Approach, ...] | dict[str, Approach] | None = None
 
 
@@ -59,159 +53,115 @@ class Request(Settings):
 
     armcal_serve: Literal[1] = 1  # the version of this protocol that the client speaks
     id: Annotated[str, Field(max_length=_MAX_ID)] | int | float | None = None  # handed back with the answer
-    do: Word  # the kind of request
-
-
-class StatusRequest(Request):
-    """How the server is doing."""
-
-    do: Literal["status"]
+    do: Literal["forward", "compensate", "status"]
 
 
 class ForwardRequest(Request, Acting):
-    """Where the tool is at commands.
+    """Where the tool is at commands."""
 
-    Attributes:
-        joints: of one posture or several, by name with the unit: ``{"q1_deg": 10, "slide_mm": 5}``.
-    """
-
-    do: Literal["forward"]
     arm: str | None = None  # which, where the calibration has several
     joint_angles: tuple[Joints, ...] | None = None  # of one posture or several (rad), for an arm without sliding joints
-    joints: tuple[dict[str, float], ...] | None = None
+    joints: tuple[dict[str, float], ...] | None = None  # the same by name with the unit: {"q1_deg": 10, "slide_mm": 5}
 
     _one_posture = field_validator("joint_angles", "joints", mode="before")(_rows)
 
 
 class TargetRequest(Acting):
-    """Where the tool shall be.
-
-    Attributes:
-        rpy: its rotation as roll, pitch, yaw about the fixed axes x, y, z (rad): Rz(yaw) Ry(pitch) Rx(roll).
-        quaternion_wxyz: its rotation as a unit quaternion, in place of ``rpy``; without either, any rotation will do.
-    """
+    """Where the tool shall be; without a rotation any will do."""
 
     position: Length3  # of the tool's origin in the base frame (m)
-    rpy: Angle3 | None = None
-    quaternion_wxyz: tuple[float, float, float, float] | None = None
+    rpy: Angle3 | None = None  # roll, pitch, yaw about the fixed axes x, y, z (rad): Rz(yaw) Ry(pitch) Rx(roll)
+    quaternion_wxyz: tuple[float, float, float, float] | None = None  # in place of ``rpy``
 
 
 class CompensateRequest(Request, Acting):
-    """Commands that bring the tool to targets; what acts is stated here for all targets, or in a target for itself.
+    """Commands that bring the tool to targets; what acts is stated here for all targets, or in a target for itself."""
 
-    Attributes:
-        path: whether the targets are a path, to be followed in order; otherwise each is reached from ``start``.
-    """
-
-    do: Literal["compensate"]
     arm: str | None = None  # which, where the calibration has several
     targets: tuple[TargetRequest, ...]  # one or several
     start: Joints | None = None  # where the arm comes from (rad), for an arm without sliding joints
     start_joints: dict[str, float] | None = None  # the same by name with the unit
-    path: bool = False
+    path: bool = False  # whether targets are followed in order; otherwise each is reached from ``start``
     units: Units = "rad"  # of the commands in the answer
 
     _one_target = field_validator("targets", mode="before")(_rows)
 
 
 REQUESTS: Mapping[str, type[Request]] = MappingProxyType(
-    {"forward": ForwardRequest, "compensate": CompensateRequest, "status": StatusRequest}
+    {"forward": ForwardRequest, "compensate": CompensateRequest, "status": Request}
 )
 
 
-class CalibrationTag(TypedDict):
-    """Which calibration an answer came from."""
-
-    sequence: int  # 1 for the one that the server began with, one more for each later one
-    created: str  # when it was made
-    sha256: str  # of its file
-    arm: str  # the identity of the arm's description, the same as long as it is the same arm
-    recalibrated: int | None  # the recalibration's last record in it; null where there was none
-    level: str | None  # the recalibration's: nominal, watch, suspect or lost; null where there was none
-
-
-class Tool(TypedDict):
-    """A pose of the tool in the base frame."""
-
-    position_mm: list[float]
-    quaternion_wxyz: list[float]
+def parsed(line: bytes) -> Any:
+    """The JSON in a line."""
+    try:
+        return json.loads(line.decode("utf-8-sig"), parse_constant=_not_finite)
+    except UnicodeDecodeError as fault:
+        message = f"the request holds the byte 0x{line[fault.start]:02x}, which is not UTF-8 text."
+        raise DataError(message, hint="Send UTF-8.") from fault
+    except RecursionError as fault:
+        raise DataError("the request is nested too deeply.", hint=f"Send an object such as {_EXAMPLE}.") from fault
+    except ValueError as fault:
+        text = f"the request is not JSON ({_short(str(fault))})."
+        raise DataError(text, hint=f"Send an object a line, such as {_EXAMPLE}.") from fault
 
 
-class Answer(TypedDict):
-    """The fields of every answer.
-
-    Attributes:
-        waited_ms, took_ms: from the request's arrival until it was begun, and until it was answered.
-    """
-
-    armcal_serve: int
-    id: str | int | float | None  # the request's; null where it could not be read
-    ok: bool  # whether it was answered; if not, ``error`` says why not and ``hint`` what to do
-    calibration: NotRequired[CalibrationTag]  # that it was answered from
-    waited_ms: NotRequired[float]
-    took_ms: NotRequired[float]
-
-
-class Refusal(Answer):
-    """The answer to a request that is refused or failed; ``where`` is the field."""
-
-    error: str
-    hint: str
-    where: str
-
-
-class PoseAnswer(Answer):
-    """The fields of answers with poses, which may lie where nothing tested how far off predictions are.
-
-    Attributes:
-        beyond_records: places (from 0) of the tools or commands that lie beyond the calibration's records; null where
-            the calibration keeps no ranges of them.
-    """
-
-    arm: str  # which one
-    beyond_records: list[int] | None
-    warning: str  # a sentence about those, with joint or payload, the farthest value and the recorded ones; else empty
-
-
-class ForwardAnswer(PoseAnswer):
-    """Where the tool is, by posture."""
-
-    tools: list[Tool]
+def request_of(fields: Any) -> Iterator[Request | None]:
+    """A request, checked; None after each slice of its rows before that."""
+    words = ", ".join(REQUESTS)
+    if not isinstance(fields, dict):
+        short = _short(json.dumps(fields))
+        raise DataError(f"found {short}, expected an object.", hint=f"Send an object such as {_EXAMPLE}.")
+    word = fields.get("do")
+    if not isinstance(word, str) or word not in REQUESTS:
+        near = difflib.get_close_matches(word, REQUESTS, n=1) if isinstance(word, str) else []
+        short = f"found {_short(json.dumps(word))}" if "do" in fields else "found nothing"
+        hint = f"Did you mean {near[0]}?" if near else f"For example {_EXAMPLE}."
+        raise DataError(f"{short}, expected one of {words}.", where=Location(field="do"), hint=hint)
+    if fields.get("armcal_serve", VERSION) != VERSION:
+        short = _short(json.dumps(fields["armcal_serve"]))
+        where = Location(field="armcal_serve")
+        raise DataError(f"found version {short}, expected {VERSION}.", where=where, hint="Leave it out, or say 1.")
+    kind = REQUESTS[word]
+    key = next((key for key in fields if key.startswith(("targets", "joint_angles", "joints"))), "")
+    rows = fields.get(key)
+    if not (isinstance(rows, list) and _AT_ONCE < len(rows) <= MAX_ROWS and isinstance(rows[0], list | dict)):
+        yield _checked(kind, fields)
+        return
+    checked: list[Any] = []
+    for start in range(0, len(rows), _AT_ONCE):
+        some = rows[start : start + _AT_ONCE]
+        try:
+            request = kind.model_validate({**fields, key: some})
+        except ValueError:
+            for place, row in enumerate(some, start):
+                _checked(kind, {**fields, key: [row]}, place)
+            request = _checked(kind, {**fields, key: some})
+        name = max((name for name in type(request).model_fields if key.startswith(name)), key=len)
+        checked += getattr(request, name)
+        yield None
+    yield request.model_copy(update={name: tuple(checked)})
 
 
-class Command(TypedDict):
-    """The command for one target, in the units of the request and in the order of ``joint_names``.
-
-    Attributes:
-        joint_angles_rad, joint_angles_deg: the commands; of an arm with sliding joints ``joints`` in their place, by
-            name with the unit.
-        counts, pulse_us: for the servo board; null for a joint without a pulse table.
-        reached: whether the target is reached; ``why_not`` says why not, and the command is the nearest that was found.
-        error_mm, error_deg: what remains.
-    """
-
-    joint_angles_rad: NotRequired[list[float]]
-    joint_angles_deg: NotRequired[list[float]]
-    joints: NotRequired[dict[str, float]]
-    counts: NotRequired[list[int | None]]
-    pulse_us: NotRequired[list[float | None]]
-    reached: bool
-    why_not: str
-    error_mm: float
-    error_deg: float
-    nearest_mm: float  # no command comes nearer than this, as far as is known
-    approach: list[int]  # the assumed side from which each joint comes: -1, 0 (not known), 1
-    tool: Tool  # its predicted pose
+def _checked(kind: type[Request], fields: dict[str, Any], place: int | None = None) -> Request:
+    """A request; ``place`` is that of its only row among others, for the message."""
+    try:
+        return kind.model_validate(fields)
+    except ValueError:
+        pass
+    try:  # the same check says what is wrong in the words of a configuration
+        validate(kind, ConfigSource(fields, {(): Location()}, Path(), Path(), ()))
+    except InputError as fault:
+        if place is not None and fault.where is not None and fault.where.field:
+            fault.where = Location(field=fault.where.field.replace(".0", f".{place}", 1))
+        raise
+    except Exception as fault:  # not even that is possible
+        hint = "Send what docs/serve.md shows."
+        raise DataError(f"the request is refused ({type(fault).__name__}).", hint=hint) from fault
+    raise DataError("the request is refused.", hint="Send what docs/serve.md shows.")
 
 
-class CompensateAnswer(PoseAnswer):
-    """What to command, by target."""
-
-    joint_names: list[str]
-    commands: list[Command]
-
-
-def refusal(identity: Any, fault: ArmcalError) -> Refusal:
+def refusal(identity: Any, fault: ArmcalError) -> dict[str, Any]:
     return {
         "armcal_serve": VERSION,
         "id": identity,
@@ -222,14 +172,6 @@ def refusal(identity: Any, fault: ArmcalError) -> Refusal:
     }
 
 
-def id_of(line: bytes) -> str | int | float | None:
-    """The id in a request that no worker answered; None where it cannot be read."""
-    try:
-        return known_id(json.loads(line.decode("utf-8-sig")))
-    except (ValueError, RecursionError):
-        return None
-
-
 def known_id(content: Any) -> str | int | float | None:
     """The id in a request's content, if it has one that may be handed back."""
     identity = content.get("id") if isinstance(content, dict) else None
@@ -238,9 +180,9 @@ def known_id(content: Any) -> str | int | float | None:
     return identity if not isinstance(identity, str) or len(identity) <= _MAX_ID else None
 
 
-def as_bytes(answer: Mapping[str, Any]) -> bytes:
-    return as_line(answer).encode()
+def _not_finite(word: str) -> NoReturn:
+    raise ValueError(f"{word} is no number")
 
 
-Notify = Callable[[str, str, Mapping[str, Any]], None]
-"""Takes an event's name, a sentence and its fields, for the program that started the server."""
+def _short(text: str) -> str:
+    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -25,20 +25,13 @@ _CHANNEL = {"payload_com": "payload"}
 
 @dataclass(frozen=True)
 class ServedArm:
-    """One arm.
-
-    Attributes:
-        heated: the compensator of requests that state the temperature; None where the arm does not change with it.
-        recorded: the joints' ranges in the calibration's records, then the payload's; None where it keeps none.
-    """
-
     name: str  # the arm's instance name
     dimensions: Mapping[str, str]  # ``angle`` or ``length`` by commanded joint, in order
-    compensator: Compensator  # of the calibration as it was loaded
+    compensator: Compensator
     needs_payload: bool  # whether what hangs on it moves it and the calibration does not state that
-    heated: Compensator | None = None
+    heated: Compensator | None = None  # for requests that state the temperature, where the arm changes with it
     point: Point = "tool"  # what requests and answers are about: the tool's frame, or the target that was measured
-    recorded: RecordedRange | None = None
+    recorded: RecordedRange | None = None  # of the joints in the calibration's records, then of the payload
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -55,22 +48,14 @@ class ServedArm:
         return {"joints": [*self.joints], "point": self.point, **conditions}
 
     def angles(self, postures: Sequence[Sequence[float] | Mapping[str, float]], field: str) -> Array:
-        """Postures (N x n; rad) from angles in order or by name.
-
-        Raises:
-            DataError: joints are missing or unknown, or some slide.
-        """
+        """Postures (N x n; rad) from angles in order or by name."""
         if not self.turns_only:
             hint = f"Give them by name with the unit, as {field.replace('joint_angles', 'joints')}."
             raise DataError("the arm has sliding joints.", where=Location(field=field), hint=hint)
         return np.array([self._in_order(row, f"{field}.{i}") for i, row in enumerate(postures)])
 
     def named(self, postures: Sequence[Mapping[str, float]], field: str) -> Array:
-        """Postures (N x n; rad, or m) from values by name with the unit (``q1_deg``).
-
-        Raises:
-            DataError: joints are missing or unknown, or have no unit of theirs.
-        """
+        """Postures (N x n; rad, or m) from values by name with the unit (``q1_deg``)."""
         rows = []
         for i, row in enumerate(postures):
             values: dict[str, float] = {}
@@ -109,11 +94,7 @@ class ServedArm:
         return np.repeat(np.array(row, dtype=float)[:, None], count, axis=1)
 
     def acting(self, general: Acting, count: int, single: Sequence[Acting] = ()) -> Array:
-        """What acts (LOAD_CHANNELS x count; SI): as stated for all, then as stated for each.
-
-        Raises:
-            DataError: the payload is needed, and stated nowhere.
-        """
+        """What acts (LOAD_CHANNELS x count; SI): as stated for all, then as stated for each."""
         expression = self.compensator.expression
         start = expression.channels.index(LOAD_CHANNELS[0])
         defaults = expression.defaults[start : start + len(LOAD_CHANNELS)]
@@ -144,11 +125,7 @@ class ServedArm:
         return places, self.recorded.sentence(values) if places else ""
 
     def at_temperature(self, field: str) -> Compensator:
-        """The compensator where a field of the request states the temperature.
-
-        Raises:
-            DataError: the arm does not change with it.
-        """
+        """The compensator where a field of the request states the temperature."""
         if self.heated is None:
             hint = "Leave it out, or calibrate the arm with an effect that depends on it, such as thermal_length."
             _refuse(f"the arm {self.name} does not change with the temperature.", field, hint)

@@ -711,7 +711,7 @@ class TestFolders:
     def test_a_long_path_of_a_simulated_bench(self, tmp_path: Path) -> None:
         folder = tmp_path / ("y" * 120)
         folder.mkdir()
-        server = JsonServer(folder / "clock", "taken", "hint", lambda request: {"now": 1.5, "wall": 2.5})
+        server = JsonServer.at(folder / "clock", "taken", "hint", lambda request: {"now": 1.5, "wall": 2.5})
         with closing(server), ThreadPoolExecutor(1) as pool:
             clock = pool.submit(SimulatedClock, folder / "clock")
             while not clock.done():

@@ -167,7 +167,7 @@ def test_a_server_says_that_its_calibration_was_edited(calibration: Path, tmp_pa
     path = tmp_path / "edited.yaml"
     path.write_text(calibration.read_text().rpartition("#")[0])
     assert armcal("calibration", "accept", str(path)).exit_code == 0
-    command = [sys.executable, "-m", "armcal.cli", "serve", str(path), "--workers", "1", "--evaluator", "interpreted"]
+    command = [sys.executable, "-m", "armcal.cli", "serve", str(path), "--evaluator", "interpreted"]
     asked = b'{"do": "forward", "joint_angles_deg": [10, -20, 30, 40, -50, 60]}\n'
     done = subprocess.run([*command, "-q"], input=asked, capture_output=True, timeout=120, check=False)
     assert done.returncode == 0 and json.loads(done.stdout)["ok"]

@@ -14,8 +14,7 @@ from typing import Any
 import pytest
 from armcal.cli.main import cli
 from armcal.errors import InputError
-from armcal.io.json_server import MOST_CLIENTS, JsonServer
-from armcal.io.unix_socket import short_address
+from armcal.io.json_server import MOST_CLIENTS, JsonServer, short_address
 from armcal_online.running.control import answer, ask, control_server
 from armcal_online.running.situation import SOCKET
 from click.testing import CliRunner
@@ -68,7 +67,7 @@ def test_a_request_is_answered_and_an_error_is_told(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "data",
-    [b"{\n", b"\xff\n", b"[]\n", b"7\n", b"\n", b"{}\n", b"[" * 9000 + b"\n"],
+    [b"{\n", b"\xff\n", b"[]\n", b"7\n", b"{}\n", b"[" * 9000 + b"\n"],
 )
 def test_what_is_not_understood_gets_an_error(tmp_path: Path, data: bytes) -> None:
     with serving(tmp_path):
@@ -108,7 +107,9 @@ def test_a_request_without_an_end_is_refused_and_many_clients_do_no_harm(tmp_pat
             clients[0].sendall(b'{"command": "status"}\n')  # it came first, and is never idle
             assert b"status" in clients[0].recv(4096)
         assert ask(tmp_path, {"command": "status"})["ok"]
-        assert clients[1].recv(1) == b""  # the one that was idle for longest had to go
+        with clients[1].makefile("rb") as said:  # the one that was idle for longest had to go, and is told so
+            assert "asked nothing" in json.loads(said.readline())["error"]
+            assert said.read() == b""
         for connection in clients:
             connection.close()
         assert ask(tmp_path, {"command": "status"})["ok"]
@@ -132,13 +133,15 @@ def test_requests_that_trickle_in_shut_nobody_out_and_have_to_end(
         idle.sendall(b'{"command": "status"}\n')
         idle.settimeout(5.0)
         assert b'"ok": true' in idle.recv(1000)
-        monkeypatch.setattr("armcal.io.json_server._PATIENCE_S", 0.1)
+        monkeypatch.setattr("armcal.io.json_server.LINE_S", 0.1)
         slow[-1].settimeout(5.0)
-        assert slow[-1].recv(10) == b""
+        with slow[-1].makefile("rb") as said:
+            assert "no whole request came" in json.loads(said.readline())["error"]
+            assert said.read() == b""
 
 
 def test_a_client_that_asks_on_and_never_reads_is_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("armcal.io.json_server._PATIENCE_S", 0.1)
+    monkeypatch.setattr("armcal.io.json_server.PATIENCE_S", 0.1)
     line = json.dumps({"command": "status", "filler": "x" * 20_000}).encode() + b"\n"
     with serving(tmp_path), socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(5.0)

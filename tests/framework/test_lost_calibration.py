@@ -9,11 +9,10 @@ from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.errors import ConfigError
 from armcal_online.tracking.updated import calibration_text
-from armcal_serve import loaded as loaded_module
-from armcal_serve.loaded import Order, loaded
+from armcal_serve.loading import Loader, Order
 from click.testing import CliRunner, Result
 from online_arm import CONFIG, begun, calibration, settings
-from serving import ask, sha256
+from serving import ask, loaded, made
 
 CONFIGS = CONFIG.parent
 WHY = "4 of the last 8 records do not fit."
@@ -76,24 +75,20 @@ def test_its_headline_is_not_that_of_the_run_any_more(texts: dict[str, str], los
 
 
 def test_a_server_answers_with_the_level_and_with_an_error_once_it_is_lost(
-    texts: dict[str, str], monkeypatch: pytest.MonkeyPatch
+    texts: dict[str, str],
 ) -> None:
     """That the file before is no longer used either: its arm is the one that moved."""
-    monkeypatch.setattr(loaded_module, "_warm_up", lambda *given: None)
     request = {"do": "forward", "joint_angles_deg": [0, 0, 0, 0, 0, 0]}
-    orders = {
-        level: [Order("c.yaml", n, sha256(text), evaluator="interpreted") for n in (1, 2)]
-        for level, text in texts.items()
-    }
-    answer = ask(loaded(orders["suspect"][0], texts["suspect"].encode()), **request)
+    loader = Loader(Order("c.yaml", evaluator="interpreted"))
+    answer = ask(loaded(loader, texts["suspect"]), **request)
     assert answer["ok"] and answer["calibration"]["level"] == "suspect"
     with pytest.raises(ConfigError, match="its level is lost, as of record 17"):
-        loaded(orders["lost"][0], texts["lost"].encode())
+        made(texts["lost"])
+    lost = loaded(loader, texts["lost"])
     for kind in ("forward", "compensate"):
         asked = request if kind == "forward" else {"do": kind, "targets": [{"position_mm": [300, 0, 100]}]}
-        answer = ask(loaded(orders["lost"][1], texts["lost"].encode()), **asked)
+        answer = ask(lost, **asked)
         assert not answer["ok"] and "its level is lost" in answer["error"]
         assert answer["calibration"]["level"] == "lost"
-    accepted = Order("c.yaml", 2, sha256(texts["lost"]), evaluator="interpreted", accept=True)
-    answer = ask(loaded(accepted, texts["lost"].encode()), **request)
+    answer = ask(made(texts["lost"], accept=True), **request)
     assert answer["ok"] and answer["calibration"]["level"] == "lost"

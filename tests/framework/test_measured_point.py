@@ -15,11 +15,10 @@ from armcal.cli.main import cli
 from armcal.errors import ConfigError
 from armcal.plugins import discover
 from armcal.run.compensate import Bench, commanded
-from armcal_serve.loaded import Order, loaded
 from click.testing import CliRunner, Result
 from made_calibrations import written
 from scipy.spatial.transform import Rotation
-from serving import sha256, told
+from serving import made, told
 from small_arms import calibration, compensator, drawn
 
 OFF_MM = "measurements.tracker.target_mm=[12, -9, 20]"
@@ -158,8 +157,7 @@ def test_a_program_and_a_server_can_ask_for_the_measured_target(tmp_path: Path) 
     goals = rows(tmp_path / "shown.csv", "x_mm y_mm z_mm")
     commands = off.compensate(goals / 1000, point="target")
     text = (tmp_path / "calibration.yaml").read_text(encoding="utf-8")
-    order = Order("c.yaml", 1, sha256(text), point="target", evaluator="interpreted")
-    answerer = loaded(order, text.encode())
+    answerer = made(text, point="target")
     assert answerer.arms["arm"].shown["point"] == "target"
     asked = {"targets": [{"position_mm": goal} for goal in goals.tolist()], "units": "rad"}
     served = told(answerer, do="compensate", **asked)["commands"]

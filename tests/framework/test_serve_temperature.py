@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from armcal.cli.main import cli
-from armcal_serve.answering import Answerer
+from armcal_serve.answers import Answerer
 from click.testing import CliRunner
 from made_calibrations import written
-from serving import ask, made, told
+from serving import answered, ask, made, told
 from small_arms import calibration, predicted
 
 NAMES = ["q1", "q2", "q3"]
@@ -30,21 +30,15 @@ def warm_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return written(calibration("three", HEAT), tmp_path_factory.mktemp("warm") / "warm.yaml")
 
 
-def quickly_made(text: str) -> Answerer:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("armcal_serve.loaded._TRIES", 1)
-        return made(text)
-
-
 @pytest.fixture(scope="module")
 def warm(warm_path: Path) -> Answerer:
-    return quickly_made(warm_path.read_text())
+    return made(warm_path.read_text())
 
 
 @pytest.fixture(scope="module")
 def other(warm_path: Path) -> Answerer:
     """The same arm, whose lengths are what they are."""
-    return quickly_made(written(calibration("three"), warm_path.with_name("other.yaml")).read_text())
+    return made(written(calibration("three"), warm_path.with_name("other.yaml")).read_text())
 
 
 def places_mm(postures_deg: Any, **channels: Any) -> np.ndarray:
@@ -146,6 +140,6 @@ def test_what_is_wrong_with_a_temperature_is_said(other: Answerer, warm: Answere
         assert not answer["ok"] and answer["where"] == where, answer
         assert says in answer["error"], answer
     infinite = b'{"do": "forward", "joint_angles_deg": [1, 2, 3], "temperature_C": 1e999}'
-    assert "finite" in json.loads(warm.answer(infinite, 0.0))["error"]
+    assert "finite" in json.loads(answered(warm, infinite))["error"]
     assert other.arms["arm"].shown == {"joints": NAMES, "point": "tool"}
     assert warm.arms["arm"].shown == {"joints": NAMES, "conditions": ["temperature_C"], "point": "tool"}

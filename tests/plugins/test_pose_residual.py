@@ -352,8 +352,7 @@ def test_errors_that_depend_on_the_load_are_learned_and_hold_on_unseen_records()
 
 
 @pytest.mark.slow
-def test_a_server_asks_for_the_load_that_was_learned(monkeypatch):
-    monkeypatch.setattr("armcal_serve.loaded._TRIES", 1)
+def test_a_server_asks_for_the_load_that_was_learned():
     content = (loaded_run().folder / "run/calibration.yaml").read_text()
     answer = ask(made(content), do="forward", joint_angles_deg=[0, 0, 0])
     assert not answer["ok"] and "nor the calibration states its payload" in answer["error"]

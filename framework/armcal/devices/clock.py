@@ -1,7 +1,5 @@
 """The time that a bench goes by: the machine's, or a simulated bench's."""
 
-import json
-import socket
 import time
 from pathlib import Path
 from typing import Any, Protocol
@@ -9,7 +7,7 @@ from typing import Any, Protocol
 from typing_extensions import override
 
 from armcal.errors import InputError, Location
-from armcal.io.unix_socket import short_address
+from armcal.io.json_server import JsonClient
 
 _LONGEST_ANSWER_S = 60.0
 
@@ -57,15 +55,10 @@ class SimulatedClock(Clock):
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._socket.settimeout(_LONGEST_ANSWER_S)
         try:
-            with short_address(path) as address:
-                self._socket.connect(address)
+            self._client = JsonClient(path, _LONGEST_ANSWER_S)
         except OSError as fault:
-            self._socket.close()
             raise self._refusal(str(fault)) from fault
-        self._answers = self._socket.makefile("r", encoding="utf-8")
         self._read = self.ask({"advance": 0.0})
 
     @override
@@ -88,20 +81,15 @@ class SimulatedClock(Clock):
             InputError: the bench is gone, or refuses.
         """
         try:
-            self._socket.sendall(json.dumps(request).encode() + b"\n")
-            line = self._answers.readline()
+            answer = self._client.ask(request)
         except OSError as fault:
             raise self._refusal(str(fault)) from fault
-        if not line:
-            raise self._refusal("it closed the connection")
-        answer: dict[str, Any] = json.loads(line)
         if "error" in answer:
             raise self._refusal(str(answer["error"]))
         return answer
 
     def close(self) -> None:
-        self._answers.close()
-        self._socket.close()
+        self._client.close()
 
     def _refusal(self, why: str) -> InputError:
         return InputError(

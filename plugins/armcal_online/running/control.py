@@ -1,15 +1,12 @@
 """The control socket of a running recalibration: requests and replies, a JSON object a line."""
 
-import json
-import socket
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from armcal.errors import InputError, Location
 from armcal.io.journal import KeptJournal
-from armcal.io.json_server import Answer, JsonServer
-from armcal.io.unix_socket import short_address
+from armcal.io.json_server import JsonClient, JsonServer
 
 from armcal_online.running.loop import RECORD, Recalibration
 from armcal_online.running.situation import SOCKET
@@ -18,13 +15,13 @@ GOOD = "good"  # in place of a sequence number: that of the last good record
 COMMANDS = ("status", "pause", "resume", "rollback", "finish")
 
 
-def control_server(folder: Path, answer: Answer) -> JsonServer:
+def control_server(folder: Path, answer: Callable[[dict[str, Any]], Mapping[str, Any]]) -> JsonServer:
     """What serves the socket in a folder.
 
     Raises:
         InputError: somebody else serves it, or it cannot be made.
     """
-    return JsonServer(folder / SOCKET, "a recalibration is running here.", "Give another --out.", answer)
+    return JsonServer.at(folder / SOCKET, "a recalibration is running here.", "Give another --out.", answer)
 
 
 def ask(folder: Path, request: Mapping[str, Any], timeout_s: float = 30.0) -> dict[str, Any]:
@@ -35,19 +32,14 @@ def ask(folder: Path, request: Mapping[str, Any], timeout_s: float = 30.0) -> di
     """
     where = Location(str(folder / SOCKET))
     try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection, short_address(folder / SOCKET) as address:
-            connection.settimeout(timeout_s)
-            connection.connect(address)
-            connection.sendall(json.dumps(request).encode() + b"\n")
-            with connection.makefile("rb") as replies:
-                reply = json.loads(replies.readline())
+        with JsonClient(folder / SOCKET, timeout_s) as client:
+            return client.ask(request)
     except TimeoutError as fault:
         hint = "It may be busy with a long roll-back; ask again."
         raise InputError(f"no answer within {timeout_s:g} s.", where=where, hint=hint) from fault
     except (OSError, ValueError) as fault:
         hint = "Start it with `armcal recalibrate`, or give the folder it was given as --out."
         raise InputError(f"no recalibration answers here ({fault}).", where=where, hint=hint) from fault
-    return dict(reply)
 
 
 def answer(recalibration: Recalibration, request: Mapping[str, Any]) -> Mapping[str, Any]:

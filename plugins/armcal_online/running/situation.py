@@ -7,7 +7,6 @@ its own to say: ``present`` asks the control socket, which ends with the process
 import json
 import math
 import shlex
-import socket
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -18,7 +17,7 @@ from statistics import median
 from typing import Any
 
 from armcal.errors import InputError, Location
-from armcal.io.unix_socket import short_address
+from armcal.io.json_server import JsonClient
 
 from armcal_online.tracking.decisions import KINDS, LEVEL_ADVICE, LEVELS, sure_to
 
@@ -161,15 +160,12 @@ def _general_advice(level: str, good: Event | None) -> str:
 
 def is_running(folder: Path) -> bool | None:
     """Whether a process answers at the control socket; None where this user may not ask."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-        connection.settimeout(1.0)
-        try:
-            with short_address(folder / SOCKET) as address:
-                connection.connect(address)
-        except (PermissionError, TimeoutError):
-            return None
-        except OSError:
-            return False
+    try:
+        JsonClient(folder / SOCKET, 1.0).close()
+    except (PermissionError, TimeoutError):
+        return None
+    except OSError:
+        return False
     return True
 
 

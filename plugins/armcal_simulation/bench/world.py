@@ -14,9 +14,8 @@ from typing import Any, ClassVar
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.devices.simulated import BOARD, CLOCK, LOG
-from armcal.io.json_server import JsonServer
+from armcal.io.json_server import JsonServer, vacate
 from armcal.io.signals import Signals
-from armcal.io.unix_socket import vacate
 
 from armcal_simulation.bench.dtrack_sender import DTrackSender
 from armcal_simulation.bench.faults import FaultCalendar, FaultRequest
@@ -116,7 +115,7 @@ class BenchWorld(ABC):
             vacate(clock, *_TAKEN)
             self.start(self._folder / BOARD)
             # After the board: who finds the clock finds the board as well.
-            with closing(JsonServer(clock, *_TAKEN, self.answer)) as server, select.epoll() as edges:
+            with closing(JsonServer.at(clock, *_TAKEN, self.answer)) as server, select.epoll() as edges:
                 server.watch(edges.fileno(), partial(self._attend, edges))
                 watched = None
                 while not (self.stopped or signals.finish):

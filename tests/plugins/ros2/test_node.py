@@ -179,17 +179,21 @@ def test_rests_become_records_in_order_each_until_it_is_acknowledged(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("stubs")
-def test_targets_become_commands_and_faults_are_reported(
-    tour: bags.Tour, calibration: Path, listener: socket.socket, tmp_path: Path
-) -> None:
-    node = made_node(exported(calibration, f"serve_port={port_of(listener)}"))
+def test_targets_become_commands_and_faults_are_reported(tour: bags.Tour, calibration: Path, tmp_path: Path) -> None:
+    path = str(tmp_path / "arm.sock")
+    node = made_node(exported(calibration, f"serve_socket={path}"))
     play(node, tour)
+    server = socket.socket(socket.AF_UNIX)
+    server.bind(path)
+    server.listen()
+    server.settimeout(5)
+    connection: Any = None
     target = Message()
     target.pose.position, target.pose.orientation = Message(x=0.3, y=0.1, z=0.2), Message(x=0.0, y=0.0, z=0.0, w=1.0)
     for reached in (True, False):
         node.subscriptions["target"](target)
-        data, sender = listener.recvfrom(65536)
-        request = json.loads(data)
+        connection = connection or server.accept()[0]
+        request = json.loads(connection.recv(65536))
         assert request["targets"] == [{"position_m": [0.3, 0.1, 0.2], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]}]
         assert request["units"] == "rad" and len(request["start_rad"]) == 6
         command = {
@@ -197,9 +201,11 @@ def test_targets_become_commands_and_faults_are_reported(
             "reached": reached,
             "why_not": "" if reached else "it is too far away",
         }
-        listener.sendto(json.dumps({"id": request["id"], "ok": True, "commands": [command]}).encode(), sender)
+        connection.sendall(json.dumps({"id": request["id"], "ok": True, "commands": [command]}).encode() + b"\n")
         time.sleep(0.01)
         node.on_answers()
+    connection.close()
+    server.close()
     (message,) = node.published["joint_command"]
     assert message.name == list(bags.NAMES) and message.position == [0.1] * 6
     (tmp_path / "status.json").write_text(json.dumps({"level": "lost", "why": "the gripper was bent."}))
@@ -247,9 +253,9 @@ def until(node: Any, done: Callable[[], bool], ask: Callable[[], None]) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("stubs")
 def test_a_real_recalibration_and_a_real_server(tour: bags.Tour, calibration: Path, tmp_path: Path) -> None:
-    ports, kept, count = (free_port(), free_port()), tmp_path / "kept", len(tour.rests)
-    node = made_node(exported(calibration, f"recalibrate_port={ports[0]}", f"serve_port={ports[1]}"))
-    with armcal("recalibrate", calibration, "--from", f"udp:{ports[0]}", "--out", kept):
+    port, kept, count, path = free_port(), tmp_path / "kept", len(tour.rests), tmp_path / "arm.sock"
+    node = made_node(exported(calibration, f"recalibrate_port={port}", f"serve_socket={path}"))
+    with armcal("recalibrate", calibration, "--from", f"udp:{port}", "--out", kept):
         play(node, tour)
         until(node, lambda: not node.waiting, node.on_second)
         assert node.counts == {"records": count, "acknowledged": count, "refused": 0}
@@ -264,7 +270,7 @@ def test_a_real_recalibration_and_a_real_server(tour: bags.Tour, calibration: Pa
         Message(**dict(zip("xyz", map(float, place), strict=True))),
         Message(w=1.0, x=0.0, y=0.0, z=0.0),
     )
-    with armcal("serve", kept / "calibration.yaml", "--udp", ports[1]):
+    with armcal("serve", kept / "calibration.yaml", "--socket", path):
         until(node, lambda: bool(node.published["joint_command"]), lambda: node.subscriptions["target"](target))
     reached = Calibration.load(kept / "calibration.yaml").forward([node.published["joint_command"][0].position])
     np.testing.assert_allclose(reached[0, :3, 3], place, atol=1e-6)

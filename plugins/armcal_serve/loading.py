@@ -1,0 +1,297 @@
+"""The calibration that is served: loaded, and loaded again beside those who ask when its file is replaced.
+
+What a calibration of the same arm changes is the numbers of its expressions: they are channels of one expression that
+was compiled at the start. So a replaced file costs a fifth of a second of reading and checking, in a thread.
+"""
+
+import hashlib
+import json
+import re
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.calibration_file import lost_calibration
+from armcal.calibration.compensation.compensator import Compensator
+from armcal.calibration.compensation.request import Options, Redundancy
+from armcal.calibration.measured_point import Point
+from armcal.calibration.recorded_range import PAYLOAD, RecordedRange
+from armcal.config.yaml_source import MAX_BYTES
+from armcal.errors import ArmcalError, CalibrationWarning, ConfigError, InputError, Location
+from armcal.functions.batch_function import EvaluatorChoice
+from armcal.io.plain_files import input_file
+
+from armcal_serve.answers import Answerer
+from armcal_serve.served_arm import TEMPERATURE, TEMPERATURE_KEY, ServedArm
+
+if TYPE_CHECKING:
+    from armcal.run.plan_poses import Workspace
+
+LOOK_S = 0.2  # How often the file is looked at; a new one must look the same twice
+_TRIES = 5  # Requests of each kind before the first real one: caches are filled by them
+_ORDINARY_C = 20.0
+_WORK_S, _REST_S = 0.001, 0.0015
+_LAST_LINE = re.compile(rb"^# sha256 of the lines above: [0-9a-f]{64}\r?\n\Z", re.MULTILINE)
+"""What a calibration ends in; the hash in it is checked when it is loaded."""
+
+State = Literal["taken", "loading", "refused", "missing"]
+
+
+@dataclass(frozen=True)
+class Order:
+    """How a calibration is to be served.
+
+    Attributes:
+        accept: whether one whose level is lost answers as any other; else the first is refused, and a later one
+            answers every request with that error, since those before it are no longer valid either.
+    """
+
+    shown: str  # the file, as it is called in messages
+    redundancy: Redundancy = "nearest"  # which of many commands
+    within: str = ""  # a configuration whose plan has limits and clearance; empty: none
+    point: Point = "tool"  # what forward and compensate are about: the tool's frame, or the target that was measured
+    evaluator: EvaluatorChoice = "compiled"  # ``compiled`` where a compiler is found, or ``interpreted``
+    accept: bool = False
+
+
+@dataclass
+class Loader:
+    """Makes answerers of one arm's calibrations, each of which takes over what was compiled for the one before."""
+
+    order: Order
+    sequence: int = 0  # of the calibration that was loaded last
+    _arm: str = ""  # the identity of its arm
+    _spaces: dict[str, "Workspace"] = field(default_factory=dict)  # by arm, where there are limits
+    _made: dict[tuple[str, tuple[str, ...]], Compensator] = field(default_factory=dict)
+
+    def load(self, data: bytes) -> tuple[Answerer, list[str]]:
+        """The answerer of a calibration's bytes, and what its users should know of it."""
+        order, sequence = self.order, self.sequence + 1
+        require_whole(data, order.shown)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("ignore")
+            warnings.simplefilter("always", CalibrationWarning)
+            calibration = Calibration.load(order.shown, accept=order.accept or sequence > 1, content=data)
+        record = calibration.record
+        identity = record.identity.get("arm", "")
+        if self._arm and identity != self._arm:
+            raise ConfigError(
+                f"it is of another arm ({identity[:12]}, expected {self._arm[:12]}).",
+                where=Location(order.shown),
+                hint="Put a calibration of the same arm there, or start a server of its own for this one.",
+            )
+        recalibrated = (record.recalibrated or {}).get("sequence")
+        tag = {
+            "sequence": sequence,  # 1 for the one that the server began with, one more for each later one
+            "created": record.created,
+            "sha256": hashlib.sha256(data).hexdigest(),
+            "arm": identity,
+            "recalibrated": recalibrated if isinstance(recalibrated, int) else None,
+            "level": record.level,
+        }
+        made: dict[tuple[str, tuple[str, ...]], Compensator] = {}
+        answerer = Answerer({name: self._served(calibration, name, made) for name in calibration.system.arms}, tag)
+        for _ in range(1 if self._made else _TRIES):
+            warm_up(answerer)
+        lost = record.level == "lost" and not order.accept
+        if lost:
+            answerer = Answerer(answerer.arms, tag, lost_calibration(record, order.shown))
+        self.sequence, self._arm, self._made = sequence, identity, made
+        return answerer, [str(notice.message) for notice in caught]
+
+    def _served(
+        self, calibration: Calibration, name: str, made: dict[tuple[str, tuple[str, ...]], Compensator]
+    ) -> ServedArm:
+        arm, statics = calibration.system.arms[name], calibration.system.statics
+        joints = tuple(arm.commanded)
+        unserved = [
+            f"{condition.name} (effect {name}.{effect})"
+            for effect, condition in arm.declared
+            if condition.name != TEMPERATURE
+        ]
+        if unserved:
+            raise ConfigError(
+                f"the arm {name} changes with {', '.join(unserved)}, which a request cannot state.",
+                where=Location(self.order.shown),
+                hint="Use armcal predict or armcal compensate, which read it from a column.",
+            )
+        for conditions in ((), (TEMPERATURE,)) if TEMPERATURE in arm.conditions else ((),):
+            made[name, conditions] = self._compensator(calibration, name, joints, conditions)
+        needs_payload = arm.depends_on_payload and statics.payload is None
+        kept, recorded = calibration.record.prediction, None
+        if kept is not None and kept.ranges:
+            is_known = needs_payload or statics.payload is not None
+            ranges = {channel: ends for channel, ends in kept.ranges.items() if channel != PAYLOAD or is_known}
+            recorded = RecordedRange.of(ranges, [*(f"{name}.{joint}" for joint in joints), PAYLOAD], {name: arm})
+        compensators = made[name, ()], made.get((name, (TEMPERATURE,)))
+        return ServedArm(
+            name, dict(arm.commanded), compensators[0], needs_payload, compensators[1], self.order.point, recorded
+        )
+
+    def _compensator(
+        self, calibration: Calibration, name: str, joints: tuple[str, ...], conditions: tuple[str, ...]
+    ) -> Compensator:
+        order, before = self.order, self._made.get((name, conditions))
+        if order.within and name not in self._spaces:
+            from armcal.plugins import discover  # late: not needed without limits
+            from armcal.run.plan_poses import workspace_of
+
+            self._spaces[name] = workspace_of(Path(order.within), joints, discover())
+        space = self._spaces.get(name)
+        limits, allowed = (space.limits, space.allowed) if space else ({}, None)
+        options = Options(limits=limits, redundancy=order.redundancy)
+        like = None if before is None else before.expression
+        expression = calibration.expression(name, conditions, order.point, calibration.free, like)
+        try:
+            return Compensator(expression, calibration.parameters, options, allowed, order.evaluator)
+        except ValueError as fault:
+            hint = "Correct the limits in the plan."
+            raise ConfigError(f"{fault}.", where=Location(order.within or order.shown), hint=hint) from fault
+
+
+def warm_up(answerer: Answerer) -> None:
+    """Answer a request of every kind: a request of a client never waits for a compiler."""
+    for arm in answerer.arms.values():
+        start = arm.written([0.05 * (k + 1) for k in range(len(arm.joints))], "rad")
+        known: dict[str, Any] = {"arm": arm.name, "payload_g": 0}
+        for request in (known, {**known, TEMPERATURE_KEY: _ORDINARY_C})[: 1 if arm.heated is None else 2]:
+            answer = _answer(answerer, {"do": "forward", "joints": start, **request})
+            if not answer["ok"] and request is known:
+                text = f"the arm {arm.name} cannot be predicted: {answer['error']}"
+                raise InputError(text, hint=answer["hint"])
+            if answer["ok"]:  # what is ordinary elsewhere may be too hot for this arm
+                tool = answer["tools"][0]
+                for target in (tool, {"position_mm": tool["position_mm"]}):
+                    for more in ({"path": False}, {"path": True}, {"start_joints": start}):
+                        _answer(answerer, {"do": "compensate", "targets": target, **more, **request})
+
+
+def _answer(answerer: Answerer, request: Mapping[str, Any]) -> dict[str, Any]:
+    *_, answer = answerer.begin(json.dumps(request).encode(), 0.0)
+    return dict(json.loads(answer or b"{}"))
+
+
+def require_whole(data: bytes, shown: str) -> None:
+    """Refuse what cannot be a whole calibration."""
+    text = ""
+    if not data:
+        text = "the file is empty."
+    elif not data.endswith(b"\n"):
+        text = "the last line of the file has no end: this is no whole calibration."
+    elif not _LAST_LINE.search(data):
+        text = "the line that ends a calibration is not at the end of the file: this is no whole calibration."
+    if text:
+        raise ConfigError(text, where=Location(shown), hint="Take a whole copy, or run the calibration again.")
+
+
+class _Breaks:
+    """Makes a thread rest for longer than it works, so that it hardly delays the one that answers."""
+
+    def __init__(self) -> None:
+        self._until = 0.0
+
+    def __call__(self, *event: Any) -> None:
+        if time.perf_counter() > self._until:
+            time.sleep(_REST_S)
+            self._until = time.perf_counter() + _WORK_S
+
+
+class CalibrationFile:
+    """A calibration's file, which may be replaced at any time.
+
+    Attributes:
+        state, why: of what is there now, and a sentence about it where it is not taken.
+        served: the answerer of the last one that could be loaded; None before the first.
+        news: events for the program that started the server: name, sentence and fields.
+    """
+
+    def __init__(self, loader: Loader) -> None:
+        self.path = Path(loader.order.shown)
+        self.state: State = "loading"
+        self.why = ""
+        self.served: Answerer | None = None
+        self.news: list[tuple[str, str, Mapping[str, Any]]] = []
+        self._loader = loader
+        self._seen: tuple[int, ...] | None = None
+        self._tried: tuple[int, ...] | None = None
+        self._ends = threading.Event()
+        self._fault: ArmcalError | None = None
+        self._thread = threading.Thread(target=self._run, name="armcal-load", daemon=True)
+
+    def start(self) -> None:
+        """Load the file, and each that takes its place, in a thread."""
+        self._thread.start()
+
+    def first(self) -> bool:
+        """Whether the first calibration is loaded."""
+        if self._fault is not None:
+            raise self._fault
+        return self.served is not None
+
+    def close(self) -> None:
+        self._ends.set()
+        if self._thread.is_alive():
+            self._thread.join(1.0)
+
+    def look(self) -> None:
+        """Load what is there if it is another file than before, and was the same at two looks."""
+        try:
+            status = self.path.stat()
+        except OSError:
+            self._seen = self._tried = None
+            self._say("missing", "there is no such file; the calibration before is used on.")
+            return
+        key = (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
+        settled, self._seen = key == self._seen, key
+        if settled and key != self._tried:
+            self._tried = key
+            try:
+                self.take(self._read())
+            except ArmcalError as fault:
+                self._say("refused", str(fault), f"the new calibration is not taken: {fault}")
+            except Exception as fault:
+                why = f"it cannot be used ({type(fault).__name__}: {fault})."
+                self._say("refused", why, f"the new calibration is not taken: {why}")
+
+    def take(self, data: bytes) -> None:
+        """Load a calibration's bytes, if they are not those that are served."""
+        before = self.served
+        if before is None or hashlib.sha256(data).hexdigest() != before.tag["sha256"]:
+            self.state, self.why = "loading", ""
+            answerer, notices = self._loader.load(data)
+            self.news += [("notice", notice, {}) for notice in notices]
+            self.served, tag = answerer, answerer.tag
+            if before is not None:
+                level = f", level {tag['level']}" if tag["level"] else ""
+                sentence = f"calibration {tag['sequence']} is answered from, of {tag['created']}{level}"
+                self.news.append(("calibration", sentence, {"calibration": tag}))
+        self.state, self.why = "taken", ""
+
+    def _run(self) -> None:
+        try:
+            self.take(self._read())
+        except ArmcalError as fault:
+            self._fault = fault
+            return
+        except Exception as fault:
+            text = f"it cannot be used ({type(fault).__name__}: {fault})."
+            self._fault = ArmcalError(text, where=Location(str(self.path)), hint="Report it with the file.")
+            return
+        sys.setprofile(_Breaks())  # of this thread: called with every call
+        while not self._ends.wait(LOOK_S):
+            self.look()
+
+    def _read(self) -> bytes:
+        with input_file(self.path, MAX_BYTES, "a calibration.yaml", ConfigError) as file:
+            return file.read(MAX_BYTES)
+
+    def _say(self, state: State, why: str, sentence: str = "") -> None:
+        if (state, why) != (self.state, self.why):
+            self.news.append((state, sentence or f"{self.path}: {why}", {"why": why} if sentence else {}))
+        self.state, self.why = state, why
