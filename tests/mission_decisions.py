@@ -24,7 +24,7 @@ _NAMING = {
 """How the kinds of decisions begin that name something else than a joint."""
 _GENERAL = ("general_change", "model_no_longer_fits", "unexplained")
 """Decisions that something changed, or is wrong, without a name."""
-_MILD = ("drift", "refit_took_over")
+_MILD = ("drift",)
 """What is no alarm where nothing happened, but notices what did."""
 IN_TIME_DAYS = 2.0
 """A decision this long after an event, or after one that grows has ended, is in time."""

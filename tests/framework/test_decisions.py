@@ -109,12 +109,12 @@ def test_no_record_is_good_from_the_first_that_a_decision_affects() -> None:
 
 def test_at_a_worse_level_a_decision_advises_what_the_level_does() -> None:
     belief = Belief(np.zeros(1), Gaussian(np.zeros(1), np.eye(1)))
-    found = Decision("refit_took_over", "A refit took over", "it predicts better", 20.0, since=6)
+    found = Decision("drift", "Records miss by more than stated", "chance", 20.0, since=6)
     for level in LEVELS:
         state = State(belief, belief, health=Health(level))
         event = decided(state, found, None, 16)
         worse = LEVELS.index(level) > LEVELS.index("watch")
-        assert event["do"].startswith(LEVEL_ADVICE[level][:20] if worse else KINDS["refit_took_over"].do[:20])
+        assert event["do"].startswith(LEVEL_ADVICE[level][:20] if worse else KINDS["drift"].do[:20])
 
 
 def test_the_last_good_record_is_known_however_long_ago_it_was() -> None:

@@ -71,7 +71,6 @@ CREEP = event("creep", 5, "arm.q3", until=20)
         ([SLIP], [decided("general_change", 9)], ["missed"], 1),
         ([SLIP], [decided("joint_slipped", 4.9, "arm.q3")], ["missed"], 1),
         ([SLIP], [decided("drift", 4)], ["missed"], 0),
-        ([SLIP], [decided("refit_took_over", 6)], ["vague"], 0),
         # What is no statement about the arm.
         ([SLIP], [decided("clock_reset", 5.1)], ["missed"], 0),
         (PAIR, [decided("joint_slipped", 5.1, "arm.q3")], ["vague"], 0),

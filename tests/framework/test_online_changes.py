@@ -104,7 +104,7 @@ def test_outliers_hardly_matter(seeds: int) -> None:
 @pytest.mark.slow
 def test_without_a_gate_outliers_matter() -> None:
     """The figures above would mean little if they did not."""
-    ungated = begun(settings(gating="off"))
+    ungated = begun(settings(gating=False))
     found = run(ungated, _Fair.drawn(0, outliers=0.05), 120, 10)
     print(f"\nungated: {found.errors[-1]:.2f} mm at the end, {found.errors.mean():.2f} on average")
     assert found.errors.mean() > 0.8

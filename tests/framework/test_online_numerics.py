@@ -382,7 +382,7 @@ def stiff(setup: FilterSetup, seed: int) -> World:
 @pytest.mark.parametrize("bounded", [False, True])
 def test_the_filter_ends_where_a_batch_of_all_records_does(bounded: bool) -> None:
     compliance = {"compliance": SMALL} if bounded else {}
-    one = begun(settings(process_noise={}, gating="off"), **compliance)
+    one = begun(settings(process_noise={}, gating=False), **compliance)
     arm = stiff(one.setup, 11) if bounded else World.drawn(9, one.setup, wanders=False)
     springs, records = [one.setup.space.parameters.entries_of(f"arm.spring.k{i}").start for i in range(7)], []
     for sequence in range(1, 121):

@@ -216,7 +216,7 @@ def test_without_gate_and_process_noise_the_filter_ends_where_a_batch_over_all_d
     experiment = Experiment.load(
         ROOT / "configs" / "lrm_arm" / "option1.yaml", data=written(poses, tmp_path, "even.csv", 0)
     )
-    course = run(Halves(odd, experiment.read(), experiment), RecalibrateSettings(gating="off", model_error="white"))
+    course = run(Halves(odd, experiment.read(), experiment), RecalibrateSettings(gating=False, model_error="white"))
     values = course.session.values
     off = [
         abs(values[i] - entry.value) / (entry.sd / every.record.noise["scale"])
@@ -280,7 +280,7 @@ def test_the_window_is_refused_for_matrices(poses: Path, tmp_path: Path) -> None
 
 def from_nominal(batch: Calibration, experiment: Experiment, estimator: dict | None = None) -> Recalibrator:
     """A session that knows nothing but nominal values and priors, five times the typical scale where none is stated."""
-    settings = RecalibrateSettings(gating="off", model_error="white", estimator=estimator or {"type": "extended"})
+    settings = RecalibrateSettings(gating=False, model_error="white", estimator=estimator or {"type": "extended"})
     session = Recalibrator(batch, settings)
     free = session.setup.space.parameters.free
     stated = [(b, experiment.parameters[b.name].prior_sd or 5 * b.scale) for b in free]

@@ -73,7 +73,7 @@ def test_a_folder_of_another_calibration_or_other_settings_is_refused(tmp_path: 
     folder = tmp_path / "out"
     run(folder, Listed(made(1, 5)), settings=RecalibrateSettings())
     with pytest.raises(InputError, match="begun with other settings"):
-        run(folder, Listed(made(1, 9)), settings=RecalibrateSettings(gating="off"))
+        run(folder, Listed(made(1, 9)), settings=RecalibrateSettings(gating=False))
     (tmp_path / "out.start.yaml").write_text("other: 1\n")
     with pytest.raises(InputError, match="begun with another calibration"):
         run(folder, Listed(made(1, 9)), settings=RecalibrateSettings())

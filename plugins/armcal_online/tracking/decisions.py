@@ -155,16 +155,6 @@ KINDS: Mapping[str, DecisionKind] = {
         "after 20 records, roll back to {good}.",
         level="suspect",
     ),
-    "refit_took_over": DecisionKind(
-        means="The filter predicted the last records worse than a robust refit of a window of records beside it, by "
-        "more than chance makes. The estimate is that refit's now, with its own uncertainty; what happened is not "
-        "named.",
-        do="Go on with coarse work. Take {calm} records at poses that move every joint before precise work.",
-        confirm="The new records fit, and the level improves. If it comes again within a day, something goes on "
-        "changing: look at the joint of the parameter that moved most.",
-        level="watch",
-        explains=True,
-    ),
     "unexplained": DecisionKind(
         means="Several of the last records do not fit, and no change explains them yet. Nothing was changed.",
         do="Stop precise work. Take 10 records at poses that move every joint.",

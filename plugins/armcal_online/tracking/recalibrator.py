@@ -30,9 +30,7 @@ from armcal_online.tracking.decisions import EXPLAINED, Decision
 from armcal_online.tracking.health import nis_limit
 from armcal_online.tracking.hypotheses import GRADUAL, Recent, find_steps, hypotheses, slow_changes
 from armcal_online.tracking.judge import Judge
-from armcal_online.tracking.net import Net
 from armcal_online.tracking.observer import Reading
-from armcal_online.tracking.refit import NetRecord
 from armcal_online.tracking.sentences import beside_model_error
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.sizes import in_model_errors, tip_error
@@ -61,7 +59,7 @@ class Recalibrator:
         estimator: OnlineEstimator = build_component(source, registry or discover(), "online", ("estimator",))[0]
         self._calibration, self.settings, self._estimator = calibration, settings, estimator
         is_filter = estimator.window == 1
-        self.setup = setup = filter_setup(calibration, settings, shares=is_filter, loads=settings.gating == "on")
+        self.setup = setup = filter_setup(calibration, settings, shares=is_filter, loads=settings.gating)
         if not is_filter and setup.space.cones:
             raise ConfigError(
                 "found an estimator that holds records back, and 3x3 compliances: together they may not converge.",
@@ -77,7 +75,6 @@ class Recalibrator:
             slow = tuple(change for change in slow if change.kind in GRADUAL)
         self._slow = SlowChanges(slow, setup.process_noise, settings.changes.probability)
         self._judge = Judge(setup.space, steps, hypothesis_filter, changes, self._slow, settings)
-        self._net = Net(setup, changes) if settings.net and settings.gating == "on" else None
         self.state = State(setup.belief, setup.belief)
 
     @property
@@ -158,17 +155,10 @@ class Recalibrator:
         state = replace(state, belief=before, anchor=anchor, slow=self._slow.passed(state.slow, passed))
         try:
             gated, first, limit = self._gated(state, readings, passed)
-            state, decisions = self._judge.after(gated) if self.settings.gating == "on" else (gated, ())
+            state, decisions = self._judge.after(gated) if self.settings.gating else (gated, ())
         except ArmcalError as fault:
-            return self._without_filter(incoming, state, readings, passed, fault.message)
+            return self._ignored(incoming, state, fault.message)
         recent = gated.recent[-1]
-        if self._net is not None:
-            record, corrected = (
-                NetRecord(recent.sequence, readings, recent.joint_noise),
-                state.belief is not gated.belief,
-            )
-            state, taken_over = self._net.after(state, record, before, passed, corrected)
-            decisions = (*decisions, *taken_over)
         decisions = tuple(self._beside_model_error(decision, gated, state.belief) for decision in decisions)
         health, level = self._judge.health(gated, decisions, first), self.state.health.level
         record_events = [events.judged(incoming, state, recent, first, limit, self.setup)]
@@ -211,7 +201,7 @@ class Recalibrator:
         covariance = first.slope @ before.gaussian.covariance @ first.slope.T + first.noise
         nis, dof = normalised_innovation_squared(first.innovation, covariance), len(first.innovation)
         limit = nis_limit(dof, self.settings.gate.probability, observer.freedom(readings))
-        rejected = self.settings.gating == "on" and not nis <= limit
+        rejected = self.settings.gating and not nis <= limit
         recent = Recent(state.sequence, readings, noise, passed, before, rejected, nis, dof)
         nis_window = self.settings.levels.window
         after = state if rejected else advanced(state, recent, self.setup, self._estimator, nis_window)
@@ -220,24 +210,6 @@ class Recalibrator:
             after = replace(after, slow=slow)
         counted = _counted(after, "rejected" if rejected else "accepted")
         return replace(counted, recent=(*counted.recent, recent)[-self.settings.gate.window :]), first, limit
-
-    def _without_filter(
-        self, incoming: Incoming, state: State, readings: tuple[Reading, ...], passed: Mapping[str, float], why: str
-    ) -> tuple[dict[str, Any], ...]:
-        """A record that the filter cannot use where it has come to: the net takes it all the same."""
-        if self._net is None:
-            return self._ignored(incoming, state, why)
-        try:
-            noise = self.setup.observer.joint_noise(self.setup.belief.origin, readings)
-        except ArmcalError:
-            return self._ignored(incoming, state, why)
-        record = NetRecord(state.sequence, readings, noise)
-        state, decisions = self._net.after(state, record, state.belief, passed, corrected=False)
-        ignored, calm = self._ignored(incoming, state, why), self.settings.levels.calm
-        for decision in decisions:
-            health = self.state.health.troubled(decision.level, decision.sentence)
-            self.state = replace(self.state, health=health)
-        return (*ignored, *(events.decided(self.state, decision, None, calm) for decision in decisions))
 
     def started_event(self, resumed: bool) -> dict[str, Any]:
         slowest = self._slow.slowest(_WEEK, self.settings.changes.odds)

@@ -126,8 +126,7 @@ class RecalibrateSettings(Settings):
     model_error: Literal["calibrated", "white"] = "calibrated"
     free: dict[str, str | float] = Field(default_factory=dict)
     gate: GateSettings = Field(default_factory=GateSettings)
-    gating: Literal["on", "off"] = "on"
-    net: bool = True
+    gating: bool = True
     outliers: OutlierSettings = Field(default_factory=OutlierSettings)
     changes: ChangeSettings = Field(default_factory=ChangeSettings)
     levels: LevelSettings = Field(default_factory=LevelSettings)

@@ -17,7 +17,6 @@ from armcal_online.tracking.belief import Belief, most_likely
 from armcal_online.tracking.decisions import Decision
 from armcal_online.tracking.health import Health
 from armcal_online.tracking.hypotheses import Candidate, Recent
-from armcal_online.tracking.refit import NetState
 from armcal_online.tracking.settings import ClockSettings
 from armcal_online.tracking.slow_changes import SlowState
 from armcal_online.tracking.start import FilterSetup
@@ -116,7 +115,6 @@ class State:
     changes: tuple[int, ...] = ()  # sequence numbers of the last changes that nothing explained
     sequence: int = 0  # of the last entry
     at: float = 0.0  # time of the last record (unix seconds, or as records count it)
-    net: NetState = field(default_factory=NetState)  # the windows of records that are refitted beside the filter
     slow: SlowState = field(default_factory=SlowState)  # evidence of slow changes, and trends that were found
 
     def following(self, belief: Belief, **changes: Any) -> State:
@@ -144,8 +142,7 @@ class State:
             KeyError, TypeError, ValueError, AttributeError, IndexError: it is no state.
         """
         anchor = content["belief"] if content["anchor"] is None else content["anchor"]
-        before_nets = {"net": _encoded(NetState()), "slow": _encoded(SlowState())}  # none in an earlier version
-        state: State = _decoded(cls, {**before_nets, **content, "anchor": anchor, "nis_window": content["nis"]})
+        state: State = _decoded(cls, {**content, "anchor": anchor, "nis_window": content["nis"]})
         if set(state.counts) != {"accepted", "rejected", "ignored"}:
             raise ValueError(f"counts of {', '.join(state.counts)}")
         return state

@@ -94,34 +94,33 @@ def _payload(arm: Loaded, since: int) -> None:
     arm.payload = 0.15
 
 
-def _errors(seed: int, happens: Callable[[Loaded, int], None]) -> tuple[np.ndarray, int]:
-    """Tip errors (mm) of the online calibration and of the reference, and how often the net took over."""
+def _errors(seed: int, happens: Callable[[Loaded, int], None]) -> np.ndarray:
+    """Tip errors (mm) of the online calibration and of the reference."""
     recalibrator, arm = begun(), Loaded.drawn(9000 + seed, outliers=0.05)
-    reference, errors, taken_over = Reference(arm.setup), [], 0
+    reference, errors = Reference(arm.setup), []
     for k in range(BEFORE + AFTER):
         if k >= BEFORE:
             happens(arm, k - BEFORE)
         record = arm.record()
         reference.readings += arm.setup.observer.readings(record.channels, {})
-        events = recalibrator.take(record, k + 1)
-        taken_over += sum(event.get("kind") == "refit_took_over" for event in events)
+        recalibrator.take(record, k + 1)
         if k >= BEFORE and k % EVERY == 0:
             true = np.array([arm.turn @ arm.tip(q) + arm.bias for q in PROBES])
             both = [(recalibrator.setup, recalibrator.values), (arm.setup, reference.refitted())]
             tips = np.array([[predicted(of, of.space.inside(values), q) for q in PROBES] for of, values in both])
             errors.append(1000 * np.linalg.norm(tips - true, axis=2).mean(axis=1))
-    return np.array(errors), taken_over
+    return np.array(errors)
 
 
 @pytest.mark.parametrize("happens", [_two_slips, _outliers, _growing_bias, _creeping_joint, _payload])
-def test_it_is_never_much_worse_than_a_refit_of_the_last_40_records(happens: Callable, net_seeds: int = 3) -> None:
+def test_it_is_never_much_worse_than_a_refit_of_the_last_40_records(happens: Callable, seeds: int = 3) -> None:
     worst = []
-    for seed in range(net_seeds):
-        errors, taken_over = _errors(seed, happens)
+    for seed in range(seeds):
+        errors = _errors(seed, happens)
         smooth = np.array([np.convolve(e, np.full(RUNNING, 1 / RUNNING), "valid") for e in errors.T])
         worst.append(float((smooth[0] / smooth[1]).max()))
         print(
             f"{happens.__name__[1:]}, seed {seed}: {errors[:, 0].mean():.3f} mm in the mean, the refit "
-            f"{errors[:, 1].mean():.3f}; at worst {worst[-1]:.2f} times it; {taken_over} taken over"
+            f"{errors[:, 1].mean():.3f}; at worst {worst[-1]:.2f} times it"
         )
     assert max(worst) <= 1.2
