@@ -29,7 +29,6 @@ class Listed:
         self.records = [*records]
         self.keeps_records = keeps_records
         self.cut = cut
-        self.acknowledged: list[tuple[str, int]] = []
 
     @property
     def ended(self) -> bool:
@@ -42,9 +41,6 @@ class Listed:
         if not self.records and self.cut:
             raise PowerCutError
         return self.records.pop(0) if self.records else None
-
-    def acknowledge(self, incoming: Incoming, sequence: int) -> None:
-        self.acknowledged.append((incoming.record_id, sequence))
 
     def close(self) -> None:
         pass

@@ -4,24 +4,22 @@ import ast
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 from armcal.base.settings import Settings
 from armcal.calibration.exporter import Exported, ExportRequest
 from armcal.errors import ConfigError, ProblemError
-from pydantic import Field
 
 _TEMPLATE = Path(__file__).with_name("templates") / "node.py.in"
 _CHANNELS = {"tip_position": False, "tip_pose": True}
 """Measurements that a node feeds, and whether they read orientations."""
-Port = Annotated[int, Field(ge=1, le=65535)]
 
 
 class NodeSettings(Settings):
-    """Which measurement feeds the recalibration (the only one unless said), and where both programs listen."""
+    """Which measurement feeds the recalibration (the only one unless said), its folder, and the server's socket."""
 
     measurement: str | None = None
-    recalibrate_port: Port = 5005
+    folder: str = "kept"
     serve_socket: str = "arm.sock"
 
 
@@ -68,7 +66,8 @@ class Ros2NodeExporter:
             "EXPERIMENT": _comment(request.origin.experiment),
             "MEASURED": kind,
             "IMPORTED": kind if is_pose else f"{kind}, PoseStamped",
-            "RECALIBRATE_PORT": str(s.recalibrate_port),
+            "=FOLDER": json.dumps(s.folder),
+            "FOLDER": _comment(s.folder),
             "SERVE_SOCKET": _comment(s.serve_socket),
         }
         text = _TEMPLATE.read_text(encoding="utf-8")
@@ -78,7 +77,7 @@ class Ros2NodeExporter:
         read = {ast.unparse(node.targets[0]): node.value for node in assigned}
         if any(ast.literal_eval(read[constant]) != value for constant, value in constants.items()):
             raise ProblemError("the names do not read back as they were written.", hint="Rename the joints.")
-        remarks = (f"run armcal recalibrate with --from udp:{s.recalibrate_port} beside it",)
+        remarks = (f"run armcal recalibrate with --from socket --out {s.folder} beside it",)
         return Exported(text.encode(), 0, remarks=remarks)
 
 

@@ -170,8 +170,8 @@ def test_bad_input_ends_with_2_and_leaves_nothing(calibration: Path, config: Pat
         ("calibration", tmp_path / "bad.yaml", "schema"),
         ("calibration", tmp_path / "gone.yaml", "gone.yaml"),
         ("--from", tmp_path / "bad.csv", "bad.csv:1"),
-        ("--from", tmp_path / "gone.csv", "udp:PORT"),
-        ("--from", "udp:70000", "no address"),
+        ("--from", tmp_path / "gone.csv", "or a CSV file"),
+        ("--from", "udp:70000", "or a CSV file"),
         ("--config", tmp_path / "bad.yaml", "gate"),
         ("--out", tmp_path / "file", "file"),
     ):

@@ -6,15 +6,18 @@ import json
 import time
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import pytest
 from armcal.errors import InputError
 from armcal.io.journal import Journal, JournalFullError, KeptJournal
 from armcal_online.commands.recalibrate import open_source
+from armcal_online.running.control import answer
 from armcal_online.running.loop import Pace, Recalibration
 from armcal_online.running.session import opened
 from armcal_online.sources.row_parser import RowParser
 from armcal_online.sources.source import Incoming
+from armcal_online.sources.streams import Sent
 from armcal_online.tracking.settings import RecalibrateSettings
 from fake_recalibrator import FakeRecalibrator, setup
 from recalibrations import (
@@ -107,17 +110,50 @@ def test_a_record_that_the_recalibrator_refuses_is_passed_over_for_good(tmp_path
     assert "it is refused" in ignored["why"] and fake.count == 7 and replayed(folder).digest() == fake.digest()
 
 
-def test_a_record_of_a_stream_that_is_sent_again_counts_once(tmp_path: Path) -> None:
+def sent(number: int, **given: Any) -> dict[str, Any]:
+    return {"id": f"p{number}", "q1_deg": number, "q2_deg": 2, "x_mm": 3, "y_mm": 4, "z_mm": 5, **given}
+
+
+def by_socket() -> Sent:
+    return Sent(RowParser(FakeRecalibrator().request, {}))
+
+
+def test_a_record_that_is_sent_again_counts_once_and_has_the_same_acknowledgement(tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    a, b, c = made(1, 4, key="")
-    source = Listed([a, b, a, b, Incoming("p1", {"arm.q1": 9.0}, {}, 1e9)], keeps_records=False)
-    run(folder, source)
-    assert taken(folder) == ["p1", "p2", "p1"]
-    first, second, third, fourth, _ = source.acknowledged
-    assert (first, second) == (third, fourth)
-    again = Listed([b, c], keeps_records=False)
-    run(folder, again)
-    assert taken(folder)[3:] == ["p3"] and again.acknowledged[0] == second
+    with stepping(folder, by_socket()) as (going, _):
+        first, second, third, fourth, _ = (going.receive(sent(*n)) for n in ((1,), (2,), (1,), (2,), (7,)))
+        other = going.receive(sent(1, q1_deg=9))
+        assert taken(folder) == ["p1", "p2", "p7", "p1"] and other["acknowledged"] > second["acknowledged"]
+        assert (first, second) == (third, fourth) and first["id"] == "p1" and first["ok"]
+    with stepping(folder, by_socket()) as (going, _):
+        assert going.receive(sent(2)) == second and going.receive(sent(3))["id"] == "p3"
+    assert taken(folder)[4:] == ["p3"]
+
+
+def test_a_sent_record_that_cannot_be_read_is_kept_with_its_fault_and_no_other_source_takes_any(tmp_path: Path) -> None:
+    with stepping(tmp_path / "out", by_socket()) as (going, fake):
+        reply = answer(going, {"id": "p1", "q1_deg": 1})
+        assert reply["ok"] and "missing: q2" in reply["fault"] and fake.count == 0
+        assert answer(going, {"command": "finish"})["ok"]
+        with pytest.raises(InputError, match="about to end"):
+            answer(going, sent(2))
+    with (
+        stepping(tmp_path / "file", Listed(made(1, 9))) as (going, _),
+        pytest.raises(InputError, match="--from socket"),
+    ):
+        answer(going, sent(1))
+
+
+def test_without_room_a_sent_record_has_no_acknowledgement_and_it_stops(tmp_path: Path) -> None:
+    with stepping(tmp_path / "out", by_socket()) as (going, _):
+        assert going.receive(sent(1))["ok"]
+        with limited(tmp_path / "out"):
+            with pytest.raises(JournalFullError):
+                answer(going, sent(2))
+            with pytest.raises(JournalFullError, match="no room for an entry"):
+                going.run()
+    assert "no room for an entry" in json.loads((tmp_path / "out" / "status.json").read_text())["fault"]
+    assert taken(tmp_path / "out") == ["p1"]
 
 
 def test_while_paused_files_keep_their_records_and_those_of_streams_are_passed_over(tmp_path: Path) -> None:
@@ -206,7 +242,7 @@ def test_a_full_journal_stops_it_says_so_and_keeps_all_that_was_acknowledged(tmp
             assert fake.digest() == before
             with pytest.raises(JournalFullError, match="no room for an entry"):
                 going.run()
-    assert fake.count == 3 and [name for name, _ in source.acknowledged] == taken(tmp_path / "out")
+    assert fake.count == 3 and taken(tmp_path / "out") == ["p1", "p2", "p3"]
     status = json.loads((tmp_path / "out" / "status.json").read_text())
     assert status["finished"] and "no room for an entry" in status["fault"] and "Make room" in status["fault"]
     assert json.loads((tmp_path / "out" / "calibration.yaml").read_text())["count"] == 3
@@ -239,10 +275,9 @@ def test_the_pace_of_what_is_written(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_real_source_in_the_real_loop(tmp_path: Path) -> None:
-    (tmp_path / "in").mkdir()
-    (tmp_path / "in" / "a.csv").write_text(table(10))
+    (tmp_path / "in.csv").write_text(table(10))
     fake = FakeRecalibrator()
-    records = open_source(str(tmp_path / "in"), RowParser(fake.request, {}))
+    records = open_source(str(tmp_path / "in.csv"), RowParser(fake.request, {}))
     with opened(setup(tmp_path / "out"), fake, records) as going:
         ends = time.monotonic() + 10
         while len(taken(tmp_path / "out")) < 10 and time.monotonic() < ends:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -15,7 +14,9 @@ from typing import Any
 
 import pytest
 from armcal.cli.main import cli
+from armcal.io.json_server import JsonClient
 from armcal_online.running.control import ask
+from armcal_online.running.situation import SOCKET
 from click.testing import CliRunner
 from fake_recalibrator import row
 from recalibrations import (
@@ -105,33 +106,28 @@ def test_kills_lose_nothing_and_repeat_nothing(tmp_path: Path, kills: int) -> No
 @pytest.mark.parametrize("kills", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_what_was_acknowledged_to_a_sender_outlasts_kills_and_counts_once(tmp_path: Path, kills: int) -> None:
     folder = tmp_path / "out"
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        address = probe.getsockname()
     ends, acknowledged = threading.Event(), []
 
     def send() -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            sender.settimeout(0.05)
-            sender.connect(address)
-            number = 1
-            while not ends.is_set():
-                record = {"id": f"p{number}", "q1_deg": number, "q2_deg": 2, "x_mm": number / 7, "y_mm": 4, "z_mm": 5}
-                try:
-                    sender.send(json.dumps(record).encode())
-                    reply = json.loads(sender.recv(1000))
-                except OSError:
-                    time.sleep(0.01)
-                    continue
-                if reply["id"] == f"p{number}":
-                    acknowledged.append(reply["id"])
-                    number += 1
+        number, client = 1, None
+        while not ends.is_set():
+            record = {"id": f"p{number}", "q1_deg": number, "q2_deg": 2, "x_mm": number / 7, "y_mm": 4, "z_mm": 5}
+            try:
+                client = client or JsonClient(folder / SOCKET, 5.0)
+                reply = client.ask(record)
+            except OSError:
+                client = None
+                time.sleep(0.01)
+                continue
+            if reply.get("id") == f"p{number}" and "acknowledged" in reply:
+                acknowledged.append(reply["id"])
+                number += 1
 
     thread = threading.Thread(target=send)
     thread.start()
     try:
         for kill in range(kills + 1):
-            going = process(folder, f"udp:127.0.0.1:{address[1]}")
+            going = process(folder, "socket")
             target = len(acknowledged) + 15
             while len(acknowledged) < target and going.poll() is None:
                 time.sleep(0.001)

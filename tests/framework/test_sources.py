@@ -6,11 +6,9 @@ import json
 import math
 import os
 import random
-import socket
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 from armcal.base.dataset import Dataset
@@ -19,10 +17,9 @@ from armcal.io.lines import LineCutter
 from armcal_online.commands.recalibrate import open_source
 from armcal_online.running.loop import MAX_FILES, Progress
 from armcal_online.sources.csv_file import CsvFile
-from armcal_online.sources.folder import Folder
 from armcal_online.sources.row_parser import RowParser
 from armcal_online.sources.source import Incoming, Place, Source
-from armcal_online.sources.streams import Lines, Udp
+from armcal_online.sources.streams import Lines
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
 from fake_recalibrator import HEADER, request, row
 
@@ -67,7 +64,7 @@ class SimulatedTime:
 def simulated(monkeypatch: pytest.MonkeyPatch) -> SimulatedTime:
     """What sources wait by."""
     passes = SimulatedTime()
-    for module in ("csv_file", "folder", "source"):
+    for module in ("csv_file", "source"):
         monkeypatch.setattr(f"armcal_online.sources.{module}.time", passes)
     return passes
 
@@ -248,7 +245,7 @@ def test_a_file_is_gone_on_with_after_the_last_row_that_was_taken(tmp_path: Path
         assert incoming is not None
         progress.take(incoming, sequence)
     second = CsvFile(path, rows(), "stop")
-    second.resume(Progress.from_dict(json.loads(json.dumps(progress.as_dict()))).positions)
+    second.resume(Progress.from_dict(json.loads(json.dumps(progress.as_dict()))).rows)
     both = [*(r for r in found if r is not None), *everything(second)]
     assert [r.record_id for r in both if not r.fault] == [f"p{i}" for i in range(1, 9)] and len(both) == 9
 
@@ -261,97 +258,17 @@ def test_a_file_that_cannot_be_used_is_refused_at_once(tmp_path: Path) -> None:
             CsvFile(path, rows(), "stop")
     with pytest.raises(InputError, match="no such file"):
         open_source(str(tmp_path / "gone.csv"), rows())
-    for text in ("udp:", "udp:x:y", "udp:99999", "udp:1:2:3"):
-        with pytest.raises(InputError, match=r"udp:PORT, udp:HOST:PORT\?from=SENDER, a directory, or a CSV file"):
-            open_source(text, rows())
-    assert isinstance(open_source(str(tmp_path), rows()), Folder)
+    with pytest.raises(InputError, match=r"Give socket \(.*\), - \(standard input\), or a CSV file"):
+        open_source("udp:5005", rows())
+    with pytest.raises(InputError, match="not a regular file"):
+        open_source(str(tmp_path), rows())
 
 
-def folder(path: Path) -> Folder:
-    return Folder(path, rows(), settled_s=0.15)
-
-
-def test_files_of_a_folder_come_in_the_order_of_their_names_and_new_ones_at_any_time(
-    tmp_path: Path, simulated: SimulatedTime
-) -> None:
-    (tmp_path / "b.csv").write_text(table(2, first=3))
-    (tmp_path / "a.csv").write_text(table(2))
-    (tmp_path / "c.jsonl").write_text(f"{json.dumps({**WHOLE, 'id': 'p5'})}\n\nnonsense\n")
-    (tmp_path / ".d.csv.part").write_text(table(2))
-    (tmp_path / "notes.txt").write_text("nothing")
-    (tmp_path / "d.csv").mkdir()
-    source = folder(tmp_path)
-    assert ids(everything(source, 0.5)) == ["p1", "p2", "p3", "p4", "p5", "3"]
-    (tmp_path / "new").write_text(json.dumps([{**WHOLE, "id": "p6"}, 7, {**WHOLE, "id": "p7"}]))
-    os.replace(tmp_path / "new", tmp_path / "aa.json")
-    found = everything(source, 0.5)
-    assert ids(found) == ["p6", "2", "p7"] and found[1].fault and not source.ended
-    with (tmp_path / "b.csv").open("a") as file:
-        file.write(f"{row(8)}\n{row(9)[:-2]}")
-    assert ids(everything(source, 0.5)) == ["p8"]
-
-
-def test_a_file_that_is_being_written_holds_up_those_after_it(tmp_path: Path, simulated: SimulatedTime) -> None:
-    source = folder(tmp_path)
-    with (tmp_path / "a.csv").open("w") as file:
-        (tmp_path / "b.csv").write_text(table(1, first=50))
-        for piece in (HEADER, f"\n{row(1)}\n{row(2)[:5]}", f"{row(2)[5:]}\n"):
-            file.write(piece)
-            file.flush()
-            assert source.incoming(0.05) is None
-    assert ids(everything(source, 0.4)) == ["p1", "p2", "p50"]
-
-
-def test_a_json_file_that_is_cut_short_is_read_when_it_is_whole(tmp_path: Path, simulated: SimulatedTime) -> None:
-    path, text = tmp_path / "a.json", json.dumps([WHOLE, WHOLE])
-    path.write_text(text[:-20])
-    source = folder(tmp_path)
-    assert everything(source, 0.4) == []
-    path.write_text(text)
-    assert len(everything(source, 0.5)) == 2
-
-
-def test_a_folder_is_gone_on_with_and_a_bad_header_costs_its_file_one_fault(
-    tmp_path: Path, simulated: SimulatedTime
-) -> None:
-    (tmp_path / "a.csv").write_text(table(3))
-    (tmp_path / "b.csv").write_text("no,header\n1,2\n3,4\n")
-    (tmp_path / "c.csv").write_text(table(3, first=4))
-    progress, first = Progress(), folder(tmp_path)
-    taken = [first.incoming(0.5) for _ in range(5)]
-    for sequence, incoming in enumerate(taken):
-        assert incoming is not None
-        progress.take(incoming, sequence)
-    second = folder(tmp_path)
-    second.resume(progress.positions)
-    assert ids([r for r in taken if r]) == ["p1", "p2", "p3", "1", "p4"]
-    assert ids(everything(second, 0.5)) == ["p5", "p6"]
-
-
-def test_what_is_remembered_of_files_does_not_grow(tmp_path: Path, simulated: SimulatedTime) -> None:
+def test_what_is_remembered_of_files_does_not_grow() -> None:
     progress = Progress()
     for i in range(3 * MAX_FILES):
         progress.take(Incoming("p", {}, {}, 0.0, f"{i:06d}.csv", 5), i)
-    positions = progress.positions
-    assert len(positions) == MAX_FILES + 1
-    for i in (0, 2 * MAX_FILES - 1, 2 * MAX_FILES, 3 * MAX_FILES - 1, 3 * MAX_FILES):
-        (tmp_path / f"{i:06d}.csv").write_text("\n" + table(5, first=i))
-    source = folder(tmp_path)
-    source.resume(positions)
-    last = 3 * MAX_FILES
-    assert ids(everything(source, 0.5)) == [f"p{n}" for i in (last - MAX_FILES, last - 1) for n in (i + 3, i + 4)] + [
-        f"p{last + i}" for i in range(5)
-    ]
-
-
-def test_a_file_that_becomes_shorter_is_told_once(tmp_path: Path, simulated: SimulatedTime) -> None:
-    path = tmp_path / "a.csv"
-    path.write_text(table(5))
-    source = folder(tmp_path)
-    assert len(everything(source, 0.4)) == 5
-    path.write_text(table(1))
-    (fault,) = everything(source, 0.4)
-    assert "became shorter" in fault.fault
+    assert len(progress.rows) == MAX_FILES and max(progress.rows) == f"{3 * MAX_FILES - 1:06d}.csv"
 
 
 def piped(*pieces: bytes) -> list[Incoming]:
@@ -389,67 +306,6 @@ def test_json_of_any_depth_is_a_fault_and_no_exception() -> None:
         assert rows().json_text("[" * depth + "]" * depth, PLACE).fault
 
 
-def test_datagrams_are_acknowledged_to_their_sender() -> None:
-    source = Udp("127.0.0.1", 0, rows())
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        sender.settimeout(2.0)
-        for data, fault in (
-            (json.dumps(WHOLE).encode(), ""),
-            (b"\xff\xfe", "not UTF-8"),
-            (b"", "not JSON"),
-            (b"x" * 20_000, "more than 16 KiB"),
-            (b"[]", "expected a JSON object"),
-        ):
-            sender.sendto(data, source.address)
-            incoming = source.incoming(2.0)
-            assert incoming is not None and fault in incoming.fault and bool(fault) == bool(incoming.fault)
-            source.acknowledge(incoming, 12)
-            reply = json.loads(sender.recv(2000))
-            assert reply["acknowledged"] == 12 and reply["id"] == incoming.record_id
-            assert reply.get("fault", "") == incoming.fault
-        assert source.incoming(0.0) is None
-    with pytest.raises(InputError, match="cannot be opened"):
-        Udp("127.0.0.1", source.address[1], rows())
-    source.close()
-    assert source.ended and source.incoming(0.0) is None
-
-
-def test_records_of_other_machines_need_a_named_sender() -> None:
-    for text in ("udp:0.0.0.0:0", "udp:[::]:0"):
-        with pytest.raises(InputError, match="no sender is named: anybody could send records"):
-            open_source(text, rows())
-    for text in ("udp:0.0.0.0:0?from=", "udp:0.0.0.0:0?from=,", "udp:0.0.0.0:0?from=no such.host"):
-        with pytest.raises(InputError, match="it is no address"):
-            open_source(text, rows())
-    with pytest.raises(InputError, match=r"the sender .nobody\.invalid. has no address"):
-        open_source("udp:0.0.0.0:0?from=127.0.0.1,nobody.invalid", rows())
-
-
-@pytest.mark.parametrize(
-    ("named", "ours"), [("127.0.0.1", True), ("192.0.2.1,localhost", True), ("any", True), ("192.0.2.1", False)]
-)
-def test_only_datagrams_of_named_senders_are_records(named: str, ours: bool) -> None:
-    source = open_source(f"udp:0.0.0.0:0?from={named}", rows())
-    assert isinstance(source, Udp)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        sender.settimeout(0.2)
-        found = []
-        for _ in range(3):
-            sender.sendto(json.dumps(WHOLE).encode(), ("127.0.0.1", source.address[1]))
-            found.append(source.incoming(2.0))
-            if found[-1] is not None:
-                source.acknowledge(found[-1], 1)
-        if ours:
-            assert [r is not None and r.fault for r in found] == ["", "", ""]
-            assert json.loads(sender.recv(2000))["acknowledged"] == 1
-        else:
-            assert found[0] is not None and "from 127.0.0.1, which is not named as a sender" in found[0].fault
-            assert found[1:] == [None, None]
-            with pytest.raises(TimeoutError):
-                sender.recv(2000)
-    source.close()
-
-
 @pytest.mark.slow
 def test_memory_stays_flat_over_a_long_line_and_many_records(tmp_path: Path) -> None:
     import tracemalloc
@@ -483,26 +339,3 @@ def test_a_pipe_in_the_place_of_a_followed_file_is_not_waited_for(tmp_path: Path
     path.unlink()
     path.write_text(table(3, 7))
     assert len(everything(source)) == 3
-
-
-@pytest.mark.slow
-def test_a_pipe_that_takes_the_place_of_a_file_before_it_is_opened_is_not_waited_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "a.csv").write_text(table(1))
-    (tmp_path / "b.csv").write_text(table(1, 7))
-    settled = Folder._is_settled
-
-    def replaced(self: Folder, name: str, watched: Any) -> bool:
-        ready = settled(self, name, watched)
-        if ready and name == "a.csv":
-            (tmp_path / name).unlink()
-            os.mkfifo(tmp_path / name)
-        return ready
-
-    monkeypatch.setattr(Folder, "_is_settled", replaced)
-    found: list[Incoming] = []
-    looking = threading.Thread(target=lambda: found.extend(everything(folder(tmp_path), 0.5)), daemon=True)
-    looking.start()
-    looking.join(10)
-    assert not looking.is_alive() and ids(found) == ["p7"]

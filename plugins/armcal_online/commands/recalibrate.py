@@ -8,18 +8,16 @@ from armcal.calibration.calibration import Calibration
 from armcal.cli.common import Console, overrides, speaking
 from armcal.errors import InputError, Location
 from armcal.io.lines import StandardOutput
-from armcal.io.udp import UDP_KINDS, parsed
 
 from armcal_online.running.session import Setup, opened
 from armcal_online.sources.csv_file import CsvFile
-from armcal_online.sources.folder import Folder
 from armcal_online.sources.row_parser import RowParser
 from armcal_online.sources.source import AtEnd, Source
-from armcal_online.sources.streams import Lines, Udp
+from armcal_online.sources.streams import Lines, Sent
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import load_settings
 
-KINDS = f"- (standard input), {UDP_KINDS}, a directory, or a CSV file"
+KINDS = "socket (programs send to control.sock in --out), - (standard input), or a CSV file"
 
 
 @click.command()
@@ -62,23 +60,17 @@ def recalibrate(
 
 
 def open_source(text: str, rows: RowParser, at_end: AtEnd = "stop") -> Source:
-    """A source by its name: ``-``, ``udp:PORT``, ``udp:HOST:PORT?from=SENDER``, a directory, or a CSV file.
+    """A source by its name: ``socket``, ``-``, or a CSV file.
 
     Raises:
         InputError: it is none of these, or cannot be opened.
         DataError: the header of a file cannot be used.
     """
+    if text == "socket":
+        return Sent(rows)
     if text == "-":
         return Lines(sys.stdin.fileno(), rows)
-    if text.startswith("udp:"):
-        address = parsed(text)
-        if address is None:
-            raise InputError("it is no address.", where=Location(text), hint=f"Give {KINDS}.")
-        host, port, senders = address
-        return Udp(host, port, rows, senders)
     path = Path(text)
-    if path.is_dir():
-        return Folder(path, rows)
     if not path.exists():
-        raise InputError("there is no such file or directory.", where=Location(text), hint=f"Give {KINDS}.")
+        raise InputError("there is no such file.", where=Location(text), hint=f"Give {KINDS}.")
     return CsvFile(path, rows, at_end)

@@ -43,12 +43,14 @@ def ask(folder: Path, request: Mapping[str, Any], timeout_s: float = 30.0) -> di
 
 
 def answer(recalibration: Recalibration, request: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The reply to one of the known commands, which act at once: ``ok``, and what it says.
+    """The reply to one of the known commands, which act at once, or to a record: ``ok``, and what it says.
 
     Raises:
         ArmcalError: the request cannot be met.
     """
-    match request.get("command"):
+    if "command" not in request:
+        return recalibration.receive(request)
+    match request["command"]:
         case "status":
             pass
         case "pause":

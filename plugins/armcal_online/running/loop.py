@@ -12,17 +12,18 @@ from typing import Any
 from zlib import crc32
 
 from armcal.base.config_text import finite
-from armcal.errors import ArmcalError, DataError, Location
+from armcal.errors import ArmcalError, DataError, InputError, Location
 from armcal.io.journal import Entry, Journal, JournalFullError
 from armcal.io.json_server import JsonServer
 from armcal.io.signals import Signals
 
 from armcal_online.running.outputs import Outputs
-from armcal_online.sources.source import THROUGH, Incoming, Source
+from armcal_online.sources.source import Incoming, Source
+from armcal_online.sources.streams import Sent
 from armcal_online.tracking.recalibrator import Recalibrator
 
 WAIT_S = 0.1  # how long a source is waited for before control and signals are looked at again
-MAX_FILES = 2000  # so many files are remembered one by one; of the others, that all up to a name were taken
+MAX_FILES = 100  # so many files are remembered that took the place of each other
 RECENT = 256  # so many records are remembered, so that one that is sent again counts once
 
 STARTED, RECORD, ROLLBACK, PAUSE, RESUME = "started", "record", "rollback", "pause", "resume"  # Kinds of entries
@@ -39,12 +40,7 @@ class Progress:
     records: int = 0  # how many records were journalled, from the beginning
     paused: bool = False  # whether records are passed over
     rows: dict[str, int] = field(default_factory=dict)  # the last one taken, by file
-    through: str = ""  # all files up to this name were taken
     recent: dict[str, int] = field(default_factory=dict)  # sequence numbers of the last records of streams
-
-    @property
-    def positions(self) -> dict[str, int]:
-        return {**self.rows, **({THROUGH + self.through: 0} if self.through else {})}
 
     def take(self, incoming: Incoming, sequence: int) -> None:
         """A record was journalled."""
@@ -53,9 +49,7 @@ class Progress:
             key = incoming.source_key
             self.rows[key] = max(self.rows.get(key, 0), incoming.source_row)
             if len(self.rows) > MAX_FILES:
-                first = min(self.rows)
-                del self.rows[first]
-                self.through = max(self.through, first)
+                del self.rows[next(iter(self.rows))]
         elif not incoming.fault:
             self.recent[_mark(incoming)] = sequence
             if len(self.recent) > RECENT:
@@ -70,7 +64,6 @@ class Progress:
             "records": self.records,
             "paused": self.paused,
             "positions": dict(self.rows),
-            "through": self.through,
             "recent": dict(self.recent),
         }
 
@@ -78,7 +71,7 @@ class Progress:
     def from_dict(cls, content: Mapping[str, Any]) -> Progress:
         """What ``as_dict`` wrote."""
         rows, recent = dict(content["positions"]), dict(content["recent"])
-        return cls(int(content["records"]), bool(content["paused"]), rows, str(content["through"]), recent)
+        return cls(int(content["records"]), bool(content["paused"]), rows, recent)
 
 
 def _mark(incoming: Incoming) -> str:
@@ -215,6 +208,7 @@ class Recalibration:
         self._calibrated = self._status_written = -float("inf")
         self.sequence = journal.sequence
         self.finishing = ""
+        self._fault: Exception | None = None  # of a record that a program sent
 
     @property
     def journal(self) -> Journal:
@@ -246,7 +240,9 @@ class Recalibration:
     def _follow(self, signals: Signals) -> None:
         self.write_calibration()
         while not self.finishing:
-            self._control.serve()
+            self._control.serve(WAIT_S if isinstance(self._source, Sent) else 0.0)
+            if self._fault is not None:
+                raise self._fault
             if signals.finish:
                 self.finishing = "It was asked to finish by a signal."
             if signals.rotate:
@@ -338,14 +334,31 @@ class Recalibration:
             path = str(self._outputs.calibration_path)
             self._outputs.event({"event": "calibration", "sequence": self.sequence, "at": time.time(), "path": path})
 
-    def _take(self, incoming: Incoming) -> None:
+    def receive(self, fields: Mapping[str, Any]) -> dict[str, Any]:
+        """Take a record that a program sent to the control socket; its acknowledgement, once it is kept.
+
+        Raises:
+            InputError: records are read from elsewhere, or it is about to end.
+        """
+        if not isinstance(self._source, Sent) or self.finishing:
+            why = "it is about to end" if self.finishing else "records are read from elsewhere"
+            hint = "Send it again when it runs." if self.finishing else "Start `armcal recalibrate` with --from socket."
+            raise InputError(f"no record is taken here: {why}.", hint=hint)
+        incoming = self._source.received(fields)
+        try:
+            sequence = self._take(incoming)
+        except Exception as fault:
+            self._fault = fault  # it stops the recalibration too
+            raise
+        reply = {"ok": True, "acknowledged": sequence, "id": incoming.record_id}
+        return {**reply, "fault": incoming.fault} if incoming.fault else reply
+
+    def _take(self, incoming: Incoming) -> int:
         earlier = None if self._source.keeps_records else self._state_replayer.progress.repeated(incoming)
         if earlier is not None:
-            self._source.acknowledge(incoming, earlier)
-            return
+            return earlier
         content = incoming.as_dict()
         self.sequence = self._journal.record(RECORD, content)
-        self._source.acknowledge(incoming, self.sequence)
         events = self._state_replayer.apply(self.sequence, RECORD, content)
         self._since_calibration += 1
         self._since_checkpoint += 1
@@ -355,6 +368,7 @@ class Recalibration:
                 self._journal.note(event["event"], finite(event))
         if any(event["event"] == "decision" for event in events):
             self.write_calibration()
+        return self.sequence
 
     def _command(self, kind: str) -> None:
         self.sequence = self._journal.record(kind, {"at": time.time()})

@@ -65,7 +65,7 @@ def opened(setup: Setup, session: Recalibrator, source: Source) -> Iterator[Reca
         journal = stack.enter_context(Journal(setup.folder, header, total))
         state_replayer = StateReplayer(session, journal.until, str(journal.path))
         left = _recover(setup, journal, state_replayer, header)
-        source.resume(state_replayer.progress.positions)
+        source.resume(state_replayer.progress.rows)
         outputs = Outputs(setup.folder, setup.stream)
         stack.callback(outputs.close)
         resumed = not journal.is_new

@@ -43,7 +43,7 @@ class CsvFile(Source):
         where = Location(str(path))
         with contextlib.suppress(OSError):  # of a path that leads nowhere, input_file says what is wrong
             if not S_ISREG(path.stat().st_mode):
-                hint = "Give a file, a directory, or - for a pipe."
+                hint = "Give a file, or - for a pipe."
                 raise InputError("it is not a regular file.", where=where, hint=hint)
         with input_file(path, sys.maxsize, "a file of records", InputError) as file:
             head = file.read(MAX_LINE_BYTES)

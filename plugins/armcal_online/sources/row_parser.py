@@ -6,11 +6,10 @@ A source must survive any input: what cannot be read becomes a record with a fau
 import csv
 import json
 import math
-import os
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, BinaryIO, Literal
+from typing import Any, Literal
 
 from armcal.base.units import from_unit
 from armcal.errors import DataError
@@ -244,8 +243,6 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return fields
 
 
-MAX_JSON_BYTES = 4 * 1024**2
-
 _CHUNK = 64 * 1024
 
 
@@ -308,48 +305,3 @@ class LineReading:
 
     def _place(self) -> Place:
         return Place(self._key, self._row)
-
-
-class WholeReading:
-    """A file that is one JSON object, or an array of them; rows count these.
-
-    Attributes:
-        offset: its size when it was read.
-        row: how many objects were taken.
-    """
-
-    def __init__(self, file: BinaryIO, rows: RowParser, key: str, through: int) -> None:
-        self._rows, self._key = rows, key
-        self._objects: deque[Any] = deque()
-        self._fault = ""
-        self.row = 0
-        with file:
-            self.offset = os.fstat(file.fileno()).st_size
-            data = file.read(MAX_JSON_BYTES + 1)
-        try:
-            if len(data) > MAX_JSON_BYTES:
-                raise ValueError("it has more than 4 MiB")
-            objects = json.loads(data.decode("utf-8-sig"))
-        except (ValueError, RecursionError) as fault:
-            self._fault = f"The file is not JSON ({fault})."
-            return
-        self._objects.extend(objects if isinstance(objects, list) else [objects])
-        while self._objects and self.row < through:
-            self._objects.popleft()
-            self.row += 1
-
-    @property
-    def begun(self) -> bool:
-        return bool(self._fault)
-
-    def next(self) -> Incoming | None:
-        """The next record; None if there is no other."""
-        if not self._objects:
-            return None
-        self.row += 1
-        return self._rows.object(self._objects.popleft(), Place(self._key, self.row))
-
-    def last(self) -> Incoming | None:
-        """Why it cannot be read, now that it does not change any more."""
-        fault, self._fault = self._fault, ""
-        return faulty(Place(self._key), fault) if fault else None

@@ -10,7 +10,6 @@ from typing import Any, Literal, Protocol
 
 AtEnd = Literal["stop", "wait"]  # what a file's end means: there is no more, or more may come
 POLL_S = 0.05  # how often a file is looked at again
-THROUGH = "/"  # before a name among positions: all files up to that name were taken. No file's name begins so.
 
 
 @dataclass(frozen=True)
@@ -89,10 +88,6 @@ class Source(Protocol):
 
     def resume(self, positions: Mapping[str, int]) -> None:
         """Pass over what was taken before: the last row taken, by file. Nothing for a stream, which begins anew."""
-        return
-
-    def acknowledge(self, incoming: Incoming, sequence: int) -> None:
-        """Tell the sender, if there is one, that a record is safe. Nothing for files: the journal keeps the row."""
         return
 
     def close(self) -> None:

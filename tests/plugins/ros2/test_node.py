@@ -121,47 +121,43 @@ def play(node: Any, tour: bags.Tour, answer: Any = lambda: None) -> None:
             looked = received
 
 
-@pytest.fixture
-def listener() -> Iterator[socket.socket]:
-    """A port that stands for another program."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as own:
-        own.bind(("127.0.0.1", 0))
-        own.settimeout(5)
-        yield own
-
-
-def port_of(own: socket.socket) -> int:
-    return int(own.getsockname()[1])
-
-
 def test_the_file_compiles_and_is_lint_free(calibration: Path) -> None:
     path = exported(calibration)
     ast.parse(path.read_text(), feature_version=(3, 10))
     lint = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "E,F,W,I,B,SIM,C4", "--ignore", "B905"]
     done = subprocess.run([*lint, "--line-length", "120", str(path)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
-    assert "udp:5005" in path.read_text() and "@" not in path.read_text()
+    assert "--from socket --out kept" in path.read_text() and "@" not in path.read_text()
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("stubs")
 def test_rests_become_records_in_order_each_until_it_is_acknowledged(
-    tour: bags.Tour, calibration: Path, listener: socket.socket
+    tour: bags.Tour, calibration: Path, tmp_path: Path
 ) -> None:
-    node = made_node(exported(calibration, f"recalibrate_port={port_of(listener)}"))
+    node = made_node(exported(calibration, f"folder={tmp_path}"))
     records: list[dict[str, Any]] = []
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(tmp_path / "control.sock"))
+    listener.listen()
     listener.setblocking(False)
+    connections: list[socket.socket] = []
 
     def acknowledge() -> None:
         try:
-            data, sender = listener.recvfrom(65536)
+            if not connections:
+                connections.append(listener.accept()[0])
+                connections[0].setblocking(False)
+            data = connections[0].recv(65536)
         except BlockingIOError:
             return
-        records.append(json.loads(data))
-        reply = {"acknowledged": len(records), "id": records[-1]["id"]}
-        if len(records) % 3:  # every third answer is lost
-            listener.sendto(json.dumps(reply).encode(), sender)
+        records.append(json.loads(data.splitlines()[0]))
+        reply = {"ok": True, "acknowledged": len(records), "id": records[-1]["id"]}
+        if len(records) % 3:  # every third time it goes away without an answer
+            connections[0].sendall(json.dumps(reply).encode() + b"\n")
         else:
+            connections.pop().close()
+            node.on_answers()
             node.on_second()
 
     play(node, tour, acknowledge)
@@ -223,12 +219,6 @@ def test_a_calibration_without_a_tip_measurement_is_refused(calibration: Path) -
         exported(calibration, "measurement=other")
 
 
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as own:
-        own.bind(("127.0.0.1", 0))
-        return port_of(own)
-
-
 @contextmanager
 def armcal(*arguments: str | Path) -> Iterator[subprocess.Popen[bytes]]:
     """A command that runs until the end of the block."""
@@ -253,13 +243,12 @@ def until(node: Any, done: Callable[[], bool], ask: Callable[[], None]) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("stubs")
 def test_a_real_recalibration_and_a_real_server(tour: bags.Tour, calibration: Path, tmp_path: Path) -> None:
-    port, kept, count, path = free_port(), tmp_path / "kept", len(tour.rests), tmp_path / "arm.sock"
-    node = made_node(exported(calibration, f"recalibrate_port={port}", f"serve_socket={path}"))
-    with armcal("recalibrate", calibration, "--from", f"udp:{port}", "--out", kept):
+    kept, count, path = tmp_path / "kept", len(tour.rests), tmp_path / "arm.sock"
+    node = made_node(exported(calibration, f"folder={kept}", f"serve_socket={path}"))
+    with armcal("recalibrate", calibration, "--from", "socket", "--out", kept):
         play(node, tour)
         until(node, lambda: not node.waiting, node.on_second)
         assert node.counts == {"records": count, "acknowledged": count, "refused": 0}
-        node.set["folder"] = str(kept)
         time.sleep(1.5)
         assert {value.key: value.value for value in node.report().values}["level"] in ("nominal", "watch")
     verdicts = [e["verdict"] for e in map(json.loads, (kept / "events.jsonl").open()) if e["event"] == "record"]
