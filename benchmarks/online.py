@@ -18,9 +18,8 @@ from armcal.problem.kernel import NEAR_REST_RAD
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal_kalman.filters import ExtendedFilter, ExtendedSettings
-from armcal_online.tracking.belief import Belief, GaussMarkovStates
+from armcal_online.tracking.belief import Belief, GaussMarkovStates, StateSpace
 from armcal_online.tracking.observer import Observer, Reading
-from armcal_online.tracking.state_space import StateSpace
 from filterpy.kalman import ExtendedKalmanFilter
 
 from benchmarks import lrm

@@ -16,10 +16,9 @@ from armcal_online.sources.source import Incoming
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.decisions import KINDS, LEVEL_ADVICE, LEVELS, Decision, advice, log_odds_of, per_cent, sure
 from armcal_online.tracking.events import decided, last_good, record_name, spoken_time
-from armcal_online.tracking.health import Health
 from armcal_online.tracking.hypotheses import Kind
 from armcal_online.tracking.recalibrator import Recalibrator
-from armcal_online.tracking.state import REMEMBERED, Arrival, State, remembering, troubled
+from armcal_online.tracking.state import REMEMBERED, Arrival, Health, State, remembering, troubled
 from online_arm import World, begun, predicted, random_poses, settings, told
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -15,8 +15,8 @@ from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
 from armcal_online.mission.mission import MissionPlan, before_launch
 from armcal_online.sources.source import Incoming
-from armcal_online.tracking.health import Health
 from armcal_online.tracking.recalibrator import Recalibrator
+from armcal_online.tracking.state import Health
 from online_arm import AXES, JOINTS, World, begun, calibration, told
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "mission.yaml"

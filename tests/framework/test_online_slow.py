@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from armcal.estimate.online import Gaussian, Linearised, kalman_update, log_likelihood
 from armcal_online.tracking.belief import Belief, GaussMarkovStates, ProcessNoise, shared_error
-from armcal_online.tracking.hypotheses import Hypothesis
-from armcal_online.tracking.slow_changes import SlowChanges, SlowState
+from armcal_online.tracking.hypotheses import Hypothesis, SlowChanges, SlowState
 from online_arm import World, begun, settings, told
 
 N, RECORDS, SECONDS = 3, 40, 3600.0

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 if TYPE_CHECKING:  # the watcher reads this table, and has no need of numpy
-    from armcal_online.tracking.sizes import Size
+    from armcal_online.tracking.window_evidence import Size
 
 Level = Literal["nominal", "watch", "suspect", "lost"]  # of health
 LEVELS: tuple[Level, ...] = get_args(Level)  # from the best to the worst

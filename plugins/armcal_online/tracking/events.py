@@ -10,12 +10,11 @@ from armcal.estimate.online import Linearised
 
 from armcal_online.sources.source import Incoming
 from armcal_online.tracking.decisions import LEVEL_ADVICE, LEVELS, Decision, advice, per_cent, sure
-from armcal_online.tracking.health import Health
 from armcal_online.tracking.hypotheses import CAUSES, LINK, Recent, Steps, spoken
 from armcal_online.tracking.settings import RecalibrateSettings
-from armcal_online.tracking.sizes import SHOWN, TipError
 from armcal_online.tracking.start import FilterSetup
-from armcal_online.tracking.state import Arrival, State
+from armcal_online.tracking.state import Arrival, Health, State
+from armcal_online.tracking.window_evidence import SHOWN, TipError
 
 _MOST_LOG_ODDS = 700.0
 _FIRST_DATE, _LAST_DATE = 1e8, 1e11  # unix seconds (1973 to 5138); other times are of a clock that began elsewhere

@@ -20,8 +20,7 @@ from armcal.problem.problem import Problem
 from scipy.linalg import block_diag
 from typing_extensions import override
 
-from armcal_online.tracking.belief import Belief, GaussMarkovStates
-from armcal_online.tracking.state_space import StateSpace
+from armcal_online.tracking.belief import Belief, GaussMarkovStates, StateSpace
 
 
 class OneRecord:

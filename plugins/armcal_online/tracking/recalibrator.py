@@ -27,18 +27,13 @@ from armcal_online.sources.source import Incoming
 from armcal_online.tracking import events
 from armcal_online.tracking.belief import Belief, most_likely
 from armcal_online.tracking.decisions import EXPLAINED, Decision
-from armcal_online.tracking.health import nis_limit
-from armcal_online.tracking.hypotheses import GRADUAL, Recent, find_steps, hypotheses, slow_changes
-from armcal_online.tracking.judge import Judge
+from armcal_online.tracking.hypotheses import GRADUAL, Recent, SlowChanges, find_steps, hypotheses, slow_changes
+from armcal_online.tracking.judge import Judge, beside_model_error
 from armcal_online.tracking.observer import Reading
-from armcal_online.tracking.sentences import beside_model_error
 from armcal_online.tracking.settings import RecalibrateSettings
-from armcal_online.tracking.sizes import in_model_errors, tip_error
-from armcal_online.tracking.slow_changes import SlowChanges
-from armcal_online.tracking.start import filter_setup
-from armcal_online.tracking.state import Arrival, State, Tick, advanced, remembering, ticked, troubled
-from armcal_online.tracking.updated import calibration_text, deviations
-from armcal_online.tracking.window_evidence import HypothesisFilter
+from armcal_online.tracking.start import calibration_text, deviations, filter_setup
+from armcal_online.tracking.state import Arrival, State, Tick, advanced, nis_limit, remembering, ticked, troubled
+from armcal_online.tracking.window_evidence import HypothesisFilter, in_model_errors, tip_error
 
 _WEEK = 7.0  # days
 _FARTHEST = 100.0  # rad or m; a joint beyond it is a fault of the record
