@@ -386,7 +386,7 @@ def test_a_drift_as_stated_is_no_error_of_the_model(lrm, seeds):
     for seed in seeds:
         problem, records = posed(lrm, recorded(lrm, 50, seed, PLANTED), PLANTED)
         fit = estimate(problem, records, SOLVER.solve(problem, records, problem.parameters.nominal()))
-        finding = _size(fit, Evidence())
+        finding = _size(fit, np.ones(1), Evidence())
         assert finding.grade == "warning" or "model explains the data" in finding.text
         warned += finding.grade == "warning"
     low, high = binom.ppf([1e-3, 1 - 1e-3], len(seeds), LEVEL / 2)
