@@ -12,7 +12,7 @@ import pytest
 from armcal.cli.main import cli
 from armcal.diagnose.evidence import Evidence
 from armcal.diagnose.evidence_findings import percent, structure_findings
-from armcal.diagnose.predictable import FEWEST_POSES, predictable
+from armcal.diagnose.predictable import FEWEST_POSES, LEVEL, predictable
 from armcal.diagnose.residual_structure import structure
 from armcal.diagnose.score_tests import FitRows, linear_fit
 from armcal.diagnose.verdict import _left
@@ -21,6 +21,7 @@ from armcal.problem.motion import Motion, recorded_position
 from armcal_ipopt.estimator import IpoptEstimator
 from click.testing import CliRunner
 from noise_cases import FEW, NOISE_M, posed
+from scipy.stats import binom
 
 COUNT = 240
 UR10 = Path(__file__).resolve().parents[3] / "shared" / "data" / "ur10_leica" / "random_poses.csv"
@@ -135,7 +136,7 @@ def test_of_too_few_poses_nothing_is_known_however_often_they_were_repeated(lrm)
     problem, records, estimate, motion, dataset = parts
     left = structure(problem, records, estimate, dataset, motion, recorded_position(dataset))
     assert any("too few distinct poses" in finding.text for finding in structure_findings(left))
-    assert all("nothing" not in sentence for sentence in _left(Evidence(left)))
+    assert all("nothing" not in sentence for sentence in _left(Evidence(left), estimate))
     none = structure_findings(None)
     assert "too few" in none[0].text and none[0].grade == "note"
 
@@ -167,9 +168,9 @@ def test_an_industrial_arm_leaves_what_joints_predict_and_learning_takes_it_away
 
 
 @pytest.mark.slow
-def test_fits_without_structure_give_no_finding(lrm):
+def test_fits_without_structure_give_a_finding_as_often_as_stated(lrm):
     above = []
-    for seed in range(40):
+    for seed in range(120):
         rng = np.random.default_rng(seed)
         q = rng.uniform(-1.7, 1.7, (70, 6))
         points = oracle.tip(oracle.published(), q) + NOISE_M * rng.normal(size=(70, 3))
@@ -180,7 +181,7 @@ def test_fits_without_structure_give_no_finding(lrm):
         own = Residuals(problem, records, estimate, motion, dataset)
         above.append(predictable(problem, own.rows, own.basis, motion, dataset).above_chance)
     print(f"{sum(above)} of {len(above)}")
-    assert sum(above) <= 2
+    assert sum(above) <= binom.ppf(1 - 1e-3, len(above), LEVEL)
 
 
 @pytest.mark.parametrize(
