@@ -10,15 +10,13 @@ from armcal.cli.common import Console, speaking
 from armcal.errors import InputError, Location
 from armcal.version import JSON_SCHEMA
 
-from armcal_online.running.control import GOOD, ask
+from armcal_online.running.control import COMMANDS, GOOD, ask
 from armcal_online.running.situation import is_running, present
-
-_COMMANDS = ("status", "pause", "resume", "finish", "rollback")
 
 
 @click.command()
 @click.argument("folder", type=click.Path(path_type=Path))
-@click.argument("command", type=click.Choice(_COMMANDS))
+@click.argument("command", type=click.Choice(COMMANDS))
 @click.argument("values", nargs=-1)
 @click.option("--timeout", default=60.0, show_default=True, help="How long to wait for the answer, in seconds.")
 @speaking
