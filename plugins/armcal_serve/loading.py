@@ -82,9 +82,9 @@ class Loader:
         identity = record.identity.get("arm", "")
         if self._arm and identity != self._arm:
             raise ConfigError(
-                f"it is of another arm ({identity[:12]}, expected {self._arm[:12]}).",
+                f"it is of another arm, or of one with other statics ({identity[:12]}, expected {self._arm[:12]}).",
                 where=Location(order.shown),
-                hint="Put a calibration of the same arm there, or start a server of its own for this one.",
+                hint="Put a calibration of the same arm and statics there, or start a server of its own for this one.",
             )
         recalibrated = (record.recalibrated or {}).get("sequence")
         tag = {

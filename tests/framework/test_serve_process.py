@@ -124,7 +124,7 @@ def test_calibrations_are_replaced_under_load_and_only_whole_ones(
                 file.write(half[at : at + len(half) // 4])
                 file.flush()
                 time.sleep(0.3)
-            running.until(lambda status: status["file"]["state"] == "refused")
+            running.until(lambda status: "no whole calibration" in status["file"]["why"])
         put(path, texts[2])
         assert taken(running, texts[2])["calibration"]["sequence"] == 3
         ended(clients)

@@ -1,8 +1,9 @@
-"""A calibrated arm as expressions: where its tool is, for what it is told and what acts on it.
+"""A calibrated arm as expressions: where its tool is, for what it is commanded and what acts on it.
 
 All parameters are numbers at their calibrated values; what remains are the commands, the approach, the load and the
-elastic state. From these come compensation, maps of what the arm can do, and code for other computers. Who loads one
-calibration of an arm after another has some parameters *tuned*: these are channels too, and nothing is compiled again.
+elastic state. From these come compensation, maps of what the arm can do, and code for other computers. A server
+that loads one calibration of an arm after another has some parameters *tuned*: they are channels too, and nothing is
+compiled again.
 """
 
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
@@ -152,8 +153,8 @@ def arm_expression(
 ) -> ToolExpression:
     """The expressions of an arm at the nominal values of ``parameters``, under what acts where nothing is said.
 
-    ``conditions`` are those of the surroundings that will be told (``temperature``); others are taken as the effects
-    take what is not told. The parameters that are ``tuned`` are channels of a record, as ``retuned`` needs it.
+    ``conditions`` are those of the surroundings that will be stated (``temperature``); others are taken as the
+    effects take what is not stated. ``tuned`` parameters are channels of a record, as ``retuned`` needs it.
 
     Raises:
         ValueError: the arm does not change with a condition.

@@ -147,7 +147,7 @@ class PlainAnswers(Answers):
             yield as_line(self._answer(request)).encode()
         except (ArmcalError, ValueError) as fault:
             yield self.refusal(fault)
-        except Exception as fault:  # whoever asks, and whatever, cannot end what is served
+        except Exception as fault:  # no request may end the server
             yield self.refusal(ArmcalError(f"it failed ({type(fault).__name__}: {fault})."))
 
     def refusal(self, fault: Exception) -> bytes:

@@ -219,7 +219,7 @@ class Recalibration:
         return self._state_replayer.progress.paused
 
     def run(self) -> None:
-        """Until the source ends, a signal comes, or a request to finish; whoever watches is told of a fault too.
+        """Until the source ends, a signal comes, or a request to finish; the status says a fault too.
 
         Raises:
             JournalFullError, JournalFailedError: the disk is full or fails; what was acknowledged is safe.
@@ -260,7 +260,7 @@ class Recalibration:
             self.write_calibration()
 
     def _end(self, sentence: str, why: Mapping[str, str]) -> None:
-        """Say so to whoever watches: in the status first, for which room is reserved."""
+        """Write it: into the status first, for which room is reserved."""
         self._outputs.status({**self.status(), "finished": True, **why})
         event = {"event": "finished", "sequence": self.sequence, "at": time.time(), "sentence": sentence}
         self._outputs.event(event)

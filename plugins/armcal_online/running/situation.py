@@ -1,4 +1,4 @@
-"""What whoever is called at night has to know: what to do, how far off, since when, and where to roll back to.
+"""The first screen for an operator on call: what to do, how far off, since when, and where to roll back to.
 
 A recalibration keeps it from its own events and writes it into ``status.json``. Whether that process still runs is not
 its own to say: ``present`` asks the control socket, which ends with the process.

@@ -144,15 +144,17 @@ class Compensator:
         return Commands.joined([part for part in self.following(targets, start) if part is not None])
 
     def following(self, targets: Targets, start: Array | None = None) -> Iterator[Commands | None]:
-        """The same a little at a time, for who has others to attend to: None while it is sought, then part by part.
+        """The same a little at a time, for a server with other clients: None while it searches, then part by part.
 
         Raises:
             ValueError: as of ``solve``.
         """
-        record, path = self._record(targets), None
+        record = self._record(targets)
         finder = PathFinder(self._kind(targets).finder, len(self.joints), self._tells_approach)
         at = None if start is None else self._commanded(start, 1)[:, 0]
-        for path in finder(record, _goal(targets), at):  # noqa: B007
+        path = None
+        for step in finder(record, _goal(targets), at):
+            path = step
             yield None
         assert path is not None
         record[len(self.joints) : 2 * len(self.joints)] = path.approach

@@ -132,7 +132,7 @@ class Rounding:
         solver: Solver,
         choice: EvaluatorChoice = "auto",
     ) -> None:
-        """For the targets of a solver; joints that it holds are only rounded."""
+        """For the targets of a solver."""
         self._counts, self._equilibrium, self._solver = counts, equilibrium, solver
 
         def slope() -> BatchFunction:

@@ -45,7 +45,7 @@ class PathFinder:
     def __call__(self, record: Array, target: Array, start: Array | None) -> Iterator[Path | None]:
         """Follow targets (3 or 12 x N) under records (channels x N) from commands (n), or from wherever is best.
 
-        None after each target, for a caller that has others to attend to; the path at last.
+        None after each target, for a server with other clients; the path at last.
         """
         ways = self.beginnings(record, target) if start is None else start[:, None]
         count, wide = target.shape[1], ways.shape[1]
