@@ -40,9 +40,14 @@ def variant(text: str, number: int) -> str:
 def foreign(text: str) -> str:
     """A calibration that is whole, and of another arm."""
     content = yaml.safe_load(text)
-    content["statics"]["body"] = "moon"
+    content["arms"]["arm"]["model"]["rows"][0]["d_m"] += 0.001
+    return described(content)
+
+
+def described(content: dict[str, Any]) -> str:
+    """A calibration whose arm or statics were changed."""
     content["identity"]["arm"] = identity_of({key: content[key] for key in ("arms", "measurements", "statics")})
-    return sealed(content)
+    return sealed({**content, "checks": None})
 
 
 def sha256(text: str) -> str:

@@ -72,8 +72,9 @@ def serve(
         evaluator=evaluator,
         accept=accept,
     )
+    server = Server(order, _notifier(console), path, streams)
     with Signals() as signals:
-        Server(order, _notifier(console), path, streams).run(signals)
+        server.run(signals)
 
 
 def _notifier(console: Console) -> Notify:

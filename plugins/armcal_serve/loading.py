@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import lost_calibration
@@ -33,7 +33,7 @@ from armcal_serve.served_arm import TEMPERATURE, TEMPERATURE_KEY, ServedArm
 if TYPE_CHECKING:
     from armcal.run.plan_poses import Workspace
 
-LOOK_S = 0.2  # How often the file is looked at; a new one must look the same twice
+LOOK_S = 0.2  # How often the file is looked at
 _TRIES = 5  # Requests of each kind before the first real one: caches are filled by them
 _ORDINARY_C = 20.0
 _WORK_S, _REST_S = 0.001, 0.0015
@@ -66,9 +66,9 @@ class Loader:
 
     order: Order
     sequence: int = 0  # of the calibration that was loaded last
-    _arm: str = ""  # the identity of its arm
+    _arms: Mapping[str, Any] = field(default_factory=dict)  # its arms, as it describes them
     _spaces: dict[str, "Workspace"] = field(default_factory=dict)  # by arm, where there are limits
-    _made: dict[tuple[str, tuple[str, ...]], Compensator] = field(default_factory=dict)
+    _last: Mapping[str, ServedArm] = field(default_factory=dict)  # by name
 
     def load(self, data: bytes) -> tuple[Answerer, list[str]]:
         """The answerer of a calibration's bytes, and what its users should know of it."""
@@ -79,74 +79,68 @@ class Loader:
             warnings.simplefilter("always", CalibrationWarning)
             calibration = Calibration.load(order.shown, accept=order.accept or sequence > 1, content=data)
         record = calibration.record
-        identity = record.identity.get("arm", "")
-        if self._arm and identity != self._arm:
-            raise ConfigError(
-                f"it is of another arm, or of one with other statics ({identity[:12]}, expected {self._arm[:12]}).",
-                where=Location(order.shown),
-                hint="Put a calibration of the same arm and statics there, or start a server of its own for this one.",
-            )
+        if self._arms and record.arms != self._arms:
+            hint = "Put a calibration of the same arm there, or start a server of its own for this one."
+            raise ConfigError("it is of another arm.", where=Location(order.shown), hint=hint)
         recalibrated = (record.recalibrated or {}).get("sequence")
         tag = {
             "sequence": sequence,  # 1 for the one that the server began with, one more for each later one
             "created": record.created,
             "sha256": hashlib.sha256(data).hexdigest(),
-            "arm": identity,
+            "arm": record.identity.get("arm", ""),
             "recalibrated": recalibrated if isinstance(recalibrated, int) else None,
             "level": record.level,
         }
-        made: dict[tuple[str, tuple[str, ...]], Compensator] = {}
-        answerer = Answerer({name: self._served(calibration, name, made) for name in calibration.system.arms}, tag)
-        for _ in range(1 if self._made else _TRIES):
+        answerer = Answerer({name: self._served(calibration, name) for name in calibration.system.arms}, tag)
+        for _ in range(1 if self._last else _TRIES):
             warm_up(answerer)
-        lost = record.level == "lost" and not order.accept
-        if lost:
+        self.sequence, self._arms, self._last = sequence, record.arms, answerer.arms
+        if record.level == "lost" and not order.accept:
             answerer = Answerer(answerer.arms, tag, lost_calibration(record, order.shown))
-        self.sequence, self._arm, self._made = sequence, identity, made
         return answerer, [str(notice.message) for notice in caught]
 
-    def _served(
-        self, calibration: Calibration, name: str, made: dict[tuple[str, tuple[str, ...]], Compensator]
-    ) -> ServedArm:
-        arm, statics = calibration.system.arms[name], calibration.system.statics
-        joints = tuple(arm.commanded)
-        unserved = [
-            f"{condition.name} (effect {name}.{effect})"
-            for effect, condition in arm.declared
-            if condition.name != TEMPERATURE
-        ]
+    def _served(self, calibration: Calibration, name: str) -> ServedArm:
+        arm, statics, before = calibration.system.arms[name], calibration.system.statics, self._last.get(name)
+        unserved = [f"{c.name} (effect {name}.{effect})" for effect, c in arm.declared if c.name != TEMPERATURE]
         if unserved:
             raise ConfigError(
                 f"the arm {name} changes with {', '.join(unserved)}, which a request cannot state.",
                 where=Location(self.order.shown),
                 hint="Use armcal predict or armcal compensate, which read it from a column.",
             )
-        for conditions in ((), (TEMPERATURE,)) if TEMPERATURE in arm.conditions else ((),):
-            made[name, conditions] = self._compensator(calibration, name, joints, conditions)
+        heated = None
+        if TEMPERATURE in arm.conditions:
+            heated = self._compensator(calibration, name, (TEMPERATURE,), before.heated if before else None)
         needs_payload = arm.depends_on_payload and statics.payload is None
         kept, recorded = calibration.record.prediction, None
         if kept is not None and kept.ranges:
             is_known = needs_payload or statics.payload is not None
             ranges = {channel: ends for channel, ends in kept.ranges.items() if channel != PAYLOAD or is_known}
-            recorded = RecordedRange.of(ranges, [*(f"{name}.{joint}" for joint in joints), PAYLOAD], {name: arm})
-        compensators = made[name, ()], made.get((name, (TEMPERATURE,)))
+            recorded = RecordedRange.of(ranges, [*(f"{name}.{joint}" for joint in arm.commanded), PAYLOAD], {name: arm})
         return ServedArm(
-            name, dict(arm.commanded), compensators[0], needs_payload, compensators[1], self.order.point, recorded
+            name,
+            dict(arm.commanded),
+            self._compensator(calibration, name, (), before.compensator if before else None),
+            needs_payload,
+            heated,
+            self.order.point,
+            recorded,
         )
 
     def _compensator(
-        self, calibration: Calibration, name: str, joints: tuple[str, ...], conditions: tuple[str, ...]
+        self, calibration: Calibration, name: str, conditions: tuple[str, ...], before: Compensator | None
     ) -> Compensator:
-        order, before = self.order, self._made.get((name, conditions))
+        """Made of what was compiled for the calibration before, where it can be."""
+        order = self.order
         if order.within and name not in self._spaces:
             from armcal.plugins import discover  # late: not needed without limits
             from armcal.run.plan_poses import workspace_of
 
+            joints = tuple(calibration.system.arms[name].commanded)
             self._spaces[name] = workspace_of(Path(order.within), joints, discover())
         space = self._spaces.get(name)
         limits, allowed = (space.limits, space.allowed) if space else ({}, None)
-        options = Options(limits=limits, redundancy=order.redundancy)
-        like = None if before is None else before.expression
+        options, like = Options(limits=limits, redundancy=order.redundancy), before.expression if before else None
         expression = calibration.expression(name, conditions, order.point, calibration.free, like)
         try:
             return Compensator(expression, calibration.parameters, options, allowed, order.evaluator)
@@ -179,14 +173,8 @@ def _answer(answerer: Answerer, request: Mapping[str, Any]) -> dict[str, Any]:
 
 def require_whole(data: bytes, shown: str) -> None:
     """Refuse what cannot be a whole calibration."""
-    text = ""
-    if not data:
-        text = "the file is empty."
-    elif not data.endswith(b"\n"):
-        text = "the last line of the file has no end: this is no whole calibration."
-    elif not _LAST_LINE.search(data):
-        text = "the line that ends a calibration is not at the end of the file: this is no whole calibration."
-    if text:
+    if not _LAST_LINE.search(data):
+        text = f"found {len(data)} bytes that do not end with the line that ends a calibration: this is no whole one."
         raise ConfigError(text, where=Location(shown), hint="Take a whole copy, or run the calibration again.")
 
 
@@ -203,7 +191,7 @@ class _Breaks:
 
 
 class CalibrationFile:
-    """A calibration's file, which may be replaced at any time.
+    """A calibration's file, which may be replaced at any time; while it is entered a thread loads what replaces it.
 
     Attributes:
         state, why: of what is there now, and a sentence about it where it is not taken.
@@ -218,80 +206,63 @@ class CalibrationFile:
         self.served: Answerer | None = None
         self.news: list[tuple[str, str, Mapping[str, Any]]] = []
         self._loader = loader
-        self._seen: tuple[int, ...] | None = None
         self._tried: tuple[int, ...] | None = None
         self._ends = threading.Event()
-        self._fault: ArmcalError | None = None
-        self._thread = threading.Thread(target=self._run, name="armcal-load", daemon=True)
+        self._thread = threading.Thread(target=self._follow, name="armcal-load", daemon=True)
 
-    def start(self) -> None:
-        """Load the file, and each that takes its place, in a thread."""
+    def __enter__(self) -> Self:
         self._thread.start()
+        return self
 
-    def first(self) -> bool:
-        """Whether the first calibration is loaded."""
-        if self._fault is not None:
-            raise self._fault
-        return self.served is not None
-
-    def close(self) -> None:
+    def __exit__(self, *fault: object) -> None:
         self._ends.set()
-        if self._thread.is_alive():
-            self._thread.join(1.0)
+        self._thread.join(1.0)
 
     def look(self) -> None:
-        """Load what is there if it is another file than before, and was the same at two looks."""
+        """Load what is there if it is another file than before."""
         try:
             status = self.path.stat()
         except OSError:
-            self._seen = self._tried = None
-            self._say("missing", "there is no such file; the calibration before is used on.")
+            self._tried = None
+            why = "there is no such file; the calibration before is used on."
+            self._set("missing", why, f"{self.path}: {why}")
             return
         key = (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
-        settled, self._seen = key == self._seen, key
-        if settled and key != self._tried:
+        if key != self._tried:
             self._tried = key
-            try:
-                self.take(self._read())
-            except ArmcalError as fault:
-                self._say("refused", str(fault), f"the new calibration is not taken: {fault}")
-            except Exception as fault:
-                why = f"it cannot be used ({type(fault).__name__}: {fault})."
-                self._say("refused", why, f"the new calibration is not taken: {why}")
+            fault = self.take()
+            if fault is not None:
+                self._set("refused", str(fault), f"the new calibration is not taken: {fault}")
 
-    def take(self, data: bytes) -> None:
-        """Load a calibration's bytes, if they are not those that are served."""
+    def take(self) -> ArmcalError | None:
+        """Load the file, if its bytes are not those that are served; what is wrong with it."""
         before = self.served
-        if before is None or hashlib.sha256(data).hexdigest() != before.tag["sha256"]:
-            self.state, self.why = "loading", ""
-            answerer, notices = self._loader.load(data)
-            self.news += [("notice", notice, {}) for notice in notices]
-            self.served, tag = answerer, answerer.tag
-            if before is not None:
-                level = f", level {tag['level']}" if tag["level"] else ""
-                sentence = f"calibration {tag['sequence']} is answered from, of {tag['created']}{level}"
-                self.news.append(("calibration", sentence, {"calibration": tag}))
-        self.state, self.why = "taken", ""
-
-    def _run(self) -> None:
         try:
-            self.take(self._read())
+            with input_file(self.path, MAX_BYTES, "a calibration.yaml", ConfigError) as file:
+                data = file.read(MAX_BYTES)
+            if before is None or hashlib.sha256(data).hexdigest() != before.tag["sha256"]:
+                self.state, self.why = "loading", ""
+                self.served, notices = self._loader.load(data)
+                self.news += [("notice", notice, {}) for notice in notices]
         except ArmcalError as fault:
-            self._fault = fault
-            return
+            return fault
         except Exception as fault:
             text = f"it cannot be used ({type(fault).__name__}: {fault})."
-            self._fault = ArmcalError(text, where=Location(str(self.path)), hint="Report it with the file.")
-            return
+            return ArmcalError(text, where=Location(str(self.path)), hint="Report it with the file.")
+        self.state, self.why = "taken", ""
+        if before is not None and self.served is not None and self.served is not before:
+            tag = self.served.tag
+            level = f", level {tag['level']}" if tag["level"] else ""
+            sentence = f"calibration {tag['sequence']} is answered from, of {tag['created']}{level}"
+            self.news.append(("calibration", sentence, {"calibration": tag}))
+        return None
+
+    def _follow(self) -> None:
         sys.setprofile(_Breaks())  # of this thread: called with every call
         while not self._ends.wait(LOOK_S):
             self.look()
 
-    def _read(self) -> bytes:
-        with input_file(self.path, MAX_BYTES, "a calibration.yaml", ConfigError) as file:
-            return file.read(MAX_BYTES)
-
-    def _say(self, state: State, why: str, sentence: str = "") -> None:
+    def _set(self, state: State, why: str, sentence: str) -> None:
         if (state, why) != (self.state, self.why):
-            self.news.append((state, sentence or f"{self.path}: {why}", {"why": why} if sentence else {}))
+            self.news.append((state, sentence, {"why": why}))
         self.state, self.why = state, why

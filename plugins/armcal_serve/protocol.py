@@ -2,41 +2,32 @@
 
 import difflib
 import json
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, NoReturn
+from typing import Annotated, Any, Literal, NoReturn, Self
 
 from armcal.base.settings import Acceleration3, Angle, Angle3, Force3, Length3, Mass, Settings, Temperature, Torque3
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ArmcalError, DataError, InputError, Location
-from pydantic import Field, field_validator
+from pydantic import Field
 
 VERSION = 1
 MAX_LINE_BYTES = 256 * 1024  # A longer request is refused, and thrown away while it comes
 MAX_ROWS = 1000  # So many targets or postures may stand in one request
-_AT_ONCE = 32  # of them are checked
 _MAX_ID = 200
 _ABSOLUTE_ZERO_C = -273.15
 _EXAMPLE = '{"id": 1, "do": "status"}'
 
 Approach = Annotated[int, Field(ge=-1, le=1)]
-Joints = tuple[Angle, ...] | dict[str, Angle]  # Of one posture: in the arm's order, or by name
 Units = Literal["rad", "deg", "pulse_us", "counts"]
 
 
-def _rows(value: Any) -> Any:
-    """One posture, or one target, is a list of one."""
-    if isinstance(value, dict) or (isinstance(value, list) and value and not isinstance(value[0], list | dict)):
-        return [value]
-    if isinstance(value, list) and not 0 < len(value) <= MAX_ROWS:
-        raise ValueError(f"found {len(value)} of them, expected 1 to {MAX_ROWS} in a request")
-    return value
-
-
-class Acting(Settings):
-    """What acts on the arm; the calibration states what is left out."""
+class Loads(Settings):
+    """The loads on the arm; the calibration states what is left out."""
 
     payload: Annotated[Mass, Field(ge=0)] | None = None  # at the tool (kg)
     payload_com: Length3 | None = None  # its centre of mass, in the tool's frame (m)
@@ -56,17 +47,15 @@ class Request(Settings):
     do: Literal["forward", "compensate", "status"]
 
 
-class ForwardRequest(Request, Acting):
+class ForwardRequest(Request, Loads):
     """Where the tool is at commands."""
 
     arm: str | None = None  # which, where the calibration has several
-    joint_angles: tuple[Joints, ...] | None = None  # of one posture or several (rad), for an arm without sliding joints
-    joints: tuple[dict[str, float], ...] | None = None  # the same by name with the unit: {"q1_deg": 10, "slide_mm": 5}
-
-    _one_posture = field_validator("joint_angles", "joints", mode="before")(_rows)
+    joint_angles: tuple[tuple[Angle, ...], ...] = ()  # of postures (rad), for an arm without prismatic joints
+    joints: tuple[dict[str, float], ...] = ()  # the same by name with the unit: {"q1_deg": 10, "slide_mm": 5}
 
 
-class TargetRequest(Acting):
+class TargetRequest(Loads):
     """Where the tool shall be; without a rotation any will do."""
 
     position: Length3  # of the tool's origin in the base frame (m)
@@ -74,22 +63,79 @@ class TargetRequest(Acting):
     quaternion_wxyz: tuple[float, float, float, float] | None = None  # in place of ``rpy``
 
 
-class CompensateRequest(Request, Acting):
-    """Commands that bring the tool to targets; what acts is stated here for all targets, or in a target for itself."""
+class CompensateRequest(Request, Loads):
+    """Commands that bring the tool to targets; loads are stated here for all targets, or in a target for itself."""
 
     arm: str | None = None  # which, where the calibration has several
-    targets: tuple[TargetRequest, ...]  # one or several
-    start: Joints | None = None  # where the arm comes from (rad), for an arm without sliding joints
+    targets: tuple[TargetRequest, ...]
+    start: tuple[Angle, ...] | None = None  # where the arm comes from (rad), for an arm without prismatic joints
     start_joints: dict[str, float] | None = None  # the same by name with the unit
     path: bool = False  # whether targets are followed in order; otherwise each is reached from ``start``
     units: Units = "rad"  # of the commands in the answer
 
-    _one_target = field_validator("targets", mode="before")(_rows)
 
-
-REQUESTS: Mapping[str, type[Request]] = MappingProxyType(
+_KINDS: Mapping[str, type[Request]] = MappingProxyType(
     {"forward": ForwardRequest, "compensate": CompensateRequest, "status": Request}
 )
+_ROWS = {"forward": ("joint_angles", "joints"), "compensate": ("targets",), "status": ()}  # keys of postures or targets
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A request whose rows, its postures or targets, are checked some at a time."""
+
+    do: str
+    fields: dict[str, Any]
+    key: str  # of the rows, as the request has it; empty where it has none
+    rows: list[Any]
+
+    @classmethod
+    def of(cls, fields: Any) -> Self:
+        if not isinstance(fields, dict):
+            raise DataError(f"found {_short(fields)}, expected an object.", hint=f"Send an object such as {_EXAMPLE}.")
+        do = fields.get("do")
+        if not isinstance(do, str) or do not in _KINDS:
+            near = difflib.get_close_matches(do, _KINDS, n=1) if isinstance(do, str) else []
+            found = f"found {_short(do)}" if "do" in fields else "found nothing"
+            hint = f"Did you mean {near[0]}?" if near else f"For example {_EXAMPLE}."
+            raise DataError(f"{found}, expected one of {', '.join(_KINDS)}.", where=Location(field="do"), hint=hint)
+        version = fields.get("armcal_serve", VERSION)
+        if version != VERSION:
+            where, hint = Location(field="armcal_serve"), "Leave it out, or say 1."
+            raise DataError(f"found version {_short(version)}, expected {VERSION}.", where=where, hint=hint)
+        keys = [key for key in fields if key.startswith(_ROWS[do])]
+        if len(keys) > 1:
+            hint = "Give one of them."
+            raise DataError(f"found {' and '.join(keys)}.", where=Location(field=keys[0]), hint=hint)
+        rows = fields[keys[0]] if keys else []
+        if isinstance(rows, dict) or (isinstance(rows, list) and rows and not isinstance(rows[0], list | dict)):
+            rows = [rows]
+        if keys and isinstance(rows, list) and not 0 < len(rows) <= MAX_ROWS:
+            text = f"found {len(rows)} of them, expected 1 to {MAX_ROWS} in a request."
+            raise DataError(text, where=Location(field=keys[0]), hint="Ask in several requests.")
+        return cls(do, fields, keys[0] if keys else "", rows if isinstance(rows, list) else [rows])
+
+    def checked(self, some: range) -> Any:
+        """The request with some of its rows, of the class of its kind."""
+        fields = {**self.fields, self.key: self.rows[some.start : some.stop]} if self.key else self.fields
+        kind = _KINDS[self.do]
+        try:
+            return kind.model_validate(fields)
+        except ValueError:
+            pass
+        try:  # the same check says what is wrong in the words of a configuration
+            validate(kind, ConfigSource(fields, {(): Location()}, Path(), Path(), ()))
+        except InputError as fault:
+            field = (fault.where and fault.where.field) or ""
+            if field.startswith(_ROWS[self.do]):
+                fault.where = Location(
+                    field=re.sub(r"\d+", lambda place: f"{int(place[0]) + some.start}", field, count=1)
+                )
+            raise
+        except Exception as fault:  # not even that is possible
+            hint = "Send what docs/serve.md shows."
+            raise DataError(f"the request is refused ({type(fault).__name__}).", hint=hint) from fault
+        raise DataError("the request is refused.", hint="Send what docs/serve.md shows.")
 
 
 def parsed(line: bytes) -> Any:
@@ -102,63 +148,8 @@ def parsed(line: bytes) -> Any:
     except RecursionError as fault:
         raise DataError("the request is nested too deeply.", hint=f"Send an object such as {_EXAMPLE}.") from fault
     except ValueError as fault:
-        text = f"the request is not JSON ({_short(str(fault))})."
+        text = f"the request is not JSON ({str(fault)[:80]})."
         raise DataError(text, hint=f"Send an object a line, such as {_EXAMPLE}.") from fault
-
-
-def request_of(fields: Any) -> Iterator[Request | None]:
-    """A request, checked; None after each slice of its rows before that."""
-    words = ", ".join(REQUESTS)
-    if not isinstance(fields, dict):
-        short = _short(json.dumps(fields))
-        raise DataError(f"found {short}, expected an object.", hint=f"Send an object such as {_EXAMPLE}.")
-    word = fields.get("do")
-    if not isinstance(word, str) or word not in REQUESTS:
-        near = difflib.get_close_matches(word, REQUESTS, n=1) if isinstance(word, str) else []
-        short = f"found {_short(json.dumps(word))}" if "do" in fields else "found nothing"
-        hint = f"Did you mean {near[0]}?" if near else f"For example {_EXAMPLE}."
-        raise DataError(f"{short}, expected one of {words}.", where=Location(field="do"), hint=hint)
-    if fields.get("armcal_serve", VERSION) != VERSION:
-        short = _short(json.dumps(fields["armcal_serve"]))
-        where = Location(field="armcal_serve")
-        raise DataError(f"found version {short}, expected {VERSION}.", where=where, hint="Leave it out, or say 1.")
-    kind = REQUESTS[word]
-    key = next((key for key in fields if key.startswith(("targets", "joint_angles", "joints"))), "")
-    rows = fields.get(key)
-    if not (isinstance(rows, list) and _AT_ONCE < len(rows) <= MAX_ROWS and isinstance(rows[0], list | dict)):
-        yield _checked(kind, fields)
-        return
-    checked: list[Any] = []
-    for start in range(0, len(rows), _AT_ONCE):
-        some = rows[start : start + _AT_ONCE]
-        try:
-            request = kind.model_validate({**fields, key: some})
-        except ValueError:
-            for place, row in enumerate(some, start):
-                _checked(kind, {**fields, key: [row]}, place)
-            request = _checked(kind, {**fields, key: some})
-        name = max((name for name in type(request).model_fields if key.startswith(name)), key=len)
-        checked += getattr(request, name)
-        yield None
-    yield request.model_copy(update={name: tuple(checked)})
-
-
-def _checked(kind: type[Request], fields: dict[str, Any], place: int | None = None) -> Request:
-    """A request; ``place`` is that of its only row among others, for the message."""
-    try:
-        return kind.model_validate(fields)
-    except ValueError:
-        pass
-    try:  # the same check says what is wrong in the words of a configuration
-        validate(kind, ConfigSource(fields, {(): Location()}, Path(), Path(), ()))
-    except InputError as fault:
-        if place is not None and fault.where is not None and fault.where.field:
-            fault.where = Location(field=fault.where.field.replace(".0", f".{place}", 1))
-        raise
-    except Exception as fault:  # not even that is possible
-        hint = "Send what docs/serve.md shows."
-        raise DataError(f"the request is refused ({type(fault).__name__}).", hint=hint) from fault
-    raise DataError("the request is refused.", hint="Send what docs/serve.md shows.")
 
 
 def refusal(identity: Any, fault: ArmcalError) -> dict[str, Any]:
@@ -184,5 +175,6 @@ def _not_finite(word: str) -> NoReturn:
     raise ValueError(f"{word} is no number")
 
 
-def _short(text: str) -> str:
+def _short(content: Any) -> str:
+    text = json.dumps(content)
     return text if len(text) <= 80 else f"{text[:77]}..."

@@ -1,26 +1,29 @@
-"""An arm that requests are about: its joints by name, in their units, and what acts on it."""
+"""An arm that requests are about: its joints by name, in their units, the loads on it, and where it is to go."""
 
 import difflib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.arrays import Array
+from armcal.base.poses import PoseSettings
+from armcal.base.quaternions import rotation_matrix
 from armcal.base.units import from_unit, split_suffix, to_unit
 from armcal.calibration.compensation.compensator import Compensator
+from armcal.calibration.compensation.request import Targets
 from armcal.calibration.measured_point import Point
 from armcal.calibration.recorded_range import PAYLOAD, RecordedRange
 from armcal.errors import DataError, Location
 
-from armcal_serve.protocol import Acting
+from armcal_serve.protocol import CompensateRequest, Loads, TargetRequest
 
 TEMPERATURE = "temperature"
 TEMPERATURE_KEY = "temperature_C"
-_VECTORS = ("gravity", "payload_com", "force", "torque")
-_CHANNEL = {"payload_com": "payload"}
-"""The channels of the payload's centre are called ``payload_x`` and so on, those of the others as the field."""
+_VECTORS = {"gravity": "gravity_x", "payload_com": "payload_x", "force": "force_x", "torque": "torque_x"}
+"""The first channel of each."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +41,8 @@ class ServedArm:
         return tuple(self.dimensions)
 
     @property
-    def turns_only(self) -> bool:
-        return set(self.dimensions.values()) <= {"angle"}
+    def slides(self) -> bool:
+        return "length" in self.dimensions.values()
 
     @property
     def shown(self) -> Mapping[str, str | list[str]]:
@@ -47,32 +50,29 @@ class ServedArm:
         conditions: dict[str, str | list[str]] = {} if self.heated is None else {"conditions": [TEMPERATURE_KEY]}
         return {"joints": [*self.joints], "point": self.point, **conditions}
 
-    def angles(self, postures: Sequence[Sequence[float] | Mapping[str, float]], field: str) -> Array:
-        """Postures (N x n; rad) from angles in order or by name."""
-        if not self.turns_only:
-            hint = f"Give them by name with the unit, as {field.replace('joint_angles', 'joints')}."
-            raise DataError("the arm has sliding joints.", where=Location(field=field), hint=hint)
-        return np.array([self._in_order(row, f"{field}.{i}") for i, row in enumerate(postures)])
-
-    def named(self, postures: Sequence[Mapping[str, float]], field: str) -> Array:
-        """Postures (N x n; rad, or m) from values by name with the unit (``q1_deg``)."""
-        rows = []
-        for i, row in enumerate(postures):
-            values: dict[str, float] = {}
-            for key, value in row.items():
-                split = split_suffix(key)
-                if split is None:
-                    _refuse(f"found {_short(key)!r} without a unit.", f"{field}.{i}", f"For example {self._example()}.")
-                name, unit = split
-                self._known(name, f"{field}.{i}")
-                if unit.dimension != self.dimensions[name]:
-                    text = f"found {unit.name} for the joint {name}, expected a unit of {self.dimensions[name]}."
-                    _refuse(text, f"{field}.{i}", f"For example {self._example()}.")
-                if name in values:
-                    _refuse(f"the joint {name} is given twice.", f"{field}.{i}", "Give it once.")
-                values[name] = from_unit(value, unit.name)
-            rows.append(self._in_order(values, f"{field}.{i}"))
-        return np.array(rows)
+    def posture(self, values: Sequence[float] | Mapping[str, float], field: str) -> list[float]:
+        """Commands (n; rad, or m) from angles in order (rad), or from values by name with the unit (``q1_deg``)."""
+        if not isinstance(values, Mapping):
+            if self.slides:
+                _refuse("the arm has prismatic joints.", field, f"Give joints by name, as {self._example}.")
+            return self._in_order(values, field)
+        found: dict[str, float] = {}
+        for key, value in values.items():
+            split = split_suffix(key)
+            if split is None:
+                _refuse(f"found {_short(key)!r} without a unit.", field, f"For example {self._example}.")
+            name, unit = split
+            self._known(name, field)
+            if unit.dimension != self.dimensions[name]:
+                text = f"found {unit.name} for the joint {name}, expected a unit of {self.dimensions[name]}."
+                _refuse(text, field, f"For example {self._example}.")
+            if name in found:
+                _refuse(f"the joint {name} is given twice.", field, "Give it once.")
+            found[name] = from_unit(value, unit.name)
+        missing = [name for name in self.joints if name not in found]
+        if missing:
+            _refuse(f"found no {', '.join(missing)}.", field, f"Give all of {', '.join(self.joints)}.")
+        return [found[name] for name in self.joints]
 
     def written(self, values: Sequence[float], angle_unit: str) -> dict[str, float]:
         """One posture by name with the unit: angles in ``rad`` or ``deg``, lengths in m or mm to match."""
@@ -80,65 +80,85 @@ class ServedArm:
         named = zip(self.dimensions.items(), values, strict=True)
         return {f"{name}_{units[kind]}": to_unit(float(value), units[kind]) for (name, kind), value in named}
 
-    def approach(self, acting: Acting, count: int) -> Array:
+    def approach(self, stated: Loads, count: int) -> Array:
         """From where each joint comes (n x count): -1, 0 (not known) or 1."""
-        sides = acting.approach
-        if sides is None:
-            return np.zeros((len(self.joints), count))
+        sides = stated.approach
         if isinstance(sides, Mapping):
             for name in sides:
                 self._known(name, "approach")
-            row: Sequence[float] = [sides.get(name, 0) for name in self.joints]
-        else:
-            row = self._in_order(sides, "approach")
-        return np.repeat(np.array(row, dtype=float)[:, None], count, axis=1)
+            sides = tuple(sides.get(name, 0) for name in self.joints)
+        row = np.zeros(len(self.joints)) if sides is None else np.array(self._in_order(sides, "approach"))
+        return np.repeat(row[:, None], count, axis=1)
 
-    def acting(self, general: Acting, count: int, single: Sequence[Acting] = ()) -> Array:
-        """What acts (LOAD_CHANNELS x count; SI): as stated for all, then as stated for each."""
+    def loads(self, general: Loads, count: int, single: Sequence[Loads] = ()) -> Array:
+        """The loads (LOAD_CHANNELS x count; SI): as stated for all, then as stated for each."""
         expression = self.compensator.expression
         start = expression.channels.index(LOAD_CHANNELS[0])
-        defaults = expression.defaults[start : start + len(LOAD_CHANNELS)]
-        loads = np.repeat(np.asarray(defaults, dtype=float)[:, None], count, axis=1)
-        _put(loads, general, slice(None))
-        for i, acting in enumerate(single):
-            _put(loads, acting, slice(i, i + 1))
-        stated = general.payload is not None or (single and all(acting.payload is not None for acting in single))
-        if self.needs_payload and not stated:
-            _refuse(
-                "what hangs on the arm moves it, and neither the request nor the calibration states its payload.",
-                "payload_g",
-                "Give payload_g, 0 where nothing hangs on it.",
-            )
+        loads = np.repeat(
+            np.asarray(expression.defaults[start : start + len(LOAD_CHANNELS), None], float), count, axis=1
+        )
+        for columns, stated in ((slice(None), general), *((slice(i, i + 1), one) for i, one in enumerate(single))):
+            if stated.payload is not None:
+                loads[LOAD_CHANNELS.index(PAYLOAD), columns] = stated.payload
+            for field, channel in _VECTORS.items():
+                vector, first = getattr(stated, field), LOAD_CHANNELS.index(channel)
+                if vector is not None:
+                    loads[first : first + 3, columns] = np.array(vector)[:, None]
+        known = general.payload is not None or (single and all(stated.payload is not None for stated in single))
+        if self.needs_payload and not known:
+            text = "what hangs on the arm moves it, and neither the request nor the calibration states its payload."
+            _refuse(text, "payload_g", "Give payload_g, 0 where nothing hangs on it.")
         return loads
 
-    def beyond_records(self, commands: Array, acting: Array) -> tuple[list[int] | None, str]:
+    def targets(self, request: CompensateRequest, first: int) -> Targets:
+        """Those of a request; ``first`` is the place of its first one, for messages."""
+        some, rotations = request.targets, None
+        if some[0].rpy is not None or some[0].quaternion_wxyz is not None:
+            rotations = np.array([_rotation(target, f"targets.{first + i}") for i, target in enumerate(some)])
+        approach = self.approach(request, len(some))
+        for i, target in enumerate(some):
+            if target.approach is not None:
+                approach[:, i : i + 1] = self.approach(target, 1)
+        loads = self.loads(request, len(some), some)
+        temperatures = [request.temperature if target.temperature is None else target.temperature for target in some]
+        field = f"targets.{first + next((i for i, t in enumerate(some) if t.temperature is not None), 0)}."
+        field = TEMPERATURE_KEY if request.temperature is not None else field + TEMPERATURE_KEY
+        conditions = self.conditions(temperatures[0], field)
+        if conditions:
+            conditions = {TEMPERATURE: np.array(temperatures, dtype=float)}
+        try:
+            return Targets(np.array([target.position for target in some]), rotations, loads, approach, conditions)
+        except ValueError as fault:
+            farthest = 1000 * self.compensator.reach.farthest
+            reach = f"; this arm reaches {farthest:.0f} mm from its mount at most" if math.isfinite(farthest) else ""
+            _refuse(f"{fault}.", "targets", f"Give places of the base frame in mm (position_mm){reach}.")
+
+    def conditions(self, temperature: float | None, field: str) -> dict[str, Any]:
+        """What a compensator takes of the surroundings, by the temperature that a field states."""
+        if temperature is None:
+            return {}
+        if self.heated is None:
+            hint = "Leave it out, or calibrate the arm with an effect that depends on it, such as thermal_length."
+            _refuse(f"the arm {self.name} does not change with the temperature.", field, hint)
+        return {TEMPERATURE: temperature}
+
+    def under(self, conditions: Mapping[str, Any]) -> Compensator:
+        return self.heated if conditions and self.heated is not None else self.compensator
+
+    def beyond_records(self, commands: Array, loads: Array) -> tuple[list[int] | None, str]:
         """Which poses lie beyond the records, and a sentence about them; None where the records' ranges are not known.
 
         Args:
             commands: N x n; rad or m.
-            acting: LOAD_CHANNELS x N; SI.
+            loads: LOAD_CHANNELS x N; SI.
         """
         if self.recorded is None:
             return None, ""
-        values = np.vstack([commands.T, acting[LOAD_CHANNELS.index(PAYLOAD)]])
+        values = np.vstack([commands.T, loads[LOAD_CHANNELS.index(PAYLOAD)]])
         places: list[int] = np.flatnonzero(self.recorded.beyond(values).any(axis=0)).tolist()
         return places, self.recorded.sentence(values) if places else ""
 
-    def at_temperature(self, field: str) -> Compensator:
-        """The compensator where a field of the request states the temperature."""
-        if self.heated is None:
-            hint = "Leave it out, or calibrate the arm with an effect that depends on it, such as thermal_length."
-            _refuse(f"the arm {self.name} does not change with the temperature.", field, hint)
-        return self.heated
-
-    def _in_order(self, row: Sequence[float] | Mapping[str, float], field: str) -> list[float]:
-        if isinstance(row, Mapping):
-            for name in row:
-                self._known(name, field)
-            missing = [name for name in self.joints if name not in row]
-            if missing:
-                _refuse(f"found no {', '.join(missing)}.", field, f"Give all of {', '.join(self.joints)}.")
-            return [float(row[name]) for name in self.joints]
+    def _in_order(self, row: Sequence[float], field: str) -> list[float]:
         if len(row) != len(self.joints):
             text = f"found {len(row)} values, expected {len(self.joints)}: {', '.join(self.joints)}."
             _refuse(text, field, "Give one for each joint, in this order, or give them by name.")
@@ -151,20 +171,19 @@ class ServedArm:
         hint = f"Did you mean {near[0]}?" if near else f"The joints are {', '.join(self.joints)}."
         _refuse(f"the arm {self.name} has no joint {_short(name)!r}.", field, hint)
 
+    @property
     def _example(self) -> str:
         name, kind = next(iter(self.dimensions.items()))
         return f"{name}_{'deg' if kind == 'angle' else 'mm'}"
 
 
-def _put(loads: Array, acting: Acting, columns: slice) -> None:
-    """Write what is stated into columns of loads (LOAD_CHANNELS x N)."""
-    if acting.payload is not None:
-        loads[LOAD_CHANNELS.index(PAYLOAD), columns] = acting.payload
-    for field in _VECTORS:
-        vector = getattr(acting, field)
-        if vector is not None:
-            first = LOAD_CHANNELS.index(f"{_CHANNEL.get(field, field)}_x")
-            loads[first : first + 3, columns] = np.array(vector)[:, None]
+def _rotation(target: TargetRequest, field: str) -> Array:
+    try:
+        stated = PoseSettings.si(rpy=target.rpy, quaternion=target.quaternion_wxyz)
+    except ValueError as fault:
+        message = getattr(fault, "errors", list)()[0]["msg"].removeprefix("Value error, ")
+        _refuse(f"{message}.", field, "Give rpy_deg or quaternion_wxyz.")
+    return rotation_matrix(np.array(stated.unit_quaternion))
 
 
 def _refuse(message: str, field: str, hint: str) -> NoReturn:

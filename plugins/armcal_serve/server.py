@@ -13,7 +13,8 @@ from armcal.errors import ArmcalError
 from armcal.io.json_server import Answers, JsonServer
 from armcal.io.signals import Signals
 
-from armcal_serve.loading import CalibrationFile, Loader, Order, warm_up
+from armcal_serve.answers import Answerer
+from armcal_serve.loading import CalibrationFile, Loader, Order
 from armcal_serve.protocol import MAX_LINE_BYTES, VERSION, refusal
 
 _STEP_S = 0.1  # How long it may take until a signal or a new calibration is noticed, when nothing else happens
@@ -28,6 +29,11 @@ class Server(Answers):
     """Serves one calibration's file, which may be replaced at any time, at a socket or at a pair of descriptors."""
 
     def __init__(self, order: Order, notify: Notify, socket: Path | None, streams: tuple[int, int] | None) -> None:
+        """Load the calibration, which may take the compiler's time.
+
+        Raises:
+            ArmcalError: it cannot be used, or the socket cannot be had.
+        """
         self._began = time.monotonic()
         self._notify = notify
         self._file = CalibrationFile(Loader(order))
@@ -36,35 +42,47 @@ class Server(Answers):
         self._by = "standard input" if socket is None else f"socket {socket}"
         if socket is not None:
             self._server.listen(socket, "a server is running here.", "Give another --socket.")
+        try:
+            fault = self._file.take()
+            if fault is not None:
+                raise fault
+        except BaseException:
+            self._server.close()
+            raise
 
     def run(self, signals: Signals) -> None:
         """Serve until a signal asks for the end, or no request can come any more."""
         switched = sys.getswitchinterval()
         sys.setswitchinterval(_SWITCH_S)
+        gc.collect()
+        gc.freeze()
         try:
-            with warnings.catch_warnings():
+            with warnings.catch_warnings(), self._file:
                 warnings.simplefilter("ignore")
                 self._serve(signals)
         finally:
             sys.setswitchinterval(switched)
-            self._file.close()
             self._server.close()
 
     def begin(self, line: bytes, arrived: float) -> Iterator[bytes | None]:
-        assert self._file.served is not None
-        return self._file.served.begin(line, arrived, self.status)
+        return self._served.begin(line, arrived, self.status)
 
     def refusal(self, fault: ArmcalError) -> bytes:
         return as_line(refusal(None, fault)).encode()
 
+    @property
+    def _served(self) -> Answerer:
+        assert self._file.served is not None
+        return self._file.served
+
     def status(self) -> Mapping[str, Any]:
         """The answer to a request for the status."""
-        served, file = self._file.served, self._file
+        served, file = self._served, self._file
         return {
             "armcal_serve": VERSION,
             "ok": True,
-            "calibration": None if served is None else served.tag,
-            "arms": {} if served is None else {name: arm.shown for name, arm in served.arms.items()},
+            "calibration": served.tag,
+            "arms": {name: arm.shown for name, arm in served.arms.items()},
             "file": {"path": str(file.path), "state": file.state, "why": file.why},
             "requests": self._server.requests,
             "waiting": self._server.waiting,
@@ -73,19 +91,8 @@ class Server(Answers):
         }
 
     def _serve(self, signals: Signals) -> None:
-        self._file.start()
-        while not self._file.first():
-            if signals.finish:
-                return
-            time.sleep(0.02)
-        served = self._file.served
-        assert served is not None
-        if served.fault is None:
-            warm_up(served)  # functions keep memory for each thread
-        gc.collect()
-        gc.freeze()
-        arms = {name: arm.shown for name, arm in served.arms.items()}
-        content = {"calibration": served.tag, "arms": arms, "by": [self._by]}
+        status = self.status()
+        content = {"calibration": status["calibration"], "arms": status["arms"], "by": [self._by]}
         self._say_news()
         self._notify("ready", f"ready: {self._file.path} by {self._by}", content)
         if self._streams is not None:

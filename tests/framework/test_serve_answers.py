@@ -22,10 +22,10 @@ from armcal.calibration.recorded_range import beyond_records
 from armcal.errors import ConfigError, DataError
 from armcal_serve.answers import Answerer, command_rows
 from armcal_serve.loading import Loader, Order, require_whole
-from armcal_serve.protocol import Acting
+from armcal_serve.protocol import Loads
 from armcal_serve.served_arm import ServedArm
 from scipy.spatial.transform import Rotation
-from serving import ROOT, answered, ask, foreign, loaded, made, sha256, told, variant
+from serving import ROOT, answered, ask, described, foreign, loaded, made, sha256, told, variant
 
 Q_DEG = [10.0, -20.0, 30.0, 40.0, -50.0, 60.0]
 NAMES = [f"q{i}" for i in range(1, 7)]
@@ -85,9 +85,7 @@ def test_what_acts_is_what_a_record_would_say(answerer: Answerer, calibration: C
         {"joint_angles_deg": [Q_DEG]},
         {"joint_angles_rad": np.deg2rad(Q_DEG).tolist()},
         {"joint_angles_mrad": (1000 * np.deg2rad(Q_DEG)).tolist()},
-        {"joint_angles_deg": dict(zip(reversed(NAMES), reversed(Q_DEG), strict=True))},
-        {"joint_angles_deg": [dict(zip(NAMES, Q_DEG, strict=True))]},
-        {"joints": {f"{name}_deg": q for name, q in zip(NAMES, Q_DEG, strict=True)}},
+        {"joints": {f"{name}_deg": q for name, q in zip(reversed(NAMES), reversed(Q_DEG), strict=True)}},
         {"joints": [{f"{name}_rad": float(np.deg2rad(q)) for name, q in zip(NAMES, Q_DEG, strict=True)}]},
         {"joint_angles_deg": Q_DEG, "arm": "arm", "payload_kg": 0, "armcal_serve": 1},
         {"joint_angles_deg": Q_DEG, "approach": {"q1": 1}},
@@ -136,12 +134,13 @@ def test_a_path_is_followed_and_what_is_out_of_reach_is_told(answerer: Answerer,
         ({"do": "forwards"}, "do", "Did you mean forward?"),
         ({}, "do", "found nothing"),
         ({"do": "forward"}, "joint_angles_deg", "neither"),
-        ({"do": "forward", "joint_angles_deg": Q_DEG, "joints": {"q1_deg": 1}}, "joint_angles_deg", "both"),
+        ({"do": "forward", "joint_angles_deg": Q_DEG, "joints": {"q1_deg": 1}}, "joint_angles_deg", "and joints"),
         ({"do": "forward", "joint_angles_deg": Q_DEG[:5]}, "joint_angles.0", "expected 6: q1, q2"),
         ({"do": "forward", "joint_angles": Q_DEG}, "joint_angles", "unit missing"),
         ({"do": "forward", "joint_angels_deg": Q_DEG}, "joint_angels_deg", "did you mean joint_angles_deg?"),
-        ({"do": "forward", "joint_angles_deg": {"q1": 1}}, "joint_angles.0", "found no q2"),
-        ({"do": "forward", "joint_angles_deg": {"q11": 1}}, "joint_angles.0", "Did you mean q1?"),
+        ({"do": "forward", "joint_angles_deg": {"q1": 1}}, "joint_angles_deg", "expected a list"),
+        ({"do": "forward", "joints": {"q1_deg": 1}}, "joints.0", "found no q2"),
+        ({"do": "forward", "joints": {"q11_deg": 1}}, "joints.0", "Did you mean q1?"),
         ({"do": "forward", "joints": {"q1": 1}}, "joints.0", "without a unit"),
         ({"do": "forward", "joints": {"q1_mm": 1}}, "joints.0", "expected a unit of angle"),
         ({"do": "forward", "joints": {"q1_deg": 1, "q1_rad": 1}}, "joints.0", "twice"),
@@ -156,7 +155,7 @@ def test_a_path_is_followed_and_what_is_out_of_reach_is_told(answerer: Answerer,
         ({"do": "compensate", "targets": [{"rpy_deg": [1, 2, 3]}]}, "targets.0", "position_mm"),
         ({"do": "compensate", "targets": {"position_mm": [1, 2, 3], "paylod_g": 1}}, "targets", "payload_g?"),
         ({"do": "compensate", "targets": HERE | {"quaternion_wxyz": [1, 1, 0, 0]}}, "targets.0", "length"),
-        ({"do": "compensate", "targets": [HERE, HERE | {"rpy_deg": [0, 0, 0]}]}, "targets.0", "all of one kind"),
+        ({"do": "compensate", "targets": [HERE, HERE | {"rpy_deg": [0, 0, 0]}]}, "targets.1", "all of one kind"),
         ({"do": "compensate", "targets": HERE, "units": "counts"}, "units", "no pulse tables"),
         ({"do": "compensate", "targets": HERE, "start_deg": [1]}, "start", "expected 6"),
         ({"do": "compensate", "targets": [{"position_mm": [1e12, 0, 0]}]}, "targets", "this arm reaches 421 mm"),
@@ -250,9 +249,9 @@ def test_counts_pulses_and_sliding_joints() -> None:
     assert row["pulse_us"] == [pytest.approx(307 * 122 / 25), None]
     (row,) = command_rows(arm, commands(), "deg")
     assert row["joints"] == {"q1_deg": pytest.approx(28.64788975654116), "s_mm": 20.0}
-    assert arm.named([{"s_mm": 5, "q1_deg": 180}], "joints") == pytest.approx(np.array([[np.pi, 0.005]]))
-    with pytest.raises(DataError, match="sliding"):
-        arm.angles([[1.0, 2.0]], "joint_angles")
+    assert arm.posture({"s_mm": 5, "q1_deg": 180}, "joints.0") == pytest.approx([np.pi, 0.005])
+    with pytest.raises(DataError, match="prismatic"):
+        arm.posture([1.0, 2.0], "joint_angles.0")
 
 
 def test_poses_beyond_the_records_are_named(answerer: Answerer, calibration: Calibration) -> None:
@@ -279,9 +278,9 @@ def test_no_range_is_no_promise(answerer: Answerer) -> None:
 def test_an_elastic_arm_whose_payload_nobody_states_asks_for_it(answerer: Answerer) -> None:
     arm = replace(answerer.arms["arm"], needs_payload=True)
     with pytest.raises(DataError, match="states its payload"):
-        arm.acting(Acting(), 2)
-    assert arm.acting(Acting.si(payload=0.1), 2).shape == (13, 2)
-    assert arm.acting(Acting(), 1, [Acting.si(payload=0.1)])[3, 0] == 0.1
+        arm.loads(Loads(), 2)
+    assert arm.loads(Loads.si(payload=0.1), 2).shape == (13, 2)
+    assert arm.loads(Loads(), 1, [Loads.si(payload=0.1)])[3, 0] == 0.1
 
 
 @pytest.mark.slow
@@ -298,9 +297,9 @@ def test_only_a_whole_calibration_of_the_same_arm_is_made_ready(path: Path, answ
         (foreign(text), "another arm"),
         (sealed({**yaml.safe_load(text), "converged": False}), "did not converge"),
         (text.replace("converged: true", "converged: false"), "edited or damaged"),
-        ("armcal_calibration: 1\n", r"c\.yaml: the line that ends"),
-        ("\x00\n", r"c\.yaml: the line that ends"),
-        (text[: len(text) // 2].rpartition("\n")[0] + "\n", r"c\.yaml: the line that ends"),
+        ("armcal_calibration: 1\n", r"c\.yaml: found \d+ bytes"),
+        ("\x00\n", r"c\.yaml: found \d+ bytes"),
+        (text[: len(text) // 2].rpartition("\n")[0] + "\n", r"c\.yaml: found \d+ bytes"),
     ):
         with pytest.raises(ConfigError, match=why) as caught:
             loaded(loader, wrong)
@@ -326,7 +325,7 @@ def test_no_beginning_of_a_calibration_is_taken_for_one(path: Path) -> None:
     """However a writer is interrupted: its last line is looked for, and all that is needed stands before it."""
     lines = path.read_text().splitlines(keepends=True)
     for end in random.Random(3).sample(range(len(lines)), 60):
-        with pytest.raises(ConfigError, match=r"whole|empty"):
+        with pytest.raises(ConfigError, match="no whole one"):
             require_whole("".join(lines[:end]).encode(), "c.yaml")
 
 
@@ -354,6 +353,24 @@ def test_a_calibration_that_takes_the_place_of_another_answers_by_its_own_number
                 assert angles[0] == pytest.approx(angles[1], abs=1e-7)
 
 
+@pytest.mark.slow
+def test_other_statics_are_taken_with_the_calibration(path: Path) -> None:
+    """As a recalibration writes them that found another payload on the arm."""
+    text = path.read_text()
+    content = yaml.safe_load(text)
+    content["statics"]["payload_kg"] = 0.4
+    heavy, loader = described(content), Loader(Order("c.yaml", evaluator="interpreted"))
+    first = loaded(loader, text)
+    found, expected = loaded(loader, heavy), made(heavy)
+    assert found.arms["arm"].compensator.expression.record is first.arms["arm"].compensator.expression.record
+    posture = {"do": "forward", "joint_angles_deg": Q_DEG}
+    places = [position(told(one, **posture)) for one in (found, expected, first)]
+    assert places[0] == pytest.approx(places[1], abs=1e-9)
+    assert np.linalg.norm(places[0] - places[2]) > 0.5
+    stated = [position(told(one, **posture, payload_g=150)) for one in (found, first)]
+    assert stated[0] == pytest.approx(stated[1], abs=1e-9)
+
+
 def test_many_targets_are_answered_as_each_alone_a_slice_at_a_time(answerer: Answerer) -> None:
     postures = np.random.default_rng(2).uniform(-60, 60, (100, 6))
     tools = told(answerer, do="forward", joint_angles_deg=postures.tolist())["tools"]
@@ -373,7 +390,7 @@ def test_many_targets_are_answered_as_each_alone_a_slice_at_a_time(answerer: Ans
 
 
 def test_a_request_that_raises_is_answered(answerer: Answerer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ServedArm, "acting", lambda *given: 1 / 0)
+    monkeypatch.setattr(ServedArm, "loads", lambda *given: 1 / 0)
     answer = ask(answerer, id=3, do="forward", joint_angles_deg=Q_DEG)
     assert answer["id"] == 3 and "it failed (ZeroDivisionError: division by zero)" in answer["error"]
     monkeypatch.undo()

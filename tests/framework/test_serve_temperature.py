@@ -76,8 +76,8 @@ def test_each_target_is_had_at_its_own_temperature(warm: Answerer, general: floa
     said = [t if c is None else t | {"temperature_C": c} for t, c in zip(targets, own, strict=True)]
     for_all = {} if general is None else {"temperature_C": general}
     answer = ask(warm, do="compensate", targets=said, path=path, **NEAR, **for_all)
-    if path and general is None:
-        assert "expected all of one kind" in answer["error"] and answer["where"] == "targets.0"
+    if general is None:
+        assert "expected all of one kind" in answer["error"] and answer["where"] == "targets.1"
         return
     otherwise = REFERENCE_C if general is None else general
     told_C = np.array([otherwise if c is None else c for c in own])
@@ -133,7 +133,8 @@ def test_what_is_wrong_with_a_temperature_is_said(other: Answerer, warm: Answere
         (warm, forward | {"temperature_C": [20, 30, 40]}, "temperature_C", "expected a number"),
         (warm, forward | {"humidity_1": 0.5}, "humidity_1", "unknown key"),
         (other, forward | {"temperature_C": 20}, "temperature_C", "does not change"),
-        (other, single, "targets.1.temperature_C", "does not change"),
+        (other, single, "targets.1", "expected all of one kind"),
+        (other, {**single, "targets": single["targets"][1]}, "targets.0.temperature_C", "does not change"),
         (other, single | {"temperature_C": 20}, "temperature_C", "does not change"),
     ):
         answer = ask(who, **request)

@@ -282,7 +282,7 @@ class Calibration:
 
         ``point`` says what is where the tool's frame is: that frame itself, or the ``target`` that was measured.
         ``tuned`` parameters are channels. ``like`` is such an expression of another calibration of the same arm: where
-        only tuned parameters differ, it and what was compiled for it serve on; else those that differ are tuned too.
+        only tuned parameters and statics differ, it and what was compiled for it serve on; else those that differ are tuned too.
 
         Raises:
             ValueError: no such arm.
@@ -291,7 +291,7 @@ class Calibration:
         system, name = self.system, self._named(arm)
         at = tool_point(point, system, name, self.parameters)
         if like is not None:
-            retuned = like.retuned(self.parameters, at or identity())
+            retuned = like.retuned(self.parameters, at or identity(), system.environment)
             if retuned is not None:
                 return retuned
             tuned = {*tuned, *like.tuned, *like.differing(self.parameters)}

@@ -73,8 +73,9 @@ class ToolExpression(ElasticPass):
             tool_T_point=tool_T_point,
         )
 
-    def retuned(self, parameters: Parameters, tool_T_point: Transform) -> Self | None:
-        """The same at other values of its tuned parameters, with all functions that were made of it so far.
+    def retuned(self, parameters: Parameters, tool_T_point: Transform, environment: Environment) -> Self | None:
+        """The same at other values of its tuned parameters, and other loads where nothing is said, with all functions
+        that were made of it so far.
 
         ``parameters`` are of a calibration of the same arm; None if a value differs that is a constant here.
         """
@@ -82,6 +83,7 @@ class ToolExpression(ElasticPass):
         if not self.tuned.issuperset(self.differing(parameters)):
             return None
         entries = {entry: value for name in self.tuned for entry, value in _entries(name, blocks[name])}
+        entries |= zip(LOAD_CHANNELS, environment.acting, strict=True)
         if _POINT[0] in self.channels:
             entries |= dict(zip(_POINT, _numbers_of(tool_T_point), strict=True))
         places = zip(self.channels, self.defaults, strict=True)
