@@ -282,7 +282,7 @@ class Calibration:
 
         ``point`` says what is where the tool's frame is: that frame itself, or the ``target`` that was measured.
         ``tuned`` parameters are channels. ``like`` is such an expression of another calibration of the same arm: where
-        only tuned parameters and statics differ, it and what was compiled for it serve on; else those that differ are tuned too.
+        only tuned parameters and statics differ, it and what was compiled for it serve on; else what differs is tuned.
 
         Raises:
             ValueError: no such arm.
