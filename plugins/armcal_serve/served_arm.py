@@ -56,7 +56,7 @@ class ServedArm:
             if self.slides:
                 _refuse("the arm has prismatic joints.", field, f"Give joints by name, as {self._example}.")
             return self._in_order(values, field)
-        found: dict[str, float] = {}
+        posture: dict[str, float] = {}
         for key, value in values.items():
             split = split_suffix(key)
             if split is None:
@@ -66,13 +66,13 @@ class ServedArm:
             if unit.dimension != self.dimensions[name]:
                 text = f"found {unit.name} for the joint {name}, expected a unit of {self.dimensions[name]}."
                 _refuse(text, field, f"For example {self._example}.")
-            if name in found:
+            if name in posture:
                 _refuse(f"the joint {name} is given twice.", field, "Give it once.")
-            found[name] = from_unit(value, unit.name)
-        missing = [name for name in self.joints if name not in found]
+            posture[name] = from_unit(value, unit.name)
+        missing = [name for name in self.joints if name not in posture]
         if missing:
             _refuse(f"found no {', '.join(missing)}.", field, f"Give all of {', '.join(self.joints)}.")
-        return [found[name] for name in self.joints]
+        return [posture[name] for name in self.joints]
 
     def written(self, values: Sequence[float], angle_unit: str) -> dict[str, float]:
         """One posture by name with the unit: angles in ``rad`` or ``deg``, lengths in m or mm to match."""

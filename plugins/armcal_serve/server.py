@@ -32,7 +32,7 @@ class Server(Answers):
         """Load the calibration, which may take the compiler's time.
 
         Raises:
-            ArmcalError: it cannot be used, or the socket cannot be had.
+            ArmcalError: it cannot be used, or somebody serves the socket.
         """
         self._began = time.monotonic()
         self._notify = notify
