@@ -18,7 +18,7 @@ from armcal.io.json_server import SLICE_S
 
 from armcal_serve.protocol import (
     VERSION,
-    Asked,
+    RawRequest,
     CompensateRequest,
     ForwardRequest,
     TargetRequest,
@@ -49,15 +49,15 @@ class Answerer:
         try:
             fields = parsed(line)
             identity = known_id(fields)
-            asked = Asked.of(fields)
-            first = asked.checked(range(1))
-            if asked.do == "status":
+            raw = RawRequest.of(fields)
+            first = raw.checked(range(1))
+            if raw.do == "status":
                 yield as_line({**status(), "id": identity}).encode()
                 return
             if self.fault is not None:
                 raise self.fault
-            computed = self._forward if asked.do == "forward" else self._compensate
-            of_kind, rows, tail = yield from computed(asked, first, self._arm(first.arm))
+            computed = self._forward if raw.do == "forward" else self._compensate
+            of_kind, rows, tail = yield from computed(raw, first, self._arm(first.arm))
             head = {"armcal_serve": VERSION, "id": identity, "ok": True, **of_kind}
         except ArmcalError as fault:
             head, rows, tail = refusal(identity, fault), "", {}
@@ -69,7 +69,7 @@ class Answerer:
         times = {"waited_ms": round(1000 * (began - arrived), 3), "took_ms": round(1000 * (now - arrived), 3)}
         yield f"{as_line(head)[:-1]}, {rows}{as_line({**tail, 'calibration': self.tag, **times})[1:]}".encode()
 
-    def _forward(self, asked: Asked, first: ForwardRequest, arm: ServedArm) -> Generator[None, None, "_Answered"]:
+    def _forward(self, raw: RawRequest, first: ForwardRequest, arm: ServedArm) -> Generator[None, None, "_Answered"]:
         rows, angles, loads = list[str](), list[Array](), list[Array]()
         field = "joint_angles" if first.joint_angles else "joints"
         if not first.joint_angles and not first.joints:
@@ -78,7 +78,7 @@ class Answerer:
             raise DataError("found neither joint_angles_deg nor joints.", where=where, hint=hint)
 
         def step(some: range) -> None:
-            request = asked.checked(some) if some.start else first
+            request = raw.checked(some) if some.start else first
             stated = getattr(request, field)
             postures = [arm.posture(row, f"{field}.{place}") for row, place in zip(stated, some, strict=True)]
             angles.append(np.array(postures))
@@ -88,10 +88,12 @@ class Answerer:
             poses = arm.under(conditions).forward(angles[-1], loads[-1], approach, conditions)
             rows.extend(as_line(_tool(pose)) for pose in poses)
 
-        yield from _sliced(len(asked.rows), step)
+        yield from _sliced(len(raw.rows), step)
         return _answered({"arm": arm.name}, "tools", rows, arm.beyond_records(np.vstack(angles), np.hstack(loads)))
 
-    def _compensate(self, asked: Asked, first: CompensateRequest, arm: ServedArm) -> Generator[None, None, "_Answered"]:
+    def _compensate(
+        self, raw: RawRequest, first: CompensateRequest, arm: ServedArm
+    ) -> Generator[None, None, "_Answered"]:
         rows, parts, done = list[str](), list[Targets](), list[Commands]()
         if first.units in ("counts", "pulse_us") and not arm.compensator.expression.servos:
             hint = "Ask for rad or deg, or give the arm's joints pulse tables and calibrate again."
@@ -108,14 +110,14 @@ class Answerer:
             rows.extend(as_line(row) for row in command_rows(arm, commands, first.units))
 
         def step(some: range) -> None:
-            request = asked.checked(some) if some.start else first
+            request = raw.checked(some) if some.start else first
             for place, target in zip(some, request.targets, strict=True):
                 _require_alike(target, first.targets[0], first.temperature is not None, place)
             parts.append(arm.targets(request, some.start))
             if not first.path:
                 emit(arm.under(parts[-1].conditions).solve(parts[-1], start))
 
-        yield from _sliced(len(asked.rows), step)
+        yield from _sliced(len(raw.rows), step)
         if first.path:
             targets = Targets.joined(parts)
             for commands in arm.under(targets.conditions).following(targets, start):
@@ -166,7 +168,7 @@ def _require_alike(target: TargetRequest, first: TargetRequest, has_temperature:
                 f"found {'a' if here else 'no'} {words} here and {'a' if there else 'no'} {words} in the first target"
             )
             where = Location(field=f"targets.{place}")
-            raise DataError(f"{found}, expected all of one kind.", where=where, hint="Ask for them in two requests.")
+            raise DataError(f"{text}, expected all of one kind.", where=where, hint="Ask for them in two requests.")
 
 
 def command_rows(arm: ServedArm, commands: Commands, units: Units) -> list[dict[str, Any]]:

@@ -81,7 +81,7 @@ _ROWS = {"forward": ("joint_angles", "joints"), "compensate": ("targets",), "sta
 
 
 @dataclass(frozen=True)
-class Asked:
+class RawRequest:
     """A request whose rows, its postures or targets, are checked some at a time."""
 
     do: str
@@ -96,9 +96,9 @@ class Asked:
         do = fields.get("do")
         if not isinstance(do, str) or do not in _KINDS:
             near = difflib.get_close_matches(do, _KINDS, n=1) if isinstance(do, str) else []
-            found = f"found {_short(do)}" if "do" in fields else "found nothing"
+            text = f"found {_short(do)}" if "do" in fields else "found nothing"
             hint = f"Did you mean {near[0]}?" if near else f"For example {_EXAMPLE}."
-            raise DataError(f"{found}, expected one of {', '.join(_KINDS)}.", where=Location(field="do"), hint=hint)
+            raise DataError(f"{text}, expected one of {', '.join(_KINDS)}.", where=Location(field="do"), hint=hint)
         version = fields.get("armcal_serve", VERSION)
         if version != VERSION:
             where, hint = Location(field="armcal_serve"), "Leave it out, or say 1."
