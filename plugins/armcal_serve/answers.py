@@ -18,9 +18,9 @@ from armcal.io.json_server import SLICE_S
 
 from armcal_serve.protocol import (
     VERSION,
-    RawRequest,
     CompensateRequest,
     ForwardRequest,
+    RawRequest,
     TargetRequest,
     Units,
     known_id,
@@ -164,7 +164,7 @@ def _require_alike(target: TargetRequest, first: TargetRequest, has_temperature:
     temperature = [has_temperature or one.temperature is not None for one in (target, first)]
     for words, (here, there) in (("rotation", rotation), (TEMPERATURE_KEY, temperature)):
         if here != there:
-            found = (
+            text = (
                 f"found {'a' if here else 'no'} {words} here and {'a' if there else 'no'} {words} in the first target"
             )
             where = Location(field=f"targets.{place}")
