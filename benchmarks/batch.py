@@ -35,7 +35,7 @@ class Sweep:
             system.arms, system.measurements, parameters, system.environment, dataset, "compiled"
         )
         self.kernel = self._problem.kernels[0]
-        (self.records,) = self._problem.records(dataset)
+        (self.records,) = self._problem.of(dataset).records
         self._values = np.ascontiguousarray(values[list(parameters.free_entries)])
         self.parameters = len(self._values)
         size = self.kernel.factor.residual.numel()

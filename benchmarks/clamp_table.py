@@ -57,11 +57,13 @@ class JointPath:
 
     def fit(self, dataset: Dataset) -> Estimate:
         """From the nominal values, as a run does it."""
-        records = self.problem.records(dataset)
-        problem = started(self.problem, records)
+        records = self.problem.of(dataset).records
+        problem = started(self.problem.with_records(records))
         start = problem.parameters.nominal()
-        records = with_joint_noise(problem, records, start)
-        return estimate(problem, records, self.experiment.estimator.solve(problem, records, start))
+        records = with_joint_noise(problem.with_records(records), start).records
+        return estimate(
+            problem.with_records(records), self.experiment.estimator.solve(problem.with_records(records), start)
+        )
 
 
 def recording(seed: int) -> Dataset:

@@ -31,7 +31,7 @@ def run() -> Iterator[Row]:
 
     def ours(name: EvaluatorChoice) -> None:
         values = case.solve(problems[name]).values
-        found[name] = problems[name].cost(values, problems[name].records(case.dataset))
+        found[name] = problems[name].of(case.dataset).cost(values)
 
     def scipys(name: str, residuals: Callable[[Array], Array]) -> None:
         found[name] = _scipy_fit(case, residuals)
@@ -54,11 +54,11 @@ def run() -> Iterator[Row]:
 
 
 def _kernel_residuals(case: lrm.Case, problem: Problem) -> Callable[[Array], Array]:
-    records = problem.records(case.dataset)
+    records = problem.of(case.dataset).records
     noise = np.array(problem.kernels[0].factor.noise)[:, None]
 
     def residuals(increment: Array) -> Array:
-        raw = problem.residuals(case.parameters.retract(increment), records)[0]
+        raw = problem.with_records(records).residuals(case.parameters.retract(increment))[0]
         return np.asarray((raw / noise).ravel())
 
     return residuals

@@ -37,11 +37,11 @@ def run() -> Iterator[Row]:
     found: dict[str, Array] = {}
 
     def ours() -> None:
-        records = problem.records(data)
-        found["armcal"] = experiment.estimator.solve(problem, records, parameters.nominal()).values
+        records = problem.of(data).records
+        found["armcal"] = experiment.estimator.solve(problem.with_records(records), parameters.nominal()).values
 
     def error_mm(values: Array) -> float:
-        shown = problem.predict(values, problem.records(rigid_arm.dataset(fresh, fresh_tips)))[0].outputs[:3]
+        shown = problem.of(rigid_arm.dataset(fresh, fresh_tips)).predict(values)[0].outputs[:3]
         return _rms_mm(shown.T - fresh_tips)
 
     work = f"IPOPT, {problem.backend}, {problem.increments} parameters"

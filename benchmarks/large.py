@@ -57,19 +57,19 @@ def _measure(way: JointPath) -> dict[str, Any]:
 
     seconds = once(fit)
     peak = _peak_mb()
-    cost = problem.cost(values[0], problem.records(case.dataset))
+    cost = problem.of(case.dataset).cost(values[0])
     return {"seconds": seconds, "before_mb": before, "peak_mb": peak, "cost": cost, "backend": problem.backend}
 
 
 def _scipy_fit(case: lrm.Case, problem: Problem) -> Array:
     """least_squares with armcal's residuals and Jacobian of all records at once: the obvious way."""
-    (kernel,), (records,) = problem.kernels, problem.records(case.dataset)
+    (kernel,), (records,) = problem.kernels, problem.of(case.dataset).records
     noise = np.array(kernel.factor.noise)[:, None]
     free = list(case.parameters.free_entries)
     shape = (len(noise), len(free), records.record.shape[1])
 
     def residuals(increment: Array) -> Array:
-        raw = problem.residuals(case.parameters.retract(increment), (records,))[0]
+        raw = problem.with_records((records,)).residuals(case.parameters.retract(increment))[0]
         return np.asarray((raw / noise).ravel())
 
     def jacobian(increment: Array) -> Array:

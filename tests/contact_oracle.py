@@ -182,7 +182,7 @@ class Bench:
     def problem(self, data: Dataset, evaluator: Any = "interpreted") -> tuple[Problem, tuple[Any, ...]]:
         """The problem of these records, and the records as it reads them."""
         built = Problem.build(self.arms, self.measurements, self.parameters(data), SURROUNDINGS, data, evaluator)
-        return built, built.records(data)
+        return built, built.of(data).records
 
 
 def vector(parameters: Parameters, values: Mapping[str, float]) -> np.ndarray:

@@ -32,9 +32,9 @@ def drifting_problem() -> tuple[Any, ...]:
     loaded = Experiment.load(DEMO, [FREE, 'parameters.priors={"arm.spring.k1": 0.02 rad/Nm}', *DRIFTING])
     dataset = loaded.read().subset(np.arange(60))
     problem = problem_of(loaded, dataset)
-    records = with_drift(problem, problem.records(dataset), dataset, loaded.parameters.nominal())
+    records = with_drift(problem.of(dataset), dataset, loaded.parameters.nominal()).records
     train, held = np.setdiff1d(np.arange(60), np.arange(3, 60, 4)), np.arange(3, 60, 4)
-    fitted = fit(problem, problem.subset(records, train), loaded.estimator, loaded.parameters.nominal())
+    fitted = fit(problem.with_records(records).subset(train), loaded.estimator, loaded.parameters.nominal())
     return loaded, dataset, problem, records, train, held, fitted
 
 
@@ -46,7 +46,7 @@ def dense_slopes(problem, values, records, step=1e-7):
         for sign in (1, -1):
             moved = values.copy()
             moved[entry] += sign * step
-            ends.append(problem.residuals(moved, records)[0].T.ravel())
+            ends.append(problem.with_records(records).residuals(moved)[0].T.ravel())
         columns.append((ends[0] - ends[1]) / (2 * step))
     return np.array(columns).T
 

@@ -93,7 +93,7 @@ class World:
         outputs = kernel.factor.output_channels
         empty = {f"arm.{name}": q[:, i] for i, name in enumerate(JOINTS)} | {c: np.zeros(len(q)) for c in outputs}
         poses = Dataset(tuple(map(str, range(len(q)))), empty)
-        read = self.problem.predict(self.values, self.problem.records(poses))[0].outputs
+        read = self.problem.of(poses).predict(self.values)[0].outputs
         noise = self.noise * np.array(kernel.factor.noise)[:, None] * self.random.normal(size=(self.rows, len(q)))
         if self.rows != 6:
             return dict(zip(outputs, read + noise, strict=True))

@@ -32,7 +32,7 @@ def posed(lrm, q, points, names=FEW, **channels):
     parameters = parameters.with_free([oracle.armcal_name(name) for name in names])
     dataset = lrm.dataset(q, points, **channels)
     problem = lrm.problem(experiment, dataset, "auto", parameters)
-    return problem, problem.records(dataset), parameters.nominal()
+    return problem, problem.of(dataset).records, parameters.nominal()
 
 
 def deviations_off(fit, truth):

@@ -102,7 +102,7 @@ def _prior(system, parameters) -> np.ndarray:
     channels = {name: q[:, i] for i, name in enumerate(JOINTS)} | {name: np.zeros(len(q)) for name in AXES}
     bench = Dataset(tuple(map(str, range(len(q)))), channels)
     problem = Problem.build(system.arms, system.measurements, parameters, system.environment, bench, "interpreted")
-    (jacobian,) = problem.jacobians(parameters.nominal(), problem.records(bench))
+    (jacobian,) = problem.of(bench).jacobians(parameters.nominal())
     slopes = np.moveaxis(jacobian, 2, 0)[: len(q)].reshape(-1, STATES)
     known = np.array([_SD[block.unit] for block in parameters.free])
     seen = slopes * known  # in units of the noise already

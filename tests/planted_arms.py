@@ -79,7 +79,7 @@ class Case:
         dataset = Dataset(tuple(str(i) for i in range(POSES)), channels)
         surroundings = Environment((0.0, 0.0, -9.81))
         problem = Problem.build({"arm": arm}, {"tracker": tracker}, parameters, surroundings, dataset, "interpreted")
-        return problem, problem.records(dataset), parameters.nominal()
+        return problem, problem.of(dataset).records, parameters.nominal()
 
 
 TWO = ChainSpec((Row(a=0.3), Row(a=0.25)))

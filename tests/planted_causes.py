@@ -206,14 +206,14 @@ def fitted(base: Experiment, cause: Cause, dataset: Dataset) -> tuple[Problem, t
     system = base.system
     parameters = base.parameters.with_free(free_of(cause))
     problem = Problem.build(system.arms, system.measurements, parameters, system.environment, dataset, "interpreted")
-    records = problem.records(dataset)
-    found = fit(problem, records, IpoptEstimator(IpoptEstimator.Settings()), parameters.nominal())
+    records = problem.of(dataset).records
+    found = fit(problem.with_records(records), IpoptEstimator(IpoptEstimator.Settings()), parameters.nominal())
     return problem, records, found.estimate
 
 
 def left(base: Experiment, cause: Cause, dataset: Dataset) -> ResidualStructure:
     problem, records, estimate = fitted(base, cause, dataset)
-    motion = Motion.of(problem, estimate.values, records, dataset)
+    motion = Motion.of(problem.with_records(records), estimate.values, dataset)
     found = structure(problem, records, estimate, dataset, motion, recorded_position(dataset))
     assert found is not None
     return found

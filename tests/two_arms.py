@@ -117,24 +117,24 @@ class Case:
         return replace(self.postures, channels=channels)
 
     def _asked(self, dataset):
-        records = self.problem.records(dataset)
-        problem = started(self.problem, records)
-        return problem, with_joint_noise(problem, records, problem.parameters.nominal())
+        records = self.problem.of(dataset).records
+        problem = started(self.problem.with_records(records))
+        return problem, with_joint_noise(problem.with_records(records), problem.parameters.nominal()).records
 
     def fit(self, dataset):
         """As a run does it, from the nominal values."""
         problem, records = self._asked(dataset)
-        solution = self.experiment.estimator.solve(problem, records, problem.parameters.nominal())
-        return estimate(problem, records, solution)
+        solution = self.experiment.estimator.solve(problem.with_records(records), problem.parameters.nominal())
+        return estimate(problem.with_records(records), solution)
 
     def warnings(self, dataset):
         """What is said before the fit."""
         problem, records = self._asked(dataset)
-        return require_solvable(problem, records, problem.parameters.nominal())
+        return require_solvable(problem.with_records(records), problem.parameters.nominal())
 
     def closing_error(self, values, dataset: Dataset, part):
         """Mean length of the closing error's position (m) or rotation (rad)."""
-        residual = self.problem.residuals(values, self.problem.records(dataset))[0]
+        residual = self.problem.of(dataset).residuals(values)[0]
         return float(np.linalg.norm(residual[part], axis=0).mean())
 
 

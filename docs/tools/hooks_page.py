@@ -42,7 +42,6 @@ WORDS: Mapping[str, str] = MappingProxyType(
         "observations": "records, the newest last, each ready to be looked at from anywhere.",
         "progress": "receives what is being done, and which fraction of it is done.",
         "pulse": "its length (s).",
-        "records": "those of each measurement, with their weights.",
         "register": "the number of the first register.",
         "targets": "ON and OFF counts, by address and channel.",
         "values": "the parameters, as CasADi expressions under their local names, a block's entries in a column.",

@@ -341,18 +341,18 @@ def compare(subject: ArmToJudge, model: str, visits: Visits, frame: _Frame) -> C
     problem = Problem.build(
         system.arms, system.measurements, parameters, system.environment, dataset, "interpreted", groups={}
     )
-    records, where = problem.records(dataset), Location(dataset.source)
-    sighting = sighting_of(problem, records, dataset, 0, len(dataset))
+    where = Location(dataset.source)
+    sighting = sighting_of(problem, dataset, 0, len(dataset))
     if sighting is None or len(sighting.chosen) < len(dataset):
         raise DataError(
             f"{next(iter(system.measurements))} does not read the position of a target in a frame in each record.",
             where=where,
             hint="Judge by a measurement tip_position or tip_pose, and leave out rows without positions.",
         )
-    tools = tools_of(problem, parameters.nominal(), records[0], 0)
+    tools = tools_of(problem, parameters.nominal(), 0)
     if frame == "stated":
         with noted(["where the instrument may stand anywhere, give --frame found."]):
-            check_reach(problem, records, dataset)
+            check_reach(problem, problem.records, dataset)
     if model == "nominal":
         refuse_strangers(visits, sighting.measured.T, float(np.median(np.linalg.norm(tools.places, axis=0))))
     if frame == "found":

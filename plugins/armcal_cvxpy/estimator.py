@@ -6,7 +6,6 @@ does not fall; cvxpy knows nothing of poses, only one small triangular matrix.
 
 import time
 import warnings
-from collections.abc import Sequence
 from typing import Annotated, ClassVar
 
 import cvxpy as cp
@@ -17,7 +16,7 @@ from armcal.base.settings import Settings
 from armcal.estimate.estimator import Progress, Solution, SolverVerdict, no_progress
 from armcal.estimate.polish import polish
 from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import FactorRecords, NormalEquations, Problem
+from armcal.problem.problem import NormalEquations, Problem
 from pydantic import Field
 
 _LEAST_DAMPING, _FIRST_DAMPING, _MOST_DAMPING = 1e-12, 1e-6, 1e8
@@ -44,7 +43,6 @@ class CvxpyEstimator:
     def solve(
         self,
         problem: Problem,
-        records: Sequence[FactorRecords],
         start: Array,
         progress: Progress = no_progress,
     ) -> Solution:
@@ -52,7 +50,7 @@ class CvxpyEstimator:
         began = time.perf_counter()
         if not problem.increments:
             return Solution(start, SolverVerdict("cvxpy", "nothing is free", True, 0, 0.0))
-        posed = PosedProblem(problem, records)
+        posed = PosedProblem(problem)
         step = _ConvexStep(posed, self._settings.solver)
         x, status, iterations = np.clip(posed.x(start), *posed.bounds()), "iteration limit", 0
         if not np.isfinite(posed.cost(x)):

@@ -15,7 +15,7 @@ entries, which needs no records, and the model is made anew where that ends.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar
@@ -32,7 +32,7 @@ from armcal.estimate.polish import bounded_step, polish
 from armcal.io.parallel import Executor, Sequential
 from armcal.io.signals import Interrupts
 from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import FactorRecords, NormalEquations, Problem
+from armcal.problem.problem import NormalEquations, Problem
 from pydantic import Field
 from typing_extensions import override
 
@@ -177,7 +177,6 @@ class IpoptEstimator:
     def solve(
         self,
         problem: Problem,
-        records: Sequence[FactorRecords],
         start: Array,
         progress: Progress = no_progress,
     ) -> Solution:
@@ -185,12 +184,12 @@ class IpoptEstimator:
         began = time.perf_counter()
         if not problem.increments:
             return Solution(start, SolverVerdict("ipopt", "nothing is free", True, 0, 0.0))
-        posed, random = PosedProblem(problem, records), np.random.default_rng(self._settings.seed)
+        posed, random = PosedProblem(problem), np.random.default_rng(self._settings.seed)
         # The given start, then random ones a typical correction away from the nominal values.
         starts = [np.clip(posed.x(start), *posed.bounds())]
         for _ in range(1, self._settings.starts):
             starts.append(np.clip(random.normal(size=len(posed.scales)), *posed.bounds()))
-        solve_once = partial(_solve_once, self._settings, problem, tuple(records))
+        solve_once = partial(_solve_once, self._settings, problem)
         runs = self._executor.map(solve_once, starts, lambda done: progress("fit", done))
         converged = [run for run in runs if run.converged]
         best = min(converged or runs, key=lambda run: run.cost)
@@ -200,9 +199,9 @@ class IpoptEstimator:
         return Solution(posed.values(x), SolverVerdict("ipopt", *ended, len(runs), agreeing))
 
 
-def _solve_once(settings: IpoptSettings, problem: Problem, records: tuple[FactorRecords, ...], start: Array) -> _Run:
+def _solve_once(settings: IpoptSettings, problem: Problem, start: Array) -> _Run:
     """From one start; on a copy of the records, so that no start warms another's equilibria."""
-    posed = PosedProblem(problem, problem.subset(records, np.arange(records[0].count)))
+    posed = PosedProblem(problem.subset(np.arange(problem.count)))
     iterations = 0
 
     def solved(model: Posed, x: Array) -> Array:

@@ -137,11 +137,10 @@ class ContactsSimulator:
         extra = {label: (text,) * _BATCH for label, text in labels.items()}
         for _ in range(_MOST_BATCHES):
             drawn = {n: middle[n] + random.uniform(-reach[n], reach[n], _BATCH) for n in names}
-            records = problem.records(Dataset(tuple(map(str, range(_BATCH))), drawn, extra))
-            taken = projected(problem, values, records)
-            angles = {n: taken[0].record[factor.channels.index(n), :_BATCH] for n in names}
+            taken = projected(problem.of(Dataset(tuple(map(str, range(_BATCH))), drawn, extra)), values)
+            angles = {n: taken.records[0].record[factor.channels.index(n), :_BATCH] for n in names}
             near = np.all([np.abs(angles[n] - middle[n]) <= 1.5 * reach[n] for n in names], axis=0)
-            good = near & fits(problem, values, taken)[0]
+            good = near & fits(taken, values)[0]
             for name in names:
                 postures[name].append(angles[name][good])
             if sum(len(part) for part in postures[names[0]]) >= settings.count:

@@ -126,9 +126,11 @@ def _experiments(lrm, make_noise, number: int, settings: BootstrapSettings):
     for seed in range(number):
         random = np.random.default_rng(seed)
         noisy = {name: values + NOISE_M * make_noise(random, len(values)) for name, values in exact.items()}
-        records = problem.records(with_channels(dataset, noisy))
-        fitted = estimate(problem, records, experiment.estimator.solve(problem, records, start))
-        resampled = bootstrap(problem, records, experiment.estimator, fitted, replace_seed(settings, seed))
+        records = problem.of(with_channels(dataset, noisy)).records
+        fitted = estimate(
+            problem.with_records(records), experiment.estimator.solve(problem.with_records(records), start)
+        )
+        resampled = bootstrap(problem.with_records(records), experiment.estimator, fitted, replace_seed(settings, seed))
         assert resampled.failed == 0 and resampled.names == fitted.names
         found.append(fitted.values[list(fitted.free_entries)])
         spreads.append(resampled.deviations)
@@ -175,9 +177,14 @@ def _fitted(lrm, *overrides):
     experiment = lrm.experiment("demo", FREE, "evaluator=interpreted", *overrides)
     dataset = experiment.read()
     problem = lrm.problem(experiment, dataset)
-    records = problem.records(dataset)
+    records = problem.of(dataset).records
     start = experiment.parameters.nominal()
-    return experiment, problem, records, estimate(problem, records, experiment.estimator.solve(problem, records, start))
+    return (
+        experiment,
+        problem,
+        records,
+        estimate(problem.with_records(records), experiment.estimator.solve(problem.with_records(records), start)),
+    )
 
 
 @pytest.mark.slow
@@ -186,21 +193,23 @@ def test_the_same_seed_gives_the_same_refits_anywhere(lrm) -> None:
     for method in ("blocks", "parametric"):
         settings = BootstrapSettings(bootstrap=6, method=method, seed=5)
         runs = [
-            bootstrap(problem, records, experiment.estimator, found, settings, executor).values
+            bootstrap(problem.with_records(records), experiment.estimator, found, settings, executor).values
             for executor in (None, Workers("loky", 2))
         ]
         assert np.array_equal(*runs)
         other = settings.model_copy(update={"seed": 6})
-        assert not np.array_equal(runs[0], bootstrap(problem, records, experiment.estimator, found, other).values)
+        assert not np.array_equal(
+            runs[0], bootstrap(problem.with_records(records), experiment.estimator, found, other).values
+        )
 
 
 def test_drawing_a_record_twice_is_having_it_twice(lrm) -> None:
     experiment, problem, records, found = _fitted(lrm)
     settings = BootstrapSettings(bootstrap=1, blocks=7, seed=9)
-    resampled = bootstrap(problem, records, experiment.estimator, found, settings)
+    resampled = bootstrap(problem.with_records(records), experiment.estimator, found, settings)
     weights = draw_weights(records[0].count, 7, np.random.default_rng(9)).astype(int)
-    twice = problem.subset(records, np.repeat(np.arange(len(weights)), weights).astype(np.intp))
-    solution = experiment.estimator.solve(problem, twice, found.values)
+    twice = problem.with_records(records).subset(np.repeat(np.arange(len(weights)), weights).astype(np.intp)).records
+    solution = experiment.estimator.solve(problem.with_records(twice), found.values)
     free = list(found.free_entries)
     assert np.allclose(resampled.values[0], solution.values[free], atol=1e-9)
 
@@ -211,10 +220,10 @@ class _Refusing:
     def __init__(self, inner, every: int, *, by_raising: bool) -> None:
         self.inner, self.every, self.count, self.by_raising = inner, every, 0, by_raising
 
-    def solve(self, problem, records, start, progress=None):
+    def solve(self, problem, start, progress=None):
         self.count += 1
         if self.count % self.every:
-            return self.inner.solve(problem, records, start)
+            return self.inner.solve(problem, start)
         if self.by_raising:
             raise NotConvergedError("no equilibrium")
         return Solution(start + np.nan, SolverVerdict("refusing", "no", False, 1, 0.0))
@@ -225,7 +234,7 @@ class _Refusing:
 def test_refits_that_fail_are_counted_and_left_out(lrm, by_raising: bool) -> None:
     experiment, problem, records, found = _fitted(lrm)
     refusing = _Refusing(experiment.estimator, 4, by_raising=by_raising)
-    few = bootstrap(problem, records, refusing, found, BootstrapSettings(bootstrap=8))
+    few = bootstrap(problem.with_records(records), refusing, found, BootstrapSettings(bootstrap=8))
     assert (few.failed, len(few.values)) == (2, 6) and np.isfinite(few.values).all()
     assert np.isnan(few.intervals).all() and np.isnan(few.deviations).all(), "six refits are no interval"
 
@@ -233,7 +242,7 @@ def test_refits_that_fail_are_counted_and_left_out(lrm, by_raising: bool) -> Non
 @pytest.mark.slow
 def test_percentiles_are_of_the_refits(lrm) -> None:
     experiment, problem, records, found = _fitted(lrm)
-    resampled = bootstrap(problem, records, experiment.estimator, found, BootstrapSettings(bootstrap=40))
+    resampled = bootstrap(problem.with_records(records), experiment.estimator, found, BootstrapSettings(bootstrap=40))
     ordered = np.sort(resampled.values, axis=0)
     assert np.all(resampled.intervals[:, 0] >= ordered[0]) and np.all(resampled.intervals[:, 1] <= ordered[-1])
     assert np.all(resampled.intervals[:, 0] < ordered[2]) and np.all(resampled.intervals[:, 1] > ordered[-3])
@@ -246,7 +255,12 @@ def test_what_was_not_measured_cannot_be_made_up(lrm) -> None:
     shared = Correlation((slopes,), (slopes,), node, np.ones((len(node) - 1, 1)))
     drifting = tuple(replace(each, correlation=shared) for each in records)
     with pytest.raises(ProblemError, match="to simulate"):
-        bootstrap(problem, drifting, experiment.estimator, found, BootstrapSettings(bootstrap=2, method="parametric"))
+        bootstrap(
+            problem.with_records(drifting),
+            experiment.estimator,
+            found,
+            BootstrapSettings(bootstrap=2, method="parametric"),
+        )
 
 
 @pytest.mark.slow

@@ -94,9 +94,9 @@ def found_in(lrm, name, seed, in_order=False):
     points = measured(name, seed, q, came)
     columns = {f"arm.approach.q{i + 1}": came[:, i] for i in range(6) if name != "hysteresis"}
     problem, records, start = posed(lrm, q, points, oracle.OPTION_1, **columns)
-    estimate = fit(problem, records, IpoptEstimator(IpoptEstimator.Settings()), start).estimate
+    estimate = fit(problem.with_records(records), IpoptEstimator(IpoptEstimator.Settings()), start).estimate
     dataset = lrm.dataset(q, points, **columns)
-    motion = Motion.of(problem, estimate.values, records, dataset)
+    motion = Motion.of(problem.with_records(records), estimate.values, dataset)
     return structure(problem, records, estimate, dataset, motion, recorded_position(dataset))
 
 
@@ -175,7 +175,7 @@ def test_how_large_an_unseen_scale_may_be_is_not_a_matter_of_chance(lrm):
     for noise in (0.0, 4 * NOISE_M):
         points = exact + noise * np.random.default_rng(2).normal(size=exact.shape)
         problem, records, start = posed(lrm, q, points, oracle.OPTION_1)
-        estimate = fit(problem, records, IpoptEstimator(IpoptEstimator.Settings()), start).estimate
+        estimate = fit(problem.with_records(records), IpoptEstimator(IpoptEstimator.Settings()), start).estimate
         read = predicted_positions(problem, estimate.values, records, lrm.dataset(q, points))
         found.append(scale_deviation(problem, FitRows.of(problem, records, estimate), read, 1.0, estimate.values))
     assert found[1] == pytest.approx(found[0], rel=0.15)

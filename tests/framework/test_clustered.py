@@ -41,8 +41,10 @@ def estimates(order: str, seeds: range, count: int) -> list[tuple[Estimate, Esti
         problem = Problem.build(
             system.arms, system.measurements, parameters, system.environment, dataset, "interpreted"
         )
-        records = problem.records(dataset)
-        plain = estimate(problem, records, loaded.estimator.solve(problem, records, parameters.nominal()))
+        records = problem.of(dataset).records
+        plain = estimate(
+            problem.with_records(records), loaded.estimator.solve(problem.with_records(records), parameters.nominal())
+        )
         wide = widened(problem, records, plain, places)
         found.append((plain, wide, (plain.values - parameters.nominal())[free]))
     return found

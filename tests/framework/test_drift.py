@@ -63,7 +63,7 @@ def posed(lrm, dataset, drifts=DRIFTS, channel="sequence"):
     """The problem and its records, correlated as the drifts demand."""
     parameters = parameters_of(lrm, drifts, channel)
     problem = lrm.problem(lrm.experiment(), dataset, "interpreted", parameters)
-    return problem, with_drift(problem, problem.records(dataset), dataset, parameters.nominal())
+    return problem, with_drift(problem.of(dataset), dataset, parameters.nominal()).records
 
 
 # ---------------------------------------------------------------- dense generalised least squares
@@ -142,15 +142,15 @@ def compared(lrm, problem, records, dense, v):
     """Cost, gradient, Hessian and triangular factor against the dense ones."""
     values, places = lrm.vector(problem.parameters, {name: v[name] for name in FREE}), in_order(problem)
     cost, gradient, hessian = dense.model(v)
-    found = problem.normal_equations(values, records)
+    found = problem.with_records(records).normal_equations(values)
     size = np.sqrt(np.diag(hessian))
     assert found.cost == pytest.approx(cost, rel=1e-6)
-    assert problem.cost(values, records) == pytest.approx(cost, rel=1e-6)
+    assert problem.with_records(records).cost(values) == pytest.approx(cost, rel=1e-6)
     tolerance = 1e-5 * np.sqrt(2 * cost)
     np.testing.assert_allclose(found.gradient[places] / size, gradient / size, rtol=0, atol=tolerance)
     np.testing.assert_allclose(found.hessian[np.ix_(places, places)] / np.outer(size, size),
                                hessian / np.outer(size, size), rtol=0, atol=1e-6)  # fmt: skip
-    upper = problem.triangular_factor(values, records)
+    upper = problem.with_records(records).triangular_factor(values)
     np.testing.assert_allclose((upper.T @ upper)[np.ix_(places, places)] / np.outer(size, size),
                                hessian / np.outer(size, size), rtol=0, atol=1e-6)  # fmt: skip
 
@@ -179,11 +179,11 @@ def test_weights_act_as_noise_of_its_own_in_each_record(lrm):
     weights[[4, 17]] = 0.0
     problem, records = posed(lrm, dataset)
     dense = Dense(dataset, DRIFTS, weights)
-    compared(lrm, problem, problem.weighted(records, [weights]), dense, somewhere(6))
-    in_two = problem.weighted(problem.weighted(records, [np.sqrt(weights)]), [np.sqrt(weights)])
+    compared(lrm, problem, problem.with_records(records).weighted([weights]).records, dense, somewhere(6))
+    in_two = problem.with_records(records).weighted([np.sqrt(weights)]).weighted([np.sqrt(weights)]).records
     compared(lrm, problem, in_two, dense, somewhere(6))
     parameters = problem.parameters
-    at_once = with_drift(problem, problem.records(dataset, weights), dataset, parameters.nominal())
+    at_once = with_drift(problem.of(dataset, weights), dataset, parameters.nominal()).records
     compared(lrm, problem, at_once, dense, somewhere(6))
 
 
@@ -191,10 +191,10 @@ def test_weights_act_as_noise_of_its_own_in_each_record(lrm):
 def test_some_of_the_records_are_a_problem_of_their_own(lrm):
     dataset, chosen = recorded(lrm, 40, 7, DRIFTS), np.array([3, 0, 22, 38, 10, 11, 12, 31, 5])
     problem, records = posed(lrm, dataset)
-    part = problem.subset(records, chosen)
+    part = problem.with_records(records).subset(chosen).records
     compared(lrm, problem, part, Dense(dataset.subset(chosen), DRIFTS), somewhere(8))
     weights = np.random.default_rng(3).uniform(0.2, 2, len(chosen))
-    weighted = problem.weighted(part, [weights])
+    weighted = problem.with_records(part).weighted([weights]).records
     compared(lrm, problem, weighted, Dense(dataset.subset(chosen), DRIFTS, weights), somewhere(8))
 
 
@@ -205,7 +205,7 @@ def test_the_order_of_the_records_does_not_matter(lrm):
     fits = []
     for each in (dataset, turned):
         problem, records = posed(lrm, each)
-        fits.append(SOLVER.solve(problem, records, problem.parameters.nominal()).values)
+        fits.append(SOLVER.solve(problem.with_records(records), problem.parameters.nominal()).values)
     np.testing.assert_allclose(*fits, rtol=0, atol=1e-9)
 
 
@@ -215,7 +215,7 @@ def test_where_a_sequence_starts_at_a_multiple_of_the_distance_does_not_matter(l
     costs = []
     for each in (dataset, later):
         problem, records = posed(lrm, each, drifts)
-        costs.append(problem.cost(problem.parameters.nominal(), records))
+        costs.append(problem.with_records(records).cost(problem.parameters.nominal()))
     assert costs[0] == pytest.approx(costs[1], rel=1e-9)
 
 
@@ -226,18 +226,21 @@ def test_residuals_of_other_records_are_kriged_from_those_that_tell(lrm, weighte
     order = np.random.default_rng(5).permutation(48)
     train, held = np.sort(order[:30]), np.sort(order[30:])
     problem, records = posed(lrm, dataset)
-    telling, others = problem.subset(records, train), problem.subset(records, held)
+    telling, others = (
+        problem.with_records(records).subset(train).records,
+        problem.with_records(records).subset(held).records,
+    )
     weights = np.random.default_rng(6).uniform(0, 2, 30) if weighted else None
-    telling = problem.weighted(telling, [weights]) if weighted else telling
+    telling = problem.with_records(telling).weighted([weights]).records if weighted else telling
     values = lrm.vector(problem.parameters, {name: v[name] for name in FREE})
     dense = Dense(dataset.subset(train), DRIFTS, weights)
-    for part, chosen in ((others, held), (problem.subset(records, train), train)):
+    for part, chosen in ((others, held), (problem.with_records(records).subset(train).records, train)):
         expected = dense.told(v, dataset.subset(chosen))
-        (found,) = residuals(problem, values, part, telling)
+        (found,) = residuals(problem.with_records(part), values, problem.with_records(telling))
         np.testing.assert_allclose(found.T, expected, rtol=0, atol=1e-9)
-        errors = record_errors(problem, values, part, telling)
+        errors = record_errors(problem.with_records(part), values, problem.with_records(telling))
         np.testing.assert_allclose(errors, np.linalg.norm(expected, axis=1), rtol=0, atol=1e-9)
-    at_rest = record_errors(problem, values, others)
+    at_rest = record_errors(problem.with_records(others), values)
     expected = np.linalg.norm(residual_of(dataset.subset(held), v), axis=1)
     np.testing.assert_allclose(at_rest, expected, rtol=0, atol=1e-9)
 
@@ -250,8 +253,8 @@ def test_records_without_weight_are_told_the_drift_too(lrm):
     weights[[7, 20]] = 0.0
     problem = posed(lrm, dataset)[0]
     values = lrm.vector(problem.parameters, {name: v[name] for name in FREE})
-    records = with_drift(problem, problem.records(dataset, weights), dataset, problem.parameters.nominal())
-    (found,) = residuals(problem, values, records, records)
+    records = with_drift(problem.of(dataset, weights), dataset, problem.parameters.nominal()).records
+    (found,) = residuals(problem.with_records(records), values, problem.with_records(records))
     expected = Dense(dataset, DRIFTS, weights).told(v, dataset)
     np.testing.assert_allclose(found.T, expected, rtol=0, atol=1e-9)
 
@@ -276,7 +279,7 @@ def test_a_drift_that_never_forgets_is_a_shift_of_the_whole_recording(lrm):
     fits = []
     for drifts in ({}, {"base_x": (2e-3, 1e7)}):
         problem, records = posed(lrm, dataset, drifts)
-        upper = problem.triangular_factor(problem.parameters.nominal(), records)
+        upper = problem.with_records(records).triangular_factor(problem.parameters.nominal())
         fits.append(np.linalg.inv(upper.T @ upper))
     place = problem.free_names.index("arm.mdh.base_x")
     assert fits[1][place, place] - fits[0][place, place] == pytest.approx((2e-3) ** 2, rel=1e-3)
@@ -285,11 +288,11 @@ def test_a_drift_that_never_forgets_is_a_shift_of_the_whole_recording(lrm):
 @pytest.mark.slow
 def test_ipopt_and_cvxpy_agree_on_a_drifting_recording(lrm):
     problem, records = posed(lrm, recorded(lrm, 60, 19, DRIFTS))
-    upper = problem.triangular_factor(problem.parameters.nominal(), records)
+    upper = problem.with_records(records).triangular_factor(problem.parameters.nominal())
     sd = np.sqrt(np.diag(np.linalg.inv(upper.T @ upper)))
     ends = []
     for solver in (SOLVER, IpoptEstimator(IpoptEstimator.Settings())):
-        solution = solver.solve(problem, records, problem.parameters.nominal())
+        solution = solver.solve(problem.with_records(records), problem.parameters.nominal())
         assert solution.verdict.converged
         ends.append(solution.values[list(problem.parameters.free_entries)])
     assert (np.abs(ends[0] - ends[1]) / sd).max() < 1e-4
@@ -327,7 +330,7 @@ def test_drifts_over_records_and_over_time_at_once(lrm):
     for sign in (1, -1):
         timed = replace(dataset, channels={**dataset.channels, "time": sign * clock})
         problem = lrm.problem(lrm.experiment(), timed, "interpreted", parameters)
-        records = with_drift(problem, problem.records(timed), timed, parameters.nominal())
+        records = with_drift(problem.of(timed), timed, parameters.nominal()).records
         dense = Dense(timed, {"base_x": (1e-3, 7.0)})
         dense.inverse = np.linalg.inv(
             np.linalg.inv(dense.inverse) + drift_covariance(timed, timed, {"theta1": (2e-3, 300.0)}, "time")
@@ -336,7 +339,7 @@ def test_drifts_over_records_and_over_time_at_once(lrm):
     clock[[3, 4]] = clock[[4, 3]]
     mixed = replace(dataset, channels={**dataset.channels, "time": clock})
     with pytest.raises(DataError, match="the same order by sequence and by time"):
-        with_drift(problem, problem.records(mixed), mixed, parameters.nominal())
+        with_drift(problem.of(mixed), mixed, parameters.nominal())
 
 
 # ---------------------------------------------------------------- planted drifts
@@ -351,7 +354,9 @@ def scores(lrm, seeds, drifts, count=80):
     for seed in seeds:
         dataset = recorded(lrm, count, seed, PLANTED)
         problem, records = posed(lrm, dataset, drifts)
-        fit = estimate(problem, records, SOLVER.solve(problem, records, problem.parameters.nominal()))
+        fit = estimate(
+            problem.with_records(records), SOLVER.solve(problem.with_records(records), problem.parameters.nominal())
+        )
         truth = lrm.vector(problem.parameters, {n: oracle.PUBLISHED[n] for n in FREE})[list(fit.free_entries)]
         ratios.append((fit.values[list(fit.free_entries)] - truth) / fit.deviations)
         held.append([i.lower <= t <= i.upper for i, t in zip(fit.intervals, truth, strict=True)])
@@ -385,7 +390,9 @@ def test_a_drift_as_stated_is_no_error_of_the_model(lrm, seeds):
     warned = 0
     for seed in seeds:
         problem, records = posed(lrm, recorded(lrm, 50, seed, PLANTED), PLANTED)
-        fit = estimate(problem, records, SOLVER.solve(problem, records, problem.parameters.nominal()))
+        fit = estimate(
+            problem.with_records(records), SOLVER.solve(problem.with_records(records), problem.parameters.nominal())
+        )
         finding = _size(fit, np.ones(1), Evidence())
         assert finding.grade == "warning" or "model explains the data" in finding.text
         warned += finding.grade == "warning"
@@ -399,7 +406,7 @@ def test_neighbours_tell_of_the_drift_so_held_out_errors_fall(lrm):
     splits, crossed = folds(120, 5, 0), {}
     for name, drifts in (("still", {}), ("drifting", PLANTED)):
         problem, records = posed(lrm, dataset, drifts)
-        crossed[name] = cross_validate(problem, records, splits, SOLVER, problem.parameters.nominal())
+        crossed[name] = cross_validate(problem.with_records(records), splits, SOLVER, problem.parameters.nominal())
     still, drifting = crossed["still"], crossed["drifting"]
     assert drifting.errors.mean() < 0.75 * still.errors.mean()
     assert drifting.at_rest.mean() == pytest.approx(still.errors.mean(), rel=0.15)
@@ -420,15 +427,15 @@ def test_a_robust_fit_finds_outliers_on_a_drifting_arm(lrm):
     spoilt = replace(dataset, channels=channels)
     problem, records = posed(lrm, spoilt, PLANTED)
     start = problem.parameters.nominal()
-    clean = SOLVER.solve(problem, posed(lrm, dataset, PLANTED)[1], start).values
-    fit = Weighing(SOLVER, NoiseSettings(loss="reject")).fit(problem, records, start)
+    clean = SOLVER.solve(problem.with_records(posed(lrm, dataset, PLANTED)[1]), start).values
+    fit = Weighing(SOLVER, NoiseSettings(loss="reject")).fit(problem.with_records(records), start)
     assert {each.record for each in fit.set_aside} == set(wrong)
-    upper = problem.triangular_factor(clean, records)
+    upper = problem.with_records(records).triangular_factor(clean)
     sd = np.sqrt(np.diag(np.linalg.inv(upper.T @ upper)))
     free = list(problem.parameters.free_entries)
     assert (np.abs(fit.solution.values - clean)[free] / sd).max() < 1
     kept = np.setdiff1d(np.arange(80), wrong)
-    without = SOLVER.solve(problem, problem.subset(records, kept), start).values
+    without = SOLVER.solve(problem.with_records(records).subset(kept), start).values
     np.testing.assert_allclose(fit.solution.values[free] / sd, without[free] / sd, rtol=0, atol=1e-4)
 
 
@@ -533,8 +540,8 @@ def test_a_run_on_a_drifting_recording_states_both_errors(tmp_path):
 
 def new_recording(problem, records, fitted):
     """What a run gathers of a fit to all records."""
-    known = estimate(problem, records, fitted)
-    drift = KnownDrift.by(problem, known.values, records)
+    known = estimate(problem.with_records(records), fitted)
+    drift = KnownDrift.by(problem.with_records(records), known.values)
     by = Predictor(problem, known.values, known.covariance, known.noise_scale, known.degrees_of_freedom, drift)
     return by.new_recording(records, np.arange(records[0].count))
 
@@ -546,7 +553,7 @@ def test_records_count_as_their_drift_lets_them(lrm, over):
     drifts = {"base_x": (1.5e-3, over), "base_z": (1.5e-3, over)}
     dataset = recorded(lrm, 60, 3, drifts)
     problem, records = posed(lrm, dataset, drifts)
-    new = new_recording(problem, records, SOLVER.solve(problem, records, problem.parameters.nominal()))
+    new = new_recording(problem, records, SOLVER.solve(problem.with_records(records), problem.parameters.nominal()))
     covariance = np.linalg.inv(Dense(dataset, drifts).inverse)
     assert np.trace(covariance) ** 2 / np.sum(covariance**2) == pytest.approx(new.freedom, rel=1e-6)
     assert (new.freedom == pytest.approx(new.independent)) == (over < 1)
@@ -562,9 +569,11 @@ def test_angles_do_not_count_where_errors_are_lengths(lrm):
     for experiment in (lrm.experiment(), lrm.experiment("option1", *pose)):
         problem = lrm.problem(experiment, dataset, "interpreted", parameters_of(lrm, drifts, experiment=experiment))
         values = problem.parameters.nominal()
-        records = with_drift(problem, problem.records(dataset), dataset, values)
+        records = with_drift(problem.of(dataset), dataset, values).records
         free = len(problem.free_names)
-        by = Predictor(problem, values, np.eye(free) * 1e-8, 1.0, 99.0, KnownDrift.by(problem, values, records))
+        by = Predictor(
+            problem, values, np.eye(free) * 1e-8, 1.0, 99.0, KnownDrift.by(problem.with_records(records), values)
+        )
         known.append(by.new_recording(records, np.arange(40)))
         assert by.new_recording(records, np.arange(0)) is None
     assert known[0].freedom == pytest.approx(known[1].freedom) and known[0].freedom < known[0].independent
@@ -580,11 +589,11 @@ def test_the_guarantee_is_for_a_new_recording(lrm):
     start = problem.parameters.nominal()
     for seed in range(24):
         dataset = recorded(lrm, 100, seed, drifts)
-        records = with_drift(problem, problem.records(dataset), dataset, start)
-        judged = cross_validate(problem, records, folds(100, 5, seed), SOLVER, start)
-        fitted = SOLVER.solve(problem, records, start)
-        others = [problem.records(recorded(lrm, 100, 1000 + 40 * seed + i, drifts)) for i in range(40)]
-        unseen = np.concatenate([record_errors(problem, fitted.values, other) for other in others]) * 1000
+        records = with_drift(problem.of(dataset), dataset, start).records
+        judged = cross_validate(problem.with_records(records), folds(100, 5, seed), SOLVER, start)
+        fitted = SOLVER.solve(problem.with_records(records), start)
+        others = [problem.of(recorded(lrm, 100, 1000 + 40 * seed + i, drifts)).records for i in range(40)]
+        unseen = np.concatenate([record_errors(problem.with_records(other), fitted.values) for other in others]) * 1000
         new = new_recording(problem, records, fitted)
         for name, errors, known in (("at rest", judged.at_rest, new), ("beside neighbours", judged.errors, None)):
             limit = float(_good_for(errors * 1000, "folds", new=known).split("+- ")[1].split(" mm")[0])

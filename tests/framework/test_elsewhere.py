@@ -46,8 +46,8 @@ def test_the_tool_is_off_away_from_the_sockets_by_as_much_as_is_said() -> None:
         parts = [(co.joints(at), {"position": "here", "socket": name}) for at, name in zip(noisy, places, strict=True)]
         ball = BallInSocket(BallInSocket.Settings.si(noise=NOISE), ("arm",))
         problem, records = co.Bench({"arm": co.the_arm(co.ELBOW)}, {"balls": ball}, FREE).problem(co.dataset(parts))
-        problem = started(problem, records)
-        estimate = fit(problem, records, IPOPT, problem.parameters.nominal()).estimate
+        problem = started(problem.with_records(records))
+        estimate = fit(problem.with_records(records), IPOPT, problem.parameters.nominal()).estimate
         away = elsewhere(problem, estimate, Dataset(tuple(map(str, range(100))), co.joints(poses)))
         assert away is not None
         stated.append(away.rms_mm)

@@ -25,7 +25,9 @@ def test_a_known_distance_of_sockets_keeps_the_size_of_the_arm_from_taking_up_th
     ball = BallInSocket(BallInSocket.Settings.si(noise=NOISE, distances=[known]), ("arm",))
     free = ("arm.mdh.a?", "arm.mdh.d?", "arm.mdh.tool_z")
     problem, records = co.Bench({"arm": co.the_arm(co.ELBOW)}, {"balls": ball}, free).problem(co.dataset(parts))
-    problem = started(problem, records)
-    solution = IpoptEstimator(IpoptEstimator.Settings()).solve(problem, records, problem.parameters.nominal())
+    problem = started(problem.with_records(records))
+    solution = IpoptEstimator(IpoptEstimator.Settings()).solve(
+        problem.with_records(records), problem.parameters.nominal()
+    )
     rows = FitRows.of(problem, records, SimpleNamespace(values=solution.values))
     assert np.linalg.norm(rows.slopes.T @ rows.residual) < 1e-6 * np.linalg.norm(rows.slopes)

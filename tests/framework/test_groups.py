@@ -79,8 +79,8 @@ def test_cost_gradient_and_hessian_are_those_of_the_dense_formulas(data, mean_we
     problem, records = bench(mean_weight=mean_weight).problem(data)
     values = near(problem)
     residual, jacobian = dense(problem, values, oracle_rows(data, mean_weight))
-    found, size = problem.normal_equations(values, records), np.sqrt(np.diag(jacobian.T @ jacobian))
-    assert problem.cost(values, records) == pytest.approx(0.5 * residual @ residual, rel=1e-11)
+    found, size = problem.with_records(records).normal_equations(values), np.sqrt(np.diag(jacobian.T @ jacobian))
+    assert problem.with_records(records).cost(values) == pytest.approx(0.5 * residual @ residual, rel=1e-11)
     assert found.cost == pytest.approx(0.5 * residual @ residual, rel=1e-11)
     np.testing.assert_allclose(
         found.hessian / np.outer(size, size), jacobian.T @ jacobian / np.outer(size, size), atol=1e-7
@@ -89,21 +89,21 @@ def test_cost_gradient_and_hessian_are_those_of_the_dense_formulas(data, mean_we
         found.gradient / size, jacobian.T @ residual / size, atol=1e-7 * np.linalg.norm(residual)
     )
     assert np.all(size > 0), "a free parameter that no row sees"
-    upper = problem.triangular_factor(values, records)
+    upper = problem.with_records(records).triangular_factor(values)
     chain = problem.parameters.entries_jacobian(values)
     np.testing.assert_allclose(upper.T @ upper, chain.T @ found.hessian @ chain, rtol=1e-9, atol=1e-9 * size.max() ** 2)
     mean_rows = 0 if mean_weight == 1 else 3 * len(SPOTS)
-    assert problem.equations(records) == len(residual) - mean_rows
+    assert problem.with_records(records).equations() == len(residual) - mean_rows
 
 
 def test_the_record_jacobians_are_the_slopes_of_the_whitened_residuals(data):
     problem, records = bench().problem(data)
     values, free = near(problem), list(problem.parameters.free_entries)
-    blocks = list(problem.jacobians(values, records))
+    blocks = list(problem.with_records(records).jacobians(values))
     for column, entry in enumerate(free):
         step = np.zeros(len(values))
         step[entry] = 1e-6
-        sides = [problem.weighted_residuals(values + sign * step, records) for sign in (1, -1)]
+        sides = [problem.with_records(records).weighted_residuals(values + sign * step) for sign in (1, -1)]
         for block, (plus, minus) in zip(blocks, zip(*sides, strict=True), strict=True):
             slope = (plus - minus) / 2e-6
             scale = max(1.0, np.abs(slope).max())
@@ -116,13 +116,16 @@ def test_the_gradient_is_that_of_the_cost_and_the_exact_hessian_that_of_the_grad
     problem, records = bench(mean_weight=mean_weight).problem(data)
     plain, _ = bench().problem(data)
     values = near(problem)
-    equations, exact = problem.normal_equations(values, records), problem.exact_hessian(values, records)
+    equations, exact = (
+        problem.with_records(records).normal_equations(values),
+        problem.with_records(records).exact_hessian(values),
+    )
     beside = equations.hessian - plain.normal_equations(values, records).hessian
     size = np.sqrt(np.diag(equations.hessian))
     for column, entry in enumerate(problem.parameters.free_entries):
         step = np.zeros(len(values))
         step[entry] = 1e-2 / size[column]
-        sides = [problem.normal_equations(values + sign * step, records) for sign in (1, -1)]
+        sides = [problem.with_records(records).normal_equations(values + sign * step) for sign in (1, -1)]
         slope = (sides[0].cost - sides[1].cost) / 2e-2
         assert slope == pytest.approx(equations.gradient[column] / size[column], rel=1e-5, abs=1e-3)
         up, down = (plain.normal_equations(values + sign * step, records) for sign in (1, -1))
@@ -141,11 +144,18 @@ def test_compiled_and_interpreted_evaluators_agree(counts):
     compiled, own = made.problem(data, "compiled")
     assert compiled.backend == "compiled"
     values = near(problem)
-    one, other = problem.normal_equations(values, records), compiled.normal_equations(values, own)
+    one, other = (
+        problem.with_records(records).normal_equations(values),
+        compiled.with_records(own).normal_equations(values),
+    )
     assert other.cost == pytest.approx(one.cost, rel=1e-11)
     np.testing.assert_allclose(other.hessian, one.hessian, rtol=1e-9, atol=1e-11 * np.abs(one.hessian).max())
     np.testing.assert_allclose(other.gradient, one.gradient, rtol=1e-9, atol=1e-9 * np.abs(one.gradient).max())
-    starts = zip(problem.nuisance_starts(values, records), compiled.nuisance_starts(values, own), strict=True)
+    starts = zip(
+        problem.with_records(records).nuisance_starts(values),
+        compiled.with_records(own).nuisance_starts(values),
+        strict=True,
+    )
     for interpreted, of_compiled in starts:
         np.testing.assert_allclose(interpreted, of_compiled, atol=1e-13)
 
@@ -155,7 +165,7 @@ def test_compiled_and_interpreted_evaluators_agree(counts):
 
 def summary(problem, records, values):
     """Cost, and gradient and Hessian by name."""
-    found = problem.normal_equations(values, records)
+    found = problem.with_records(records).normal_equations(values)
     order = np.argsort(problem.free_names)
     return found.cost, found.gradient[order], found.hessian[np.ix_(order, order)]
 
@@ -184,7 +194,7 @@ def test_names_of_groups_mean_nothing_but_their_order():
     again, others = bench().problem(renamed)
     values = co.by_name(problem.parameters, near(problem))
     moved = {n.replace("back", "zebra").replace("front", "ant").replace("shelf", "mouse"): x for n, x in values.items()}
-    first = problem.normal_equations(co.vector(problem.parameters, values), records)
+    first = problem.with_records(records).normal_equations(co.vector(problem.parameters, values))
     second = again.normal_equations(co.vector(again.parameters, moved), others)
     assert second.cost == pytest.approx(first.cost, rel=1e-12)
     np.testing.assert_allclose(np.linalg.eigvalsh(second.hessian), np.linalg.eigvalsh(first.hessian), rtol=1e-8)
@@ -200,7 +210,7 @@ def test_the_same_records_in_two_measurements_give_the_same_sums():
     halves = {"balls": ball(("left",), distances=(known_distance(),)), "more": ball(("left",), sockets_of="balls")}
     parted, both = co.Bench(arms, halves, FREE[:3]).problem(data)
     mine = (np.arange(len(data)) % 2).astype(float)
-    both = parted.weighted(both, [mine, 1 - mine])
+    both = parted.with_records(both).weighted([mine, 1 - mine]).records
     moved = co.vector(parted.parameters, co.by_name(problem.parameters, values))
     assert_same(summary(problem, records, values), summary(parted, both, moved))
 
@@ -221,24 +231,26 @@ def test_the_unit_of_length_means_nothing():
     values = near(problem)
     lengths = np.array([b.unit == "m" for b in problem.parameters.blocks])
     grown = np.where(lengths, k, 1.0)
-    assert large.cost(values * grown, others) == pytest.approx(problem.cost(values, records), rel=1e-10)
+    assert large.cost(values * grown, others) == pytest.approx(problem.with_records(records).cost(values), rel=1e-10)
     free = list(problem.parameters.free_entries)
     slope = large.normal_equations(values * grown, others).gradient * grown[free]
-    expected = problem.normal_equations(values, records).gradient
+    expected = problem.with_records(records).normal_equations(values).gradient
     np.testing.assert_allclose(slope, expected, rtol=1e-8, atol=1e-9 * np.abs(expected).max())
 
 
 def test_a_problem_that_went_through_a_pickle_is_the_same(data):
     problem, records = bench(mean_weight=30.0).problem(data)
-    few = problem.subset(records, np.flatnonzero(np.array(data.extra["position"]) == "front"))
-    held = restricted(problem, few)
+    few = problem.with_records(records).subset(np.flatnonzero(np.array(data.extra["position"]) == "front")).records
+    held = restricted(problem.with_records(few))
     assert len(held.parameters.free) < len(problem.parameters.free)
     for one in (problem, held):
         other, values = pickle.loads(pickle.dumps(one)), near(one)
         assert other.parameters == one.parameters
         assert [tie.groups for tie in other.ties] == [tie.groups for tie in one.ties]
         assert_same(summary(one, few, values), summary(other, few, values))
-        assert_same([one.nuisance_starts(values, few)[0]], [other.nuisance_starts(values, few)[0]])
+        assert_same(
+            [one.with_records(few).nuisance_starts(values)[0]], [other.with_records(few).nuisance_starts(values)[0]]
+        )
 
 
 # ---------------------------------------------------------------- bad labels
@@ -305,9 +317,9 @@ def seated(chain=LEFT, spots=("back/hole_0", "back/hole_1", "front/hole_0", "fro
 def refusal(made, data):
     """What is said of a problem that cannot be solved; nothing if it can."""
     problem, records = made.problem(data)
-    problem = started(problem, records)
+    problem = started(problem.with_records(records))
     try:
-        require_solvable(problem, records, problem.parameters.nominal())
+        require_solvable(problem.with_records(records), problem.parameters.nominal())
     except ProblemError as fault:
         return f"{fault.message} {fault.hint}"
     return ""
@@ -388,9 +400,9 @@ def test_a_base_that_may_move_with_its_sockets_is_named_and_not_claimed():
     assert "6 combinations" in said
     assert UNSEEN not in said
     problem, records = made.problem(data)
-    problem = started(problem, records)
+    problem = started(problem.with_records(records))
     verdict = SolverVerdict("none", "", True, 0, 0.0)
-    found = estimate(problem, records, Solution(problem.parameters.nominal(), verdict))
+    found = estimate(problem.with_records(records), Solution(problem.parameters.nominal(), verdict))
     determined = dict(zip(found.names, found.determined, strict=True))
     assert determined["left.mdh.a2"]
     assert determined["left.mdh.theta3"]
@@ -404,9 +416,9 @@ def test_a_base_that_may_move_with_its_sockets_is_named_and_not_claimed():
 
 def test_priors_on_every_length_hold_the_size_and_say_so(in_sockets):
     problem, records = one_arm().problem(in_sockets)
-    problem = started(problem, records)
+    problem = started(problem.with_records(records))
     every = {b.name: replace(b, prior_sd=0.01) for b in problem.parameters.free}
-    problem = replace(problem, parameters=problem.parameters.replaced(every))
-    warned = " ".join(require_solvable(problem, records, problem.parameters.nominal()))
+    problem = problem.with_parameters(problem.parameters.replaced(every))
+    warned = " ".join(require_solvable(problem.with_records(records), problem.parameters.nominal()))
     assert UNSEEN in warned
     assert "its priors hold it" in warned

@@ -47,7 +47,7 @@ def test_where_sockets_start_does_not_depend_on_the_order_of_records(counts):
     for seed in range(6):
         order = np.random.default_rng(seed).permutation(len(data)) if seed else np.arange(len(data))
         problem, records = made.problem(data.subset(order))
-        starts.append(started(problem, records).parameters.nominal())
+        starts.append(started(problem.with_records(records)).parameters.nominal())
     assert np.ptp(starts, axis=0).max() == 0.0
     found = co.by_name(problem.parameters, starts[0])
     for key, spot in SPOTS.items():
@@ -60,7 +60,7 @@ def test_a_prior_keeps_what_was_stated_and_known_sockets_stay(data):
     made = bench(values=stated, priors={"balls.front/hole_0.x": 0.01})
     made = replace(made, measurements={**made.measurements, "balls": ball(sockets={"back/hole_0": (0.1, 0.2, 0.3)})})
     problem, records = made.problem(data)
-    found = co.by_name(problem.parameters, started(problem, records).parameters.nominal())
+    found = co.by_name(problem.parameters, started(problem.with_records(records)).parameters.nominal())
     assert found["balls.front/hole_0.x"] == 0.31
     assert found["balls.front/hole_0.y"] != 0.0, "the others start from the records"
     assert [found[f"balls.back/hole_0.{a}"] for a in "xyz"] == [0.1, 0.2, 0.3]
@@ -72,8 +72,8 @@ def test_a_prior_keeps_what_was_stated_and_known_sockets_stay(data):
 
 def solved(problem, records):
     """The optimum, which the solver must have reached."""
-    begun = started(problem, records)
-    solution = IpoptEstimator(IpoptEstimator.Settings()).solve(begun, records, begun.parameters.nominal())
+    begun = started(problem.with_records(records))
+    solution = IpoptEstimator(IpoptEstimator.Settings()).solve(begun, begun.parameters.nominal())
     assert solution.verdict.converged, solution.verdict.status
     return begun, solution.values
 
@@ -86,17 +86,17 @@ def part_of(data, *positions):
 def test_restricted_to_some_groups_the_estimate_is_that_of_a_problem_without_the_others(data, trained):
     chosen = part_of(data, *trained)
     problem, records = bench(free=FREE[1:2]).problem(data)
-    problem, train = started(problem, records), problem.subset(records, chosen)
-    held = restricted(problem, train)
+    problem, train = started(problem.with_records(records)), problem.with_records(records).subset(chosen).records
+    held = restricted(problem.with_records(train))
     begun, values = solved(held, train)
     alone, few = bench(free=FREE[1:2]).problem(data.subset(chosen))
     alone, expected = solved(alone, few)
     assert set(held.free_names) == set(alone.free_names)
-    assert held.equations(train) == alone.equations(few)
+    assert held.with_records(train).equations() == alone.with_records(few).equations()
     found = co.by_name(begun.parameters, values)
     for name, x in co.by_name(alone.parameters, expected).items():
         assert found[name] == pytest.approx(x, abs=1e-9), name
-    assert restricted(held, train) is held
+    assert restricted(held.with_records(train)).compiled is held.compiled
 
 
 def test_a_tie_to_a_socket_that_no_training_record_touched_says_nothing(data):
@@ -104,30 +104,33 @@ def test_a_tie_to_a_socket_that_no_training_record_touched_says_nothing(data):
     labels = np.array([f"{p}/{s}" for p, s in zip(data.extra["position"], data.extra["socket"], strict=True)])
     chosen = np.flatnonzero((labels != "front/hole_1") & (labels != "back/hole_0"))
     problem, records = bench().problem(data)
-    problem, train = started(problem, records), problem.subset(records, chosen)
-    held = restricted(problem, train)
+    problem, train = started(problem.with_records(records)), problem.with_records(records).subset(chosen).records
+    held = restricted(problem.with_records(train))
     assert held.ties == ()
     alone, few = bench().problem(data.subset(chosen))
     values = near(alone)
     moved = co.vector(held.parameters, co.by_name(alone.parameters, values))
-    assert held.cost(moved, train) == pytest.approx(alone.cost(values, few), rel=1e-12)
+    assert held.with_records(train).cost(moved) == pytest.approx(alone.with_records(few).cost(values), rel=1e-12)
 
 
 def test_a_tie_to_a_known_socket_counts(data):
     known = ball(sockets={"front/hole_0": SPOTS["front/hole_0"]}, distances=(known_distance(),))
     made = bench()
     problem, records = replace(made, measurements={**made.measurements, "balls": known}).problem(data)
-    assert ("front/hole_0", "front/hole_1") in [tie.groups for tie in restricted(problem, records).ties]
+    assert ("front/hole_0", "front/hole_1") in [tie.groups for tie in restricted(problem.with_records(records)).ties]
 
 
 def test_sockets_that_only_judge_settle_at_the_mean_of_their_balls(data):
     problem, records = bench().problem(data)
-    problem = started(problem, records)
-    train, held = (problem.subset(records, part_of(data, *p)) for p in (("front",), ("back", "shelf", "front")))
-    inner, values = restricted(problem, train), near(problem)
-    found = co.by_name(problem.parameters, settled(inner, values, held))
+    problem = started(problem.with_records(records))
+    train, held = (
+        problem.with_records(records).subset(part_of(data, *p)).records
+        for p in (("front",), ("back", "shelf", "front"))
+    )
+    inner, values = restricted(problem.with_records(train)), near(problem)
+    found = co.by_name(problem.parameters, settled(inner.with_records(held), values))
     before = co.by_name(problem.parameters, values)
-    told, seen = problem.nuisance_starts(values, records), set()
+    told, seen = problem.with_records(records).nuisance_starts(values), set()
     for key in SPOTS:
         position, socket = key.split("/")
         inside = [
@@ -143,10 +146,13 @@ def test_sockets_that_only_judge_settle_at_the_mean_of_their_balls(data):
             np.testing.assert_allclose([found[n] for n in names], mean, atol=1e-12)
     assert all(found[n] == before[n] for n in found if n not in seen)
     # With nothing trained all of them settle, and weights of zero do not count.
-    every = co.by_name(problem.parameters, settled(untrained(problem), values, records))
+    every = co.by_name(problem.parameters, settled(untrained(problem).with_records(records), values))
     assert every["balls.front/hole_0.x"] != before["balls.front/hole_0.x"]
     off = [np.ones(len(data)), np.zeros(len(data))]
-    left_only = co.by_name(problem.parameters, settled(untrained(problem), values, problem.weighted(records, off)))
+    left_only = co.by_name(
+        problem.parameters,
+        settled(untrained(problem).with_records(problem.with_records(records).weighted(off).records), values),
+    )
     inside = np.array(data.extra["socket"]) == "hole_0"
     inside &= (np.array(data.extra["position"]) == "shelf") & ~np.isnan(data.channels["left.q1"])
     assert left_only["balls.shelf/hole_0.y"] == pytest.approx(told[0][1, inside].mean(), abs=1e-12)
@@ -214,22 +220,22 @@ def test_a_mean_is_that_of_the_postures_whatever_is_known_of_their_noise(how):
     arm = co.the_arm(LEFT, "left", 1e-3 if how == "joint noise" else 0.0)
     made = co.Bench({"left": arm}, {"balls": ball(("left",), socket="mean")}, FREE[1:2], priors={FREE[1]: 1e-3})
     problem, records = made.problem(data)
-    problem = started(problem, records)
+    problem = started(problem.with_records(records))
     if how == "joint noise":
-        records = with_joint_noise(problem, records, problem.parameters.nominal())
+        records = with_joint_noise(problem.with_records(records), problem.parameters.nominal()).records
     if how == "weights":
         weights = np.random.default_rng(1).uniform(0.0, 1.0, len(data)) * (np.arange(len(data)) % 4 > 0)
-        records = problem.weighted(records, [weights])
+        records = problem.with_records(records).weighted([weights]).records
     problem, values = solved(problem, records)
-    found, told = co.by_name(problem.parameters, values), problem.nuisance_starts(values, records)[0]
+    found, told = co.by_name(problem.parameters, values), problem.with_records(records).nuisance_starts(values)[0]
     for socket in ("hole_0", "hole_1"):
         own = weights * (np.array(data.extra["socket"]) == socket)
         mean = told @ own / own.sum()
         assert np.abs([found[f"balls.front/{socket}.{a}"] for a in "xyz"] - mean).max() < 1e-4 * NOISE
     away = near(problem)
-    equations = problem.normal_equations(away, records)
-    assert equations.cost == pytest.approx(problem.cost(away, records), rel=1e-11)
-    upper = problem.triangular_factor(away, records)
+    equations = problem.with_records(records).normal_equations(away)
+    assert equations.cost == pytest.approx(problem.with_records(records).cost(away), rel=1e-11)
+    upper = problem.with_records(records).triangular_factor(away)
     size = np.sqrt(np.diag(equations.hessian))
     np.testing.assert_allclose(
         upper.T @ upper / np.outer(size, size), equations.hessian / np.outer(size, size), atol=1e-9
@@ -263,7 +269,7 @@ def test_tracker_and_socket_rows_in_one_dataset_each_count_once(noise):
     tracked = np.arange(len(data)) < 6
     assert np.array_equal(records[0].weight[: len(data)] > 0, tracked)
     assert np.array_equal(records[1].weight[: len(data)] > 0, ~tracked)
-    assert problem.equations(records) == 3 * len(data)
+    assert problem.with_records(records).equations() == 3 * len(data)
     values = near(problem)
     v = co.by_name(problem.parameters, values)
     q = np.stack([data.channels[f"left.q{i}"] for i in range(1, 5)], axis=1)
@@ -272,12 +278,12 @@ def test_tracker_and_socket_rows_in_one_dataset_each_count_once(noise):
     spot = [v[f"balls.shelf/hole_0.{a}"] for a in "xyz"]
     left = co.points(LEFT, q[~tracked], BALL, v, "left") - spot
     expected = 0.5 * np.sum((off / (noise or 1e-3)) ** 2) + 0.5 * np.sum((left / NOISE) ** 2)
-    assert problem.cost(values, records) == pytest.approx(expected, rel=1e-10)
-    found = problem.normal_equations(values, records)
+    assert problem.with_records(records).cost(values) == pytest.approx(expected, rel=1e-10)
+    found = problem.with_records(records).normal_equations(values)
     assert found.cost == pytest.approx(expected, rel=1e-10)
     assert np.isfinite(found.hessian).all()
-    assert np.isfinite(problem.exact_hessian(values, records)).all()
-    errors = record_errors(problem, values, records)
+    assert np.isfinite(problem.with_records(records).exact_hessian(values)).all()
+    errors = record_errors(problem.with_records(records), values)
     np.testing.assert_allclose(errors, np.linalg.norm(np.vstack([off, left]), axis=1), rtol=1e-9)
 
 
@@ -286,12 +292,12 @@ def test_tracker_rows_alone_touch_no_socket():
     made, data = mixed()
     problem, _ = made.problem(data)
     values = near(problem)
-    few = problem.records(data.subset(range(6)))
+    few = problem.of(data.subset(range(6))).records
     assert not few[1].weight.any()
-    assert problem.equations(few) == 18
-    whole = problem.records(data)
-    part = problem.subset(whole, np.arange(6))
-    assert problem.cost(values, few) == pytest.approx(problem.cost(values, part), rel=1e-12)
+    assert problem.with_records(few).equations() == 18
+    whole = problem.of(data).records
+    part = problem.with_records(whole).subset(np.arange(6)).records
+    assert problem.with_records(few).cost(values) == pytest.approx(problem.with_records(part).cost(values), rel=1e-12)
 
 
 def test_a_record_that_no_measurement_applies_to_is_not_counted_for_a_socket_it_never_touched():
@@ -303,9 +309,9 @@ def test_a_record_that_no_measurement_applies_to_is_not_counted_for_a_socket_it_
     problem, records = made.problem(data)
     values = near(problem)
     try:
-        odd = problem.records(replace(data, extra=blank))
-        cost = problem.cost(values, odd)
+        odd = problem.of(replace(data, extra=blank)).records
+        cost = problem.with_records(odd).cost(values)
     except InputError:
         return
-    part = problem.subset(records, np.arange(1, len(data)))
-    assert cost == pytest.approx(problem.cost(values, part), rel=1e-9)
+    part = problem.with_records(records).subset(np.arange(1, len(data))).records
+    assert cost == pytest.approx(problem.with_records(part).cost(values), rel=1e-9)

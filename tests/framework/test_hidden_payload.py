@@ -23,12 +23,14 @@ def fitted(lrm, **columns):
     q = random.uniform(-1, 1, (COUNT, 6)) * np.deg2rad([100, 50, 100, 100, 100, 50])
     points = oracle.tip(oracle.published(), q) + NOISE_M * random.normal(size=(COUNT, 3))
     problem, records, start = posed(lrm, q, points, oracle.OPTION_1, **columns)
-    estimate = fit(problem, records, IpoptEstimator(IpoptEstimator.Settings()), start).estimate
+    estimate = fit(problem.with_records(records), IpoptEstimator(IpoptEstimator.Settings()), start).estimate
     return problem, records, estimate, lrm.dataset(q, points, **columns)
 
 
 def hidden(problem, records, estimate, dataset):
-    return hidden_payload(problem, records, estimate, dataset, Motion.of(problem, estimate.values, records, dataset))
+    return hidden_payload(
+        problem, records, estimate, dataset, Motion.of(problem.with_records(records), estimate.values, dataset)
+    )
 
 
 @pytest.mark.slow
@@ -36,7 +38,9 @@ def test_its_deviation_is_how_fast_the_misfit_grows_with_an_assumed_payload(lrm)
     sums, step = [], 0.01
     for mass in (0.0, step, 2 * step):
         problem, records, estimate, _ = fitted(lrm, payload=np.full(COUNT, mass))
-        sums.append(sum(float(np.sum(part**2)) for part in problem.weighted_residuals(estimate.values, records)))
+        sums.append(
+            sum(float(np.sum(part**2)) for part in problem.with_records(records).weighted_residuals(estimate.values))
+        )
     run = fitted(lrm)
     found = hidden(*run)
     assert found is not None and found.taken_up > 0.5

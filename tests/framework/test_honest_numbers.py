@@ -62,8 +62,8 @@ def fits_under_priors(
         moved = (system.arms, system.measurements, parameters.with_nominal(truth), system.environment)
         exact = measured_without_noise(SimulationRequest(*moved), commands)
         noisy = {name: values + random.normal(0, noise, len(values)) for name, values in exact.items()}
-        records = problem.records(with_channels(commands, noisy))
-        found.append((fit(problem, records, estimator, parameters.nominal()), truth))
+        records = problem.of(with_channels(commands, noisy)).records
+        found.append((fit(problem.with_records(records), estimator, parameters.nominal()), truth))
     return found
 
 
@@ -118,8 +118,10 @@ def test_intervals_hold_under_priors_when_the_noise_is_ten_times_what_was_declar
         )
         exact = measured_without_noise(request, commands)
         noisy = {name: values + random.normal(0, 5e-3, len(values)) for name, values in exact.items()}
-        records = problem.records(with_channels(commands, noisy))
-        found = estimate(problem, records, loaded.estimator.solve(problem, records, parameters.nominal()))
+        records = problem.of(with_channels(commands, noisy)).records
+        found = estimate(
+            problem.with_records(records), loaded.estimator.solve(problem.with_records(records), parameters.nominal())
+        )
         free = list(parameters.free_entries)
         scores.append((found.values - truth)[free] / found.deviations)
     assert 0.9 < np.sqrt(np.mean(np.square(scores))) < 1.1
@@ -151,11 +153,11 @@ class FailsOnSecondFold:
     def __init__(self, real) -> None:
         self._real, self._calls = real, 0
 
-    def solve(self, problem, records, start, progress=None):
+    def solve(self, problem, start, progress=None):
         self._calls += 1
         if self._calls == 3:
             raise NotConvergedError("no equilibrium")
-        solution = self._real.solve(problem, records, start)
+        solution = self._real.solve(problem, start)
         return replace(solution, verdict=replace(solution.verdict, converged=self._calls != 2))
 
 
@@ -165,7 +167,7 @@ def test_a_fold_that_does_not_converge_is_counted_and_judges_nothing() -> None:
     problem = Problem.build(system.arms, system.measurements, loaded.parameters, system.environment, dataset)
     splits = folds(len(dataset), 5, 0)
     estimator = FailsOnSecondFold(loaded.estimator)
-    judged = cross_validate(problem, problem.records(dataset), splits, estimator, loaded.parameters.nominal())
+    judged = cross_validate(problem.of(dataset), splits, estimator, loaded.parameters.nominal())
     assert judged.failed_folds == 2
     unknown = set(np.flatnonzero(np.isnan(judged.errors)))
     assert unknown == {int(i) for split in splits[1:3] for i in split.holdout}
@@ -221,8 +223,11 @@ def test_the_information_kept_is_that_of_the_estimate() -> None:
     problem = Problem.build(
         system.arms, system.measurements, loaded.parameters, system.environment, dataset, "interpreted"
     )
-    records = problem.records(dataset)
-    found = estimate(problem, records, loaded.estimator.solve(problem, records, loaded.parameters.nominal()))
+    records = problem.of(dataset).records
+    found = estimate(
+        problem.with_records(records),
+        loaded.estimator.solve(problem.with_records(records), loaded.parameters.nominal()),
+    )
     root = found.square_root_information
     inverse = np.linalg.inv(root.T @ root)
     size = np.outer(found.deviations, found.deviations)

@@ -19,8 +19,8 @@ from planted_arms import PLANTED, SOUND, as_rows, full, oracle_null, same_span
 def test_what_is_planted_is_found_exactly_and_nothing_else(name: str) -> None:
     case = PLANTED[name]
     problem, records, start = case.problem(noise=0.001)
-    known = identify(problem, start, records)
-    found = explain(problem, start, records, known)
+    known = identify(problem.with_records(records), start)
+    found = explain(problem.with_records(records), start, known)
     scales = dict(zip(known.names, problem.parameters.scales(), strict=True))
     told = [{n: w * scales[n] for n, w in each.combination.terms} for each in found]
     planted = [{full(n): w for n, w in each.items()} for each, _ in case.planted]
@@ -38,7 +38,7 @@ def test_what_is_planted_is_found_exactly_and_nothing_else(name: str) -> None:
 def test_what_is_told_has_no_more_names_than_what_was_planted(name: str) -> None:
     case = PLANTED[name]
     problem, records, start = case.problem()
-    found = explain(problem, start, records, identify(problem, start, records))
+    found = explain(problem.with_records(records), start, identify(problem.with_records(records), start))
     assert sorted(len(each.combination.terms) for each in found) == sorted(len(each) for each, _ in case.planted)
 
 
@@ -49,27 +49,27 @@ def test_what_is_told_has_no_more_names_than_what_was_planted(name: str) -> None
 def test_nothing_is_invented(name: str) -> None:
     case = SOUND[name]
     problem, records, start = case.problem(noise=0.001)
-    known = identify(problem, start, records)
+    known = identify(problem.with_records(records), start)
     assert not len(oracle_null(case, dict(zip(known.names, problem.parameters.scales(), strict=True))))
     assert known.rank == known.rank_by_qr == len(case.free)
-    assert known.undetermined == () == explain(problem, start, records, known)
+    assert known.undetermined == () == explain(problem.with_records(records), start, known)
     assert all(known.determined)
 
 
 @pytest.mark.parametrize("name", ["base yaw and the first zero", "a shoulder that never moved", "tool and target"])
 def test_moving_along_a_told_combination_changes_no_measurement(name: str) -> None:
     problem, records, start = PLANTED[name].problem()
-    known = identify(problem, start, records)
-    (found,) = explain(problem, start, records, known)
+    known = identify(problem.with_records(records), start)
+    (found,) = explain(problem.with_records(records), start, known)
     moved = start.copy()
     for term, weight in found.combination.terms:
         moved[problem.parameters.entries_of(term)] += weight * 0.5 * problem.parameters[term].scale
-    before, after = problem.residuals(start, records)[0], problem.residuals(moved, records)[0]
+    before, after = problem.with_records(records).residuals(start)[0], problem.with_records(records).residuals(moved)[0]
     assert np.abs(after - before).max() < 1e-12
     first = found.combination.terms[0][0]
     alone = start.copy()
     alone[problem.parameters.entries_of(first)] += 0.5 * problem.parameters[first].scale
-    assert np.abs(problem.residuals(alone, records)[0] - before).max() > 1e-3
+    assert np.abs(problem.with_records(records).residuals(alone)[0] - before).max() > 1e-3
 
 
 def test_there_are_twenty_of_each() -> None:

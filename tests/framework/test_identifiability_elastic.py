@@ -30,7 +30,7 @@ def elastic(lrm: Any, names: Sequence[str], count: int = 60) -> tuple[Any, Any, 
     parameters = parameters.with_free([oracle.armcal_name(n) for n in names])
     dataset = lrm.dataset(q, oracle.tip(oracle.published(), q))
     problem = lrm.problem(experiment, dataset, "interpreted", parameters)
-    return problem, problem.records(dataset), parameters.nominal(), q
+    return problem, problem.of(dataset).records, parameters.nominal(), q
 
 
 def two_masses_in_one_frame() -> dict[str, float]:
@@ -57,8 +57,8 @@ ELASTIC = {
 def test_planted_elastic_combinations_are_found_exactly(lrm: Any, name: str) -> None:
     planted, company = ELASTIC[name]
     problem, records, start, q = elastic(lrm, (*planted, *company))
-    known = identify(problem, start, records)
-    found = explain(problem, start, records, known)
+    known = identify(problem.with_records(records), start)
+    found = explain(problem.with_records(records), start, known)
     assert [each.cause for each in found] == ["gauge"]
     locals_ = {oracle.armcal_name(n): n for n in (*planted, *company)}
     sizes = problem.parameters.scales()
@@ -85,7 +85,7 @@ def test_planted_elastic_combinations_are_found_exactly(lrm: Any, name: str) -> 
 )
 def test_nothing_elastic_is_invented(lrm: Any, names: tuple[str, ...]) -> None:
     problem, records, start, q = elastic(lrm, names)
-    known = identify(problem, start, records)
+    known = identify(problem.with_records(records), start)
     order = [n.removeprefix("arm.links.").rpartition(".spring.")[2].rpartition(".mdh.")[2] for n in known.names]
     slopes = jacobian(lambda v: oracle.tip(v, q), oracle.published(), order) * problem.parameters.scales()
     assert np.linalg.svd(slopes, compute_uv=False)[-1] > 1e-7
@@ -108,18 +108,18 @@ def upright(springs: Mapping[str, Any], axis: str) -> tuple[Problem, Any, np.nda
     dataset = Dataset(tuple(str(i) for i in range(POSES)), channels)
     environment = Environment((0.0, 0.0, -9.81))
     problem = Problem.build({"arm": arm}, {"tracker": tracker}, parameters, environment, dataset, "interpreted")
-    return problem, problem.records(dataset), parameters.nominal()
+    return problem, problem.of(dataset).records, parameters.nominal()
 
 
 def test_springs_that_gravity_never_loads_are_named_alone() -> None:
     problem, records, start = upright({"compliance": 0.01}, "z")
-    found = explain(problem, start, records, identify(problem, start, records))
+    found = explain(problem.with_records(records), start, identify(problem.with_records(records), start))
     assert {str(each.combination) for each in found} == {"arm.spring.k1 alone", "arm.spring.k2 alone"}
     assert {each.cause for each in found} == {"gauge"}
 
 
 def test_the_base_spring_and_the_first_joints_about_one_axis_trade() -> None:
     problem, records, start = upright({"compliance": 0.01, "base_axis": "z"}, "y")
-    (found,) = explain(problem, start, records, identify(problem, start, records))
+    (found,) = explain(problem.with_records(records), start, identify(problem.with_records(records), start))
     assert dict(found.combination.terms) == pytest.approx({"arm.spring.k0": 1.0, "arm.spring.k1": -1.0})
     assert found.cause == "gauge"

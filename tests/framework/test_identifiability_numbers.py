@@ -20,12 +20,12 @@ from planted_arms import PLANTED, POSES, SOUND, full
 
 def test_the_order_of_records_and_the_unit_of_a_parameter_do_not_matter() -> None:
     problem, records, start = PLANTED["a shoulder that never moved"].problem()
-    known = identify(problem, start, records)
-    shuffled = problem.subset(records, np.random.default_rng(2).permutation(POSES))
-    again = identify(problem, start, shuffled)
+    known = identify(problem.with_records(records), start)
+    shuffled = problem.with_records(records).subset(np.random.default_rng(2).permutation(POSES)).records
+    again = identify(problem.with_records(shuffled), start)
     assert [str(c) for c in again.undetermined] == [str(c) for c in known.undetermined]
     np.testing.assert_allclose(again.singular_values, known.singular_values, atol=1e-9 * known.singular_values[0])
-    triangle = problem.triangular_factor(start, records)
+    triangle = problem.with_records(records).triangular_factor(start)
     for factor in (1e-3, 1e3):
         # Parameters in mm instead of m: columns and typical scales change against each other.
         other = analyse(triangle * factor, problem.parameters.scales() / factor, known.names)
@@ -36,23 +36,25 @@ def test_the_order_of_records_and_the_unit_of_a_parameter_do_not_matter() -> Non
 def test_records_without_weight_are_no_evidence() -> None:
     case = SOUND["an elbow that stood, and what it leaves"]
     problem, records, start = replace(case, free=("a1", "a2", "theta1"), held={}).problem()
-    assert identify(problem, start, records).rank == 3
+    assert identify(problem.with_records(records), start).rank == 3
     one = (replace(records[0], weight=np.where(np.arange(len(records[0].weight)) == 0, 1.0, 0.0)),)
-    assert identify(problem, start, one).rank == 2
-    assert {each.cause for each in explain(problem, start, one, identify(problem, start, one))} == {"poses"}
+    assert identify(problem.with_records(one), start).rank == 2
+    assert {
+        each.cause for each in explain(problem.with_records(one), start, identify(problem.with_records(one), start))
+    } == {"poses"}
 
 
 def test_no_equations_at_all_determine_nothing_and_say_so() -> None:
     problem, records, start = SOUND["a planar arm"].problem()
-    none = problem.subset(records, np.zeros(0, dtype=np.intp))
-    known = identify(problem, start, none)
+    none = problem.with_records(records).subset(np.zeros(0, dtype=np.intp)).records
+    known = identify(problem.with_records(none), start)
     assert known.rank == 0 and len(known.undetermined) == 4
-    assert {each.cause for each in explain(problem, start, none, known)} == {"unknown"}
+    assert {each.cause for each in explain(problem.with_records(none), start, known)} == {"unknown"}
 
 
 def test_priors_hold_what_they_touch_and_no_more() -> None:
     problem, records, start = PLANTED["three heights of parallel axes"].problem()
-    known = identify(problem, start, records)
+    known = identify(problem.with_records(records), start)
 
     def with_priors(*names: str) -> Parameters:
         blocks = {full(n): replace(problem.parameters[full(n)], prior_sd=0.001) for n in names}
@@ -90,7 +92,7 @@ def test_where_the_two_rank_decisions_differ_nothing_is_called_undetermined() ->
 
 def test_correlations_above_the_limit_are_those_of_the_inverse_information() -> None:
     problem, records, start = SOUND["axes parallel but for half a degree"].problem()
-    triangle = problem.triangular_factor(start, records)
+    triangle = problem.with_records(records).triangular_factor(start)
     covariance = expected_covariance(triangle, problem.parameters)
     expected = np.linalg.inv(triangle.T @ triangle)
     np.testing.assert_allclose(covariance, expected, rtol=1e-6, atol=1e-9 * expected.max())
@@ -100,7 +102,7 @@ def test_correlations_above_the_limit_are_those_of_the_inverse_information() -> 
 
 def test_undetermined_parameters_have_no_expected_deviation_unless_a_prior_gives_one() -> None:
     problem, records, start = PLANTED["heights of parallel axes"].problem()
-    triangle = problem.triangular_factor(start, records)
+    triangle = problem.with_records(records).triangular_factor(start)
     names = problem.parameters.coordinate_names
     variance = dict(zip(names, np.diag(expected_covariance(triangle, problem.parameters)), strict=True))
     assert variance["arm.mdh.d1"] == variance["arm.mdh.d2"] == 0 < variance["arm.mdh.a1"]

@@ -84,7 +84,7 @@ def posed(
     parameters = Parameters(tuple(blocks)).with_free(free)
     dataset = Dataset(tuple(map(str, range(len(q)))), {"arm.q1": q[:, 0], "arm.q2": q[:, 1], **channels})
     problem = Problem.build(arms, {"seen": measurement}, parameters, GRAVITY, dataset, "interpreted")
-    return problem, problem.records(dataset), parameters.nominal()
+    return problem, problem.of(dataset).records, parameters.nominal()
 
 
 def poses(seed: int = 0) -> np.ndarray:
@@ -132,9 +132,9 @@ def test_without_projection_errors_seem_to_determine_what_they_cannot(name: str)
     make, _ = PLANTED[name]
     problem, records, start = make(0.01)
     scales, names = problem.parameters.scales(), problem.parameters.coordinate_names
-    assert analyse(problem.triangular_factor(start, records), scales, names).rank == len(names)
+    assert analyse(problem.with_records(records).triangular_factor(start), scales, names).rank == len(names)
     problem, records, start = make(0.0)
-    assert analyse(problem.triangular_factor(start, records), scales, names).rank == len(names) - 1
+    assert analyse(problem.with_records(records).triangular_factor(start), scales, names).rank == len(names) - 1
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.001, 0.01, 0.05])
@@ -142,8 +142,8 @@ def test_without_projection_errors_seem_to_determine_what_they_cannot(name: str)
 def test_with_projection_the_planted_combination_is_found_whatever_the_errors(name: str, noise: float) -> None:
     make, planted = PLANTED[name]
     problem, records, start = make(noise)
-    known = identify(problem, start, records)
-    (found,) = explain(problem, start, records, known)
+    known = identify(problem.with_records(records), start)
+    (found,) = explain(problem.with_records(records), start, known)
     told = np.array([dict(found.combination.terms).get(n, 0.0) for n in known.names])
     expected = np.array([planted.get(n, 0.0) for n in known.names]) / problem.parameters.scales()
     assert abs(told @ expected) == pytest.approx(np.linalg.norm(told) * np.linalg.norm(expected), rel=1e-9)
@@ -156,9 +156,9 @@ def test_what_is_judged_before_solving_and_after_it_agree(name: str) -> None:
     make, planted = PLANTED[name]
     problem, records, start = make(0.01)
     with pytest.raises(Exception, match=r"does not determine 1 .*a gauge: no poses determine it") as refused:
-        require_solvable(problem, records, start)
+        require_solvable(problem.with_records(records), start)
     assert "measure poses" not in str(refused.value)
-    found = estimate(problem, records, Solution(start, SolverVerdict("none", "", True, 0, 0.0)))
+    found = estimate(problem.with_records(records), Solution(start, SolverVerdict("none", "", True, 0, 0.0)))
     assert found.identifiability.rank == len(planted) - 1 + len(found.names) - len(planted)
     told = dict(zip(found.names, found.determined, strict=True))
     assert not any(told[n] for n in planted) and told["arm.planar.theta2"]
@@ -167,16 +167,16 @@ def test_what_is_judged_before_solving_and_after_it_agree(name: str) -> None:
 def test_projected_records_have_no_residual_and_others_are_left_alone() -> None:
     for make in (bearings, touches):
         problem, records, start = make(0.02)
-        assert np.abs(problem.residuals(start, records)[0]).max() > 1e-3
-        (moved,) = projected(problem, start, records)
-        assert np.abs(problem.residuals(start, [moved])[0]).max() < 1e-9
+        assert np.abs(problem.with_records(records).residuals(start)[0]).max() > 1e-3
+        (moved,) = projected(problem.with_records(records), start).records
+        assert np.abs(problem.with_records([moved]).residuals(start)[0]).max() < 1e-9
         assert moved.count == records[0].count
         np.testing.assert_array_equal(moved.weight, records[0].weight)
 
 
 def test_contacts_move_joint_angles_no_farther_than_their_errors() -> None:
     problem, records, start = touches(0.02)
-    (moved,) = projected(problem, start, records)
+    (moved,) = projected(problem.with_records(records), start).records
     shift = (moved.record - records[0].record)[:, :COUNT]
     assert 0 < np.abs(shift).max() < 0.1
 
@@ -187,9 +187,11 @@ def test_a_contact_that_no_angles_reach_is_left_as_it_is() -> None:
     problem, records, start = posed(Board(), ("seen.level", "seen.up"), q, {})
     far = start.copy()
     far[problem.parameters.entries_of("seen.level")] = -5.0
-    (moved,) = projected(problem, far, records)
+    (moved,) = projected(problem.with_records(records), far).records
     np.testing.assert_array_equal(moved.record, records[0].record)
-    assert {e.cause for e in explain(problem, far, records, identify(problem, far, records))} <= {"gauge", "poses"}
+    assert {
+        e.cause for e in explain(problem.with_records(records), far, identify(problem.with_records(records), far))
+    } <= {"gauge", "poses"}
 
 
 def test_a_position_is_not_touched_at_all() -> None:
@@ -198,4 +200,4 @@ def test_a_position_is_not_touched_at_all() -> None:
     x, z = tip(q)
     channels = {"seen.x": x + 0.1, "seen.y": 0 * x, "seen.z": z}
     problem, records, start = posed(Tip(), ("arm.planar.a1", "arm.planar.a2"), q, channels)
-    assert all(a is b for a, b in zip(projected(problem, start, records), records, strict=True))
+    assert all(a is b for a, b in zip(projected(problem.with_records(records), start).records, records, strict=True))

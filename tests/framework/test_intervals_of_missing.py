@@ -22,9 +22,9 @@ def judged(seen: np.ndarray):
     told = {f"second.{a}": dataset.column(f"tracker.{a}") + random.normal(0, 5e-4, 60) for a in "xyz"}
     dataset = with_channels(dataset, {name: np.where(seen, values, np.nan) for name, values in told.items()})
     problem = problem_of(loaded, dataset)
-    records = problem.records(dataset)
-    fitted = fit(problem, problem.subset(records, np.arange(40)), loaded.estimator, loaded.parameters.nominal())
-    return predictor(problem, fitted), problem.subset(records, np.arange(40, 60))
+    records = problem.of(dataset).records
+    fitted = fit(problem.with_records(records).subset(np.arange(40)), loaded.estimator, loaded.parameters.nominal())
+    return predictor(problem, fitted), problem.with_records(records).subset(np.arange(40, 60)).records
 
 
 @pytest.mark.slow

@@ -40,7 +40,9 @@ def seated(count=4, seed=0, key="front/hole_0", chain=LEFT, arm="left", place=BA
 def covariances(problem, records, values):
     """What the whitening of each record stands for (factors of N x n x n)."""
     found = []
-    for kernel, each in zip(problem.kernels, with_joint_noise(problem, records, values), strict=True):
+    for kernel, each in zip(
+        problem.kernels, with_joint_noise(problem.with_records(records), values).records, strict=True
+    ):
         if each.whitening is None:
             found.append(np.repeat(np.diag(np.array(kernel.factor.noise) ** 2)[None], each.count, axis=0))
         else:
@@ -81,13 +83,13 @@ def test_residuals_scatter_as_the_covariance_says():
     made = co.Bench({"left": noisy_arm()}, {"balls": ball(("left",), noise=SEAT_SD)})
     problem, records = made.problem(data)
     values = problem.parameters.nominal()
-    scattered = problem.residuals(values, records)[0] + random.normal(0, SEAT_SD, (3, count))
-    expected = covariances(problem, problem.records(exact), values)[0][0]
+    scattered = problem.with_records(records).residuals(values)[0] + random.normal(0, SEAT_SD, (3, count))
+    expected = covariances(problem, problem.of(exact).records, values)[0][0]
     sample = np.cov(scattered)
     size = np.sqrt(np.diag(expected))
     assert np.abs((sample - expected) / np.outer(size, size)).max() < 0.06
     assert size.max() > 1.2 * SEAT_SD, "the joints add hardly anything: the test is empty"
-    whitened = with_joint_noise(problem, problem.records(exact), values)[0].whitening[:, :, 0] @ scattered
+    whitened = with_joint_noise(problem.of(exact), values).records[0].whitening[:, :, 0] @ scattered
     np.testing.assert_allclose(np.cov(whitened), np.eye(3), atol=0.06)
 
 
@@ -103,7 +105,7 @@ def test_sliding_joints_and_arms_without_noise_add_nothing():
     quiet, records = co.Bench({"left": noisy_arm(sd=0.0)}, {"balls": ball(("left",))}).problem(
         co.dataset([seated()[1]])
     )
-    same = with_joint_noise(quiet, records, quiet.parameters.nominal())
+    same = with_joint_noise(quiet.with_records(records), quiet.parameters.nominal()).records
     assert all(one is other for one, other in zip(same, records, strict=True))
 
 
@@ -133,10 +135,10 @@ def test_each_arm_brings_its_own_joints_and_rows_of_the_other_do_not_matter():
     theirs = slopes(RIGHT, other, (0, 0, 0), None, "right")
     expected = 1e-6 * np.eye(3) + (3 * JOINT_SD) ** 2 * theirs @ np.swapaxes(theirs, 1, 2)
     np.testing.assert_allclose(of_tracker[3:], expected, rtol=0, atol=1e-6 * expected.max())
-    weighed = with_joint_noise(problem, records, values)
-    found = problem.normal_equations(values, weighed)
+    weighed = with_joint_noise(problem.with_records(records), values).records
+    found = problem.with_records(weighed).normal_equations(values)
     assert np.isfinite(found.hessian).all()
-    assert found.cost == pytest.approx(problem.cost(values, weighed), rel=1e-12)
+    assert found.cost == pytest.approx(problem.with_records(weighed).cost(values), rel=1e-12)
 
 
 def test_a_distance_between_two_records_has_the_noise_of_both():
@@ -147,7 +149,7 @@ def test_a_distance_between_two_records_has_the_noise_of_both():
     data = replace(data, extra={"partner": partner})
     gauge = TipDistance(TipDistance.Settings.si(noise=SEAT_SD, tip=tip), ("left",))
     problem, records = co.Bench({"left": noisy_arm()}, {"gauge": gauge}).problem(data.subset([0, 3, 1, 2, 4, 5]))
-    records = problem.subset(records, np.arange(2, 6))
+    records = problem.with_records(records).subset(np.arange(2, 6)).records
     found = covariances(problem, records, problem.parameters.nominal())[0].ravel()
     at, turns = co.points(LEFT, q, tip), slopes(LEFT, q, tip)
     for row, one in enumerate((1, 2, 4, 5)):
@@ -161,15 +163,15 @@ def test_part_of_the_records_keeps_the_whitening_of_each():
     made = co.Bench({"left": noisy_arm()}, {"balls": ball(("left",), noise=SEAT_SD)})
     problem, records = made.problem(co.dataset([seated(6, 7)[1], seated(5, 8, "shelf/hole_0")[1]]))
     values = near(problem)
-    whole, chosen = with_joint_noise(problem, records, values), np.array([9, 2, 5])
-    part = problem.subset(whole, chosen)
-    alone = with_joint_noise(problem, problem.subset(records, chosen), values)
+    whole, chosen = with_joint_noise(problem.with_records(records), values).records, np.array([9, 2, 5])
+    part = problem.with_records(whole).subset(chosen).records
+    alone = with_joint_noise(problem.with_records(records).subset(chosen), values).records
     np.testing.assert_allclose(part[0].whitening[:, :, :3], alone[0].whitening[:, :, :3], rtol=1e-12)
-    assert problem.cost(values, part) == pytest.approx(problem.cost(values, alone), rel=1e-12)
-    residual = problem.residuals(values, problem.subset(records, chosen))[0].T
-    precision = np.linalg.inv(covariances(problem, problem.subset(records, chosen), values)[0])
+    assert problem.with_records(part).cost(values) == pytest.approx(problem.with_records(alone).cost(values), rel=1e-12)
+    residual = problem.with_records(records).subset(chosen).residuals(values)[0].T
+    precision = np.linalg.inv(covariances(problem, problem.with_records(records).subset(chosen).records, values)[0])
     expected = 0.5 * np.einsum("ni,nij,nj->", residual, precision, residual)
-    assert problem.cost(values, part) == pytest.approx(expected, rel=1e-9)
+    assert problem.with_records(part).cost(values) == pytest.approx(expected, rel=1e-9)
 
 
 def test_slopes_by_joints_are_those_in_elastic_equilibrium(lrm):
@@ -180,11 +182,11 @@ def test_slopes_by_joints_are_those_in_elastic_equilibrium(lrm):
     problem, names = lrm.problem(experiment, dataset), [f"arm.q{i}" for i in range(1, 7)]
     soft = {n: 2 * x for n, x in oracle.published().items() if n.startswith("k")}
     values = lrm.vector(problem.parameters, {n: soft[n] for n in soft})
-    found = problem.channel_slopes(values, problem.records(dataset), names)[0]
+    found = problem.of(dataset).channel_slopes(values, names)[0]
     for joint, step in enumerate(1e-5 * np.eye(6)):
-        sides = [problem.residuals(values, problem.records(lrm.dataset(q + s * step)))[0] for s in (1, -1)]
+        sides = [problem.of(lrm.dataset(q + s * step)).residuals(values)[0] for s in (1, -1)]
         np.testing.assert_allclose(found[:, joint], (sides[0] - sides[1]) / 2e-5, rtol=0, atol=1e-7)
-    nothing = problem.channel_slopes(values, problem.records(dataset), ["arm.q1", "nobody.q1"])[0]
+    nothing = problem.of(dataset).channel_slopes(values, ["arm.q1", "nobody.q1"])[0]
     np.testing.assert_array_equal(nothing[:, 1], 0.0)
     np.testing.assert_allclose(nothing[:, 0], found[:, 0], atol=1e-12)
 
@@ -213,12 +215,11 @@ def simulated_fits(seeds):
         seat = np.einsum("nij,nj->ni", by_place, random.normal(0, SEAT_SD, (len(data), 3)))
         off = seat + random.normal(0, JOINT_SD, seat.shape)
         dataset = replace(data, channels={c: x + off[:, i] for i, (c, x) in enumerate(data.channels.items())})
-        records = problem.records(dataset)
-        begun = started(problem, records)
-        records = with_joint_noise(begun, records, begun.parameters.nominal())
-        solution = solver.solve(begun, records, begun.parameters.nominal())
+        begun = started(problem.of(dataset))
+        begun = with_joint_noise(begun, begun.parameters.nominal())
+        solution = solver.solve(begun, begun.parameters.nominal())
         assert solution.verdict.converged
-        yield estimate(begun, records, solution), truth
+        yield estimate(begun, solution), truth
 
 
 def inside_and_errors(seeds):

@@ -117,13 +117,13 @@ def lrm_case(lrm, count, seed=0, evaluator="compiled", noise=0.01, **channels):
     dataset = lrm.dataset(q, measured, **channels)
     problem = lrm.problem(lrm.experiment(), dataset, evaluator)
     assert problem.backend == evaluator
-    return problem, problem.records(dataset), lrm.vector(problem.parameters, oracle.PUBLISHED), dataset
+    return problem, problem.of(dataset).records, lrm.vector(problem.parameters, oracle.PUBLISHED), dataset
 
 
 def equations(problem, values, records):
     """Normal equations from states at rest to rounding; from a colder start they are good to about 1e-9."""
-    problem.residuals(values, records)
-    return problem.normal_equations(values, records)
+    problem.with_records(records).residuals(values)
+    return problem.with_records(records).normal_equations(values)
 
 
 def assert_same(one, two, tolerance=AGREEMENT):
@@ -309,7 +309,7 @@ def test_c_and_interpreter_agree_on_every_output_of_the_arm(lrm):
     one, two = fast.residuals(values, fast_records)[0], slow.residuals(values, slow_records)[0]
     np.testing.assert_allclose(one, two, rtol=0, atol=AGREEMENT)
     assert_same(equations(fast, values, fast_records), equations(slow, values, slow_records))
-    cold = fast.normal_equations(values, fast.records(dataset)), slow.normal_equations(values, slow.records(dataset))
+    cold = (p.of(dataset).normal_equations(values) for p in (fast, slow))
     assert_same(*cold, tolerance=1e-9)
     upper = [p.triangular_factor(values, r) for p, r in ((fast, fast_records), (slow, slow_records))]
     products = [u.T @ u for u in upper]
@@ -323,31 +323,34 @@ def test_residuals_are_the_oracles(lrm, evaluator):
     q = np.stack([dataset.column(f"arm.q{i}") for i in range(1, 7)], axis=1)
     measured = dataset.stacked([f"tracker.{a}" for a in "xyz"]).T
     expected = measured - oracle.tip(oracle.published(), q)
-    np.testing.assert_allclose(problem.residuals(values, records)[0].T, expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(problem.with_records(records).residuals(values)[0].T, expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("evaluator", ["interpreted", pytest.param("compiled", marks=needs_compiler)])
 def test_any_number_of_records_gives_each_its_own_residual_and_no_padding_counts(lrm, evaluator):
     problem, records, values, dataset = lrm_case(lrm, 17, 3, evaluator)
-    all_residuals = problem.residuals(values, records)[0]
+    all_residuals = problem.with_records(records).residuals(values)[0]
     for count in range(1, 18):
-        part = problem.records(dataset.subset(range(count)))
-        found = problem.residuals(values, part)[0]
+        part = problem.of(dataset.subset(range(count))).records
+        found = problem.with_records(part).residuals(values)[0]
         assert found.shape == (3, count)
         np.testing.assert_allclose(found, all_residuals[:, :count], rtol=0, atol=AGREEMENT)
         noise = np.array(problem.kernels[0].factor.noise)[:, None]
         cost = 0.5 * np.sum((all_residuals[:, :count] / noise) ** 2)
-        assert problem.normal_equations(values, part).cost == pytest.approx(cost, rel=1e-11)
-        assert problem.cost(values, part) == pytest.approx(cost, rel=1e-11)
-        chosen = problem.subset(records, np.arange(count))
-        assert problem.cost(values, chosen) == pytest.approx(cost, rel=1e-11)
+        assert problem.with_records(part).normal_equations(values).cost == pytest.approx(cost, rel=1e-11)
+        assert problem.with_records(part).cost(values) == pytest.approx(cost, rel=1e-11)
+        chosen = problem.with_records(records).subset(np.arange(count)).records
+        assert problem.with_records(chosen).cost(values) == pytest.approx(cost, rel=1e-11)
 
 
 def test_no_records_at_all_are_a_sum_of_nothing(lrm):
     problem, records, values, dataset = lrm_case(lrm, 9, 3, "interpreted")
-    for none in (problem.records(dataset.subset([])), problem.subset(records, np.array([], dtype=np.intp))):
-        assert problem.residuals(values, none)[0].shape == (3, 0)
-        found = problem.normal_equations(values, none)
+    for none in (
+        problem.of(dataset.subset([])).records,
+        problem.with_records(records).subset(np.array([], dtype=np.intp)).records,
+    ):
+        assert problem.with_records(none).residuals(values)[0].shape == (3, 0)
+        found = problem.with_records(none).normal_equations(values)
         assert found.cost == 0
         assert not found.hessian.any()
 
@@ -356,9 +359,11 @@ def test_no_records_at_all_are_a_sum_of_nothing(lrm):
 def test_the_order_of_records_changes_no_sum_and_moves_residuals_along(lrm, evaluator):
     problem, records, values, _ = lrm_case(lrm, 53, 4, evaluator)
     order = np.random.default_rng(4).permutation(53)
-    shuffled = problem.subset(records, order)
-    straight = problem.residuals(values, records)[0]
-    np.testing.assert_allclose(problem.residuals(values, shuffled)[0], straight[:, order], rtol=0, atol=AGREEMENT)
+    shuffled = problem.with_records(records).subset(order).records
+    straight = problem.with_records(records).residuals(values)[0]
+    np.testing.assert_allclose(
+        problem.with_records(shuffled).residuals(values)[0], straight[:, order], rtol=0, atol=AGREEMENT
+    )
     assert_same(equations(problem, values, shuffled), equations(problem, values, records))
 
 
@@ -369,14 +374,19 @@ def test_a_record_of_weight_two_counts_as_two_and_of_weight_zero_not_at_all(lrm,
     random = np.random.default_rng(5)
     weights = random.integers(0, 4, 21).astype(float)
     repeated = np.repeat(np.arange(21), weights.astype(int))
-    weighted = problem.records(dataset, weights)
-    again = problem.subset(records, repeated)
+    weighted = problem.of(dataset, weights).records
+    again = problem.with_records(records).subset(repeated).records
     assert_same(equations(problem, values, weighted), equations(problem, values, again))
-    assert problem.cost(values, weighted) == pytest.approx(problem.cost(values, again), rel=AGREEMENT)
-    np.testing.assert_allclose(
-        problem.exact_hessian(values, weighted), problem.exact_hessian(values, again), rtol=1e-9, atol=1e-3
+    assert problem.with_records(weighted).cost(values) == pytest.approx(
+        problem.with_records(again).cost(values), rel=AGREEMENT
     )
-    chosen = problem.subset(weighted, np.array([3, 3, 8]))
+    np.testing.assert_allclose(
+        problem.with_records(weighted).exact_hessian(values),
+        problem.with_records(again).exact_hessian(values),
+        rtol=1e-9,
+        atol=1e-3,
+    )
+    chosen = problem.with_records(weighted).subset(np.array([3, 3, 8])).records
     assert chosen[0].weight[:3].tolist() == [weights[3], weights[3], weights[8]]
     assert not chosen[0].weight[3:].any()
 
@@ -388,14 +398,16 @@ def test_many_records_in_threads_give_the_sum_of_small_blocks(lrm):
     problem, records, values, _ = lrm_case(lrm, count, 6)
     whole = equations(problem, values, records)
     parts = [
-        equations(problem, values, problem.subset(records, np.arange(start, min(start + 100, count))))
+        equations(
+            problem, values, problem.with_records(records).subset(np.arange(start, min(start + 100, count))).records
+        )
         for start in range(0, count, 100)
     ]
     assert whole.cost == pytest.approx(sum(p.cost for p in parts), rel=AGREEMENT)
     for name in ("gradient", "hessian"):
         total = sum(getattr(p, name) for p in parts)
         np.testing.assert_allclose(getattr(whole, name), total, rtol=0, atol=AGREEMENT * np.abs(total).max())
-    upper = problem.triangular_factor(values, records)
+    upper = problem.with_records(records).triangular_factor(values)
     np.testing.assert_allclose(upper.T @ upper, whole.hessian, rtol=0, atol=1e-11 * np.abs(whole.hessian).max())
 
 
@@ -403,8 +415,11 @@ def test_many_records_in_threads_give_the_sum_of_small_blocks(lrm):
 @needs_compiler
 def test_the_same_sum_twice_is_the_same_to_the_last_bit(lrm):
     problem, records, values, _ = lrm_case(lrm, 3 * BLOCK_RECORDS, 7)
-    problem.residuals(values, records)
-    one, two = problem.normal_equations(values, records), problem.normal_equations(values, records)
+    problem.with_records(records).residuals(values)
+    one, two = (
+        problem.with_records(records).normal_equations(values),
+        problem.with_records(records).normal_equations(values),
+    )
     assert np.allclose(one.gradient, two.gradient, rtol=1e-12, atol=0)
     assert one.cost == pytest.approx(two.cost, rel=1e-14)
 
@@ -419,13 +434,13 @@ def test_several_threads_with_records_of_their_own_do_not_disturb_each_other(lrm
         moved = values.copy()
         moved[free] += random.normal(0, 1e-3, len(free)) * problem.parameters.scales()
         cases.append(moved)
-    alone = [problem.residuals(moved, problem.records(dataset))[0] for moved in cases]
+    alone = [problem.of(dataset).residuals(moved)[0] for moved in cases]
     barrier = threading.Barrier(4)
 
     def work(number):
         barrier.wait()
-        own = problem.records(dataset)
-        return [problem.residuals(cases[i], own)[0] for i in range(number, 24, 4)]
+        own = problem.of(dataset).records
+        return [problem.with_records(own).residuals(cases[i])[0] for i in range(number, 24, 4)]
 
     with ThreadPoolExecutor(4) as pool:
         together = list(pool.map(work, range(4)))
@@ -458,7 +473,7 @@ def truly_settled(lrm, evaluator, soft, use):
     values = lrm.vector(problem.parameters, {n: soft[n] for n in oracle.OPTION_1})
     q = np.stack([dataset.column(f"arm.q{i}") for i in range(1, 7)], axis=1)
     for i in range(16):
-        one = problem.subset(records, np.array([i]))
+        one = problem.with_records(records).subset(np.array([i])).records
         try:
             found = use(problem, values, one, dataset.subset([i]))
         except NotConvergedError:
@@ -476,7 +491,7 @@ def truly_settled(lrm, evaluator, soft, use):
 def test_residuals_with_springs_too_soft_for_repetition_are_true_or_refused(lrm, evaluator, which, compliance):
     def use(problem, values, records, dataset):
         measured = dataset.stacked([f"tracker.{a}" for a in "xyz"])
-        return (measured - problem.residuals(values, records)[0])[:, 0]
+        return (measured - problem.with_records(records).residuals(values)[0])[:, 0]
 
     truly_settled(lrm, evaluator, softened(which, compliance), use)
 
@@ -485,7 +500,7 @@ def test_residuals_with_springs_too_soft_for_repetition_are_true_or_refused(lrm,
 @pytest.mark.quick("all-100.0", "k2-1000.0")
 def test_predictions_with_springs_too_soft_for_repetition_are_true_or_refused(lrm, which, compliance):
     def use(problem, values, records, dataset):
-        return problem.predict(values, records)[0].outputs[:3, 0]
+        return problem.with_records(records).predict(values)[0].outputs[:3, 0]
 
     truly_settled(lrm, "interpreted", softened(which, compliance), use)
 
@@ -503,8 +518,8 @@ def test_costs_with_springs_too_soft_for_repetition_are_one_number_or_refused(lr
     values = lrm.vector(problem.parameters, {n: soft[n] for n in oracle.OPTION_1})
     for i in range(16):
         try:
-            one = problem.cost(values, problem.subset(records, np.array([i])))
-            two = problem.normal_equations(values, problem.subset(records, np.array([i]))).cost
+            one = problem.with_records(records).subset(np.array([i])).cost(values)
+            two = problem.with_records(records).subset(np.array([i])).normal_equations(values).cost
         except NotConvergedError:
             continue
         assert one == pytest.approx(two, rel=1e-6), i
@@ -519,7 +534,7 @@ def test_one_record_that_needs_newton_leaves_the_others_right(lrm, evaluator):
     problem, records, values, dataset = lrm_case(lrm, 8, 11, evaluator, payload=payload)
     plain, plain_records, _, _ = lrm_case(lrm, 8, 11, evaluator)
     try:
-        found = problem.residuals(values, records)[0]
+        found = problem.with_records(records).residuals(values)[0]
     except NotConvergedError:
         pytest.fail("the equilibrium exists: Newton should find it")
     others = [0, 1, 2, 4, 5, 6, 7]
@@ -536,10 +551,10 @@ def test_a_record_without_numbers_is_refused_not_averaged_away(lrm, evaluator):
     problem, _, values, dataset = lrm_case(lrm, 9, 12, evaluator)
     broken = dict(dataset.channels)
     broken["arm.q3"] = np.where(np.arange(9) == 4, np.nan, broken["arm.q3"])
-    records = problem.records(lrm.dataset(np.stack([broken[f"arm.q{i}"] for i in range(1, 7)], axis=1)))
+    records = problem.of(lrm.dataset(np.stack([broken[f"arm.q{i}"] for i in range(1, 7)], axis=1))).records
     for use in (problem.residuals, problem.normal_equations, problem.predict):
         with pytest.raises(NotConvergedError):
-            use(values, problem.subset(records, np.arange(9)))
+            use(values, problem.with_records(records).subset(np.arange(9)).records)
 
 
 # ---------------------------------------------------------------- the cache and the compiler
@@ -561,7 +576,7 @@ SCRIPT = """
     problem = Problem.build(
         system.arms, system.measurements, experiment.parameters, system.environment, dataset, {evaluator!r}
     )
-    cost = problem.cost(experiment.parameters.nominal(), problem.records(dataset))
+    cost = problem.of(dataset).cost(experiment.parameters.nominal())
     print(json.dumps([problem.backend, cost]))
 """
 

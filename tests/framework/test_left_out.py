@@ -18,8 +18,8 @@ def without_priors():
     """Slopes by values and innovations of the training records, raw; the fit; and what is known beforehand."""
     loaded, dataset, problem, records, train, _, _ = drifting_problem()
     loose = loaded.parameters.replaced({"arm.spring.k1": replace(loaded.parameters["arm.spring.k1"], prior_sd=None)})
-    problem = replace(problem, parameters=loose)
-    fitted = fit(problem, problem.subset(records, train), loaded.estimator, loose.nominal())
+    problem = problem.with_parameters(loose)
+    fitted = fit(problem.with_records(records).subset(train), loaded.estimator, loose.nominal())
     plain = [replace(each, correlation=None) for each in records]
     slopes = dense_slopes(problem, fitted.estimate.values, plain)
     drift = dense_drift(loaded, dataset.column("sequence"), dense_slopes(problem, loose.nominal(), plain))
@@ -63,7 +63,7 @@ def test_where_nothing_drifts_both_recordings_are_the_same() -> None:
     loaded = Experiment.load(DEMO, [FREE])
     dataset = loaded.read().subset(np.arange(20))
     problem = problem_of(loaded, dataset)
-    fitted = fit(problem, problem.records(dataset), loaded.estimator, loaded.parameters.nominal())
+    fitted = fit(problem.of(dataset), loaded.estimator, loaded.parameters.nominal())
     by = predictor(problem, fitted)
     (same,), (new,) = by.left_out(fitted.records, "same"), by.left_out(fitted.records, "new")
     assert np.array_equal(same.covariance, new.covariance)
@@ -79,8 +79,8 @@ def test_a_record_alone_in_telling_something_is_not_predicted_without_it() -> No
     loaded = Experiment.load(DEMO, [FREE])
     dataset = loaded.read().subset(np.arange(2))
     problem = problem_of(loaded, dataset)
-    records = problem.records(dataset)
-    fitted = fit(problem, records, loaded.estimator, loaded.parameters.nominal())
+    records = problem.of(dataset).records
+    fitted = fit(problem.with_records(records), loaded.estimator, loaded.parameters.nominal())
     (spread,) = predictor(problem, fitted).left_out(fitted.records, "same")
     (own,) = predictor(problem, fitted).spreads(fitted.records, "same")
     assert np.isfinite(spread.covariance).all()
@@ -91,6 +91,6 @@ def test_a_record_alone_in_telling_something_is_not_predicted_without_it() -> No
 def test_the_order_of_records_does_not_matter(recording: str) -> None:
     *_, problem, _, _, _, fitted = drifting_problem()
     by, count = predictor(problem, fitted), fitted.records[0].count
-    turned = problem.subset(fitted.records, np.arange(count)[::-1])
+    turned = problem.with_records(fitted.records).subset(np.arange(count)[::-1]).records
     (forth,), (back,) = by.left_out(fitted.records, recording), by.left_out(turned, recording)
     assert np.allclose(forth.covariance, back.covariance[::-1], rtol=1e-10)

@@ -78,7 +78,7 @@ def loaded(repository: Path, lrm_data: Path):
     problem = Problem.build(
         system.arms, system.measurements, experiment.parameters, system.environment, dataset, "compiled"
     )
-    return experiment, problem, problem.records(dataset)
+    return experiment, problem, problem.of(dataset).records
 
 
 @pytest.mark.slow
@@ -90,11 +90,11 @@ def test_no_training_set_gives_a_negative_compliance(loaded, sets: int) -> None:
     rng, held = np.random.default_rng(0), 0
     for _ in range(sets):
         chosen = np.sort(rng.choice(313, 50, replace=False))
-        subset = problem.subset(records, chosen)
-        solution = experiment.estimator.solve(problem, subset, experiment.parameters.nominal())
+        subset = problem.with_records(records).subset(chosen).records
+        solution = experiment.estimator.solve(problem.with_records(subset), experiment.parameters.nominal())
         assert solution.verdict.converged, solution.verdict
         assert np.all(solution.values[places] >= 0)
-        held += bool(estimate(problem, subset, solution).at_bound)
+        held += bool(estimate(problem.with_records(subset), solution).at_bound)
     assert held > sets / 10, "the bounds were hardly ever needed: this test shows nothing"
 
 
@@ -106,12 +106,12 @@ def test_ipopt_and_cvxpy_agree_on_the_real_arm(repository: Path, loaded, sets: i
     start, free = experiment.parameters.nominal(), list(experiment.parameters.free_entries)
     rng = np.random.default_rng(1)
     for chosen in [np.arange(313), *(np.sort(rng.choice(313, 50, replace=False)) for _ in range(sets))]:
-        subset = problem.subset(records, chosen)
-        one = experiment.estimator.solve(problem, subset, start)
-        two = other.solve(problem, subset, start)
-        deviations = estimate(problem, subset, one).deviations
+        subset = problem.with_records(records).subset(chosen).records
+        one = experiment.estimator.solve(problem.with_records(subset), start)
+        two = other.solve(problem.with_records(subset), start)
+        deviations = estimate(problem.with_records(subset), one).deviations
         assert np.max(np.abs(one.values - two.values)[free] / deviations) < 1e-4
-        errors = [record_errors(problem, s.values, subset).mean() * 1000 for s in (one, two)]
+        errors = [record_errors(problem.with_records(subset), s.values).mean() * 1000 for s in (one, two)]
         assert errors[0] == pytest.approx(errors[1], abs=1e-4)
 
 

@@ -155,7 +155,7 @@ def all_of_the_arm(lrm: Any) -> tuple[np.ndarray, Parameters]:
     q = oracle.random_poses(100, 4)
     dataset = lrm.dataset(q, oracle.tip(oracle.nominal(), q))
     problem = lrm.problem(experiment, dataset)
-    return problem.triangular_factor(experiment.parameters.nominal(), problem.records(dataset)), experiment.parameters
+    return problem.of(dataset).triangular_factor(experiment.parameters.nominal()), experiment.parameters
 
 
 @pytest.mark.slow

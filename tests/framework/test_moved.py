@@ -32,8 +32,8 @@ def found(shift_m: float, before: int, count: int = 20, seed: int = 0):
     data = Dataset(tuple(str(i) for i in range(len(q))), channels, extra)
     ball = BallInSocket(BallInSocketSettings.si(noise=NOISE), ("arm",))
     problem, records = co.Bench({"arm": co.the_arm(co.ELBOW)}, {"balls": ball}).problem(data)
-    problem = started(problem, records)
-    values = settled(untrained(problem), problem.parameters.nominal(), records)
+    problem = started(problem.with_records(records))
+    values = settled(untrained(problem).with_records(records), problem.parameters.nominal())
     return moved_groups(problem, values, records)
 
 
@@ -58,7 +58,7 @@ def test_records_that_name_each_others_socket_are_listed(exchanged: tuple[int, .
     data = Dataset(tuple(map(str, range(24))), channels, {"position": ("here",) * 24, "socket": tuple(names)})
     ball = BallInSocket(BallInSocketSettings.si(noise=NOISE), ("arm",))
     problem, records = co.Bench({"arm": co.the_arm(co.ELBOW)}, {"balls": ball}).problem(data)
-    listed = mislabelled(problem, records, data)
+    listed = mislabelled(problem.with_records(records), data)
     assert len(listed) == (1 if exchanged else 0)
     for text in listed:
         assert "4 (named here/hole_1, at here/hole_0), 15 (named here/hole_0, at here/hole_1)." in text

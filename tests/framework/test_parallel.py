@@ -37,8 +37,8 @@ def _setup(lrm, evaluator="interpreted", *overrides):
 def _fold_errors(lrm, executor: Executor | None) -> np.ndarray:
     experiment, problem, dataset = _setup(lrm)
     start, splits = experiment.parameters.nominal(), folds(len(dataset), 4, 3)
-    records = problem.records(dataset)
-    return cross_validate(problem, records, splits, experiment.estimator, start, executor=executor).errors
+    records = problem.of(dataset).records
+    return cross_validate(problem.with_records(records), splits, experiment.estimator, start, executor=executor).errors
 
 
 @pytest.mark.parametrize(
@@ -70,13 +70,13 @@ def test_what_the_option_cannot_say_is_bad_input(text: str) -> None:
 @pytest.mark.parametrize("evaluator", ["interpreted", "compiled"])
 def test_a_problem_sent_elsewhere_gives_the_same_bits(lrm, evaluator: str) -> None:
     _, problem, dataset = _setup(lrm, evaluator)
-    problem.residuals(problem.parameters.nominal(), problem.records(dataset))  # fills what arms keep of expressions
+    problem.of(dataset).residuals(problem.parameters.nominal())  # fills what arms keep of expressions
     sent = pickle.dumps(problem)
     there = pickle.loads(sent)
     assert there is not problem and there.backend == problem.backend
-    assert pickle.loads(sent) is there, "compiled again for every task"
+    assert pickle.loads(sent).compiled is there.compiled, "compiled again for every task"
     values = problem.parameters.retract(np.full(problem.increments, 1e-3))
-    ours, theirs = (p.normal_equations(values, p.records(dataset)) for p in (problem, there))
+    ours, theirs = (p.of(dataset).normal_equations(values) for p in (problem, there))
     assert ours.cost == theirs.cost
     assert np.array_equal(ours.gradient, theirs.gradient) and np.array_equal(ours.hessian, theirs.hessian)
 
@@ -93,8 +93,8 @@ def test_every_backend_gives_the_same_bits(lrm, executor: Executor) -> None:
 def test_the_order_of_folds_does_not_change_a_fold(lrm) -> None:
     """No fit warms another's equilibria."""
     experiment, problem, dataset = _setup(lrm)
-    records, start = problem.records(dataset), experiment.parameters.nominal()
-    tasks = [FitTask(problem, experiment.estimator, start, records, s) for s in folds(len(dataset), 3, 0)]
+    problem, start = problem.of(dataset), experiment.parameters.nominal()
+    tasks = [FitTask(problem, experiment.estimator, start, s) for s in folds(len(dataset), 3, 0)]
     forth, back = Sequential().map(fit_and_judge, tasks), Sequential().map(fit_and_judge, tasks[::-1])
     for one, other in zip(forth, back[::-1], strict=True):
         assert np.array_equal(one.errors, other.errors)
@@ -176,7 +176,7 @@ def test_starts_of_one_fit_can_be_spread(lrm) -> None:
     experiment, problem, dataset = _setup(lrm, "interpreted", "estimator.starts=4", "estimator.seed=2")
     start = experiment.parameters.nominal()
     found = [
-        spread(experiment.estimator, executor).solve(problem, problem.records(dataset), start)
+        spread(experiment.estimator, executor).solve(problem.of(dataset), start)
         for executor in (None, Workers("loky", 2))
     ]
     assert np.array_equal(found[0].values, found[1].values)
@@ -307,7 +307,7 @@ def test_a_problem_is_its_own_blueprint(lrm) -> None:
     again = Problem.build(b.arms, b.measurements, b.parameters, b.environment, dataset, "interpreted")
     assert b.parameters is problem.parameters and b.channels == frozenset(dataset.channels)
     start = experiment.parameters.nominal()
-    pair = [np.vstack(p.residuals(start, p.records(dataset))) for p in (problem, again)]
+    pair = [np.vstack(p.of(dataset).residuals(start)) for p in (problem, again)]
     assert np.array_equal(*pair)
 
 

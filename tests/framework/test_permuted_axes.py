@@ -41,7 +41,7 @@ def changed(dataset: Dataset, **columns: str) -> Dataset:
 
 
 def told(ready: Prepared, dataset: Dataset) -> tuple[str, ...]:
-    found = find_permuted_axes(ready.problem, ready.problem.records(dataset), dataset)
+    found = find_permuted_axes(ready.problem, ready.problem.of(dataset).records, dataset)
     return () if found is None else found.readings
 
 
@@ -272,7 +272,7 @@ def test_a_fit_against_a_wall_ends(demo: Prepared, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(ipopt.PosedProblem, "cost", walled)
     monkeypatch.setattr(ipopt.PosedProblem, "model", counted)
     estimator = ipopt.IpoptEstimator(ipopt.IpoptSettings())
-    found = estimator.solve(demo.problem, demo.training, start)
+    found = estimator.solve(demo.problem.with_records(demo.training), start)
     assert not found.verdict.converged and "stuck" in found.verdict.status
     assert len(asked) < 1000
 
@@ -301,12 +301,12 @@ def test_a_lost_fit_whose_residuals_cannot_be_taken_says_what_to_look_at(monkeyp
 def test_a_record_without_equilibrium_leaves_the_others_as_they_were(demo: Prepared) -> None:
     """So that the next trial point starts where the last good one ended."""
     problem, nominal = demo.problem, demo.problem.parameters.nominal()
-    records = problem.subset(demo.records, np.arange(40))
-    expected = problem.residuals(nominal, records)[0]
+    records = problem.with_records(demo.records).subset(np.arange(40)).records
+    expected = problem.with_records(records).residuals(nominal)[0]
     before, soft = records[0].state.copy(), nominal.copy()
     for i in range(7):
         soft[problem.parameters.entries_of(f"arm.spring.k{i}")] = 50.0
     with pytest.raises(NotConvergedError):
-        problem.residuals(soft, records)
+        problem.with_records(records).residuals(soft)
     np.testing.assert_array_equal(records[0].state, before)
-    np.testing.assert_allclose(problem.residuals(nominal, records)[0], expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(problem.with_records(records).residuals(nominal)[0], expected, rtol=0, atol=1e-12)

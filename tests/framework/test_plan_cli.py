@@ -55,7 +55,7 @@ def scaled_rows(path: Path) -> np.ndarray:
     problem = Problem.build(
         system.arms, system.measurements, experiment.parameters, system.environment, dataset, "interpreted"
     )
-    triangle = problem.triangular_factor(experiment.parameters.nominal(), problem.records(dataset))
+    triangle = problem.of(dataset).triangular_factor(experiment.parameters.nominal())
     return triangle * experiment.parameters.scales()
 
 

@@ -98,11 +98,11 @@ def test_a_tip_near_the_origin_of_its_frame_is_in_no_other_unit(tmp_path: Path) 
     path = PRINTED.write(data, tmp_path / "data.csv")
     ready = assemble(Experiment.load(PRINTED.config, QUICK, path), Stopwatch())
     problem, nominal = ready.problem, ready.problem.parameters.nominal()
-    shown = problem.predict(nominal, ready.records)[0].outputs[:3, 7]
+    shown = problem.with_records(ready.records).predict(nominal)[0].outputs[:3, 7]
     origin = shown - (tips(data)[:, 7] - shown) / 9
     for axis, place in zip("xyz", origin, strict=True):
         nominal[problem.parameters.entries_of(f"arm.mdh.base_{axis}")] -= place
-    moved = replace(problem, parameters=problem.parameters.with_nominal(nominal))
+    moved = problem.with_parameters(problem.parameters.with_nominal(nominal))
     check_reach(moved, ready.records, with_tips(data, tips(data) - origin[:, None]))
 
 

@@ -36,9 +36,9 @@ def fitted(lrm, count=COUNT, poses=None):
     sides = {f"arm.approach.q{i + 1}": rng.choice((-1.0, 1.0), count) for i in range(6)}
     more = {**sides, "temperature": rng.uniform(15, 30, count)}
     problem, records, start = posed(lrm, q, points, FEW, **more)
-    estimate = fit(problem, records, IpoptEstimator(IpoptEstimator.Settings()), start).estimate
+    estimate = fit(problem.with_records(records), IpoptEstimator(IpoptEstimator.Settings()), start).estimate
     dataset = lrm.dataset(q, points, **more)
-    return problem, records, estimate, Motion.of(problem, estimate.values, records, dataset), dataset
+    return problem, records, estimate, Motion.of(problem.with_records(records), estimate.values, dataset), dataset
 
 
 class Residuals:
@@ -175,9 +175,9 @@ def test_fits_without_structure_give_a_finding_as_often_as_stated(lrm):
         q = rng.uniform(-1.7, 1.7, (70, 6))
         points = oracle.tip(oracle.published(), q) + NOISE_M * rng.normal(size=(70, 3))
         problem, records, start = posed(lrm, q, points, FEW)
-        estimate = fit(problem, records, IpoptEstimator(IpoptEstimator.Settings()), start).estimate
+        estimate = fit(problem.with_records(records), IpoptEstimator(IpoptEstimator.Settings()), start).estimate
         dataset = lrm.dataset(q, points)
-        motion = Motion.of(problem, estimate.values, records, dataset)
+        motion = Motion.of(problem.with_records(records), estimate.values, dataset)
         own = Residuals(problem, records, estimate, motion, dataset)
         above.append(predictable(problem, own.rows, own.basis, motion, dataset).above_chance)
     print(f"{sum(above)} of {len(above)}")

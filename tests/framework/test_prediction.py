@@ -82,7 +82,7 @@ def test_covariances_are_those_of_dense_gaussian_conditioning(drifting) -> None:
     h = slopes[rows["h"]] - drift[rows["h"]] @ message_of @ a.T @ j
     g = drift[rows["h"]]
     whole = h @ found.covariance @ h.T + s**2 * (g @ message_of @ g.T + noise**2 * np.eye(len(g)))
-    (spread,) = by.spreads(problem.subset(records, held), "same")
+    (spread,) = by.spreads(problem.with_records(records).subset(held).records, "same")
     for i in range(len(held)):
         block = whole[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
         assert np.allclose(spread.covariance[i], block, rtol=2e-4, atol=1e-4 * np.trace(block))
@@ -93,8 +93,8 @@ def test_without_priors_it_is_the_joint_posterior(drifting) -> None:
     """The textbook form: invert the information on values and innovations together."""
     loaded, dataset, problem, records, train, held, _ = drifting
     loose = loaded.parameters.replaced({"arm.spring.k1": replace(loaded.parameters["arm.spring.k1"], prior_sd=None)})
-    problem = replace(problem, parameters=loose)
-    fitted = fit(problem, problem.subset(records, train), loaded.estimator, loose.nominal())
+    problem = problem.with_parameters(loose)
+    fitted = fit(problem.with_records(records).subset(train), loaded.estimator, loose.nominal())
     plain = [replace(each, correlation=None) for each in records]
     slopes = dense_slopes(problem, fitted.estimate.values, plain)
     drift = dense_drift(loaded, dataset.column("sequence"), dense_slopes(problem, loose.nominal(), plain))
@@ -106,14 +106,14 @@ def test_without_priors_it_is_the_joint_posterior(drifting) -> None:
     posterior = scale[:, None] * np.linalg.inv(scaled.T @ scaled + known) * scale
     new = joint[rows_h]
     whole = fitted.estimate.noise_scale**2 * (new @ posterior @ new.T + 5e-4**2 * np.eye(len(new)))
-    (spread,) = predictor(problem, fitted).spreads(problem.subset(records, held), "same")
+    (spread,) = predictor(problem, fitted).spreads(problem.with_records(records).subset(held).records, "same")
     assert np.allclose(spread.deviations.T.ravel(), np.sqrt(np.diag(whole)), rtol=2e-2)
 
 
 def test_nothing_told_of_the_drift_counts_all_of_it(drifting) -> None:
     loaded, _, problem, records, _, held, fitted = drifting
     by, found = predictor(problem, fitted), fitted.estimate
-    new = problem.subset(records, held)
+    new = problem.with_records(records).subset(held).records
     plain = [replace(each, correlation=None) for each in new]
     slopes = dense_slopes(problem, found.values, plain)
     free = [b.name for b in loaded.parameters.free]
@@ -133,7 +133,9 @@ def test_the_order_of_new_records_does_not_matter(drifting) -> None:
     *_, problem, records, _, held, fitted = drifting
     by, turned = predictor(problem, fitted), held[::-1]
     for recording in ("same", "new"):
-        (forth,), (back,) = (by.spreads(problem.subset(records, own), recording) for own in (held, turned))
+        (forth,), (back,) = (
+            by.spreads(problem.with_records(records).subset(own).records, recording) for own in (held, turned)
+        )
         assert np.allclose(forth.covariance, back.covariance[::-1], rtol=1e-10)
 
 
@@ -143,8 +145,8 @@ def test_a_record_counts_its_own_noise() -> None:
     noise = np.where(np.arange(60) % 2, 5e-4, 5e-3)
     dataset = with_channels(dataset, {"tracker.noise": noise})
     problem = problem_of(loaded, dataset)
-    records = problem.records(dataset)
-    fitted = fit(problem, records, loaded.estimator, loaded.parameters.nominal())
+    records = problem.of(dataset).records
+    fitted = fit(problem.with_records(records), loaded.estimator, loaded.parameters.nominal())
     (spread,) = predictor(problem, fitted).spreads(records, "same")
     deviations = spread.deviations / (fitted.estimate.noise_scale * noise)
     assert (deviations > 1).all() and (deviations < 1.5).all()
@@ -187,11 +189,11 @@ def test_intervals_hold_their_share_when_the_model_is_true() -> None:
     problem = problem_of(loaded, commands)
     for _ in range(25):
         dataset = _planted(loaded, commands, random)
-        records = with_drift(problem, problem.records(dataset), dataset, loaded.parameters.nominal())
+        records = with_drift(problem.of(dataset), dataset, loaded.parameters.nominal()).records
         chosen = np.sort(random.permutation(100)[:50])
-        train = problem.subset(records, chosen)
-        fitted = fit(problem, train, loaded.estimator, loaded.parameters.nominal())
-        held = problem.subset(records, np.setdiff1d(np.arange(100), chosen))
+        train = problem.with_records(records).subset(chosen).records
+        fitted = fit(problem.with_records(train), loaded.estimator, loaded.parameters.nominal())
+        held = problem.with_records(records).subset(np.setdiff1d(np.arange(100), chosen)).records
         for name, each in score(predictor(problem, fitted), held).items():
             scores[name].append(each)
     for name, tolerance in (("same", 0.03), ("new", 0.05)):
@@ -274,7 +276,7 @@ def test_folds_err_as_they_did_before_they_were_asked_for_intervals() -> None:
     loaded = Experiment.load(DEMO, [FREE])
     dataset = loaded.read().subset(np.arange(80))
     problem, splits = problem_of(loaded, dataset), folds(80, 4, 0)
-    parts = (problem, problem.records(dataset), splits, loaded.estimator, loaded.parameters.nominal())
+    parts = (problem.of(dataset), splits, loaded.estimator, loaded.parameters.nominal())
     plain, asked = cross_validate(*parts), cross_validate(*parts, judge=fit_and_predict)
     assert np.array_equal(plain.errors, asked.errors)
 
@@ -396,10 +398,13 @@ def test_what_is_kept_predicts_as_the_fit_itself(extra: tuple[str, ...], tmp_pat
     dataset = loaded.read()
     split = prepare(loaded, Stopwatch()).split
     problem = problem_of(loaded, dataset)
-    records = with_drift(problem, problem.records(dataset), dataset, loaded.parameters.nominal())
-    train = problem.subset(records, split.train)
-    fitted = fit(problem, train, loaded.estimator, loaded.parameters.nominal())
-    acting, position = problem.weighted(fitted.records, fitted.weights), recorded_position(dataset)[split.train]
+    records = with_drift(problem.of(dataset), dataset, loaded.parameters.nominal()).records
+    train = problem.with_records(records).subset(split.train).records
+    fitted = fit(problem.with_records(train), loaded.estimator, loaded.parameters.nominal())
+    acting, position = (
+        problem.with_records(fitted.records).weighted(fitted.weights).records,
+        recorded_position(dataset)[split.train],
+    )
     fitted = replace(fitted, estimate=widened(problem, acting, fitted.estimate, position))
     by = predictor(problem, fitted)
     alike = whitened_like(problem, fitted, records, loaded.estimator)

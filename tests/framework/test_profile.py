@@ -26,8 +26,8 @@ DEMO = str(Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "demo.y
 class GaussNewton:
     """Steps halved until the cost falls, then the last digits: enough for these small problems."""
 
-    def solve(self, problem, records, start, progress=None):
-        posed = PosedProblem(problem, records)
+    def solve(self, problem, start, progress=None):
+        posed = PosedProblem(problem)
         lower, upper = posed.bounds()
         x = np.clip(posed.x(start), lower, upper)
         for _ in range(60 if problem.increments else 0):
@@ -49,10 +49,10 @@ class Fails(GaussNewton):
     def __init__(self, place: int, limit: float) -> None:
         self._place, self._limit = place, limit
 
-    def solve(self, problem, records, start, progress=None):
+    def solve(self, problem, start, progress=None):
         if start[self._place] > self._limit:
             raise NotConvergedError("no equilibrium")
-        return super().solve(problem, records, start)
+        return super().solve(problem, start)
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Lab:
 
     def records(self, random, noise):
         noisy = {name: values + random.normal(0, noise, len(values)) for name, values in self.exact.items()}
-        return self.problem.records(with_channels(self.commands, noisy))
+        return self.problem.of(with_channels(self.commands, noisy)).records
 
 
 def lab(free: str, count: int, truth: dict | None = None, settings: tuple[str, ...] = ()) -> Lab:
@@ -83,8 +83,8 @@ def lab(free: str, count: int, truth: dict | None = None, settings: tuple[str, .
 
 def profiled_once(made: Lab, records, name: str, estimator=None):
     estimator = estimator or GaussNewton()
-    fitted = fit(made.problem, records, estimator, made.problem.parameters.nominal())
-    (found,) = profiles(made.problem, fitted, estimator, [name])
+    fitted = fit(made.problem.with_records(records), estimator, made.problem.parameters.nominal())
+    (found,) = profiles(fitted, estimator, [name])
     return fitted.estimate, found
 
 
@@ -114,8 +114,10 @@ def test_the_curve_is_that_of_fits_with_the_parameter_fixed() -> None:
         b = base.blueprint
         other = Problem.build(b.arms, b.measurements, alone, b.environment, made.commands, "interpreted")
         data = [type(r)(r.count, r.record, r.weight, np.zeros_like(r.state)) for r in records]
-        at = GaussNewton().solve(other, data, alone.nominal()).values
-        expected = 2 * (other.cost(at, data) - base.cost(estimate.values, records)) / estimate.noise_scale**2
+        at = GaussNewton().solve(other.with_records(data), alone.nominal()).values
+        expected = (
+            2 * (other.with_records(data).cost(at) - base.cost(estimate.values, records)) / estimate.noise_scale**2
+        )
         assert rise == pytest.approx(expected, rel=1e-5, abs=1e-8)
 
 
@@ -151,7 +153,7 @@ def test_a_combination_that_the_data_does_not_see_has_no_end() -> None:
 def test_a_fit_that_fails_leaves_its_end_open() -> None:
     made = lab("arm.mdh.base_[xyz]", 20)
     records = made.records(np.random.default_rng(1), 1e-3)
-    estimate = fit(made.problem, records, GaussNewton(), made.problem.parameters.nominal()).estimate
+    estimate = fit(made.problem.with_records(records), GaussNewton(), made.problem.parameters.nominal()).estimate
     place = made.problem.parameters.entries_of("arm.mdh.base_x").start
     limit = estimate.values[place] + 0.1 * estimate.deviations[0]
     _, found = profiled_once(made, records, "arm.mdh.base_x", Fails(place, float(limit)))
@@ -167,7 +169,7 @@ def test_records_weigh_as_in_a_robust_fit() -> None:
     random = np.random.default_rng(6)
     spoilt = {name: values + random.normal(0, 5e-4, len(values)) for name, values in spoilt.items()}
     spoilt["tracker.x"][7] += 0.06
-    records = made.problem.records(with_channels(made.commands, spoilt))
+    records = made.problem.of(with_channels(made.commands, spoilt)).records
     _, without = profiled_once(made, clean, "arm.mdh.base_x")
     _, rejecting = profiled_once(made, records, "arm.mdh.base_x", Weighing(GaussNewton(), NoiseSettings(loss="reject")))
     _, plain = profiled_once(made, records, "arm.mdh.base_x")

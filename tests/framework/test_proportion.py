@@ -32,8 +32,8 @@ def test_a_known_distance_that_is_wrong_lengthens_all_links_in_proportion(factor
     known = {"between": ["hole_0", "hole_1"], "distance": apart, "noise": 1e-5}
     ball = BallInSocket(BallInSocket.Settings.si(noise=1e-4, distances=[known]), ("arm",))
     problem, records = co.Bench({"arm": co.the_arm(co.ELBOW)}, {"balls": ball}, FREE).problem(co.dataset(parts))
-    problem = started(problem, records)
-    estimate = fit(problem, records, IPOPT, problem.parameters.nominal()).estimate
+    problem = started(problem.with_records(records))
+    estimate = fit(problem.with_records(records), IPOPT, problem.parameters.nominal()).estimate
     lengths = proportion(problem, estimate, records)
     assert lengths is not None and lengths.share == pytest.approx(factor - 1, abs=3 * lengths.sd)
     assert lengths.is_clear == (factor > 1)

@@ -56,10 +56,10 @@ def recording(lrm, count=150, seed=0, stood=None, moved=None, noise=NOISE_M, nam
 
 def looked_at(problem, records, start, dataset, **more):
     """What is left in a fit's residuals."""
-    found = fit(problem, records, IPOPT, start)
+    found = fit(problem.with_records(records), IPOPT, start)
     assert found.estimate.verdict.converged
-    motion = Motion.of(problem, found.estimate.values, records, dataset)
-    acting = problem.weighted(found.records, found.weights)
+    motion = Motion.of(problem.with_records(records), found.estimate.values, dataset)
+    acting = problem.with_records(found.records).weighted(found.weights).records
     return structure(problem, acting, found.estimate, dataset, motion, recorded_position(dataset), **more)
 
 
@@ -98,7 +98,7 @@ def planted(lrm, name, seed, size=1.0):
             problem.parameters.nominal() - 0.02 * (np.array(problem.parameters.entry_names) == "arm.spring.k1")
         )
         problem = lrm.problem(lrm.experiment(), dataset, "auto", k1)
-        return problem, problem.records(dataset), k1.nominal(), dataset
+        return problem, problem.of(dataset).records, k1.nominal(), dataset
     return made
 
 
@@ -219,7 +219,7 @@ def test_the_order_of_the_rows_does_not_matter_where_the_recording_is_numbered(l
     problem, _, start, dataset = planted(lrm, "backlash", 5)
     numbered = replace(dataset, channels={**dataset.channels, "sequence": np.arange(150.0)})
     mixed = numbered.subset(np.random.default_rng(0).permutation(150))
-    one, other = (looked_at(problem, problem.records(d), start, d) for d in (numbered, mixed))
+    one, other = (looked_at(problem, problem.of(d).records, start, d) for d in (numbered, mixed))
     assert [s.words for s in one.structures] == [s.words for s in other.structures]
     assert one.lag_one == pytest.approx(other.lag_one, abs=1e-6)
     assert one.structures[0].falls_mm == pytest.approx(other.structures[0].falls_mm, abs=1e-6)
@@ -234,8 +234,8 @@ def test_records_of_no_weight_tell_nothing(lrm):
     spoilt = replace(dataset, channels=spoilt)
     weights = np.ones(150)
     weights[[10, 70]] = 0
-    one = looked_at(problem, problem.records(dataset, weights), start, dataset)
-    other = looked_at(problem, problem.records(spoilt, weights), start, spoilt)
+    one = looked_at(problem, problem.of(dataset, weights).records, start, dataset)
+    other = looked_at(problem, problem.of(spoilt, weights).records, start, spoilt)
     assert one.records == other.records == 148
     assert json.dumps(asdict(one)) == json.dumps(asdict(other))
 
@@ -256,7 +256,7 @@ def test_very_many_records_are_looked_at_in_part_and_few_not_at_all(lrm, monkeyp
     many = looked_at(problem, records, start, dataset)
     assert most // 2 <= many.records <= most and many.structures[0].subject == "q4"
     few = dataset.subset(np.arange(20))
-    assert looked_at(problem, problem.records(few), start, few) is None
+    assert looked_at(problem, problem.of(few).records, start, few) is None
 
 
 def test_a_sliding_joint_without_masses_is_no_obstacle():
@@ -334,7 +334,7 @@ def test_loads_and_levers_against_plain_numbers(lrm):
 def sound_fit(lrm):
     """A problem, its dataset, and its fit to sound records."""
     problem, records, start, dataset = recording(lrm, 120, 11)
-    return problem, dataset, fit(problem, records, IPOPT, start).estimate
+    return problem, dataset, fit(problem.with_records(records), IPOPT, start).estimate
 
 
 def large_errors_of(lrm, spoil, limit=None):
@@ -343,10 +343,10 @@ def large_errors_of(lrm, spoil, limit=None):
     columns = {name: dataset.column(name).copy() for name in dataset.channels}
     spoil(columns, dataset.stacked([f"arm.q{i}" for i in range(1, 7)]).T)
     dataset = replace(dataset, channels=columns)
-    records = problem.records(dataset)
-    raw = problem.residuals(found.values, records)
+    records = problem.of(dataset).records
+    raw = problem.with_records(records).residuals(found.values)
     errors = 1000 * np.linalg.norm(raw[0], axis=0)
-    motion = Motion.of(problem, found.values, records, dataset)
+    motion = Motion.of(problem.with_records(records), found.values, dataset)
     return large_errors(problem, records, found, dataset, motion, Judged(errors, raw, np.arange(120)), limit)
 
 
@@ -400,7 +400,7 @@ def test_whether_the_tip_depends_on_what_priors_hold(lrm, poses_seen):
     freed = experiment.parameters.with_free(free)
     held = tuple(replace(block, prior_sd=block.scale) if block.free else block for block in freed.blocks)
     problem = lrm.problem(experiment, dataset, "interpreted", replace(freed, blocks=held))
-    found = fit(problem, problem.records(dataset), IPOPT, problem.parameters.nominal()).estimate
+    found = fit(problem.of(dataset), IPOPT, problem.parameters.nominal()).estimate
     assert found.identifiability.undetermined
     joints = [f"arm.q{i}" for i in range(1, 7)]
     alone = priors_alone(problem, found, *(unseen_poses(dataset, joints, between) for between in (False, True)))
@@ -425,7 +425,7 @@ def test_what_positions_at_their_ends_leave_open_shows_between_them(lrm):
     freed = experiment.parameters.with_free(free)
     held = tuple(replace(block, prior_sd=block.scale) if block.free else block for block in freed.blocks)
     problem = lrm.problem(experiment, dataset, "interpreted", replace(freed, blocks=held))
-    found = fit(problem, problem.records(dataset), IPOPT, problem.parameters.nominal()).estimate
+    found = fit(problem.of(dataset), IPOPT, problem.parameters.nominal()).estimate
     assert len(found.identifiability.undetermined) == 1
     joints = [f"arm.q{i}" for i in range(1, 7)]
     alone = priors_alone(problem, found, *(unseen_poses(dataset, joints, between) for between in (False, True)))
@@ -450,5 +450,5 @@ def test_unseen_poses_are_of_what_was_recorded_although_an_arm_is_not_in_all_rec
 
 def test_without_priors_nothing_is_said_to_be_held_by_them(lrm):
     problem, records, start, dataset = recording(lrm, 60, 1)
-    found = fit(problem, records, IPOPT, start).estimate
+    found = fit(problem.with_records(records), IPOPT, start).estimate
     assert priors_alone(problem, found, dataset, dataset) is None

@@ -24,7 +24,7 @@ quick_losses = pytest.mark.parametrize("loss", ["huber", pytest.param("cauchy", 
 
 
 def fitted(problem, records, start, loss, estimator=IPOPT, **settings):
-    found = fit(problem, records, weighed(estimator, NoiseSettings(loss=loss, **settings)), start)
+    found = fit(problem.with_records(records), weighed(estimator, NoiseSettings(loss=loss, **settings)), start)
     assert found.solution.verdict.converged, found.solution.verdict.status
     return found
 
@@ -121,7 +121,7 @@ def test_stated_deviations_hold_over_many_experiments(lrm, loss):
     off = []
     for seed in range(60):
         q, points, _ = measured(80, 100 + seed, outliers=0.05)
-        records = problem.records(lrm.dataset(q, points))
+        records = problem.of(lrm.dataset(q, points)).records
         off.append(deviations_off(fitted(problem, records, truth, loss), truth))
     off = np.array(off)
     assert np.sqrt(np.mean(off**2)) == pytest.approx(1.0, abs=0.12)
@@ -135,7 +135,7 @@ def test_hardly_any_experiment_without_outliers_has_a_record_set_aside(lrm):
     count = 0
     for seed in range(150):
         q, points, _ = measured(60, 500 + seed)
-        count += bool(fitted(problem, problem.records(lrm.dataset(q, points)), truth, "reject").set_aside)
+        count += bool(fitted(problem, problem.of(lrm.dataset(q, points)).records, truth, "reject").set_aside)
     assert count <= 8  # 1.5 expected; the median scale makes it somewhat more
 
 
@@ -152,7 +152,7 @@ def test_the_answer_minimises_the_robust_cost(lrm, loss):
     def cost(x):
         values = found.estimate.values.copy()
         values[free] += x * sd
-        residual = np.linalg.norm(problem.residuals(values, records)[0], axis=0) / NOISE_M
+        residual = np.linalg.norm(problem.with_records(records).residuals(values)[0], axis=0) / NOISE_M
         return scale**2 * kind.rho(residual / scale).sum()
 
     best = minimize(cost, np.full(4, 0.3), method="BFGS")
@@ -162,9 +162,9 @@ def test_the_answer_minimises_the_robust_cost(lrm, loss):
 
 
 def scale_of(problem, records, start, loss):
-    first = IPOPT.solve(problem, records, start)
-    huber = robust.reweighted(problem, records, IPOPT, first, "huber")
-    last = huber if loss == "huber" else robust.reweighted(problem, records, IPOPT, huber.solution, loss)
+    first = IPOPT.solve(problem.with_records(records), start)
+    huber = robust.reweighted(problem.with_records(records), IPOPT, first, "huber")
+    last = huber if loss == "huber" else robust.reweighted(problem.with_records(records), IPOPT, huber.solution, loss)
     return last.scales[0]
 
 
@@ -186,9 +186,9 @@ def test_the_cost_also_falls_from_a_bad_start_at_a_fixed_scale(lrm, monkeypatch)
     """With the scale held from the first round on, from an answer that outliers led astray."""
     q, points, _ = measured(60, 9, outliers=0.3, size=0.1)
     problem, records, start = posed(lrm, q, points)
-    first = IPOPT.solve(problem, records, start)
+    first = IPOPT.solve(problem.with_records(records), start)
     monkeypatch.setattr(robust, "MOST_SCALE_ROUNDS", 0)
-    rounds = robust.reweighted(problem, records, IPOPT, first, "cauchy").rounds
+    rounds = robust.reweighted(problem.with_records(records), IPOPT, first, "cauchy").rounds
     assert len(rounds) > 3 and rounds[0].cost > 1.01 * rounds[-1].cost
     assert np.all(np.diff([r.cost for r in rounds]) <= 1e-9 * rounds[0].cost)
 
@@ -239,15 +239,15 @@ def test_studentised_distances_against_fits_without_the_record(lrm):
     """For a kept record: leaving it out moves its residual r to (I - H)^-1 r, with covariance (I - H)^-1."""
     q, points, _ = measured(40, 13)
     problem, records, start = posed(lrm, q, points)
-    values = IPOPT.solve(problem, records, start).values
-    told = studentised_distances(problem, values, records, robust.ones(records))
+    values = IPOPT.solve(problem.with_records(records), start).values
+    told = studentised_distances(problem.with_records(records), values, robust.ones(problem.with_records(records)))
     for i in (0, 7, 23):
-        others = problem.subset(records, np.delete(np.arange(40), i))
-        without = IPOPT.solve(problem, others, values).values
-        alone = problem.subset(records, np.array([i]))
-        left = problem.whitened_residuals(without, alone)[0][:, 0]
-        jacobian = next(iter(problem.jacobians(without, alone)))[:, :, 0]
-        triangle = problem.triangular_factor(without, others)
+        others = problem.with_records(records).subset(np.delete(np.arange(40), i)).records
+        without = IPOPT.solve(problem.with_records(others), values).values
+        alone = problem.with_records(records).subset(np.array([i])).records
+        left = problem.with_records(alone).whitened_residuals(without)[0][:, 0]
+        jacobian = next(iter(problem.with_records(alone).jacobians(without)))[:, :, 0]
+        triangle = problem.with_records(others).triangular_factor(without)
         covariance = np.eye(3) + jacobian @ np.linalg.solve(triangle.T @ triangle, jacobian.T)
         expected = np.sqrt(left @ np.linalg.solve(covariance, left)) / told.scales[0]
         assert told.studentised[0][i] == pytest.approx(expected, rel=1e-2)
@@ -257,8 +257,9 @@ def test_studentised_distances_against_fits_without_the_record(lrm):
 def test_distances_of_good_records_are_chi_distributed(lrm):
     q, points, _ = measured(400, 14)
     problem, records, start = posed(lrm, q, points)
-    values = IPOPT.solve(problem, records, start).values
-    squared = studentised_distances(problem, values, records, robust.ones(records)).studentised[0] ** 2
+    values = IPOPT.solve(problem.with_records(records), start).values
+    problem = problem.with_records(records)
+    squared = studentised_distances(problem, values, robust.ones(problem)).studentised[0] ** 2
     for level in (0.25, 0.5, 0.9, 0.99):
         assert np.mean(squared < chi2.ppf(level, 3)) == pytest.approx(level, abs=0.05)
 
@@ -292,8 +293,10 @@ def test_a_record_that_was_set_aside_wrongly_comes_back(lrm):
     problem, records, start = posed(lrm, q, points)
     weights = np.ones(80)
     weights[np.flatnonzero(~wrong)[:6]] = 0.0
-    solution = IPOPT.solve(problem, problem.weighted(records, [weights]), start)
-    found = robust.selected(problem, records, IPOPT, robust.RobustFit(solution, (weights,), (1.0,), ()), 0.1)
+    solution = IPOPT.solve(problem.with_records(records).weighted([weights]), start)
+    found = robust.selected(
+        problem.with_records(records), IPOPT, robust.RobustFit(solution, (weights,), (1.0,), ()), 0.1
+    )
     np.testing.assert_array_equal(found.weights[0] == 0, wrong)
 
 
@@ -314,9 +317,9 @@ class _GivesUp:
     def __init__(self, good):
         self.left = good
 
-    def solve(self, problem, records, start, progress=None):
+    def solve(self, problem, start, progress=None):
         self.left -= 1
-        found = IPOPT.solve(problem, records, start)
+        found = IPOPT.solve(problem, start)
         if self.left >= 0:
             return found
         return replace(found, values=start, verdict=SolverVerdict("tired", "gave up", False, 1, 0.0))
@@ -328,7 +331,7 @@ class _GivesUp:
 def test_a_solver_that_gives_up_on_the_way_is_not_called_converged(lrm, loss, good):
     q, points, _ = measured(60, 18, outliers=0.05)
     problem, records, start = posed(lrm, q, points)
-    found = fit(problem, records, Weighing(_GivesUp(good), NoiseSettings(loss=loss)), start)
+    found = fit(problem.with_records(records), Weighing(_GivesUp(good), NoiseSettings(loss=loss)), start)
     assert not found.solution.verdict.converged and "gave up" in found.solution.verdict.status
 
 
@@ -337,7 +340,7 @@ def test_weights_that_do_not_settle_are_told(lrm, monkeypatch):
     monkeypatch.setattr(robust, "MOST_ROUNDS", 2)
     q, points, _ = measured(60, 18, outliers=0.05)
     problem, records, start = posed(lrm, q, points)
-    found = fit(problem, records, Weighing(IPOPT, NoiseSettings(loss="huber")), start)
+    found = fit(problem.with_records(records), Weighing(IPOPT, NoiseSettings(loss="huber")), start)
     assert not found.solution.verdict.converged
     assert "weights still moved" in found.solution.verdict.status
 
@@ -357,18 +360,18 @@ def test_a_record_with_its_own_noise_weighs_by_it(lrm):
     channels = {f"tracker.noise_{axis}": own[:, i] for i, axis in enumerate("xyz")}
     problem, records, start = posed(lrm, q, points, **channels)
     residual, jacobian = (
-        problem.residuals(start, records)[0],
-        np.concatenate(list(problem.jacobians(start, records)), 2),
+        problem.with_records(records).residuals(start)[0],
+        np.concatenate(list(problem.with_records(records).jacobians(start)), 2),
     )
     plain_problem, plain_records, _ = posed(lrm, q, points)
-    plain = np.concatenate(list(plain_problem.jacobians(start, plain_records)), axis=2) * NOISE_M
+    plain = np.concatenate(list(plain_problem.with_records(plain_records).jacobians(start)), axis=2) * NOISE_M
     np.testing.assert_allclose(jacobian[:, :, :50], plain[:, :, :50] / own.T[:, None], rtol=1e-9, atol=1e-6)
-    model = problem.normal_equations(start, records)
+    model = problem.with_records(records).normal_equations(start)
     whitened = residual / own.T
     assert model.cost == pytest.approx(0.5 * np.sum(whitened**2), rel=1e-9)
-    assert problem.cost(start, records) == pytest.approx(model.cost, rel=1e-9)
+    assert problem.with_records(records).cost(start) == pytest.approx(model.cost, rel=1e-9)
     some = np.array([3, 4, 30])
-    assert problem.cost(start, problem.subset(records, some)) == pytest.approx(0.5 * np.sum(whitened[:, some] ** 2))
+    assert problem.with_records(records).subset(some).cost(start) == pytest.approx(0.5 * np.sum(whitened[:, some] ** 2))
 
 
 @pytest.mark.slow
@@ -378,7 +381,7 @@ def test_one_column_of_noise_stands_for_all_three_coordinates(lrm):
     one = posed(lrm, q, points, **{"tracker.noise": own})
     three = posed(lrm, q, points, **{f"tracker.noise_{axis}": own for axis in "xyz"})
     nearer = posed(lrm, q, points, **{"tracker.noise": 7 * own, **{f"tracker.noise_{a}": own for a in "xyz"}})
-    costs = [problem.cost(start, records) for problem, records, start in (one, three, nearer)]
+    costs = [problem.with_records(records).cost(start) for problem, records, start in (one, three, nearer)]
     assert costs[1] == pytest.approx(costs[0]) and costs[2] == pytest.approx(costs[0])
 
 
@@ -394,10 +397,10 @@ def test_the_exact_hessian_knows_each_records_noise(lrm):
         for sign in (1, -1):
             at = start.copy()
             at[entry] += sign * h
-            problem.residuals(at, records)
-            sides.append(problem.normal_equations(at, records).gradient)
+            problem.with_records(records).residuals(at)
+            sides.append(problem.with_records(records).normal_equations(at).gradient)
         columns.append((sides[0] - sides[1]) / (2 * h))
-    exact = problem.exact_hessian(start, records)
+    exact = problem.with_records(records).exact_hessian(start)
     np.testing.assert_allclose(exact, np.array(columns), rtol=1e-4, atol=1e-4 * np.abs(exact).max())
 
 

@@ -84,12 +84,12 @@ class Form:
         held = {block.name: replace(block, prior_sd=PRIOR) for block in parameters.free}
         built = (system.arms, system.measurements, parameters.replaced(held), system.environment, data)
         problem = Problem.build(*built, "interpreted")
-        return problem, problem.records(data)
+        return problem, problem.of(data).records
 
     def fit(self, data):
         problem, records = self.problem(data)
-        solution = self.experiment.estimator.solve(problem, records, problem.parameters.nominal())
-        return estimate(problem, records, solution)
+        solution = self.experiment.estimator.solve(problem.with_records(records), problem.parameters.nominal())
+        return estimate(problem.with_records(records), solution)
 
     def chain(self, found) -> Chain:
         """As calibrated."""
@@ -216,4 +216,4 @@ def test_with_noise_the_forms_are_as_good_as_each_other(arm, tmp_path):
 def test_every_form_sees_as_much_at_its_nominal_values(form, tmp_path):
     """Where the point is off all axes the nominal arm is no special case."""
     problem, records = Form.of("frida", form, tmp_path).problem(recorded("frida"))
-    assert identify(problem, problem.parameters.nominal(), records).rank == 4 * 7 + 3
+    assert identify(problem.with_records(records), problem.parameters.nominal()).rank == 4 * 7 + 3

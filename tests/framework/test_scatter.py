@@ -14,17 +14,18 @@ def told(residual: np.ndarray, places: np.ndarray | None = None, weight: np.ndar
     """The scatter of one measurement's residuals (3 x N), none of their freedom used up."""
     count = residual.shape[1]
     factor = SimpleNamespace(name="tracker", noise=(1.0, 1.0, 1.0))
-    problem = SimpleNamespace(
-        kernels=[SimpleNamespace(factor=factor)],
-        residuals=lambda values, records: [residual],
-        equations=lambda records: 3 * count,
-    )
     estimate = SimpleNamespace(values=None, degrees_of_freedom=3 * count, noise_scale=1.0)
     weights = np.ones(count) if weight is None else weight
-    records = [SimpleNamespace(count=count, weight=weights, measured=np.ones(count, dtype=bool), correlation=None)]
+    problem = SimpleNamespace(
+        kernels=[SimpleNamespace(factor=factor)],
+        records=[SimpleNamespace(count=count, weight=weights, measured=np.ones(count, dtype=bool))],
+        correlation=None,
+        residuals=lambda values: [residual],
+        equations=lambda: 3 * count,
+    )
     channels = {} if places is None else {"sequence": places}
     dataset = Dataset(tuple(str(i) for i in range(count)), channels)
-    return residual_spread(problem, estimate, records, dataset)["tracker"]
+    return residual_spread(problem, estimate, dataset)["tracker"]
 
 
 def made(count: int, share: float, over: float, seed: int = 0) -> np.ndarray:

@@ -84,9 +84,9 @@ def test_what_upright_axes_do_not_determine_is_named() -> None:
 @pytest.mark.slow
 def test_parameters_that_place_the_arm_are_known_by_what_they_move(anywhere: Prepared) -> None:
     problem, records = anywhere.problem, anywhere.records
-    sighting = sighting_of(problem, records, anywhere.dataset, 0, 300)
+    sighting = sighting_of(problem.with_records(records), anywhere.dataset, 0, 300)
     assert sighting is not None
-    placing = placings(problem, records, sighting)[0]
+    placing = placings(problem.with_records(records), sighting)[0]
     assert placing.base == (*(f"arm.mdh.base_{of}" for of in ("x", "y", "z", "rx", "ry")), "arm.mdh.theta1")
     assert placing.target == ("arm.mdh.tool_y", "arm.mdh.tool_z", "tracker.target_x")
     assert placing.stands_anywhere and placing.basis.shape == (3, 3)
@@ -99,7 +99,7 @@ def test_the_start_follows_the_frame(anywhere: Prepared, seed: int) -> None:
     random = np.random.default_rng(seed)
     turn, shift = Rotation.random(random_state=random).as_matrix(), random.normal(scale=3, size=3)
     dataset = seen_from(anywhere.dataset, turn, shift)
-    start = aligned_start(anywhere.problem, anywhere.problem.records(dataset), dataset)
+    start = aligned_start(anywhere.problem.of(dataset), dataset)
     assert start.taken and start.alignment is not None and start.configured > 0.5
     assert start.left == pytest.approx(start.alignment.left, rel=0.01) and start.left < 0.015
     assert not start.warnings
@@ -124,7 +124,7 @@ def test_a_prior_is_kept_and_a_contradiction_said() -> None:
     for prior, contradicts in (("100 m", False), ("10 mm", True)):
         ready = loaded(f"parameters.priors={json.dumps({'arm.mdh.base_[xyz]': prior})}", "evaluator=interpreted")
         dataset = seen_from(ready.dataset, turn, shift)
-        start = aligned_start(ready.problem, ready.problem.records(dataset), dataset)
+        start = aligned_start(ready.problem.of(dataset), dataset)
         assert start.taken is not contradicts
         assert bool(start.warnings) is contradicts
         held = start.problem.parameters["arm.mdh.base_x"].nominal
@@ -155,8 +155,8 @@ def test_mistakes_are_named_in_any_frame(anywhere: Prepared, change, words: str)
     dataset = replace(
         dataset, channels={**dataset.channels, **{f"tracker.{a}": r for a, r in zip(AXES, wrong, strict=True)}}
     )
-    start = aligned_start(anywhere.problem, anywhere.problem.records(dataset), dataset)
-    found = find_permuted_axes(start.problem, start.problem.records(dataset), dataset)
+    start = aligned_start(anywhere.problem.of(dataset), dataset)
+    found = find_permuted_axes(start.problem, start.problem.of(dataset).records, dataset)
     assert found is not None and len(found.readings) == 1 and found.readings[0].startswith((words, f"the {words}"))
     assert found.as_given_mm > 3 * found.left_mm
 
@@ -171,8 +171,8 @@ def test_a_tracker_that_was_moved_in_the_middle_is_named_with_the_record(anywher
     moved = Rotation.from_euler("z", 0.4).as_matrix() @ dataset.stacked(names) + np.array([[0.3], [0.1], [0.0]])
     both = np.where(np.arange(len(dataset)) >= since, moved, dataset.stacked(names))
     dataset = replace(dataset, channels={**dataset.channels, **dict(zip(names, both, strict=True))})
-    start = aligned_start(anywhere.problem, anywhere.problem.records(dataset), dataset)
-    found = find_permuted_axes(start.problem, start.problem.records(dataset), dataset)
+    start = aligned_start(anywhere.problem.of(dataset), dataset)
+    found = find_permuted_axes(start.problem, start.problem.of(dataset).records, dataset)
     assert (
         found is not None
         and f"from record {dataset.ids[since]} on taken for those in another frame" in found.readings[0]
@@ -237,7 +237,7 @@ def studied(name: str, folder: Path) -> tuple[Prepared, Experiment]:
     if name != "hobby":
         return ready, experiment
     dataset = hobby(ready.dataset, np.random.default_rng(5))
-    return replace(ready, dataset=dataset, records=ready.problem.records(dataset)), experiment
+    return replace(ready, dataset=dataset, records=ready.problem.of(dataset).records), experiment
 
 
 @pytest.mark.slow
@@ -246,7 +246,7 @@ def test_a_hundred_frames_and_targets_end_where_the_true_ones_do(name: str, tmp_
     """Each is fitted from the configuration, which knows nothing of them, and from the truth: to the same cost."""
     ready, experiment = studied(name, tmp_path)
     problem, nominal, alike = ready.problem, ready.problem.parameters.nominal(), 0
-    tools = tools_of(problem, nominal, ready.records[0], 0)
+    tools = tools_of(problem.with_records(ready.records), nominal, 0)
     measured = ready.dataset.stacked([f"tracker.{axis}" for axis in AXES])
     for seed in range(100):
         random = np.random.default_rng(seed)
@@ -255,12 +255,18 @@ def test_a_hundred_frames_and_targets_end_where_the_true_ones_do(name: str, tmp_
         offset *= random.uniform(0, 0.2) / np.linalg.norm(offset)
         moved = measured + np.einsum("nij,j->in", tools.rotations, offset)
         dataset = with_tips(ready.dataset, turn @ moved + shift[:, None])
-        found = aligned_start(problem, problem.records(dataset), dataset)
-        away = experiment.estimator.solve(found.problem, problem.records(dataset), found.values(found.problem)[0])
-        there = problem.records(with_tips(ready.dataset, moved))
-        start = placings(problem, ready.records, sighting_of(problem, ready.records, ready.dataset, 0, 300))[0]
-        true = experiment.estimator.solve(problem, there, start.with_target(problem.parameters, nominal, offset))
-        costs = [problem.cost(away.values, problem.records(dataset)), problem.cost(true.values, there)]
+        found = aligned_start(problem.of(dataset), dataset)
+        away = experiment.estimator.solve(
+            found.problem.with_records(problem.of(dataset).records), found.values(found.problem)[0]
+        )
+        there = problem.of(with_tips(ready.dataset, moved)).records
+        start = placings(
+            problem.with_records(ready.records), sighting_of(problem.with_records(ready.records), ready.dataset, 0, 300)
+        )[0]
+        true = experiment.estimator.solve(
+            problem.with_records(there), start.with_target(problem.parameters, nominal, offset)
+        )
+        costs = [problem.of(dataset).cost(away.values), problem.with_records(there).cost(true.values)]
         alike += costs[0] <= costs[1] * (1 + 1e-4) + 1e-6
     assert alike == 100
 
@@ -286,8 +292,8 @@ def test_mistakes_are_named_and_clean_recordings_are_not_suspected(name: str, tm
     joints = [channel for channel in ready.dataset.channels if channel.startswith("arm.") and "approach" not in channel]
 
     def said(dataset: Dataset) -> str:
-        start = aligned_start(problem, problem.records(dataset), dataset)
-        reading = find_permuted_axes(start.problem, start.problem.records(dataset), dataset)
+        start = aligned_start(problem.of(dataset), dataset)
+        reading = find_permuted_axes(start.problem, start.problem.of(dataset).records, dataset)
         return "" if reading is None else " | ".join(reading.readings)
 
     for seed in range(6):

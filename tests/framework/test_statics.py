@@ -66,7 +66,7 @@ def channels(loads):
 
 def predicted(problem, values, dataset):
     """The measured points armcal predicts (N x 3)."""
-    return problem.predict(values, problem.records(dataset))[0].outputs[:3].T
+    return problem.of(dataset).predict(values)[0].outputs[:3].T
 
 
 @pytest.mark.parametrize("is_physical", [False, True], ids=["as counted by the authors", "physical"])
@@ -204,7 +204,7 @@ def test_the_tip_moves_with_every_parameter_as_the_independently_iterated_oracle
 
 def tip_jacobian(problem, values, dataset):
     """d tip / d free entries (3N x n), from the compiled linearisation."""
-    records, kernel = problem.records(dataset)[0], problem.kernels[0]
+    records, kernel = problem.of(dataset).records[0], problem.kernels[0]
     width, n = records.record.shape[1], len(problem.parameters.free_entries)
     residual, jacobian = np.empty((3, width)), np.empty((3 * n, width))
     free = np.ascontiguousarray(values[list(problem.parameters.free_entries)])
@@ -229,9 +229,9 @@ def test_the_exact_hessian_is_the_difference_of_the_gradient(lrm, evaluator):
     dataset = lrm.dataset(q, measured)
     problem = lrm.problem(lrm.experiment(), dataset, evaluator)
     weights = np.linspace(0.2, 2.0, 11)
-    records = problem.records(dataset, weights)
+    records = problem.of(dataset, weights).records
     values, free = lrm.vector(problem.parameters, oracle.PUBLISHED), list(problem.parameters.free_entries)
-    hessian = problem.exact_hessian(values, records)
+    hessian = problem.with_records(records).exact_hessian(values)
     np.testing.assert_allclose(hessian, hessian.T, rtol=0, atol=1e-9 * np.abs(hessian).max())
     for column, place in enumerate(free):
         step = np.zeros_like(values)
@@ -243,8 +243,8 @@ def test_the_exact_hessian_is_the_difference_of_the_gradient(lrm, evaluator):
 
 def settled_gradient(problem, values, records):
     """The gradient from states that are at rest to rounding."""
-    problem.residuals(values, records)
-    return problem.normal_equations(values, records).gradient
+    problem.with_records(records).residuals(values)
+    return problem.with_records(records).normal_equations(values).gradient
 
 
 @pytest.mark.parametrize("evaluator", ["interpreted", "compiled"])
@@ -255,13 +255,13 @@ def test_the_gradient_does_not_depend_on_the_state_it_started_from(lrm, evaluato
     dataset = lrm.dataset(q, measured)
     problem = lrm.problem(lrm.experiment(), dataset, evaluator)
     values = lrm.vector(problem.parameters, oracle.PUBLISHED)
-    cold = problem.normal_equations(values, problem.records(dataset))
-    records = problem.records(dataset)
+    cold = problem.of(dataset).normal_equations(values)
+    records = problem.of(dataset).records
     settled = settled_gradient(problem, values, records)
-    hessian = problem.normal_equations(values, records).hessian
+    hessian = problem.with_records(records).normal_equations(values).hessian
     np.testing.assert_allclose(cold.gradient, settled, rtol=0, atol=1e-9 * np.abs(settled).max())
     np.testing.assert_allclose(cold.hessian, hessian, rtol=0, atol=1e-9 * np.abs(hessian).max())
-    assert cold.cost == pytest.approx(problem.cost(values, records), rel=1e-12)
+    assert cold.cost == pytest.approx(problem.with_records(records).cost(values), rel=1e-12)
 
 
 def test_the_gradient_is_the_difference_of_the_cost(lrm):
@@ -269,14 +269,14 @@ def test_the_gradient_is_the_difference_of_the_cost(lrm):
     measured = oracle.tip(oracle.published(), q) + np.random.default_rng(10).normal(0, 0.01, (11, 3))
     dataset = lrm.dataset(q, measured)
     problem = lrm.problem(lrm.experiment(), dataset)
-    records = problem.records(dataset)
+    records = problem.of(dataset).records
     values = lrm.vector(problem.parameters, oracle.PUBLISHED)
-    equations = problem.normal_equations(values, records)
-    assert equations.cost == pytest.approx(problem.cost(values, records), rel=1e-12)
+    equations = problem.with_records(records).normal_equations(values)
+    assert equations.cost == pytest.approx(problem.with_records(records).cost(values), rel=1e-12)
     for column, place in enumerate(problem.parameters.free_entries):
         step = np.zeros_like(values)
         step[place] = 1e-6
-        ahead, behind = (problem.cost(values + s * step, records) for s in (1, -1))
+        ahead, behind = (problem.with_records(records).cost(values + s * step) for s in (1, -1))
         numeric = (ahead - behind) / 2e-6
         assert equations.gradient[column] == pytest.approx(numeric, abs=1e-6 * np.abs(equations.gradient).max())
 
@@ -324,8 +324,8 @@ def test_turning_and_shifting_the_root_frame_with_gravity_changes_no_deflection(
         problem = Problem.build(
             {"arm": one}, system.measurements, parameters, system.environment, dataset, "interpreted"
         )
-        records = problem.records(dataset)
-        points.append(problem.predict(stiff, records)[0].outputs[:3].T)
+        records = problem.of(dataset).records
+        points.append(problem.with_records(records).predict(stiff)[0].outputs[:3].T)
         at_rest.append(records[0].state[:, :30])
     np.testing.assert_allclose(at_rest[0], at_rest[1], rtol=0, atol=1e-12)
     np.testing.assert_allclose(turn.apply(points[0]) + shift, points[1], rtol=0, atol=1e-12)
@@ -469,7 +469,7 @@ def test_the_measured_arm_gives_the_published_errors(lrm, shared_data):
     measured = np.stack([table[f"{axis}_mm"] for axis in "xyz"], axis=1) / 1000
     dataset = lrm.dataset(q, measured)
     problem = lrm.problem(lrm.experiment(), dataset)
-    residual = problem.residuals(problem.parameters.nominal(), problem.records(dataset))[0]
+    residual = problem.of(dataset).residuals(problem.parameters.nominal())[0]
     errors = 1000 * np.linalg.norm(residual, axis=0)
     assert errors.mean() == pytest.approx(27.949, abs=5e-4)
     assert errors.max() == pytest.approx(60.30, abs=5e-3)

@@ -287,12 +287,12 @@ def test_a_nested_choice_is_that_of_a_plain_loop(place: Path, close_choices) -> 
         dataset = e.read()
         system = e.system
         problem = _problem(e, system, dataset)
-        made[name] = (e, problem, problem.records(dataset))
+        made[name] = (e, problem.of(dataset))
 
     def errors(name: str, train: np.ndarray, held: np.ndarray) -> np.ndarray:
-        e, problem, records = made[name]
+        e, problem = made[name]
         split = replace(folds(40, 3, 1)[0], train=train, holdout=held)
-        return fit_and_judge(FitTask(problem, e.estimator, e.parameters.nominal(), records, split)).errors
+        return fit_and_judge(FitTask(problem, e.estimator, e.parameters.nominal(), split)).errors
 
     chosen, judged = [], np.zeros(40)
     for outer in folds(40, 3, 1):

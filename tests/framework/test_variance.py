@@ -123,7 +123,7 @@ def test_slopes_by_joint_angles_agree_with_differences_of_the_oracle(lrm):
     q, points, _ = measured(15, 1)
     problem, records, start = posed(lrm, q, points)
     joints = [f"arm.q{i}" for i in range(1, 7)]
-    slopes = problem.channel_slopes(start, records, [*joints, "tracker.x", "no.such"])[0]
+    slopes = problem.with_records(records).channel_slopes(start, [*joints, "tracker.x", "no.such"])[0]
     h = 1e-6
     for i in range(6):
         step = h * np.eye(6)[i]
@@ -138,9 +138,9 @@ def test_applied_components_are_the_covariance_they_say(lrm):
     """W' W against the inverse of tracker noise plus propagated joint noise, from the oracle's differences."""
     q, points, _ = measured(40, 2, joint_sd=JOINT_RAD)
     problem, records, start = posed(lrm, q, points)
-    found = estimate_components(problem, start, records)
+    found = estimate_components(problem.with_records(records), start)
     sd = {c.name: c.sd for c in found.components}
-    whitening = apply_components(problem, start, records, found, "together")[0].whitening
+    whitening = apply_components(problem.with_records(records), start, found, "together").records[0].whitening
     for n in (0, 11, 39):
         covariance = (sd["tracker"] * NOISE_M) ** 2 * np.eye(3)
         for i in range(6):
@@ -156,7 +156,7 @@ def test_applied_components_are_the_covariance_they_say(lrm):
 
 
 def weighed_fit(problem, records, start, **settings):
-    found = fit(problem, records, weighed(IPOPT, NoiseSettings(estimate=True, **settings)), start)
+    found = fit(problem.with_records(records), weighed(IPOPT, NoiseSettings(estimate=True, **settings)), start)
     assert found.solution.verdict.converged, found.solution.verdict.status
     return found
 
@@ -170,7 +170,7 @@ def test_planted_components_come_back_within_their_intervals(lrm):
     off = []
     for seed in range(24):
         q, points, _ = measured(150, 300 + seed, noise=1.4 * NOISE_M, joint_sd=JOINT_RAD)
-        found = weighed_fit(problem, problem.records(lrm.dataset(q, points)), truth)
+        found = weighed_fit(problem, problem.of(lrm.dataset(q, points)).records, truth)
         for c in found.components.components:
             held += c.lower <= planted[c.name] <= c.upper
             count += 1
@@ -191,8 +191,8 @@ def test_weighing_by_what_was_estimated_is_more_accurate(lrm, experiments):
     plain, better = [], []
     for seed in range(experiments):
         q, points, _ = measured(100, 600 + seed, joint_sd=joint_sd)
-        records = problem.records(lrm.dataset(q, points))
-        plain.append(IPOPT.solve(problem, records, truth).values[free] - truth[free])
+        records = problem.of(lrm.dataset(q, points)).records
+        plain.append(IPOPT.solve(problem.with_records(records), truth).values[free] - truth[free])
         better.append(weighed_fit(problem, records, truth).solution.values[free] - truth[free])
     gain = np.sqrt(np.mean(np.square(better), axis=0) / np.mean(np.square(plain), axis=0))
     assert np.median(gain) < 0.6
@@ -244,7 +244,7 @@ def test_one_pose_again_and_again_tells_no_joint_from_another(lrm):
     q = np.repeat(oracle.random_poses(1, 6), 60, axis=0)
     points = oracle.tip(oracle.published(), q + 0.005 * rng.normal(size=q.shape))
     problem, records, start = posed(lrm, q, points, ("base_x", "base_z"))
-    found = estimate_components(problem, start, records)
+    found = estimate_components(problem.with_records(records), start)
     assert found.inseparable
     assert any("hardly separate some variances" in finding.text for finding in component_findings(found))
 
@@ -256,7 +256,7 @@ def test_joints_through_the_tip_are_unseen(lrm):
     parameters = experiment.parameters.with_free(["arm.mdh.base_x", "arm.mdh.base_z"])
     dataset = lrm.dataset(q, points)
     problem = lrm.problem(experiment, dataset, "auto", parameters)
-    found = estimate_components(problem, parameters.nominal(), problem.records(dataset))
+    found = estimate_components(problem.of(dataset), parameters.nominal())
     assert found.unseen == ("arm.q5", "arm.q6")
     assert "arm.q6" in component_findings(found)[-1].text
 
@@ -279,7 +279,7 @@ def test_too_few_equations_are_refused(lrm):
     q, points, _ = measured(8, 9)
     problem, records, start = posed(lrm, q, points)
     with pytest.raises(ProblemError, match=r"13\.0 degrees of freedom, too few to estimate 7 variance components"):
-        fit(problem, records, weighed(IPOPT, NoiseSettings(estimate=True)), start)
+        fit(problem.with_records(records), weighed(IPOPT, NoiseSettings(estimate=True)), start)
 
 
 def test_a_fit_with_estimated_variances_keeps_the_one_by_the_declared_noise(tmp_path):
@@ -289,7 +289,8 @@ def test_a_fit_with_estimated_variances_keeps_the_one_by_the_declared_noise(tmp_
     plain, weighing = (Experiment.load(arm.config, (f"noise.estimate={flag}",), path) for flag in ("false", "true"))
     ready = prepare(plain, Stopwatch())
     one, other = (
-        fit(ready.problem, ready.training, e.estimator, ready.start.values(ready.problem)[0]) for e in (plain, weighing)
+        fit(ready.problem.with_records(ready.training), e.estimator, ready.start.values(ready.problem)[0])
+        for e in (plain, weighing)
     )
     assert one.as_declared is None and np.array_equal(other.as_declared, one.estimate.values)
     assert not np.array_equal(other.estimate.values, one.estimate.values)

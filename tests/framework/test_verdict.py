@@ -248,8 +248,11 @@ def test_suggested_poses_tell_more_than_random_ones() -> None:
     problem = Problem.build(
         system.arms, system.measurements, experiment.parameters, system.environment, dataset, "interpreted"
     )
-    records = problem.records(dataset)
-    found = estimate(problem, records, experiment.estimator.solve(problem, records, experiment.parameters.nominal()))
+    records = problem.of(dataset).records
+    found = estimate(
+        problem.with_records(records),
+        experiment.estimator.solve(problem.with_records(records), experiment.parameters.nominal()),
+    )
     joints = {f"arm.q{i}": "angle" for i in range(1, 7)}
     chosen = suggest(problem, dataset, found, joints, count=3)
     assert len({tuple(s.commands.values()) for s in chosen}) == 3
@@ -263,7 +266,7 @@ def test_suggested_poses_tell_more_than_random_ones() -> None:
         for i, joint in enumerate(joints):
             channels[joint][len(dataset) :] = [row[i] for row in angles]
         more = replace(dataset, ids=tuple(map(str, range(count))), channels=channels, rows=(), extra={})
-        triangle = problem.triangular_factor(found.values, problem.records(more))
+        triangle = problem.of(more).triangular_factor(found.values)
         return float(2 * np.sum(np.log(np.abs(np.diag(triangle)))))
 
     best = information([tuple(s.commands.values()) for s in chosen])

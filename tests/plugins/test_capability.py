@@ -168,7 +168,7 @@ def predicted(commands: np.ndarray, loads: dict[str, float]) -> np.ndarray:
     dataset = Dataset(tuple(map(str, range(count))), channels)
     alone = {"pose": ArmsAlone(("arm",))}
     problem = Problem.build(system.arms, alone, parameters, system.environment, dataset, "interpreted", groups={})
-    return problem.predict(parameters.nominal(), problem.records(dataset))[0].tools[0].transpose(2, 1, 0)
+    return problem.of(dataset).predict(parameters.nominal())[0].tools[0].transpose(2, 1, 0)
 
 
 @pytest.mark.slow

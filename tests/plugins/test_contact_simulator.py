@@ -169,16 +169,18 @@ def test_records_and_labels_come_back_from_a_csv(tmp_path):
     one, records = made.problem(data)
     other, again = made.problem(back)
     values = co.away(one.parameters, 0.2, 1)
-    assert other.cost(values, again) == pytest.approx(one.cost(values, records), rel=1e-9)
+    assert other.with_records(again).cost(values) == pytest.approx(one.with_records(records).cost(values), rel=1e-9)
 
 
 def test_what_was_simulated_is_found_within_its_intervals(tmp_path):
     data = simulated(tmp_path, sockets(1e-3), {"balls": KEYS}, count=15)
     problem, records = sockets(1e-3, noise=1e-6).problem(data)
-    problem = started(problem, records)
-    records = with_joint_noise(problem, records, problem.parameters.nominal())
-    solution = IpoptEstimator(IpoptEstimator.Settings()).solve(problem, records, problem.parameters.nominal())
-    found = estimate(problem, records, solution)
+    problem = started(problem.with_records(records))
+    records = with_joint_noise(problem.with_records(records), problem.parameters.nominal()).records
+    solution = IpoptEstimator(IpoptEstimator.Settings()).solve(
+        problem.with_records(records), problem.parameters.nominal()
+    )
+    found = estimate(problem.with_records(records), solution)
     assert found.noise_scale == pytest.approx(1.0, abs=0.25)
     for name, value, sd in zip(found.names, found.values[list(found.free_entries)], found.deviations, strict=True):
         assert abs(value - TRUTH[name]) < 4 * sd, name

@@ -25,8 +25,8 @@ MM, MRAD = 1e-3, 1e-3
 
 def solved(problem, records):
     """The started problem and its optimum by entry name."""
-    begun = started(problem, records)
-    solution = IpoptEstimator(IpoptEstimator.Settings()).solve(begun, records, begun.parameters.nominal())
+    begun = started(problem.with_records(records))
+    solution = IpoptEstimator(IpoptEstimator.Settings()).solve(begun, begun.parameters.nominal())
     assert solution.verdict.converged, solution.verdict.status
     return begun, solution.values
 
@@ -107,7 +107,7 @@ def test_two_planes_and_a_length_of_the_arm_come_back_together():
     plane = PlaneContact(PlaneContact.Settings.si(noise=0.1 * MM, normal=(0.2, 0, 1)), ("arm",))
     made = co.Bench({"arm": co.the_arm(LEFT)}, {"plane": plane}, ("arm.mdh.theta3",))
     problem, records = made.problem(co.dataset(parts))
-    require_solvable(problem, records, problem.parameters.nominal())
+    require_solvable(problem.with_records(records), problem.parameters.nominal())
     begun, values = solved(problem, records)
     v = co.by_name(begun.parameters, values)
     assert v["arm.mdh.theta3"] == pytest.approx(0.01, abs=1e-7)
@@ -147,7 +147,7 @@ def test_what_a_clamp_leaves_open_is_the_pose_of_the_tool_in_it():
     measurement = clamp(fixture=state(*fixture), points={"bench": state(*point)})
     problem, records = clamp_bench(measurement).problem(co.dataset([(co.joints(q), {"point": "bench"})]))
     assert problem.parameters.free == ()
-    found = problem.residuals(problem.parameters.nominal(), records)[0]
+    found = problem.with_records(records).residuals(problem.parameters.nominal())[0]
     where = matrix(*fixture) @ matrix(*point)
     expected = difference(np.broadcast_to(where, (20, 4, 4)), co.tool_poses(co.SEVEN, q))
     np.testing.assert_allclose(found, expected.T, atol=1e-9)
@@ -160,7 +160,7 @@ def test_an_unknown_clamp_starts_at_the_tool_wherever_that_points(turn):
     q = clamped(pose, 3, 8)
     fixture = state((0.1, 0.2, 0.0), Rotation.from_euler("z", 2.0))
     problem, records = clamp_bench(clamp(fixture=fixture)).problem(co.dataset([(co.joints(q), {"point": "bench"})]))
-    begun = started(problem, records)
+    begun = started(problem.with_records(records))
     assert np.abs(begun.residuals(begun.parameters.nominal(), records)[0]).max() < 1e-7
     v = co.by_name(begun.parameters, begun.parameters.nominal())
     np.testing.assert_allclose(pose_in(v, "clamp.fixture") @ pose_in(v, "clamp.bench.point"), pose, atol=1e-7)
@@ -173,10 +173,10 @@ def test_a_clamp_that_only_judges_settles_at_the_pose_of_least_squares():
     other = clamped(HOLD @ matrix((0.1, 0, 0), Rotation.identity()), 5, 10, 3e-3)
     parts = [(co.joints(q), {"point": "judged"}), (co.joints(other), {"point": "trained"})]
     problem, records = clamp_bench(clamp()).problem(co.dataset(parts))
-    problem = started(problem, records)
-    begun = restricted(problem, problem.subset(records, np.arange(6, 11)))
+    problem = started(problem.with_records(records))
+    begun = restricted(problem.with_records(records).subset(np.arange(6, 11)))
     values = begun.parameters.nominal()
-    found = settled(begun, values, records)
+    found = settled(begun.with_records(records), values)
     poses = co.tool_poses(co.SEVEN, q)
 
     def rows(x):
@@ -190,7 +190,7 @@ def test_a_clamp_that_only_judges_settles_at_the_pose_of_least_squares():
     still = [n for n in v if not n.startswith("clamp.judged.")]
     assert all(v[n] == before[n] for n in still)
     assert np.abs(found - values).max() > 1e-5, "it did not move at all"
-    every = co.by_name(problem.parameters, settled(untrained(problem), values, records))
+    every = co.by_name(problem.parameters, settled(untrained(problem).with_records(records), values))
     np.testing.assert_allclose(pose_in(every, "clamp.judged.point"), expected, atol=1e-7)
 
 
@@ -242,10 +242,10 @@ def test_a_closed_chain_leaves_open_how_the_clamp_is_off(labels):
     arms, chain = two_arms(clamps={key: state(*pose)}, group_labels=labels)
     part = ({**co.joints(q_left, "left"), **co.joints(q_right, "right")}, dict.fromkeys(labels, key))
     problem, records = co.Bench(arms, {"chain": chain}).problem(co.dataset([part]))
-    found = problem.residuals(problem.parameters.nominal(), records)[0]
+    found = problem.with_records(records).residuals(problem.parameters.nominal())[0]
     left, right = both_poses(q_left, q_right)
     np.testing.assert_allclose(found, difference(left @ matrix(*pose), right).T, atol=1e-9)
-    told, _ = problem.nuisance_starts(problem.parameters.nominal(), records), None
+    told, _ = problem.with_records(records).nuisance_starts(problem.parameters.nominal()), None
     between = np.linalg.inv(left) @ right
     np.testing.assert_allclose(told[0][:3].T, between[:, :3, 3], atol=1e-12)
     turned = Rotation.from_quat(told[0][[4, 5, 6, 3]].T).as_matrix()
@@ -258,7 +258,7 @@ def test_both_arms_of_a_closed_chain_bring_the_noise_of_their_joints():
     arms, chain = two_arms()
     data = co.dataset([({**co.joints(q_left, "left"), **co.joints(q_right, "right")}, {})])
     problem, records = co.Bench(arms, {"chain": chain}).problem(data)
-    problem = started(problem, records)
+    problem = started(problem.with_records(records))
     values = problem.parameters.nominal()
     v = co.by_name(problem.parameters, values)
     clamp_pose = pose_in(v, "chain.one.clamp")
@@ -274,7 +274,7 @@ def test_both_arms_of_a_closed_chain_bring_the_noise_of_their_joints():
             columns.append(sd * (ends[0] - ends[1]) / 2e-6)
     slopes = np.stack(columns, axis=-1)
     own = np.diag([0.1 * MM] * 3 + [0.5 * MRAD] * 3) ** 2
-    whitening = np.moveaxis(with_joint_noise(problem, records, values)[0].whitening, 2, 0)[:2]
+    whitening = np.moveaxis(with_joint_noise(problem.with_records(records), values).records[0].whitening, 2, 0)[:2]
     covariance = own + slopes @ np.swapaxes(slopes, 1, 2)
     np.testing.assert_allclose(
         whitening @ covariance @ np.swapaxes(whitening, 1, 2), np.tile(np.eye(6), (2, 1, 1)), atol=2e-5

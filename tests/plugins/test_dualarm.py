@@ -302,8 +302,8 @@ FIRST = {"left.poe.offset1", "right.poe.offset1"}
 
 def test_the_placement_trades_with_the_first_joint_of_each_arm_and_both_are_named(chained):
     data = chained.records(1)
-    problem, records = chained.problem, chained.problem.records(data)
-    known = identify(problem, problem.parameters.nominal(), records)
+    problem, records = chained.problem, chained.problem.of(data).records
+    known = identify(problem.with_records(records), problem.parameters.nominal())
     assert (known.rank, len(known)) == (18, 20)
     combinations = [set(dict(each.terms)) for each in known.undetermined]
     assert len(combinations) == 2

@@ -44,7 +44,7 @@ def posed(lrm, names, q, measured, change=lambda parameters: parameters):
     parameters = change(experiment.parameters.with_free([oracle.armcal_name(n) for n in names]))
     dataset = lrm.dataset(q, measured)
     problem = lrm.problem(experiment, dataset, EVALUATOR, parameters)
-    return problem, problem.records(dataset), parameters.nominal()
+    return problem, problem.of(dataset).records, parameters.nominal()
 
 
 def fitted(problem, solution):
@@ -55,7 +55,7 @@ def fitted(problem, solution):
 
 def deviations(problem, records, solution):
     """Standard deviations of the free values at the declared noise."""
-    upper = problem.triangular_factor(solution.values, records)
+    upper = problem.with_records(records).triangular_factor(solution.values)
     held = np.diag(np.sqrt(problem.parameters.prior_information()))
     return np.sqrt(np.diag(np.linalg.inv(upper.T @ upper + held @ held)))
 
@@ -81,7 +81,7 @@ def test_the_truth_comes_back_from_measurements_without_noise(lrm, name, names):
     truth = {**oracle.nominal(), **{n: oracle.PUBLISHED[n] for n in names}}
     q, measured = simulated(truth, 100, 1, noise=0)
     problem, records, start = posed(lrm, names, q, measured)
-    solution = estimator(name).solve(problem, records, start)
+    solution = estimator(name).solve(problem.with_records(records), start)
     expected = lrm.vector(problem.parameters, truth)[list(problem.parameters.free_entries)]
     off = np.abs(fitted(problem, solution) - expected) / problem.parameters.scales()
     assert off.max() < 1e-6
@@ -92,7 +92,7 @@ def test_a_start_at_the_truth_stays_there_and_converges(lrm, name):
     q, measured = simulated(oracle.published(), 60, 2, noise=0)
     problem, records, _ = posed(lrm, oracle.OPTION_1, q, measured)
     truth = lrm.vector(problem.parameters, oracle.PUBLISHED)
-    solution = estimator(name).solve(problem, records, truth)
+    solution = estimator(name).solve(problem.with_records(records), truth)
     off = np.abs(fitted(problem, solution) - truth[list(problem.parameters.free_entries)])
     assert (off / problem.parameters.scales()).max() < 1e-6
 
@@ -101,7 +101,7 @@ def test_a_start_at_the_truth_stays_there_and_converges(lrm, name):
 def test_without_free_parameters_nothing_moves(lrm, name):
     q, measured = simulated(oracle.published(), 10, 2)
     problem, records, start = posed(lrm, (), q, measured)
-    solution = estimator(name).solve(problem, records, start)
+    solution = estimator(name).solve(problem.with_records(records), start)
     np.testing.assert_array_equal(solution.values, start)
     assert solution.verdict.converged
 
@@ -120,12 +120,12 @@ def test_ipopt_and_cvxpy_agree_to_a_ten_thousandth_of_a_standard_deviation(lrm, 
         measured[::10] += 0.05
     change = with_priors(0.3) if "priors" in case else (lambda parameters: parameters)
     problem, records, start = posed(lrm, oracle.OPTION_1, q, measured, change)
-    one, two = (estimator(n).solve(problem, records, start) for n in ESTIMATORS)
+    one, two = (estimator(n).solve(problem.with_records(records), start) for n in ESTIMATORS)
     sd = deviations(problem, records, one)
     assert (np.abs(fitted(problem, one) - fitted(problem, two)) / sd).max() < 1e-4
-    at_bound = [n for n in estimate(problem, records, one).at_bound if "spring" in n]
+    at_bound = [n for n in estimate(problem.with_records(records), one).at_bound if "spring" in n]
     assert at_bound or not case.endswith("at bounds")
-    assert set(estimate(problem, records, two).at_bound) == set(at_bound)
+    assert set(estimate(problem.with_records(records), two).at_bound) == set(at_bound)
 
 
 @pytest.mark.slow
@@ -147,14 +147,14 @@ def test_scipys_trust_region_finds_the_same_on_the_oracles_residual(lrm, bounded
     assert not bounded or min(scipys.x[:7]) < 1e-6
     for name in ESTIMATORS:
         problem, records, start = posed(lrm, names, q, measured)
-        solution = estimator(name).solve(problem, records, start)
+        solution = estimator(name).solve(problem.with_records(records), start)
         fitted(problem, solution)
         sd = dict(zip(problem.parameters.coordinate_names, deviations(problem, records, solution), strict=True))
         # An interior method stops a little inside its bounds: a hundredth of a deviation, and no lower cost.
         for n, x in zip(names, scipys.x, strict=True):
             mine = solution.values[problem.parameters.entries_of(oracle.armcal_name(n))][0]
             assert abs(mine - x) < (1e-2 if bounded else 1e-4) * sd[oracle.armcal_name(n)], (name, n)
-        assert problem.cost(solution.values, records) <= scipys.cost * (1 + 1e-9)
+        assert problem.with_records(records).cost(solution.values) <= scipys.cost * (1 + 1e-9)
 
 
 @both
@@ -164,7 +164,7 @@ def test_the_answer_satisfies_the_conditions_of_an_optimum_within_bounds(lrm, na
     truth = {**oracle.published(), "k0": 0.0, "k4": 0.0, "k6": 0.0}
     q, measured = simulated(truth, 60, 5, noise=0.003)
     problem, records, start = posed(lrm, FEW, q, measured)
-    solution = estimator(name).solve(problem, records, start)
+    solution = estimator(name).solve(problem.with_records(records), start)
     fitted(problem, solution)
     sd = deviations(problem, records, solution)
     found = {n: solution.values[problem.parameters.entries_of(oracle.armcal_name(n))][0] for n in FEW}
@@ -192,7 +192,7 @@ def test_no_bound_is_passed_by_even_the_last_bit(lrm, name):
     truth = {**oracle.published(), **{f"k{i}": 0.0 for i in range(7)}}
     q, measured = simulated(truth, 60, 6, noise=0.003)
     problem, records, start = posed(lrm, oracle.OPTION_1, q, measured)
-    solution = estimator(name).solve(problem, records, start)
+    solution = estimator(name).solve(problem.with_records(records), start)
     fitted(problem, solution)
     problem.parameters.check(solution.values)
     springs = [solution.values[problem.parameters.entries_of(f"arm.spring.k{i}")][0] for i in range(7)]
@@ -210,10 +210,10 @@ def test_a_bound_on_either_side_of_any_parameter_holds(lrm, name):
         return parameters.replaced({n: replace(parameters[n], domain=Interval(*bounds)) for n, bounds in ends.items()})
 
     problem, records, start = posed(lrm, oracle.OPTION_1, q, measured, narrow)
-    solution = estimator(name).solve(problem, records, start)
+    solution = estimator(name).solve(problem.with_records(records), start)
     fitted(problem, solution)
     problem.parameters.check(solution.values)
-    assert "arm.spring.k5" in estimate(problem, records, solution).at_bound
+    assert "arm.spring.k5" in estimate(problem.with_records(records), solution).at_bound
 
 
 # ---------------------------------------------------------------- priors, starts, settings
@@ -232,7 +232,7 @@ def test_a_prior_weighs_as_its_closed_form_says(lrm, name, deviation_m):
         )
 
     problem, records, start = posed(lrm, ("base_x", "base_y", "base_z"), q, measured, change)
-    found = fitted(problem, estimator(name).solve(problem, records, start))
+    found = fitted(problem, estimator(name).solve(problem.with_records(records), start))
     nominal = oracle.nominal()
     off = measured - oracle.tip(nominal, q)
     weight = np.array([deviation_m**-2, deviation_m**-2, 0.0])
@@ -249,7 +249,7 @@ def test_a_prior_is_about_the_nominal_value_not_about_the_start(lrm, name):
     moved = start.copy()
     moved[problem.parameters.entries_of("arm.mdh.base_x")] += 0.01
     moved[problem.parameters.entries_of("arm.spring.k5")] += 0.1
-    one, two = (fitted(problem, estimator(name).solve(problem, records, s)) for s in (start, moved))
+    one, two = (fitted(problem, estimator(name).solve(problem.with_records(records), s)) for s in (start, moved))
     np.testing.assert_allclose(one, two, rtol=0, atol=1e-9)
 
 
@@ -258,7 +258,9 @@ def test_the_exact_hessian_gives_the_same_answer(lrm):
     truth = {**oracle.published(), "k0": 0.0}
     q, measured = simulated(truth, 60, 10, noise=0.002)
     problem, records, start = posed(lrm, FEW, q, measured)
-    one, two = (estimator("ipopt", hessian=h).solve(problem, records, start) for h in ("gauss-newton", "exact"))
+    one, two = (
+        estimator("ipopt", hessian=h).solve(problem.with_records(records), start) for h in ("gauss-newton", "exact")
+    )
     sd = deviations(problem, records, one)
     assert (np.abs(fitted(problem, one) - fitted(problem, two)) / sd).max() < 1e-4
 
@@ -267,14 +269,14 @@ def test_the_exact_hessian_gives_the_same_answer(lrm):
 def test_the_number_of_starts_and_of_those_that_agree_is_told(lrm):
     q, measured = simulated(oracle.published(), 40, 11)
     problem, records, start = posed(lrm, FEW, q, measured)
-    single = estimator("ipopt").solve(problem, records, start)
+    single = estimator("ipopt").solve(problem.with_records(records), start)
     assert (single.verdict.starts, single.verdict.agreeing_starts) == (1, 1)
-    several = estimator("ipopt", starts=5, seed=3).solve(problem, records, start)
+    several = estimator("ipopt", starts=5, seed=3).solve(problem.with_records(records), start)
     assert several.verdict.starts == 5
     assert 2 <= several.verdict.agreeing_starts <= 5
     sd = deviations(problem, records, single)
     assert (np.abs(fitted(problem, several) - fitted(problem, single)) / sd).max() < 1e-4
-    again = estimator("ipopt", starts=5, seed=3).solve(problem, records, start)
+    again = estimator("ipopt", starts=5, seed=3).solve(problem.with_records(records), start)
     assert again.verdict.agreeing_starts == several.verdict.agreeing_starts
     np.testing.assert_allclose(again.values, several.values, rtol=0, atol=1e-9)
 
@@ -284,10 +286,12 @@ def test_a_start_beside_the_optimum_takes_no_search_among_rounding_errors(lrm, m
     """What the fits of a robust loss start from: there the cost's rounding errors exceed what is left to gain."""
     q, measured = simulated(oracle.published(), 60, 10)
     problem, records, start = posed(lrm, oracle.OPTION_1, q, measured)
-    first = estimator("ipopt").solve(problem, records, start)
+    first = estimator("ipopt").solve(problem.with_records(records), start)
     taken, cost = [], PosedProblem.cost
     monkeypatch.setattr(PosedProblem, "cost", lambda self, x: taken.append(1) or cost(self, x))
-    again = [estimator("ipopt").solve(problem, records, first.values + k * 1e-6 * start) for k in range(10)]
+    again = [
+        estimator("ipopt").solve(problem.with_records(records), first.values + k * 1e-6 * start) for k in range(10)
+    ]
     assert len(taken) <= 6 * sum(1 + solution.verdict.iterations for solution in again)
     sd = deviations(problem, records, first)
     for solution in again:
@@ -298,7 +302,7 @@ def test_a_start_beside_the_optimum_takes_no_search_among_rounding_errors(lrm, m
 def test_one_iteration_is_not_called_converged(lrm, name):
     q, measured = simulated(oracle.published(), 40, 12)
     problem, records, start = posed(lrm, oracle.OPTION_1, q, measured)
-    solution = estimator(name, max_iterations=1).solve(problem, records, start)
+    solution = estimator(name, max_iterations=1).solve(problem.with_records(records), start)
     assert not solution.verdict.converged
     assert solution.verdict.iterations <= 1
     problem.parameters.check(solution.values)
@@ -312,8 +316,8 @@ def test_a_start_without_an_equilibrium_is_told_in_the_verdict_not_raised(lrm, n
     start = start.copy()
     for i in range(7):
         start[problem.parameters.entries_of(f"arm.spring.k{i}")] = 1e7
-    solution = estimator(name).solve(problem, records, start)
-    assert not solution.verdict.converged or np.isfinite(problem.cost(solution.values, records))
+    solution = estimator(name).solve(problem.with_records(records), start)
+    assert not solution.verdict.converged or np.isfinite(problem.with_records(records).cost(solution.values))
 
 
 @pytest.mark.quick("('d3', 'after2_z', 'theta2')-ipopt")
@@ -322,7 +326,7 @@ def test_a_start_without_an_equilibrium_is_told_in_the_verdict_not_raised(lrm, n
 def test_an_undetermined_problem_ends_in_a_verdict_not_in_an_exception(lrm, name, names):
     q, measured = simulated(oracle.published(), 30, 14)
     problem, records, start = posed(lrm, names, q, measured)
-    solution = estimator(name).solve(problem, records, start)
+    solution = estimator(name).solve(problem.with_records(records), start)
     assert np.isfinite(solution.values).all()
 
 
@@ -337,7 +341,7 @@ def test_the_noise_declared_moves_no_answer_without_priors(lrm, name):
         tracker = {"tracker": TipPosition(TipPositionSettings.si(noise=noise), ("arm",))}
         parameters = experiment.parameters
         problem = Problem.build(system.arms, tracker, parameters, system.environment, dataset, EVALUATOR)
-        solution = estimator(name).solve(problem, problem.records(dataset), parameters.nominal())
+        solution = estimator(name).solve(problem.of(dataset), parameters.nominal())
         answers.append(fitted(problem, solution) / parameters.scales())
     np.testing.assert_allclose(answers[0], answers[1], rtol=0, atol=1e-6)
     np.testing.assert_allclose(answers[2], answers[1], rtol=0, atol=1e-6)
@@ -354,7 +358,9 @@ def test_the_order_of_records_changes_no_answer(lrm, name):
     answers = []
     for chosen in (np.arange(83), order):
         problem, records, start = posed(lrm, oracle.OPTION_1, q[chosen], measured[chosen])
-        answers.append(fitted(problem, estimator(name).solve(problem, records, start)) / problem.parameters.scales())
+        answers.append(
+            fitted(problem, estimator(name).solve(problem.with_records(records), start)) / problem.parameters.scales()
+        )
     np.testing.assert_allclose(*answers, rtol=0, atol=1e-9)
 
 
@@ -374,7 +380,7 @@ def test_the_unit_of_length_changes_no_answer(lrm, name):
         tracker = {"tracker": TipPosition(TipPositionSettings.si(noise=NOISE_M * unit), ("arm",))}
         system, dataset = experiment.system, lrm.dataset(q, measured * unit)
         problem = Problem.build(system.arms, tracker, parameters, system.environment, dataset, EVALUATOR)
-        solution = estimator(name).solve(problem, problem.records(dataset), parameters.nominal())
+        solution = estimator(name).solve(problem.of(dataset), parameters.nominal())
         answers.append(fitted(problem, solution) / parameters.scales())
     np.testing.assert_allclose(*answers, rtol=1e-9, atol=1e-9)
 
@@ -432,7 +438,7 @@ def known_of(lrm, names):
     """What 60 random poses determine of these at the nominal arm, and a problem to ask further."""
     q, measured = simulated(oracle.nominal(), 60, 18)
     problem, records, start = posed(lrm, names, q, measured)
-    triangle = problem.triangular_factor(start, records)
+    triangle = problem.with_records(records).triangular_factor(start)
     found = analyse(triangle, problem.parameters.scales(), problem.parameters.coordinate_names)
     return found, problem, records, start
 
@@ -453,7 +459,7 @@ def test_a_planted_undetermined_combination_is_found_and_named(lrm, planted):
     assert all(determined[oracle.armcal_name(n)] for n in COMPANY)
     assert not any(determined[oracle.armcal_name(n)] for n in planted)
     with pytest.raises(ProblemError, match="does not determine 1"):
-        require_solvable(problem, records, start)
+        require_solvable(problem.with_records(records), start)
 
 
 @pytest.mark.parametrize("names", quick_and_slow(SOUND), ids=lambda n: str(n[:4]))
@@ -462,7 +468,7 @@ def test_a_sound_choice_of_parameters_is_not_suspected(lrm, names):
     assert found.undetermined == ()
     assert found.rank == len(found)
     assert all(found.determined)
-    require_solvable(problem, records, start)
+    require_solvable(problem.with_records(records), start)
 
 
 def test_two_planted_combinations_are_told_apart(lrm):
@@ -479,11 +485,11 @@ def test_a_prior_on_one_of_the_two_makes_the_problem_solvable_with_a_warning(lrm
         return parameters.replaced({"arm.mdh.d3": replace(parameters["arm.mdh.d3"], prior_sd=0.001)})
 
     problem, records, start = posed(lrm, ("d3", "after2_z"), q, measured, change)
-    warnings = require_solvable(problem, records, start)
+    warnings = require_solvable(problem.with_records(records), start)
     assert any("arm.mdh.d3" in w and "arm.mdh.after2_z" in w for w in warnings)
-    answers = [fitted(problem, estimator(n).solve(problem, records, start)) for n in ESTIMATORS]
+    answers = [fitted(problem, estimator(n).solve(problem.with_records(records), start)) for n in ESTIMATORS]
     np.testing.assert_allclose(*answers, rtol=0, atol=1e-7)  # a ten thousandth of the prior's deviation
-    found = estimate(problem, records, estimator("ipopt").solve(problem, records, start))
+    found = estimate(problem.with_records(records), estimator("ipopt").solve(problem.with_records(records), start))
     assert found.determined == (True, True)
 
 
@@ -491,7 +497,7 @@ def test_fewer_equations_than_parameters_are_refused(lrm):
     q, measured = simulated(oracle.nominal(), 9, 20)
     problem, records, start = posed(lrm, oracle.OPTION_1, q, measured)
     with pytest.raises(ProblemError, match="27 equations"):
-        require_solvable(problem, records, start)
+        require_solvable(problem.with_records(records), start)
 
 
 # ---------------------------------------------------------------- how sure
@@ -501,8 +507,8 @@ def test_fewer_equations_than_parameters_are_refused(lrm):
 def test_deviations_are_those_of_the_oracles_differences(lrm):
     q, measured = simulated(oracle.published(), 80, 21)
     problem, records, start = posed(lrm, FEW, q, measured)
-    solution = estimator("ipopt").solve(problem, records, start)
-    found = estimate(problem, records, solution)
+    solution = estimator("ipopt").solve(problem.with_records(records), start)
+    found = estimate(problem.with_records(records), solution)
     at = {n: solution.values[problem.parameters.entries_of(oracle.armcal_name(n))][0] for n in FEW}
     columns = {}
     for n in FEW:
@@ -524,9 +530,12 @@ def test_a_record_of_weight_zero_is_no_evidence(lrm):
     weights = np.ones(40)
     weights[25:] = 0
     dataset = lrm.dataset(q, measured)
-    weighted = problem.records(dataset, weights)
-    fewer = problem.records(dataset.subset(range(25)))
-    one, two = (estimate(problem, r, estimator("ipopt").solve(problem, r, start)) for r in (weighted, fewer))
+    weighted = problem.of(dataset, weights).records
+    fewer = problem.of(dataset.subset(range(25))).records
+    one, two = (
+        estimate(problem.with_records(r), estimator("ipopt").solve(problem.with_records(r), start))
+        for r in (weighted, fewer)
+    )
     np.testing.assert_allclose(one.values, two.values, rtol=0, atol=1e-9)
     assert one.degrees_of_freedom == two.degrees_of_freedom
     np.testing.assert_allclose(one.deviations, two.deviations, rtol=1e-6)
@@ -541,7 +550,7 @@ def test_95_per_cent_intervals_hold_the_truth_95_times_in_a_hundred(lrm):
     for seed in range(200):
         q, measured = simulated(truth, 25, 1000 + seed)
         problem, records, start = posed(lrm, names, q, measured)
-        found = estimate(problem, records, estimator("ipopt").solve(problem, records, start))
+        found = estimate(problem.with_records(records), estimator("ipopt").solve(problem.with_records(records), start))
         for name, interval in zip(found.names, found.intervals, strict=True):
             value = lrm.vector(problem.parameters, truth)[problem.parameters.entries_of(name)][0]
             held += interval.lower <= value <= interval.upper
@@ -560,7 +569,7 @@ def test_the_published_fifty_poses_give_the_published_compliances(lrm, shared_da
     published = [0.01832, 0.07149, 0.06617, 0.07887, 0.07902, 0.37994, 0.01614]
     for name in ESTIMATORS:
         problem, records, start = posed(lrm, oracle.OPTION_1, q, measured)
-        solution = estimator(name).solve(problem, records, start)
+        solution = estimator(name).solve(problem.with_records(records), start)
         fitted(problem, solution)
         found = [solution.values[problem.parameters.entries_of(f"arm.spring.k{i}")][0] for i in range(7)]
         np.testing.assert_allclose(found, published, rtol=0, atol=5.0001e-6)

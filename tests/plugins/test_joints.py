@@ -282,7 +282,7 @@ def visited(lrm, seed, count=POSES):
 def predicted(lrm, experiment, dataset, evaluator="interpreted"):
     """The tip by armcal, at the configured values."""
     problem = lrm.problem(experiment, dataset, evaluator)
-    return problem.predict(problem.parameters.nominal(), problem.records(dataset))[0].outputs[:3].T
+    return problem.of(dataset).predict(problem.parameters.nominal())[0].outputs[:3].T
 
 
 # ---------------------------------------------------------------- laws
@@ -346,7 +346,7 @@ def test_gravity_is_turned_about_the_bases_x_axis_and_then_about_its_y_axis(lrm,
     changed = {name: replace(parameters[name], nominal=(angle,)) for name, angle in tilt.items()}
     dataset = visited(lrm, 9)
     problem = lrm.problem(experiment, dataset, "interpreted", parameters.replaced(changed))
-    found = problem.predict(problem.parameters.nominal(), problem.records(dataset))[0].outputs[:3].T
+    found = problem.of(dataset).predict(problem.parameters.nominal())[0].outputs[:3].T
     turned = Rotation.from_rotvec([0, -0.07, 0]) * Rotation.from_rotvec([0.11, 0, 0])
     expected = expected_tip(["compliance"], drawn, dataset, oracle.Loads(gravity=turned.apply(oracle.EARTH)))
     np.testing.assert_allclose(found, expected, rtol=0, atol=AGREEMENT_M)
@@ -360,7 +360,7 @@ def test_a_configured_tilt_turns_the_gravity_of_each_record_too(lrm, tmp_path):
     dataset = replace(dataset, channels={**dataset.channels, **columns})
     parameters = experiment.parameters.replaced({"statics.gravity_ry": changed})
     problem = lrm.problem(experiment, dataset, "interpreted", parameters)
-    found = problem.predict(problem.parameters.nominal(), problem.records(dataset))[0].outputs[:3].T
+    found = problem.of(dataset).predict(problem.parameters.nominal())[0].outputs[:3].T
     loads = oracle.Loads(gravity=Rotation.from_rotvec([0, 0.2, 0]).apply(own))
     np.testing.assert_allclose(found, expected_tip(["compliance"], drawn, dataset, loads), rtol=0, atol=AGREEMENT_M)
 
@@ -371,16 +371,16 @@ def test_the_tip_moves_with_every_parameter_of_every_effect_as_differences_say(l
     free = [*parameters.select(["arm.e?.*"]), "statics.gravity_rx", "statics.gravity_ry"]
     parameters = parameters.with_free(free).without_bounds()
     problem = lrm.problem(experiment, dataset, "interpreted", parameters)
-    records, values = problem.records(dataset), parameters.nominal()
+    records, values = problem.of(dataset).records, parameters.nominal()
     noise = np.array(problem.kernels[0].factor.noise)[:, None, None]
-    found = np.concatenate(list(problem.jacobians(values, records)), axis=2)[:, :, :8] * noise
+    found = np.concatenate(list(problem.with_records(records).jacobians(values)), axis=2)[:, :, :8] * noise
     for column, entry in enumerate(parameters.free_entries):
         name, sides = parameters.entry_names[entry], []
         step = 1e-4 if ".c" in name else 1e-5
         for sign in (1, -1):
             aside = values.copy()
             aside[entry] += sign * step
-            sides.append(problem.residuals(aside, records)[0])
+            sides.append(problem.with_records(records).residuals(aside)[0])
         numeric = (sides[0] - sides[1]) / (2 * step)
         size = max(np.abs(numeric).max(), 1e-3)
         np.testing.assert_allclose(found[:, column], numeric, rtol=0, atol=2e-6 * size + 1e-8, err_msg=name)
@@ -397,7 +397,7 @@ def test_compiled_effects_give_the_numbers_of_interpreted_ones(lrm, tmp_path):
     models = []
     for evaluator in ("interpreted", "compiled"):
         problem = lrm.problem(experiment, dataset, evaluator, parameters)
-        models.append(problem.normal_equations(parameters.nominal(), problem.records(dataset)))
+        models.append(problem.of(dataset).normal_equations(parameters.nominal()))
     assert problem.backend == "compiled"
     size = np.abs(models[0].hessian).max()
     np.testing.assert_allclose(models[0].cost, models[1].cost, rtol=1e-10)
@@ -514,7 +514,7 @@ def scara(effects, q, gravity, **columns):
     dataset = Dataset(tuple(map(str, range(len(q)))), {**channels, **columns})
     environment = Environment(tuple(gravity), force=(0.4, -0.2, 0.7))
     problem = Problem.build({"arm": arm}, {"t": tracker}, parameters, environment, dataset, "interpreted")
-    return problem.predict(values, problem.records(dataset))[0].outputs[:3].T
+    return problem.of(dataset).predict(values)[0].outputs[:3].T
 
 
 def scara_chain(count, growth=(1, 1, 1, 1)):

@@ -91,9 +91,9 @@ def test_a_joint_that_is_off_moves_the_tip_whatever_the_counts(lrm):
     without = lrm.problem(lrm.experiment(), lrm.dataset(stood, np.zeros((20, 3))))
     channels, at_rest = [f"arm.{joint}" for joint in ARM], []
     for problem, angles in ((with_board, q), (without, stood)):
-        records, values = problem.records(lrm.dataset(angles, np.zeros((20, 3)))), problem.parameters.nominal()
-        residuals = problem.residuals(values, records)
-        at_rest.append((residuals[0], problem.channel_slopes(values, records, channels)[0]))
+        records, values = problem.of(lrm.dataset(angles, np.zeros((20, 3)))).records, problem.parameters.nominal()
+        residuals = problem.with_records(records).residuals(values)
+        at_rest.append((residuals[0], problem.with_records(records).channel_slopes(values, channels)[0]))
     (residual, slopes), (same, expected) = at_rest
     assert residual == pytest.approx(same, abs=1e-9) and slopes == pytest.approx(expected, abs=1e-6)
     assert np.abs(expected).max() > 0.1

@@ -67,12 +67,12 @@ def springs_measured(lrm, seed, count, *overrides):
     q = oracle.random_poses(count, seed)
     dataset = lrm.dataset(q, noisy(oracle.tip(oracle.published(), q), seed))
     problem = lrm.problem(experiment, dataset, "interpreted")
-    return problem, problem.records(dataset)
+    return problem, problem.of(dataset).records
 
 
 def deviations(problem, records, values):
     """Standard deviations of the free entries at the declared noise."""
-    upper = problem.triangular_factor(values, records)
+    upper = problem.with_records(records).triangular_factor(values)
     information = upper.T @ upper + np.diag(problem.parameters.prior_information())
     return np.sqrt(np.diag(np.linalg.inv(information)))
 
@@ -87,7 +87,7 @@ def same_answer(problem, records, one, other):
     free = list(problem.parameters.free_entries)
     off = np.abs(one - other)[free] / deviations(problem, records, one)
     assert off.max() <= SAME_SD, dict(zip(problem.free_names, off, strict=True))
-    shown = [problem.predict(values, records)[0].outputs[:3] for values in (one, other)]
+    shown = [problem.with_records(records).predict(values)[0].outputs[:3] for values in (one, other)]
     np.testing.assert_allclose(*shown, rtol=0, atol=SAME_M)
 
 
@@ -108,7 +108,7 @@ def posed(lrm):
     parameters = problem.parameters
     names = [n for n in parameters.names if n in ("arm.mdh.theta2", "arm.mdh.d4", "arm.mdh.base_x")]
     changed = parameters.replaced({n: replace(parameters[n], prior_sd=2 * parameters[n].scale) for n in names})
-    return PosedProblem(replace(problem, parameters=changed), records)
+    return PosedProblem(problem.with_records(records).with_parameters(changed))
 
 
 @pytest.mark.slow
@@ -159,7 +159,7 @@ def test_the_prior_of_a_matrix_is_quadratic_in_its_entries(posed):
         for b in parameters.free
         if b.prior_sd is not None
     )
-    of_data = posed.problem.cost(values, posed.records)
+    of_data = posed.problem.cost(values)
     assert expected > 0.1
     assert posed.cost(x) - of_data == pytest.approx(expected, rel=1e-9)
 
@@ -210,7 +210,7 @@ def test_ipopt_evaluates_all_records_no_more_than_three_times_as_often_as_cvxpy(
     answers, counts = [], []
     for estimator in (CONE, ROOT):
         evaluated.clear()
-        answers.append(found(estimator.solve(problem, records, start)))
+        answers.append(found(estimator.solve(problem.with_records(records), start)))
         counts.append(len(evaluated))
     same_answer(problem, records, *answers)
     assert counts[1] <= 3 * counts[0], counts
@@ -219,7 +219,7 @@ def test_ipopt_evaluates_all_records_no_more_than_three_times_as_often_as_cvxpy(
 def agree(lrm, seed, count, *overrides):
     problem, records = springs_measured(lrm, seed, count, *overrides)
     start = problem.parameters.nominal()
-    cone, root = (found(solver.solve(problem, records, start)) for solver in (CONE, ROOT))
+    cone, root = (found(solver.solve(problem.with_records(records), start)) for solver in (CONE, ROOT))
     same_answer(problem, records, cone, root)
     smallest = np.linalg.eigvalsh(matrices(problem, cone))[:, 0]
     assert smallest.min() >= LEAST_EIGENVALUE
@@ -239,8 +239,8 @@ def test_cone_and_root_agree_where_matrices_end_on_the_boundary(lrm, seed, count
 def test_an_answer_meets_the_conditions_of_a_minimum_on_the_cone(lrm, solver):
     """Where a matrix gives, its gradient vanishes; where it does not, more compliance would cost."""
     problem, records = springs_measured(lrm, 4, 60)
-    posed = PosedProblem(problem, records)
-    values = found(solver.solve(problem, records, problem.parameters.nominal()))
+    posed = PosedProblem(problem.with_records(records))
+    values = found(solver.solve(problem.with_records(records), problem.parameters.nominal()))
     gradient, start = posed.convex_model(posed.x(values)).gradient, 0
     for block in problem.parameters.free:
         part = gradient[start : start + block.domain.dof]
@@ -284,12 +284,12 @@ def test_a_start_on_the_boundary_does_not_keep_a_solver_there(lrm, solver):
     experiment = flexible(lrm, PRIOR, free=("arm.mdh.theta?", "arm.flex.C[1-5]"))
     dataset = lrm.dataset(q, noisy(points(q, definite), 7, 2e-4))
     problem = lrm.problem(experiment, dataset, "interpreted", with_sites(experiment.parameters, definite))
-    records, start = problem.records(dataset), rank_one(problem)
+    records, start = problem.of(dataset).records, rank_one(problem)
     for site in (0, 6):
         place = problem.parameters.entries_of(f"arm.flex.C{site}")
         start[place] = problem.parameters.nominal()[place]
-    expected = found(CONE.solve(problem, records, problem.parameters.nominal()))
-    same_answer(problem, records, expected, found(solver.solve(problem, records, start)))
+    expected = found(CONE.solve(problem.with_records(records), problem.parameters.nominal()))
+    same_answer(problem, records, expected, found(solver.solve(problem.with_records(records), start)))
 
 
 def with_sites(parameters, compliances):
@@ -310,11 +310,11 @@ def training_sets(lrm, seeds, solver):
     q = oracle.random_poses(300, 8)
     exact = oracle.tip(oracle.published(), q)
     dataset = lrm.dataset(q, noisy(exact, 9, 0.002))
-    records, smallest = problem.records(dataset), []
+    records, smallest = problem.of(dataset).records, []
     for seed in seeds:
         chosen = np.sort(np.random.default_rng(seed).choice(300, 50, replace=False))
-        train = problem.subset(records, chosen)
-        values = found(solver.solve(problem, train, problem.parameters.nominal()))
+        train = problem.with_records(records).subset(chosen).records
+        values = found(solver.solve(problem.with_records(train), problem.parameters.nominal()))
         assert all(not b.domain.check(values[problem.parameters.entries_of(b.name)]) for b in problem.parameters.free)
         smallest.append(np.linalg.eigvalsh(matrices(problem, values)).min())
     return smallest
@@ -338,9 +338,9 @@ def test_no_fit_of_many_has_a_negative_eigenvalue(lrm, solver, count):
 @pytest.mark.slow
 def test_the_order_of_the_records_does_not_matter(lrm):
     problem, records = springs_measured(lrm, 11, 50, f"parameters.free={json.dumps(FEW)}")
-    turned = problem.subset(records, np.random.default_rng(1).permutation(50))
+    turned = problem.with_records(records).subset(np.random.default_rng(1).permutation(50)).records
     start = problem.parameters.nominal()
-    one, other = (found(CONE.solve(problem, each, start)) for each in (records, turned))
+    one, other = (found(CONE.solve(problem.with_records(each), start)) for each in (records, turned))
     same_answer(problem, records, one, other)
 
 
@@ -351,10 +351,10 @@ def test_what_a_parameter_calls_an_ordinary_size_does_not_matter(lrm):
     scaled = parameters.replaced(
         {b.name: replace(b, scale=b.scale * 10 ** random.uniform(-1, 1)) for b in parameters.free}
     )
-    other = replace(problem, parameters=scaled)
-    one = found(CONE.solve(problem, records, parameters.nominal()))
-    same_answer(problem, records, one, found(CONE.solve(other, records, parameters.nominal())))
-    same_answer(problem, records, one, found(ROOT.solve(other, records, parameters.nominal())))
+    other = problem.with_parameters(scaled)
+    one = found(CONE.solve(problem.with_records(records), parameters.nominal()))
+    same_answer(problem, records, one, found(CONE.solve(other.with_records(records), parameters.nominal())))
+    same_answer(problem, records, one, found(ROOT.solve(other.with_records(records), parameters.nominal())))
 
 
 @pytest.mark.slow
@@ -376,12 +376,12 @@ def test_an_arm_ten_times_as_large_is_the_same_arm_in_another_unit(lrm, tmp_path
         experiment = Experiment.load(tmp_path / "case.yaml")
         dataset = lrm.dataset(q, measured * factor)
         problem = lrm.problem(experiment, dataset, "interpreted")
-        values = found(CONE.solve(problem, problem.records(dataset), problem.parameters.nominal()))
+        values = found(CONE.solve(problem.of(dataset), problem.parameters.nominal()))
         lengths = [b.unit == "m" for b in problem.parameters.free for _ in range(b.size)]
         flexes = [b.unit == "rad_per_Nm" for b in problem.parameters.free for _ in range(b.size)]
         free = values[list(problem.parameters.free_entries)]
         free = np.where(lengths, free / factor, np.where(flexes, free * factor, free))
-        fits.append((free, deviations(problem, problem.records(dataset), values)))
+        fits.append((free, deviations(problem, problem.of(dataset).records, values)))
     (one, sd), (other, _) = fits
     assert (np.abs(one - other) / sd).max() <= SAME_SD
 
@@ -409,8 +409,10 @@ def coverage(lrm, seeds, count=150, noise=2e-4):
     for seed in seeds:
         dataset = lrm.dataset(q, noisy(exact, seed, noise))
         problem = problem or lrm.problem(experiment, dataset, "interpreted")
-        records = problem.records(dataset)
-        fit = estimate(problem, records, CONE.solve(problem, records, problem.parameters.nominal()))
+        records = problem.of(dataset).records
+        fit = estimate(
+            problem.with_records(records), CONE.solve(problem.with_records(records), problem.parameters.nominal())
+        )
         assert fit.verdict.converged
         for name, value, sd, interval in zip(
             fit.names, fit.values[list(fit.free_entries)], fit.deviations, fit.intervals, strict=True
@@ -444,5 +446,5 @@ def test_without_noise_the_truth_comes_back(lrm):
     dataset = lrm.dataset(q, points(q, truth))
     problem = lrm.problem(experiment, dataset, "interpreted")
     for solver in (CONE, ROOT):
-        values = found(solver.solve(problem, problem.records(dataset), problem.parameters.nominal()))
+        values = found(solver.solve(problem.of(dataset), problem.parameters.nominal()))
         np.testing.assert_allclose(matrices(problem, values), truth, rtol=0, atol=1e-6)

@@ -51,7 +51,7 @@ def test_without_noise_the_truth_comes_back(solver: str) -> None:
     loaded = experiment(f"estimator.type={solver}")
     dataset = simulated(loaded, noise=0.0)
     problem = problem_for(loaded, dataset)
-    solution = loaded.estimator.solve(problem, problem.records(dataset), loaded.parameters.nominal())
+    solution = loaded.estimator.solve(problem.of(dataset), loaded.parameters.nominal())
     assert solution.verdict.converged
     free = list(loaded.parameters.free_entries)
     away = np.abs(solution.values - truth(loaded))[free] / loaded.parameters.scales()
@@ -79,10 +79,10 @@ def test_intervals_hold_the_truth_as_often_as_they_say(
     for seed in range(seeds):
         dataset = simulated(loaded, seed)
         problem = problem or problem_for(loaded, dataset)
-        records = problem.records(dataset)
-        solution = loaded.estimator.solve(problem, records, loaded.parameters.nominal())
+        records = problem.of(dataset).records
+        solution = loaded.estimator.solve(problem.with_records(records), loaded.parameters.nominal())
         assert solution.verdict.converged
-        intervals = estimate(problem, records, solution).intervals
+        intervals = estimate(problem.with_records(records), solution).intervals
         held.append([i.lower <= x <= i.upper for i, x in zip(intervals, expected, strict=True)])
         one_sided.append([i.bound is not None for i in intervals])
     share = np.mean(held, axis=0)

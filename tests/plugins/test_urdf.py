@@ -252,7 +252,7 @@ def test_springs_bend_the_arm_by_compliance_times_pinocchios_torque(tmp_path):
     problem = Problem.build(system.arms, system.measurements, parameters, system.environment, records, "interpreted")
     values = parameters.nominal()
     values[parameters.entries_of("arm.spring.k2")] = 1e-6
-    tip = -problem.residuals(values, problem.records(records))[0][:, 0]
+    tip = -problem.of(records).residuals(values)[0][:, 0]
     arm, oracle = arm_of(), Oracle(pin, ODD)
     oracle.model.gravity.linear = np.array([0, 0, -9.81])
     index = oracle.model.joints[oracle.model.getJointId("bend")].idx_v

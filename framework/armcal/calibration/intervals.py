@@ -40,7 +40,7 @@ from armcal.io.plain_files import input_file
 from armcal.measure.reader import RequestedChannel
 from armcal.problem.corrected import sizes_of, unexplained
 from armcal.problem.drift import Chain, chain, with_drift
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 from armcal.problem.readings import reading_slopes, with_joint_noise
 
 _AT_ONCE = 1000  # Records whose slopes are in memory together
@@ -150,12 +150,12 @@ def covariance_rows(covariance: Array) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(float(f"{x:.{_DIGITS}g}") for x in row[: i + 1]) for i, row in enumerate(covariance))
 
 
-def recording_record(problem: Problem, dataset: Dataset, fitted: Sequence[FactorRecords]) -> RecordingRecord | None:
-    """The training records (a dataset in the order of ``fitted``); None where nothing drifts."""
+def recording_record(problem: Problem, dataset: Dataset) -> RecordingRecord | None:
+    """The training records (a dataset in the order of those of the fitted problem); None where nothing drifts."""
     drifts = {b.name: b.drift for b in problem.parameters.free if b.drift is not None}
     if not drifts:
         return None
-    weights = [factor_records.weight[: factor_records.count] for factor_records in fitted]
+    weights = [factor_records.weight[: factor_records.count] for factor_records in problem.records]
     weighed = any(np.any(weight != 1) for weight in weights)
     return RecordingRecord(
         drifts={name: DriftRecord(sd=d.sd, over=d.over, channel=d.channel) for name, d in drifts.items()},
@@ -203,32 +203,37 @@ class Uncertainty:
         plus_minus = _joined(problem, parts, len(commands), self.record.stretches)
         if not any(arm.residual and arm.residual.is_learned for arm in self.system.arms.values()):
             return plus_minus
-        rows = [problem.records(commands.subset(chunk)) for chunk in _chunks(np.arange(len(commands)))]
-        unknown = [sizes_of(unexplained(problem, self.values, own)) for own in rows]
+        chunks = [problem.of(commands.subset(chunk)) for chunk in _chunks(np.arange(len(commands)))]
+        unknown = [sizes_of(unexplained(chunk, self.values)) for chunk in chunks]
         return replace(plus_minus, unknown=np.concatenate([np.zeros(0), *unknown]))
 
     def _apart(self, problem: Problem, commands: Dataset, places: Indices) -> _Part:
         """Where nothing is told of a drift."""
-        records = with_joint_noise(problem, problem.records(commands), self.values, self.noise_scale)
-        whitened = records
+        problem = with_joint_noise(problem.of(commands), self.values, self.noise_scale)
+        whitened = problem
         if self.components:  # with the noise that the calibration estimated
             instruments = {component.name for component in self.components if component.kind == "instrument"}
             axes: Axes = "together" if instruments <= set(self.system.measurements) else "apart"
             estimated = VarianceComponents(self.components, (), (), 0.0)
-            whitened = apply_components(problem, self.values, records, estimated, axes)
-        spreads = self._from_either_side(problem, self._predictor(problem, None).spreads(whitened, "new"), commands)
+            whitened = apply_components(problem, self.values, estimated, axes)
+        spreads = self._from_either_side(
+            problem, self._predictor(problem, None).spreads(whitened.records, "new"), commands
+        )
         recording: Recording = "same" if self.record.recording is None else "new"
         still = tuple(np.zeros_like(spread.deviations) for spread in spreads)
-        return _Part(places, recording, still, spreads, reading_slopes(problem, self.values, records))
+        return _Part(places, recording, still, spreads, reading_slopes(problem, self.values))
 
     def _within(
         self, problem: Problem, commands: Dataset, places: Indices, drift: KnownDrift, along: Chain | None
     ) -> _Part:
-        records = self._drifted(problem, commands, along, self.noise_scale)
-        spreads = self._from_either_side(problem, self._predictor(problem, drift).spreads(records, "same"), commands)
-        moved = [record.correlation.shift(i, drift.states) for i, record in enumerate(records) if record.correlation]
+        problem = self._drifted(problem.of(commands), commands, along, self.noise_scale)
+        spreads = self._from_either_side(
+            problem, self._predictor(problem, drift).spreads(problem.records, "same"), commands
+        )
+        shared = problem.correlation
+        moved = () if shared is None else [shared.shift(i, drift.states) for i in range(len(problem.records))]
         off = tuple(m[:, : len(places), 0] for m in moved)
-        return _Part(places, "same", off, spreads, reading_slopes(problem, self.values, records))
+        return _Part(places, "same", off, spreads, reading_slopes(problem, self.values))
 
     def _from_either_side(self, problem: Problem, spreads: Sequence[Spread], commands: Dataset) -> tuple[Spread, ...]:
         """With half of what the side makes that a joint came from, squared, where that side is not known (0)."""
@@ -239,8 +244,8 @@ class Uncertainty:
             ends = []
             for side in (-1.0, 1.0):
                 sides = np.where(np.nan_to_num(known) == 0, side, known)
-                records = problem.records(replace(commands, channels={**commands.channels, channel: sides}))
-                ends.append(problem.residuals(self.values, records))
+                turned = replace(commands, channels={**commands.channels, channel: sides})
+                ends.append(problem.of(turned).residuals(self.values))
             for covariance, low, high in zip(covariances, *ends, strict=True):
                 half = (high - low) / 2
                 covariance += np.einsum("rn,sn->nrs", half, half)
@@ -250,20 +255,18 @@ class Uncertainty:
         return Predictor(problem, self.values, self.record.symmetric_covariance, self.noise_scale, self.freedom, drift)
 
     def _known_drift(self, recording: RecordingRecord, dataset: Dataset, along: Chain | None) -> KnownDrift:
-        problem = self._problem(dataset)
-        records = self._drifted(problem, dataset, along)
+        problem = self._drifted(self._problem(dataset), dataset, along)
         if recording.weights:
-            records = problem.weighted(records, [np.array(row) for row in recording.weights])
-        known_drift = KnownDrift.by(problem, self.values, records)
+            problem = problem.weighted([np.array(row) for row in recording.weights])
+        known_drift = KnownDrift.by(problem, self.values)
         if known_drift is None:
             raise TypeError("a recording is kept only where something drifts")
         return known_drift
 
-    def _drifted(
-        self, problem: Problem, dataset: Dataset, along: Chain | None, noise_scale: float = 1.0
-    ) -> tuple[FactorRecords, ...]:
-        records = with_joint_noise(problem, problem.records(dataset), self.values, noise_scale)
-        return with_drift(problem, records, dataset, self.parameters.nominal(), along)
+    def _drifted(self, problem: Problem, dataset: Dataset, along: Chain | None, noise_scale: float = 1.0) -> Problem:
+        """The problem of a dataset with the noise of joints, and with what drifts."""
+        noisy = with_joint_noise(problem, self.values, noise_scale)
+        return with_drift(noisy, dataset, self.parameters.nominal(), along)
 
     def _with_predictions(self, commands: Dataset) -> tuple[Problem, Dataset]:
         """The commands with what instruments read there: residuals may depend on readings in any way."""
@@ -271,9 +274,8 @@ class Uncertainty:
         unread = dict.fromkeys(names, np.zeros(len(commands)))
         sides = [f"{arm.name}.{APPROACH}{joint}" for arm in self.system.arms.values() for joint in arm.commanded]
         commands = replace(commands, channels={**dict.fromkeys(sides, np.zeros(len(commands))), **commands.channels})
-        blank = replace(commands, channels={**commands.channels, **unread})
-        problem = self._problem(blank)
-        read = problem.by_channel(problem.predict(self.values, problem.records(blank)))
+        problem = self._problem(replace(commands, channels={**commands.channels, **unread}))
+        read = problem.by_channel(problem.predict(self.values))
         return problem, replace(commands, channels={**unread, **commands.channels, **read})
 
     def _problem(self, dataset: Dataset) -> Problem:

@@ -95,7 +95,7 @@ def predict(system: System, parameters: Parameters, commands: Dataset) -> tuple[
         measurements = {"_arms": ArmsAlone(names), **measurements}
     parts = (system.arms, measurements, fixed, system.environment, commands)
     problem = Problem.build(*parts, "interpreted", groups={})
-    shown = problem.predict(fixed.nominal(), problem.records(commands))
+    shown = problem.predict(fixed.nominal())
     return problem.by_channel(shown), poses_of(shown[0].tools)
 
 

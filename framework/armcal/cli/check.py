@@ -36,10 +36,12 @@ def check(console: Console, config: Path, data: Path | None, overrides: tuple[st
     with console.progress() as progress:
         ready = assemble(experiment, Stopwatch(), progress=progress)
     start = ready.problem.parameters.nominal()
-    known = identify(ready.problem, start, ready.training)
+    known = identify(ready.problem.with_records(ready.training), start)
     refused: ProblemError | None = None
     try:
-        ready = replace(ready, warnings=(*ready.warnings, *require_solvable(ready.problem, ready.training, start)))
+        ready = replace(
+            ready, warnings=(*ready.warnings, *require_solvable(ready.problem.with_records(ready.training), start))
+        )
     except ProblemError as fault:
         refused = fault
     gravity = [f"{finding.text} {finding.action}" for finding in gravity_findings(experiment.system, ready.dataset)]

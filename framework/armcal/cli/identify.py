@@ -72,7 +72,7 @@ def identify(
     if not parameters.free:
         raise ConfigError("no parameter is free.", where=Location(str(config)), hint="Name some under parameters.free.")
     preferred = _preferred(parameters, prefer)
-    triangle = factor_at_zero(ready.problem, parameters.nominal(), ready.training)
+    triangle = factor_at_zero(ready.problem.with_records(ready.training), parameters.nominal())
     known = identify_from(triangle, parameters)
     content = _content(experiment, ready, triangle, known)
     if minimal or prefer or most is not None or max_sd is not None:
@@ -112,7 +112,7 @@ def _content(experiment: Experiment, ready: Prepared, triangle: Array, known: Id
     covariance = expected_covariance(triangle, parameters)
     deviation = np.sqrt(np.diag(covariance))
     indices = observability(known.singular_values[: known.rank], equations).as_dict() if known.rank else None
-    explained = explain(problem, parameters.nominal(), ready.training, known)
+    explained = explain(problem.with_records(ready.training), parameters.nominal(), known)
     return {
         "experiment": experiment.name,
         "records": len(ready.split.train),

@@ -119,7 +119,7 @@ def level_name(level: float) -> str:
 
 def predictor(problem: Problem, fitted: WeighedFit) -> Predictor:
     estimate = fitted.estimate
-    drift = KnownDrift.by(problem, estimate.values, fitted.records)
+    drift = KnownDrift.by(problem.with_records(fitted.records), estimate.values)
     return Predictor(
         problem, estimate.values, estimate.covariance, estimate.noise_scale, estimate.degrees_of_freedom, drift
     )
@@ -163,7 +163,9 @@ def whitened_like(
     """Records with the noise that the fit estimated, if it did."""
     if fitted.components is None or not isinstance(estimator, Weighing):
         return tuple(held)
-    return apply_components(problem, fitted.solution.values, held, fitted.components, estimator.settings.axes)
+    return apply_components(
+        problem.with_records(held), fitted.solution.values, fitted.components, estimator.settings.axes
+    ).records
 
 
 def fit_and_predict(task: FitTask) -> JudgedFit:
@@ -173,11 +175,11 @@ def fit_and_predict(task: FitTask) -> JudgedFit:
     began = time.perf_counter()
     try:
         train, held = task.parts()
-        fitted = fit(task.problem, train, task.estimator, task.start)
+        fitted = fit(train, task.estimator, task.start)
         judged = judged_fit(task, fitted.solution, train, held, began)
         if not judged.converged:
             return judged
-        alike = whitened_like(task.problem, fitted, held, task.estimator)
+        alike = whitened_like(task.problem, fitted, held.records, task.estimator)
         own = missed(predictor(task.problem, fitted), alike)
         return replace(judged, held_residuals=own, seconds=time.perf_counter() - began)
     except NotConvergedError:

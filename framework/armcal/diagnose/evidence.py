@@ -142,9 +142,9 @@ def _tip_motions(problem: Problem, values: Array, poses: Dataset, null: Array) -
     if rows := _position_rows(problem):
         noise = np.concatenate([kernel.factor.noise for kernel in problem.kernels])
         return np.asarray((whitened_rows(problem, values, poses)[rows] * noise[rows, None, None] @ null.T)[None])
-    records = problem.records(poses)  # nothing reads a position: of the tools, up to what no contact could see
-    at, axes = tools(problem, values, records)
-    moves = np.array([along(problem, values, records, direction).ravel() for direction in null]).T
+    records = problem.of(poses).records  # nothing reads a position: of the tools, up to what no contact could see
+    at, axes = tools(problem.with_records(records), values)
+    moves = np.array([along(problem.with_records(records), values, direction).ravel() for direction in null]).T
     return apart_from(np.array(unseen_motions(at, axes)).T, moves).reshape(len(at), 3, -1, moves.shape[1])
 
 

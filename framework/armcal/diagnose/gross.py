@@ -13,7 +13,7 @@ from armcal.base.domains import Pose, ScrewAxis
 from armcal.base.poses import NO_TURN
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Estimate
-from armcal.estimate.identifiability import Measure, random_records
+from armcal.estimate.identifiability import Measure, at_random_poses
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.problem.rigid_alignment import along, apart_from, rigid_fit, spread_of, tools, unseen_motions
 
@@ -94,7 +94,7 @@ def thinned(chosen: Indices, most: int) -> Indices:
 
 def figure_of(problem: Problem, estimate: Estimate, records: Sequence[FactorRecords]) -> Figure:
     """Of the first tool of all, at random poses about the recorded ones: what touches a socket hardly moves in them."""
-    poses = problem.subset(random_records(problem, records), np.arange(_POSES, dtype=np.intp))
+    poses = at_random_poses(problem.with_records(records)).subset(np.arange(_POSES, dtype=np.intp)).records
     try:
         nominal, calibrated, bent = _places(problem, estimate, poses)
     except NotConvergedError:
@@ -123,7 +123,7 @@ def _places(problem: Problem, estimate: Estimate, poses: Sequence[FactorRecords]
             own = parameters.entries_of(block.name)
             bent[own] = configured[own]
     nominal, calibrated, bent_places = (
-        tools(problem, values, poses)[0][0] for values in (configured, estimate.values, bent)
+        tools(problem.with_records(poses), values)[0][0] for values in (configured, estimate.values, bent)
     )
     return nominal, calibrated, bent_places
 
@@ -173,8 +173,8 @@ def only_places(problem: Problem, values: Array, records: Sequence[FactorRecords
     names = problem.parameters.coordinate_names
     if names[coordinate].partition(".")[0] not in problem.blueprint.arms:
         return True
-    at, axes = tools(problem, values, records)
-    moves = along(problem, values, records, np.eye(len(names))[coordinate]).reshape(-1, 1)
+    at, axes = tools(problem.with_records(records), values)
+    moves = along(problem.with_records(records), values, np.eye(len(names))[coordinate]).reshape(-1, 1)
     left = np.linalg.norm(apart_from(np.array(unseen_motions(at, axes)).T, moves))
     return bool(left <= _SAME_MOTION * np.linalg.norm(moves))
 

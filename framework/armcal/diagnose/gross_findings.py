@@ -123,12 +123,12 @@ def held_turn(problem: Problem, records: Sequence[FactorRecords], dataset: Datas
     for number, kernel in enumerate(problem.kernels):
         own = f"{kernel.factor.name}."
         names = [b.name for b in problem.parameters.blocks if b.name.startswith(own) and isinstance(b.domain, Rotation)]
-        sighting = sighting_of(problem, records, dataset, number, MOST_RECORDS)
+        sighting = sighting_of(problem.with_records(records), dataset, number, MOST_RECORDS)
         if sighting is None or sighting.turned is None or len(sighting.chosen) < FEWEST:
             continue
         if not names or problem.parameters[names[0]].free:
             continue
-        tools = tools_of(problem, nominal, problem.subset(records, sighting.chosen)[number], number)
+        tools = tools_of(problem.with_records(records).subset(sighting.chosen), nominal, number)
         base, mounted = hand_eye(tools.rotations, sighting.turned)
         left = np.swapaxes(base @ tools.rotations @ mounted, 1, 2) @ sighting.turned
         turn, scatter = (float(np.median(Turns.from_matrix(t).magnitude())) for t in (mounted, left))

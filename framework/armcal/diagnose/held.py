@@ -155,7 +155,8 @@ def freed(problem: Problem, names: Sequence[str]) -> Problem:
         alike = [name for part in parts if len(parts) > 1 and freed(problem, part) is not problem for name in part]
         return freed(problem, alike)
     same = (replace(k, factor=replace(k.factor, **{n: getattr(own.factor, n) for n in kept})) for k, own in pairs)
-    return replace(problem, parameters=parameters, kernels=tuple(same), blueprint=plan)
+    compiled = replace(problem.compiled, parameters=parameters, kernels=tuple(same), blueprint=plan)
+    return replace(problem, compiled=compiled)
 
 
 def moves_of(problem: Problem, values: Array, records: Sequence[FactorRecords], held: Sequence[str]) -> Moves:

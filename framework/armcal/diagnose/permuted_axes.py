@@ -147,7 +147,7 @@ def _of_contact(
         except NotConvergedError:
             return np.inf
 
-    reach = spread_of(tools(problem, nominal, records)[0][0])
+    reach = spread_of(tools(problem.with_records(records), nominal)[0][0])
     if not MISSES * reach < (as_given := left({})) < np.inf:
         return None
     # Another unit of angles would put all tools near one place, whatever they touch.
@@ -169,7 +169,7 @@ def _seen(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, 
 
     Records without both neighbours are left out, unless these are most.
     """
-    sighting = sighting_of(problem, records, dataset, number, _MOST_RECORDS)
+    sighting = sighting_of(problem.with_records(records), dataset, number, _MOST_RECORDS)
     if sighting is None:
         return None
     every, rows = _neighbours(dataset, records[number], problem.kernels[number].factor.position_channels, sighting)
@@ -204,7 +204,7 @@ def _of(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, arm: Ar
     spread = max(spread_of(seen.measured), spread_of(straight.predicted))
     as_given = straight.left(seen.measured)
     if as_given > MISSES * spread:
-        placing = placings(problem, records, seen.sighting)[0]
+        placing = placings(problem.with_records(records), seen.sighting)[0]
         seen = replace(seen, placing=placing if placing.stands_anywhere else None)
         as_given = min(as_given, _left(problem, seen, {}, seen.measured, np.inf))
     if as_given <= MISSES * spread:
@@ -267,8 +267,9 @@ def _fitted(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, rea
     rows, unturned = np.zeros(len(problem.kernels[number].factor.noise)), np.tile(np.eye(3), (own.count, 1, 1))
     rows[:3] = 1 / seen.noise
     whitening = np.tile(np.diag(rows)[:, :, None], len(own.weight))
-    some[number] = replace(shown_instead(problem, own, number, Tools(measured, unturned)), whitening=whitening)
-    posed = PosedProblem(problem, some)
+    some[number] = replace(own, whitening=whitening)
+    problem = shown_instead(problem.with_records(some), number, Tools(measured, unturned))
+    posed = PosedProblem(problem)
     try:
         if problem.increments:
             matters = np.diag(posed.model(posed.x(values)).hessian)
@@ -276,7 +277,7 @@ def _fitted(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, rea
             if np.abs(x - posed.x(values))[matters > _DETERMINED * matters.max()].max(initial=0.0) > _FARTHEST:
                 return np.inf
             values = posed.values(x)
-        return float(np.median(np.linalg.norm(problem.residuals(values, some)[number][:3], axis=0)))
+        return float(np.median(np.linalg.norm(problem.residuals(values)[number][:3], axis=0)))
     except NotConvergedError:
         return np.inf
 
@@ -306,7 +307,7 @@ def _placed(problem: Problem, seen: _Seen, read_as: Wires, measured: Array) -> t
     if placing is None:
         return nominal, measured, 0.0
     as_read = rewired(problem.kernels[number].factor.channels, seen.records, read_as)
-    alignment = nearest(tools_of(problem, nominal, as_read, number), measured, placing.basis)
+    alignment = nearest(tools_of(problem.with_record(number, as_read), nominal, number), measured, placing.basis)
     values = placing.with_target(problem.parameters, nominal, alignment.offset)
     return values, alignment.back(measured), alignment.left
 
@@ -348,7 +349,8 @@ def _in_two_frames(problem: Problem, seen: _Seen) -> Iterator[_Reading]:
     if seen.placing is None:
         return
     nominal = problem.blueprint.parameters.nominal()
-    tools = tools_of(problem, nominal, seen.records, seen.sighting.kernel)
+    number = seen.sighting.kernel
+    tools = tools_of(problem.with_record(number, seen.records), nominal, number)
     apart = two_frames(tools, seen.measured, seen.placing.basis)
     if apart is not None:
         words = f"the positions from record {seen.ids[apart.begins]} on taken for those in another frame"

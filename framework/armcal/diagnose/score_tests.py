@@ -283,7 +283,8 @@ def widened(problem: Problem, records: Sequence[FactorRecords], estimate: Estima
         position: how many of all records were recorded before each (N).
     """
     estimate = _of_alike_points(problem, records, estimate)
-    problem, records = with_few_points(problem, records)
+    problem = with_few_points(problem.with_records(records))
+    records = problem.records
     taking_part = np.any([record.weight[: record.count] > 0 for record in records], axis=0)
     chosen = np.flatnonzero(taking_part)
     chosen = chosen[np.argsort(position[chosen], kind="stable")][:_MOST_RECORDS]

@@ -7,7 +7,6 @@ the model were true.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Literal
@@ -22,9 +21,9 @@ from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.estimator import CONFIDENCE, Estimate, Estimator, Progress, no_progress
 from armcal.io.parallel import Executor, Sequential
 from armcal.problem.factor_records import noise_roots
-from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.projection import predicted_records
-from armcal.problem.readings import disturbed_records, reading_slopes
+from armcal.problem.problem import Problem
+from armcal.problem.projection import predicted
+from armcal.problem.readings import disturbed, reading_slopes
 
 BlockLength = int | Literal["auto"]
 _SIGNIFICANT = 2.0
@@ -133,7 +132,6 @@ class Bootstrap:
 
 def bootstrap(
     problem: Problem,
-    records: Sequence[FactorRecords],
     estimator: Estimator,
     estimate: Estimate,
     settings: BootstrapSettings,
@@ -148,12 +146,12 @@ def bootstrap(
     Raises:
         ProblemError: a parametric one of measurements that measure nothing, or of drifting parameters.
     """
-    count, random = records[0].count, np.random.default_rng(settings.seed)
+    count, random = problem.count, np.random.default_rng(settings.seed)
     poses = np.arange(count) if poses is None else poses
     parametric = settings.method == "parametric"
     if parametric:
-        slopes = reading_slopes(problem, estimate.values, predicted_records(problem, estimate.values, records))
-        for kernel, record, slope in zip(problem.kernels, records, slopes, strict=True):
+        slopes = reading_slopes(predicted(problem, estimate.values), estimate.values)
+        for kernel, record, slope in zip(problem.kernels, problem.records, slopes, strict=True):
             if slope is None or record.correlation is not None:
                 raise ProblemError(
                     f"{kernel.factor.name} has no measured values of its own noise to simulate.",
@@ -161,7 +159,7 @@ def bootstrap(
                 )
         block = 1
     elif settings.blocks == "auto":  # the longest that any residual component asks for
-        block = max(automatic_block_length(rows) for rows in problem.whitened_residuals(estimate.values, records))
+        block = max(automatic_block_length(rows) for rows in problem.whitened_residuals(estimate.values))
     else:
         block = min(settings.blocks, count)
     tasks = []
@@ -170,7 +168,7 @@ def bootstrap(
         chosen = np.flatnonzero(weights).astype(np.intp)
         seed = int(random.integers(2**63)) if parametric else None
         tasks.append((chosen, weights[chosen], seed))
-    refit = partial(_refit, problem, tuple(records), estimator, estimate.values, estimate.noise_scale)
+    refit = partial(_refit, problem, estimator, estimate.values, estimate.noise_scale)
     refits = (executor or Sequential()).map(refit, tasks, lambda done: progress("bootstrap", done))
     free = list(estimate.free_entries)
     values = np.array([values[free] for values in refits if values is not None]).reshape(-1, len(free))
@@ -179,7 +177,6 @@ def bootstrap(
 
 def _refit(
     problem: Problem,
-    records: tuple[FactorRecords, ...],
     estimator: Estimator,
     start: Array,
     noise_scale: float,
@@ -190,17 +187,15 @@ def _refit(
     A resample is which records, how often each, and the seed of other measured values if these are simulated.
     """
     chosen, weights, seed = resample
-    records = problem.subset(records, chosen)
+    problem = problem.subset(chosen)
     if seed is not None:
         random, noise = np.random.default_rng(seed), []
-        for kernel, record in zip(problem.kernels, records, strict=True):
+        for kernel, record in zip(problem.kernels, problem.records, strict=True):
             white = noise_scale * random.normal(size=(len(kernel.factor.noise), record.count))
             noise.append(np.einsum("wrs,sw->rw", noise_roots(kernel.factor, record), white))
-        predicted = predicted_records(problem, start, records)
-        records = disturbed_records(problem, start, predicted, noise)
-    records = problem.weighted(records, [weights] * len(records))
+        problem = disturbed(predicted(problem, start), start, noise)
     try:
-        solution = estimator.solve(problem, records, start)
+        solution = estimator.solve(problem.weighted([weights] * len(problem.records)), start)
     except NotConvergedError:
         return None
     return solution.values if solution.verdict.converged else None

@@ -1,9 +1,9 @@
-"""Estimators and estimates: from a problem and records to values, and how sure they are."""
+"""Estimators and estimates: from a problem to values, and how sure they are."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterator, KeysView, Sequence
+from collections.abc import Callable, Iterator, KeysView
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, Protocol, runtime_checkable
@@ -16,7 +16,7 @@ from armcal.base.parameters import Parameters
 from armcal.errors import NotConvergedError
 from armcal.estimate.identifiability import Identifiability, InverseInformation, identify_from
 from armcal.io.parallel import Executor
-from armcal.problem.problem import FactorRecords, Problem, triangular
+from armcal.problem.problem import Problem, triangular
 from armcal.problem.projection import factor_at_zero
 
 CONFIDENCE = 0.95
@@ -68,12 +68,11 @@ class Solution:
 
 
 class Estimator(Protocol):
-    """What a plugin provides to solve a problem on all records at once."""
+    """What a plugin provides to solve a problem on all its records at once."""
 
     def solve(
         self,
         problem: Problem,
-        records: Sequence[FactorRecords],
         start: Array,
         progress: Progress = no_progress,
     ) -> Solution:
@@ -246,9 +245,7 @@ class Influence:
         return cls(None, noise_scale, 1.0, noise_scale)
 
 
-def estimate(
-    problem: Problem, records: Sequence[FactorRecords], solution: Solution, influence: Influence | None = None
-) -> Estimate:
+def estimate(problem: Problem, solution: Solution, influence: Influence | None = None) -> Estimate:
     """Covariance, intervals and identifiability at a solution; without ``influence``, one of least squares.
 
     The declared noise is scaled to the residuals found (the a posteriori variance factor [Mikhail1976]): with a
@@ -260,16 +257,16 @@ def estimate(
     Raises:
         NotConvergedError: springs do not hold the arm in a record.
     """
-    problem.require_held(solution.values, records)
+    problem.require_held(solution.values)
     parameters = problem.parameters
     prior, slope = parameters.prior_information(), 1.0 if influence is None else influence.slope
     chain = parameters.entries_jacobian(solution.values)
-    acting = problem.weighted(records, influence.weights) if influence and influence.weights else records
-    equations = problem.normal_equations(solution.values, acting).chained(chain)
-    triangle = factor_at_zero(problem, solution.values, records)
+    acting = problem.weighted(influence.weights) if influence and influence.weights else problem
+    equations = acting.normal_equations(solution.values).chained(chain)
+    triangle = factor_at_zero(problem, solution.values)
     known = identify_from(triangle, parameters)
     inverse = InverseInformation.of(np.sqrt(slope) * triangle, parameters)
-    half, freedom = inverse.root, problem.equations(records) - inverse.spent
+    half, freedom = inverse.root, problem.equations() - inverse.spent
     influence = influence or Influence.of_least_squares(equations.cost, freedom)
     by_data = influence.spread * half @ (half.T @ triangle.T)
     by_both = np.hstack([by_data, half @ (half.T * np.sqrt(prior))])
@@ -311,14 +308,14 @@ def _identified_by_data(
     return tuple(bool(x) for x in added & (moves <= 1e-6 * np.where(typical > 0, typical, 1.0)))
 
 
-def degrees_of_freedom(problem: Problem, values: Array, records: Sequence[FactorRecords], slope: float = 1.0) -> float:
+def degrees_of_freedom(problem: Problem, values: Array, slope: float = 1.0) -> float:
     """Residual numbers less what a fit takes up of them, the trace of its hat matrix.
 
     A parameter that its prior holds takes up nothing, so that it is not counted as spent. ``slope`` is that of an
     influence.
     """
-    triangle = np.sqrt(slope) * factor_at_zero(problem, values, records)
-    return problem.equations(records) - InverseInformation.of(triangle, problem.parameters).spent
+    triangle = np.sqrt(slope) * factor_at_zero(problem, values)
+    return problem.equations() - InverseInformation.of(triangle, problem.parameters).spent
 
 
 def _entry_bounds(parameters: Parameters) -> tuple[Array, Array]:

@@ -14,7 +14,7 @@ from armcal.base.arrays import Array
 from armcal.base.domains import Semidefinite
 from armcal.base.parameters import Parameters
 from armcal.problem.normal_equations import NormalEquations
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 
 LEVEL = 0.05  # Of naming any parameter though nothing is to be gained
 MOST_UNCERTAIN = 0.5  # In typical scales: what the noise leaves less certain than this is not determined
@@ -51,16 +51,16 @@ def candidates(parameters: Parameters) -> tuple[str, ...]:
     )
 
 
-def freeing(wide: Problem, own: Sequence[str], values: Array, records: Sequence[FactorRecords]) -> Freeing:
+def freeing(wide: Problem, own: Sequence[str], values: Array) -> Freeing:
     """Judge all that is free in ``wide`` and not among the ``own`` parameters, at a fit of these alone."""
     parameters = wide.parameters
     chain = parameters.entries_jacobian(values) * parameters.scales()
-    model = wide.normal_equations(values, records).chained(chain)
+    model = wide.normal_equations(values).chained(chain)
     priors = parameters.prior_information() * parameters.scales() ** 2
     off = parameters.coordinates(parameters.local(values)) / parameters.scales()
     model = NormalEquations(model.cost, model.gradient + priors * off, model.hessian + np.diag(priors))
     places = {name: np.arange(own.start, own.stop) for name, own in parameters.coordinates_of.items()}
-    search = _Search(model, priors, wide.equations(records), parameters.scales())
+    search = _Search(model, priors, wide.equations(), parameters.scales())
     taken, left = [i for name in own for i in places[name]], [name for name in places if name not in set(own)]
     gaining, count = list[Candidate](), len(left)
     while left and len(gaining) < MOST_FREED:

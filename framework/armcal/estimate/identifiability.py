@@ -32,7 +32,8 @@ from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.parameters import Parameters
 from armcal.base.units import shown_unit
 from armcal.errors import NotConvergedError, ProblemError
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.factor_records import subset
+from armcal.problem.problem import Problem
 from armcal.problem.projection import approach_channels, factor_at_zero, fits, joint_channels, projected
 from armcal.problem.rigid_alignment import along, apart_from, tools, unseen_motions
 
@@ -550,17 +551,15 @@ class Undetermined:
         return f"{self.combination}: {CAUSES[self.cause]}"
 
 
-def identify(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Identifiability:
-    return identify_from(factor_at_zero(problem, values, records), problem.parameters)
+def identify(problem: Problem, values: Array) -> Identifiability:
+    return identify_from(factor_at_zero(problem, values), problem.parameters)
 
 
 def identify_from(triangle: Array, parameters: Parameters) -> Identifiability:
     return analyse(triangle, parameters.scales(), parameters.coordinate_names, measures_of(parameters))
 
 
-def explain(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], known: Identifiability
-) -> tuple[Undetermined, ...]:
+def explain(problem: Problem, values: Array, known: Identifiability) -> tuple[Undetermined, ...]:
     """Every undetermined combination with its cause: gauges first, as few parameters in each as possible."""
     null = known.null
     if not len(null):
@@ -570,13 +569,13 @@ def explain(
     causes: list[Cause] = ["unknown"] * len(null)
     nested: tuple[Array, ...] = ()
     with suppress(NotConvergedError):
-        if all(record.count for record in records):
-            poses, parameters = random_records(problem, records), problem.parameters
-            at = _scaled(problem, values, poses)
+        if all(record.count for record in problem.records):
+            poses, parameters = at_random_poses(problem), problem.parameters
+            at = _scaled(poses, values)
             here = null_rows(at @ null.T, 1e3 * RANK_TOLERANCE * _largest(at)) @ null  # no poses show these here
-            away = _scaled(problem, nearby(parameters, values), poses)
+            away = _scaled(poses, nearby(parameters, values))
             count = len(null_rows(away, RANK_TOLERANCE * _largest(away)))
-            near = _scaled(problem, nearby(parameters, values, _HARDLY_AWAY), poses)
+            near = _scaled(poses, nearby(parameters, values, _HARDLY_AWAY))
             anywhere = np.linalg.svd(near)[2][len(near.T) - count :]
             turn, cosines, _ = np.linalg.svd(here @ anywhere.T)
             gauge = turn.T[: int(np.sum(cosines > np.sqrt(1 - _WITHIN**2)))] @ here
@@ -610,15 +609,15 @@ def nearby(parameters: Parameters, values: Array, away: float = _AWAY, seed: int
     return parameters.retract(np.clip(at + step, lower, upper))
 
 
-def random_records(problem: Problem, records: Sequence[FactorRecords], seed: int = 0) -> tuple[FactorRecords, ...]:
-    """Random poses about the recorded ones and beyond them, under the recorded loads, from either side."""
+def at_random_poses(problem: Problem, seed: int = 0) -> Problem:
+    """With random poses about the recorded ones and beyond them, under the recorded loads, from either side."""
     count = int(np.clip(3 * problem.increments, 60, 600))
     result = []
-    for kernel, factor_records in zip(problem.kernels, records, strict=True):
+    for kernel, factor_records in zip(problem.kernels, problem.records, strict=True):
         random = np.random.default_rng(seed)
         rows = np.flatnonzero(factor_records.weight[: factor_records.count])
         chosen = random.choice(rows if len(rows) else np.arange(factor_records.count), count)
-        (drawn,) = Problem.subset([factor_records], chosen.astype(np.intp))
+        (drawn,) = subset([replace(factor_records, correlation=None)], chosen.astype(np.intp))
         record, joints = drawn.record.copy(), list(joint_channels(kernel.factor))
         seen, approaches = factor_records.record[joints, : factor_records.count], list(approach_channels(kernel.factor))
         lowest, highest = seen.min(axis=1) - _BEYOND, seen.max(axis=1) + _BEYOND
@@ -626,25 +625,20 @@ def random_records(problem: Problem, records: Sequence[FactorRecords], seed: int
         record[approaches] = random.choice([-1.0, 1.0], (len(approaches), record.shape[1]))
         weight = (np.arange(record.shape[1]) < count).astype(float)
         result.append(replace(drawn, record=record, weight=weight, state=np.zeros_like(drawn.state)))
-    return tuple(result)
+    return problem.with_records(result)
 
 
-def _scaled(problem: Problem, values: Array, poses: Sequence[FactorRecords]) -> Array:
-    fitting = projected(problem, values, poses)
-    can = fits(problem, values, fitting)
-    weighed = []
-    for factor_records, mask in zip(fitting, can, strict=True):
-        weight = factor_records.weight.copy()
-        weight[: factor_records.count] *= mask
-        weighed.append(replace(factor_records, weight=weight))
-    return problem.triangular_factor(values, weighed) * problem.parameters.scales()
+def _scaled(problem: Problem, values: Array) -> Array:
+    fitting = projected(problem, values)
+    can = [mask.astype(float) for mask in fits(fitting, values)]
+    return fitting.weighted(can).triangular_factor(values) * problem.parameters.scales()
 
 
 def _largest(matrix: Array) -> float:
     return float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0
 
 
-def scale_is_unseen(problem: Problem, values: Array, records: Sequence[FactorRecords], known: Identifiability) -> bool:
+def scale_is_unseen(problem: Problem, values: Array, known: Identifiability) -> bool:
     """Whether some undetermined combination makes all tools' positions grow in proportion.
 
     Contacts fit a smaller arm in a smaller world just as well. The tools decide, not the parameters: which numbers
@@ -653,15 +647,15 @@ def scale_is_unseen(problem: Problem, values: Array, records: Sequence[FactorRec
     """
     if not len(known.null):
         return False
-    poses = problem.subset(random_records(problem, records), np.arange(_POSES, dtype=np.intp))
-    at, axes = tools(problem, values, poses)
-    moves = [along(problem, values, poses, direction) for direction in known.null]
+    poses = at_random_poses(problem).subset(np.arange(_POSES, dtype=np.intp))
+    at, axes = tools(poses, values)
+    moves = [along(poses, values, direction) for direction in known.null]
     growth = (at - at.mean(axis=(0, 2), keepdims=True)).ravel()
     left = apart_from(np.array([move.ravel() for move in moves] + unseen_motions(at, axes)).T, growth[:, None])
     return bool(np.linalg.norm(left) < _GROWTH_LEFT * np.linalg.norm(growth))
 
 
-def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: Array) -> tuple[str, ...]:
+def require_solvable(problem: Problem, start: Array) -> tuple[str, ...]:
     """Refuse a problem whose answer would be invented.
 
     Returns:
@@ -671,24 +665,24 @@ def require_solvable(problem: Problem, records: Sequence[FactorRecords], start: 
         ProblemError: fewer equations than parameters, or undetermined combinations, without priors on them.
     """
     parameters = problem.parameters
-    count = problem.equations(records)
+    count = problem.equations()
     unknown = problem.increments
     has_prior = parameters.prior_information() > 0
     warnings = []
     if count < unknown:
-        poses = max((record.count for record in records), default=0)
+        poses = max((record.count for record in problem.records), default=0)
         text = f"{count} equations ({poses} records) for {unknown} free parameters"
         if not has_prior.all():
             raise ProblemError(f"{text}.", hint="Measure more poses, fix parameters, or give every one a prior.")
         warnings.append(f"{text}: what the data does not determine comes from the priors.")
-    known = identify(problem, start, records)
+    known = identify(problem, start)
     if known.undetermined:
-        explained = explain(problem, start, records, known)
+        explained = explain(problem, start, known)
         listed = "; ".join(str(undetermined) for undetermined in explained[:MOST_LISTED])
         more = len(explained) - MOST_LISTED
         listed += f"; and {more} more, which armcal identify lists" if more > 0 else ""
         text = f"the data does not determine {len(explained)} combinations"
-        unseen_scale = scale_is_unseen(problem, start, records, known)
+        unseen_scale = scale_is_unseen(problem, start, known)
         if held_by_nothing(parameters, known):
             first, mend = (f"{UNSEEN_SCALE}; ", f"{GIVE_A_LENGTH}. ") if unseen_scale else ("", "")
             raise ProblemError(f"{first}{text}: {listed}.", hint=_sentence(f"{mend}{_mend(explained)}"))

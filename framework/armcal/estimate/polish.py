@@ -8,7 +8,6 @@ apart, a long one does too.
 
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +19,7 @@ from armcal.estimate.estimator import Solution, SolverVerdict
 from armcal.measure.groups import OTHER, group_name, owner_of
 from armcal.measure.measurement import GroupedMeasurement
 from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import FactorRecords, NormalEquations, Problem
+from armcal.problem.problem import NormalEquations, Problem
 from armcal.problem.rigid_alignment import spread_of
 
 HOPELESS = 0.12
@@ -43,7 +42,7 @@ def polish(posed: PosedProblem, x: Array) -> Array:
     secant of the slopes at both ends of a step gives how far it should have gone.
     """
     (lower, upper), best, kept = posed.bounds(), np.inf, x
-    equations = max(1, posed.problem.equations(posed.records))
+    equations = max(1, posed.problem.equations())
     tried: tuple[Array, Array, float] | None = None
     for _ in range(MOST_STEPS):
         try:
@@ -115,9 +114,7 @@ def bounded_step(model: NormalEquations, lower: Array, upper: Array) -> Array | 
     return np.asarray(np.clip(np.select(held, [lower, upper], solution.x / size), lower, upper))
 
 
-def hopeless(
-    problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, start: Array, named: bool = False
-) -> Solution | None:
+def hopeless(problem: Problem, dataset: Dataset, start: Array, named: bool = False) -> Solution | None:
     """The start, if a short search over some of the records says that no search leads on from there; else None.
 
     Asked of measurements of positions in the base frame alone; ``records`` are those of the dataset, which train. Where
@@ -125,13 +122,13 @@ def hopeless(
     """
     began = time.perf_counter()
     chosen = np.arange(0, len(dataset), max(1, -(-len(dataset) // _MOST_RECORDS)))
-    some = problem.subset(records, chosen)
+    some = problem.subset(chosen)
     try:
-        if not problem.increments or typical_off(problem, some, dataset.subset(chosen), start) <= HOPELESS:
+        if not problem.increments or typical_off(some, dataset.subset(chosen), start) <= HOPELESS:
             return None
-        posed = PosedProblem(problem, some)
+        posed = PosedProblem(some)
         values = posed.values(descended(posed, posed.x(start), _SEARCH_STEPS, _SEARCH_DAMPING))
-        off = typical_off(problem, some, dataset.subset(chosen), values)
+        off = typical_off(some, dataset.subset(chosen), values)
     except NotConvergedError:
         return None
     if off <= HOPELESS:
@@ -143,9 +140,9 @@ def hopeless(
     return Solution(start, SolverVerdict("the first search", status, False, _SEARCH_STEPS, seconds))
 
 
-def typical_off(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, values: Array) -> float:
+def typical_off(problem: Problem, dataset: Dataset, values: Array) -> float:
     worst = 0.0
-    for kernel, record, residual in zip(problem.kernels, records, problem.residuals(values, records), strict=True):
+    for kernel, record, residual in zip(problem.kernels, problem.records, problem.residuals(values), strict=True):
         channels, seen = kernel.factor.position_channels, record.measured[: len(dataset)]
         if not channels or any(OTHER in name for name in kernel.factor.channels) or np.count_nonzero(seen) < _FEWEST:
             continue
@@ -163,13 +160,13 @@ _MOST_NAMED = 5
 _DAMPING = 1e-9
 
 
-def started(problem: Problem, records: Sequence[FactorRecords]) -> Problem:
+def started(problem: Problem) -> Problem:
     """The problem with the free parameters of each group starting from what a middling record gives for them."""
     if not problem.parameters.nuisances:
         return problem
     nominal, plan, done = problem.parameters.nominal(), problem.blueprint, set[tuple[str, str]]()
-    starts = problem.nuisance_starts(nominal, records)
-    parts = zip(problem.kernels, plan.measurements.items(), records, starts, strict=True)
+    starts = problem.nuisance_starts(nominal)
+    parts = zip(problem.kernels, plan.measurements.items(), problem.records, starts, strict=True)
     for kernel, (instance, measurement), record, own in parts:
         if not isinstance(measurement, GroupedMeasurement) or record.group is None or not len(own):
             continue
@@ -188,10 +185,10 @@ def started(problem: Problem, records: Sequence[FactorRecords]) -> Problem:
                 name = group_name(owner, key, local)
                 if problem.parameters[name].free and problem.parameters[name].prior_sd is None:
                     nominal[problem.parameters.entries_of(name)] = own[names == local, middling]
-    return replace(problem, parameters=problem.parameters.with_nominal(nominal))
+    return problem.with_parameters(problem.parameters.with_nominal(nominal))
 
 
-def mislabelled(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> list[str]:
+def mislabelled(problem: Problem, dataset: Dataset) -> list[str]:
     """Warnings of records that the arm, as it starts, has at the place of another group than they name.
 
     Places are those of the middling record of each group; only groups that are places have them.
@@ -200,8 +197,8 @@ def mislabelled(problem: Problem, records: Sequence[FactorRecords], dataset: Dat
         NotConvergedError: a record has no elastic equilibrium at the nominal values.
     """
     warnings, plan = [], problem.blueprint
-    starts = problem.nuisance_starts(problem.parameters.nominal(), records) if problem.parameters.nuisances else ()
-    parts = zip(problem.kernels, plan.measurements.items(), records, starts, strict=False)
+    starts = problem.nuisance_starts(problem.parameters.nominal()) if problem.parameters.nuisances else ()
+    parts = zip(problem.kernels, plan.measurements.items(), problem.records, starts, strict=False)
     for kernel, (instance, measurement), record, own in parts:
         if not isinstance(measurement, GroupedMeasurement) or record.group is None:
             continue
@@ -223,22 +220,22 @@ def mislabelled(problem: Problem, records: Sequence[FactorRecords], dataset: Dat
     return warnings
 
 
-def restricted(problem: Problem, records: Sequence[FactorRecords]) -> Problem:
+def restricted(problem: Problem) -> Problem:
     """The problem with the groups held that no weighted record belongs to; the same object if there are none."""
-    present = _present(problem, records)
+    present = _present(problem)
     free = {block.name for block in problem.parameters.free if not block.nuisance or block.name in present}
     return problem if len(free) == len(problem.parameters.free) else with_free(problem, free)
 
 
 def with_free(problem: Problem, names: set[str]) -> Problem:
-    return replace(problem, parameters=problem.parameters.with_free(names))
+    return problem.with_parameters(problem.parameters.with_free(names))
 
 
 def untrained(problem: Problem) -> Problem:
     return with_free(problem, {block.name for block in problem.parameters.free if not block.nuisance})
 
 
-def settled(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Array:
+def settled(problem: Problem, values: Array) -> Array:
     """Values with the groups that a fit did not see fitted to their own records, and all else held.
 
     A socket that only records touch which judge has to be found from them: what is left is how far they disagree.
@@ -250,20 +247,20 @@ def settled(problem: Problem, values: Array, records: Sequence[FactorRecords]) -
     """
     fitted = {block.name for block in problem.parameters.free}
     open_names = {block.name for block in problem.blueprint.parameters.free if block.nuisance} - fitted
-    names = open_names & _present(problem, records)
+    names = open_names & _present(problem)
     if not names:
         return values
     parameters = problem.parameters.with_nominal(values)
     without_priors = {block.name: replace(block, prior_sd=None) for block in parameters.nuisances}
-    inner = replace(problem, parameters=parameters.replaced(without_priors).with_free(names), known_ties=())
-    posed = PosedProblem(inner, records)
+    inner = parameters.replaced(without_priors).with_free(names)
+    posed = PosedProblem(problem.with_parameters(inner, tied=False))
     return posed.values(descended(posed, np.zeros(len(posed.scales)), _MOST_STEPS, _DAMPING))
 
 
-def _present(problem: Problem, records: Sequence[FactorRecords]) -> set[str]:
+def _present(problem: Problem) -> set[str]:
     names = set()
     plan = problem.blueprint
-    for (instance, measurement), record in zip(plan.measurements.items(), records, strict=True):
+    for (instance, measurement), record in zip(plan.measurements.items(), problem.records, strict=True):
         if isinstance(measurement, GroupedMeasurement) and record.group is not None:
             owner = owner_of(instance, measurement)
             for number in np.unique(record.group[record.weight > 0]):

@@ -20,7 +20,7 @@ from scipy.special import fdtri, stdtrit
 from armcal.base.arrays import Array, Indices
 from armcal.estimate.validation import Recording, error_dimension
 from armcal.problem.corrected import unexplained
-from armcal.problem.factor_records import correlation_of, noise_roots, unweighted
+from armcal.problem.factor_records import correlation_of, noise_roots
 from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -79,13 +79,13 @@ class KnownDrift:
     covariance: Array  # of the states at each node (n_k x n_s x n_s)
 
     @classmethod
-    def by(cls, problem: Problem, values: Array, records: Sequence[FactorRecords]) -> KnownDrift | None:
+    def by(cls, problem: Problem, values: Array) -> KnownDrift | None:
         """From the records of a fit at the values found; None where nothing drifts."""
-        shared = correlation_of(records)
+        shared = problem.correlation
         if shared is None:
             return None
-        jacobians = [np.moveaxis(jacobian, 1, 2) for jacobian in problem.jacobians(values, records)]
-        states = shared.states([r[:, :, None] for r in problem.weighted_residuals(values, records)])
+        jacobians = [np.moveaxis(jacobian, 1, 2) for jacobian in problem.jacobians(values)]
+        states = shared.states([r[:, :, None] for r in problem.weighted_residuals(values)])
         return cls(states, shared.states(jacobians), shared.covariance)
 
 
@@ -115,7 +115,7 @@ class Predictor:
 
     def residuals(self, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
         """Raw residuals less the known drift, one (n_r x N) a factor; records on the chain of those of the fit."""
-        raw, here = self.problem.residuals(self.values, records), correlation_of(records)
+        raw, here = self.problem.with_records(records).residuals(self.values), correlation_of(records)
         return raw if here is None or self.drift is None else here.taken_off(raw, self.drift.states)
 
     def spreads(self, records: Sequence[FactorRecords], recording: Recording) -> tuple[Spread, ...]:
@@ -180,7 +180,7 @@ class Predictor:
         here, there, parts = correlation_of(records), self.drift if recording == "same" else None, []
         blocks, variance = self.problem.parameters.free, self.noise_scale**2
         drifting = np.array([0.0 if b.drift is None else b.drift.sd**2 for b in blocks for _ in range(b.size)])
-        unknown = unexplained(self.problem, self.values, records) if unknown is None else unknown
+        unknown = unexplained(self.problem.with_records(records), self.values) if unknown is None else unknown
         rows = zip(self.problem.kernels, records, self._slopes(records), unknown, strict=True)
         for i, (kernel, record, slope, own) in enumerate(rows):
             if here is None or there is None:
@@ -196,8 +196,8 @@ class Predictor:
 
     def _slopes(self, records: Sequence[FactorRecords]) -> list[Array]:
         """Residuals by free canonical entries, raw, one (n_r x n_v x N) a factor."""
-        bare = [replace(record, whitening=None) for record in unweighted(records)]
-        pairs = zip(self.problem.kernels, self.problem.jacobians(self.values, bare), strict=True)
+        bare = self.problem.with_records([replace(record, whitening=None) for record in records]).unweighted()
+        pairs = zip(self.problem.kernels, bare.jacobians(self.values), strict=True)
         return [jacobian * np.array(kernel.factor.noise)[:, None, None] for kernel, jacobian in pairs]
 
 

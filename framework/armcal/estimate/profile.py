@@ -8,7 +8,7 @@ noise found, less where priors hold the parameter, since they weigh as they were
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
@@ -22,7 +22,7 @@ from armcal.estimate.estimator import CONFIDENCE, Estimate, Estimator, Progress,
 from armcal.estimate.robust import WeighedFit, Weighing
 from armcal.io.parallel import Executor, Sequential
 from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 from armcal.problem.projection import factor_at_zero
 
 End = Literal["crossed", "bound", "open"]
@@ -74,7 +74,6 @@ class Profile:
 
 
 def profiles(
-    problem: Problem,
     fitted: WeighedFit,
     estimator: Estimator,
     patterns: Sequence[str],
@@ -86,10 +85,10 @@ def profiles(
     Raises:
         ConfigError: a glob matches no free number.
     """
-    records = fitted.records
+    problem = fitted.problem
     if isinstance(estimator, Weighing):
-        estimator, records = estimator.inner, problem.weighted(records, fitted.weights)
-    one, names = partial(_profile, problem, estimator, records, fitted.estimate), profiled(problem, patterns)
+        estimator, problem = estimator.inner, problem.weighted(fitted.weights)
+    one, names = partial(_profile, problem, estimator, fitted.estimate), profiled(problem, patterns)
     return tuple((executor or Sequential()).map(one, names, lambda share: progress("profile likelihood", share)))
 
 
@@ -112,11 +111,9 @@ def profiled(problem: Problem, patterns: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in parameters.select(patterns) if name in numbers)
 
 
-def _profile(
-    problem: Problem, estimator: Estimator, records: tuple[FactorRecords, ...], estimate: Estimate, name: str
-) -> Profile:
+def _profile(problem: Problem, estimator: Estimator, estimate: Estimate, name: str) -> Profile:
     """Pin, fit again, look outward on both sides."""
-    search = _Search(problem, estimator, records, estimate, name)
+    search = _Search(problem, estimator, estimate, name)
     lower, lower_end = search.end(-1.0)
     upper, upper_end = search.end(1.0)
     places = np.array(sorted(search.rises))
@@ -139,10 +136,8 @@ def _profile(
 class _Search:
     """Pinned fits of one parameter, and where their cost passes the quantile."""
 
-    def __init__(
-        self, problem: Problem, estimator: Estimator, records: tuple[FactorRecords, ...], estimate: Estimate, name: str
-    ) -> None:
-        self._problem, self._estimator, self._records, self._name = problem, estimator, records, name
+    def __init__(self, problem: Problem, estimator: Estimator, estimate: Estimate, name: str) -> None:
+        self._problem, self._estimator, self._name = problem, estimator, name
         self._place = problem.parameters.entries_of(name).start
         own, block = estimate.names.index(name), problem.parameters[name]
         self.value = float(estimate.values[self._place])
@@ -153,13 +148,13 @@ class _Search:
         domain = block.domain
         self._bounds = (domain.lower, domain.upper) if isinstance(domain, Interval) else (-np.inf, np.inf)
         self._cost = self._cost_of(estimate.values)
-        self._unit = _unit(problem, records, estimate, own) if known else max(estimate.noise_scale**2, 1e-30)
+        self._unit = _unit(problem, estimate, own) if known else max(estimate.noise_scale**2, 1e-30)
         self._fits = {self.value: estimate.values}
         self.rises = {self.value: 0.0}
         self.failed = 0
 
     def _cost_of(self, values: Array) -> float:
-        posed = PosedProblem(self._problem, self._records)
+        posed = PosedProblem(self._problem)
         return posed.cost(posed.x(values))
 
     def end(self, sign: float) -> tuple[float, End]:
@@ -219,9 +214,9 @@ class _Search:
             nominal = parameters.nominal()
             nominal[self._place] = place
             free = {block.name for block in parameters.free} - {self._name}
-            problem = replace(self._problem, parameters=parameters.with_nominal(nominal).with_free(free))
+            problem = self._problem.with_parameters(parameters.with_nominal(nominal).with_free(free))
             try:
-                solution = self._estimator.solve(problem, self._records, start)
+                solution = self._estimator.solve(problem, start)
                 converged = solution.verdict.converged
             except NotConvergedError:
                 converged = False
@@ -234,10 +229,10 @@ class _Search:
         return self.rises[place]
 
 
-def _unit(problem: Problem, records: Sequence[FactorRecords], estimate: Estimate, own: int) -> float:
+def _unit(problem: Problem, estimate: Estimate, own: int) -> float:
     """What the rise is divided by: variance of the estimate over that by the curvature of the cost alone."""
     parameters = problem.parameters
-    triangle, scales = factor_at_zero(problem, estimate.values, records), parameters.scales()
+    triangle, scales = factor_at_zero(problem, estimate.values), parameters.scales()
     stacked = np.vstack([triangle * scales, np.diag(np.sqrt(parameters.prior_information()) * scales)])
     row = parameters.entries_jacobian(estimate.values)[own] * scales
     by_curvature = float(np.sum((np.linalg.pinv(stacked).T @ row) ** 2))

@@ -10,7 +10,6 @@ residuals, as the mean of an inverse Wishart distribution whose weight is the li
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,8 +18,7 @@ from scipy.special import multigammaln
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.estimate.estimator import SMALLEST_SPREAD, Estimate
-from armcal.problem.factor_records import correlation_of
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 
 _FEWEST = 20
 _SIGNIFICANT_SD = 3.0
@@ -43,9 +41,7 @@ class ResidualSpread:
     freedom: float = math.inf  # degrees of freedom with which the covariance is known
 
 
-def residual_spread(
-    problem: Problem, estimate: Estimate, records: Sequence[FactorRecords], dataset: Dataset
-) -> dict[str, ResidualSpread]:
+def residual_spread(problem: Problem, estimate: Estimate, dataset: Dataset) -> dict[str, ResidualSpread]:
     """The scatter of the residuals that an estimate leaves, by measurement.
 
     Where parameters drift, what neighbours share is the drift: what is left is the declared noise, scaled to the
@@ -58,15 +54,15 @@ def residual_spread(
         dataset: the same ones, in the order of recording or with their ``sequence``.
     """
     known = max(float(estimate.degrees_of_freedom), 1.0)
-    if correlation_of(records) is not None:
+    if problem.correlation is not None:
         noise = {k.factor.name: np.array(k.factor.noise) * estimate.noise_scale for k in problem.kernels}
         return {name: ResidualSpread(np.diag(sd**2), 0.0, 1.0, freedom=known) for name, sd in noise.items()}
     # Parameters that were fitted make residuals too small.
-    freedom = known / max(problem.equations(records), 1)
+    freedom = known / max(problem.equations(), 1)
     channel = "sequence" if dataset.has("sequence") else "record"
     places = dataset.column("sequence") if dataset.has("sequence") else np.arange(len(dataset), dtype=float)
-    residual_spreads, residuals = {}, problem.residuals(estimate.values, records)
-    for kernel, record, residual in zip(problem.kernels, records, residuals, strict=True):
+    residual_spreads, residuals = {}, problem.residuals(estimate.values)
+    for kernel, record, residual in zip(problem.kernels, problem.records, residuals, strict=True):
         weight = np.minimum(record.weight[: record.count], 1.0) * record.measured
         kept = np.flatnonzero(weight > 0)
         if len(kept) < 2:

@@ -48,7 +48,6 @@ from armcal.estimate.identifiability import InverseInformation
 from armcal.estimate.polish import bounded_step
 from armcal.estimate.variance import Axes, VarianceComponents, apply_components, estimate_components
 from armcal.io.parallel import Executor
-from armcal.problem.factor_records import correlation_of
 from armcal.problem.posed import PosedProblem
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -141,19 +140,17 @@ class Distances:
         return tuple(length / limit for length, limit in zip(self.studentised, self.limits, strict=True))
 
 
-def studentised_distances(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], weights: Sequence[Array]
-) -> Distances:
+def studentised_distances(problem: Problem, values: Array, weights: Sequence[Array]) -> Distances:
     """Distances of all records from a fit that gave them these weights (N each, 0 to 1).
 
     The limit is Fisher's quantile at 1 % over the number of records (Bonferroni).
     """
-    counted = problem.weighted(records, weights)
-    inverse = InverseInformation.of(problem.triangular_factor(values, counted), problem.parameters)
-    residuals = remaining(problem, values, records, weights)
+    counted = problem.weighted(weights)
+    inverse = InverseInformation.of(counted.triangular_factor(values), problem.parameters)
+    residuals = remaining(problem, values, weights)
     directions = problem.parameters.entries_jacobian(values) @ inverse.root
     lengths = []
-    for residual, jacobian, weight in zip(residuals, problem.jacobians(values, records), weights, strict=True):
+    for residual, jacobian, weight in zip(residuals, problem.jacobians(values), weights, strict=True):
         reached = np.einsum("avn,vk->akn", jacobian, directions)
         hat = np.einsum("avn,bvn->nab", reached, reached)
         sizes, axes = np.linalg.eigh(np.eye(len(reached)) - (2 * weight[:, None, None] - 1) * hat)
@@ -161,7 +158,7 @@ def studentised_distances(
         along, controlled = np.einsum("nab,an->nb", axes, residual), sizes > UNCONTROLLED
         squares = np.where(controlled, along**2 / np.where(controlled, sizes, 1.0), 0.0)
         lengths.append(np.sqrt(np.sum(squares, axis=1)))
-    freedom = max(1.0, problem.equations(counted) - inverse.spent)
+    freedom = max(1.0, counted.equations() - inverse.spent)
     tests = sum(len(length) for length in lengths)
     rows = [len(residual) for residual in residuals]
     typical = [float(np.median(length)) / median_norm(m) for length, m in zip(lengths, rows, strict=True)]
@@ -171,19 +168,16 @@ def studentised_distances(
     return Distances(tuple(studentised), tuple(limits), tuple(scales))
 
 
-def remaining(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], weights: Sequence[Array]
-) -> tuple[Array, ...]:
+def remaining(problem: Problem, values: Array, weights: Sequence[Array]) -> tuple[Array, ...]:
     """Whitened residuals (n_r x N) times the roots of the records' own weights.
 
     Of drifting records less the drift that they determine with these further weights (N each).
     """
-    residuals, shared = problem.weighted_residuals(values, records), correlation_of(records)
-    weighed = problem.weighted(records, weights) if shared is not None else records
-    correlation = correlation_of(weighed)
-    if shared is None or correlation is None:
+    residuals, shared = problem.weighted_residuals(values), problem.correlation
+    weighed = problem if shared is None else problem.weighted(weights)
+    if shared is None or weighed.correlation is None:
         return residuals
-    states = correlation.states([r[:, :, None] for r in problem.weighted_residuals(values, weighed)])
+    states = weighed.correlation.states([r[:, :, None] for r in weighed.weighted_residuals(values)])
     return tuple(r - shared.taken_up(i, states)[:, : r.shape[1], 0] for i, r in enumerate(residuals))
 
 
@@ -221,28 +215,26 @@ def losses(problem: Problem, name: LossName) -> tuple[Loss, ...]:
     return tuple(tuned(name, kernel.factor.rows) for kernel in problem.kernels)
 
 
-def ones(records: Sequence[FactorRecords]) -> Weights:
-    return tuple(np.ones(record.count) for record in records)
+def ones(problem: Problem) -> Weights:
+    return tuple(np.ones(record.count) for record in problem.records)
 
 
-def norms(problem: Problem, values: Array, records: Sequence[FactorRecords], weights: Weights) -> Weights:
+def norms(problem: Problem, values: Array, weights: Weights) -> Weights:
     """Norm of each record's whitened residual in a fit with these weights, factor by factor (N each)."""
-    return tuple(np.linalg.norm(r, axis=0) for r in remaining(problem, values, records, weights))
+    return tuple(np.linalg.norm(r, axis=0) for r in remaining(problem, values, weights))
 
 
-def scales_of(
-    problem: Problem, lengths: Weights, records: Sequence[FactorRecords], freedom: float
-) -> tuple[float, ...]:
+def scales_of(problem: Problem, lengths: Weights, freedom: float) -> tuple[float, ...]:
     """Each factor's median norm over that of Gaussian noise, with what the fit took up (all but ``freedom``) added.
 
     Half the records may be wrong without it being far off. With less than one degree of freedom the declared noise is
     believed.
     """
-    count = problem.equations(records)
+    count = problem.equations()
     if freedom < 1:
-        return (1.0,) * len(records)
+        return (1.0,) * len(problem.records)
     scales: list[float] = []
-    for kernel, record, length in zip(problem.kernels, records, lengths, strict=True):
+    for kernel, record, length in zip(problem.kernels, problem.records, lengths, strict=True):
         counted = length[record.weight[: record.count] > 0]
         typical = float(np.median(counted)) / median_norm(kernel.factor.rows) if len(counted) else 1.0
         scales.append(max(typical * float(np.sqrt(count / freedom)), SMALLEST_SCALE))
@@ -262,7 +254,6 @@ def robust_cost(
 
 def reweighted(
     problem: Problem,
-    records: Sequence[FactorRecords],
     estimator: Estimator,
     first: Solution,
     name: LossName,
@@ -273,16 +264,16 @@ def reweighted(
     First scales and weights are found in turn until the scales rest; then they are held, and from there on no round
     raises the robust cost, since the weighted squares touch the loss from above.
     """
-    kinds, weights, scales = losses(problem, name), ones(records), (np.inf,) * len(records)
+    kinds, weights, scales = losses(problem, name), ones(problem), (np.inf,) * len(problem.records)
     solution, rounds, settling, freedom = first, list[Round](), True, 0.0
     for number in range(MOST_ROUNDS):
         if not solution.verdict.converged:
             return RobustFit(solution, weights, scales, tuple(rounds))
-        lengths = norms(problem, solution.values, records, weights)
+        lengths = norms(problem, solution.values, weights)
         if not number:
-            freedom = degrees_of_freedom(problem, solution.values, records)
+            freedom = degrees_of_freedom(problem, solution.values)
         if settling:
-            before, scales = scales, scales_of(problem, lengths, records, freedom)
+            before, scales = scales, scales_of(problem, lengths, freedom)
             settling = number < MOST_SCALE_ROUNDS and not np.allclose(scales, before, rtol=SCALE_SETTLED, atol=0)
         following = tuple(loss.weight(u / s) for loss, u, s in zip(kinds, lengths, scales, strict=True))
         moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(weights, following, strict=True))
@@ -294,14 +285,13 @@ def reweighted(
             )
         weights = following
         progress(f"{name} loss", number / MOST_ROUNDS)
-        solution = _continued(solution, problem, problem.weighted(records, weights), estimator)
+        solution = _continued(solution, problem.weighted(weights), estimator)
     text = f"{name}: weights still moved by {rounds[-1].moved:.1e} after {MOST_ROUNDS} rounds"
     return RobustFit(_with_status(solution, text, converged=False), weights, scales, tuple(rounds))
 
 
 def selected(
     problem: Problem,
-    records: Sequence[FactorRecords],
     estimator: Estimator,
     first: RobustFit,
     most: float,
@@ -316,7 +306,7 @@ def selected(
     for number in range(MOST_SELECTIONS):
         if not fit.solution.verdict.converged:
             return fit
-        distances = studentised_distances(problem, fit.solution.values, records, fit.weights)
+        distances = studentised_distances(problem, fit.solution.values, fit.weights)
         following, warning = _selection(distances.beyond(), most)
         key = b"".join(weights.tobytes() for weights in following)
         fit = replace(fit, scales=distances.scales)
@@ -327,10 +317,10 @@ def selected(
             return _noted(fit, "selection goes round in circles", warning)
         seen.append(key)
         progress("reject", number / MOST_SELECTIONS)
-        kept = problem.weighted(records, following)
+        kept = problem.weighted(following)
         moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(fit.weights, following, strict=True))
-        solution = _continued(fit.solution, problem, kept, estimator)
-        rounds = (*fit.rounds, Round("selection", problem.cost(solution.values, kept), moved))
+        solution = _continued(fit.solution, kept, estimator)
+        rounds = (*fit.rounds, Round("selection", kept.cost(solution.values), moved))
         fit = replace(fit, solution=solution, weights=following, rounds=rounds)
         if warning:
             return _noted(fit, "selection ended at the most that may be set aside", warning)
@@ -343,14 +333,12 @@ def _noted(fit: RobustFit, status: str, warning: str = "") -> RobustFit:
     return replace(fit, solution=_with_status(fit.solution, status), warnings=warnings)
 
 
-def influence(
-    problem: Problem, records: Sequence[FactorRecords], fit: RobustFit, name: LossName, trusted: Weights
-) -> Influence:
+def influence(problem: Problem, fit: RobustFit, name: LossName, trusted: Weights) -> Influence:
     """How residuals act under a loss, with Huber's correction for few records [Huber1981].
 
     The noise scale is the root mean square over the trusted records (1, else 0; N each).
     """
-    lengths, count = norms(problem, fit.solution.values, records, fit.weights), problem.equations(records)
+    lengths, count = norms(problem, fit.solution.values, fit.weights), problem.equations()
     spread = slope = squared = noise = 0.0
     for loss, u, s, w, good in zip(losses(problem, name), lengths, fit.scales, fit.weights, trusted, strict=True):
         along, across = loss.stiffness(u / s)
@@ -359,8 +347,8 @@ def influence(
         squared += float(np.sum(along**2 + (loss.dimension - 1) * across**2))
         noise += float(np.sum(good * u**2))
     slope, squared = max(slope / count, 1e-3), squared / count
-    spent = count - degrees_of_freedom(problem, fit.solution.values, records, slope)
-    trusted_freedom = max(1.0, problem.equations(problem.weighted(records, trusted)) - spent)
+    spent = count - degrees_of_freedom(problem, fit.solution.values, slope)
+    trusted_freedom = max(1.0, problem.weighted(trusted).equations() - spent)
     few = 1 + spent / count * max(squared - slope**2, 0.0) / slope**2
     noise_scale = float(np.sqrt(noise / trusted_freedom))
     return Influence(fit.weights, few * float(np.sqrt(spread / max(1.0, count - spent))), slope, noise_scale)
@@ -382,22 +370,22 @@ def _selection(beyond: Weights, most: float) -> tuple[Weights, str]:
     return tuple(np.split(kept, np.cumsum([len(limits) for limits in beyond])[:-1])), text
 
 
-def _continued(before: Solution, problem: Problem, records: Sequence[FactorRecords], estimator: Estimator) -> Solution:
+def _continued(before: Solution, problem: Problem, estimator: Estimator) -> Solution:
     """The next solve, with the work of those before it counted.
 
     A solver that starts at its answer may find no direction to go; if no step would gain anything, it is there.
     """
-    after, past = estimator.solve(problem, records, before.values), before.verdict
+    after, past = estimator.solve(problem, before.values), before.verdict
     verdict = after.verdict
-    if not verdict.converged and _at_rest(problem, records, after.values):
+    if not verdict.converged and _at_rest(problem, after.values):
         verdict = replace(verdict, converged=True, status=f"{verdict.status} (no step gains anything)")
     iterations, seconds = past.iterations + verdict.iterations, past.seconds + verdict.seconds
     return Solution(after.values, replace(verdict, iterations=iterations, seconds=seconds))
 
 
-def _at_rest(problem: Problem, records: Sequence[FactorRecords], values: Array) -> bool:
+def _at_rest(problem: Problem, values: Array) -> bool:
     """Whether the best step within the bounds is shorter than a millionth of a standard deviation."""
-    posed = PosedProblem(problem, records)
+    posed = PosedProblem(problem)
     (lower, upper), x = posed.bounds(), posed.x(values)
     try:
         model = posed.model(x)
@@ -406,7 +394,7 @@ def _at_rest(problem: Problem, records: Sequence[FactorRecords], values: Array) 
     step = bounded_step(model, lower - x, upper - x)
     if step is None:
         return False
-    noise = max(1.0, float(np.sqrt(2 * model.cost / max(1, problem.equations(records)))))
+    noise = max(1.0, float(np.sqrt(2 * model.cost / max(1, problem.equations()))))
     return float(step @ model.hessian @ step) <= (AT_REST * noise) ** 2
 
 
@@ -455,7 +443,7 @@ class WeighedFit:
 
     solution: Solution  # the solver's
     estimate: Estimate  # values and how sure they are
-    records: tuple[FactorRecords, ...]  # those of the fit, with the whitening used; set-aside ones have weight zero
+    problem: Problem  # of its records, with the whitening used; set-aside ones have weight zero
     weights: tuple[Array, ...]  # of each record, factor by factor (N each)
     suspects: tuple[Suspect, ...] = ()  # the farthest first; empty without a loss
     components: VarianceComponents | None = None  # estimated variances, or None
@@ -463,6 +451,10 @@ class WeighedFit:
     rounds: tuple[Round, ...] = ()  # of reweighting and selecting
     warnings: tuple[str, ...] = ()  # what a user should know
     as_declared: Array | None = None
+
+    @property
+    def records(self) -> tuple[FactorRecords, ...]:
+        return self.problem.records
 
     @property
     def set_aside(self) -> tuple[Suspect, ...]:
@@ -487,33 +479,30 @@ class Weighing:
     def solve(
         self,
         problem: Problem,
-        records: Sequence[FactorRecords],
         start: Array,
         progress: Progress = no_progress,
     ) -> Solution:
-        return self._weighed(problem, self._declared(problem, records, start, progress), records, progress)[0].solution
+        return self._weighed(problem, self._declared(problem, start, progress), progress)[0].solution
 
-    def fit(
-        self, problem: Problem, records: Sequence[FactorRecords], start: Array, progress: Progress = no_progress
-    ) -> WeighedFit:
+    def fit(self, problem: Problem, start: Array, progress: Progress = no_progress) -> WeighedFit:
         """Values, and everything that is known of how records weighed."""
-        declared = self._declared(problem, records, start, progress)
-        robust, whitened, components = self._weighed(problem, declared, records, progress)
+        declared = self._declared(problem, start, progress)
+        robust, whitened, components = self._weighed(problem, declared, progress)
         loss, acting, suspects = self.settings.loss, None, list[Suspect]()
         if loss != "none":
-            distances = studentised_distances(problem, robust.solution.values, whitened, robust.weights)
+            distances = studentised_distances(whitened, robust.solution.values, robust.weights)
             rows = zip(problem.kernels, distances.studentised, distances.limits, robust.weights, strict=True)
             for kernel, lengths, limit, weights in rows:
                 for i in np.flatnonzero((lengths > limit) | (weights == 0)):
                     weight = float(weights[i])
                     suspects.append(Suspect(int(i), kernel.factor.name, float(lengths[i]), limit, weight))
         if loss == "huber" or loss == "cauchy":
-            acting = influence(problem, whitened, robust, loss, self._trusted(problem, whitened, robust))
+            acting = influence(whitened, robust, loss, self._trusted(whitened, robust))
         elif loss == "reject":
-            whitened = problem.weighted(whitened, robust.weights)
+            whitened = whitened.weighted(robust.weights)
         return WeighedFit(
             robust.solution,
-            _estimate(problem, whitened, robust.solution, acting),
+            _estimate(whitened, robust.solution, acting),
             whitened,
             robust.weights,
             tuple(sorted(suspects, key=lambda suspect: -suspect.distance)),
@@ -524,53 +513,49 @@ class Weighing:
             None if components is None else declared.solution.values,
         )
 
-    def _declared(
-        self, problem: Problem, records: Sequence[FactorRecords], start: Array, progress: Progress
-    ) -> RobustFit:
-        return self._robust(problem, tuple(records), self.inner.solve(problem, records, start, progress), progress)
+    def _declared(self, problem: Problem, start: Array, progress: Progress) -> RobustFit:
+        return self._robust(problem, self.inner.solve(problem, start, progress), progress)
 
     def _weighed(
-        self, problem: Problem, robust: RobustFit, records: Sequence[FactorRecords], progress: Progress
-    ) -> tuple[RobustFit, tuple[FactorRecords, ...], VarianceComponents | None]:
+        self, problem: Problem, robust: RobustFit, progress: Progress
+    ) -> tuple[RobustFit, Problem, VarianceComponents | None]:
         """The fit, its records whitened, and components: these and values in turn, until the components rest.
 
         Begins with a fit by the declared noise. Suspects are no evidence of the variances.
         """
-        axes, whitened, before = self.settings.axes, tuple(records), None
+        axes, whitened, before = self.settings.axes, problem, None
         for number in range(MOST_ESTIMATES if self.settings.estimate else 0):
             if not robust.solution.verdict.converged:
                 break
             progress("variance components", number / MOST_ESTIMATES)
-            counted = problem.weighted(records, self._trusted(problem, whitened, robust))
+            counted = problem.weighted(self._trusted(whitened, robust))
             of_joints = self.settings.estimate is True
-            components = estimate_components(problem, robust.solution.values, counted, axes, of_joints)
+            components = estimate_components(counted, robust.solution.values, axes, of_joints)
             components = replace(components, rounds=number + 1)
             if before is not None and components.close_to(before):
                 return robust, whitened, components
             before = components
-            whitened = apply_components(problem, robust.solution.values, records, components, axes)
-            again = self.inner.solve(problem, whitened, robust.solution.values)
-            robust = self._robust(problem, whitened, again, progress)
+            whitened = apply_components(problem, robust.solution.values, components, axes)
+            again = self.inner.solve(whitened, robust.solution.values)
+            robust = self._robust(whitened, again, progress)
         return robust, whitened, before
 
-    def _robust(
-        self, problem: Problem, records: tuple[FactorRecords, ...], first: Solution, progress: Progress
-    ) -> RobustFit:
+    def _robust(self, problem: Problem, first: Solution, progress: Progress) -> RobustFit:
         loss = self.settings.loss
         if loss == "none" or not first.verdict.converged or not problem.increments:
-            return RobustFit(first, ones(records), (1.0,) * len(records), ())
-        huber = reweighted(problem, records, self.inner, first, "huber", progress)
+            return RobustFit(first, ones(problem), (1.0,) * len(problem.records), ())
+        huber = reweighted(problem, self.inner, first, "huber", progress)
         if loss == "huber" or not huber.solution.verdict.converged:
             return huber
         if loss == "cauchy":
-            return reweighted(problem, records, self.inner, huber.solution, "cauchy", progress)
-        return selected(problem, records, self.inner, huber, self.settings.most_rejected, progress)
+            return reweighted(problem, self.inner, huber.solution, "cauchy", progress)
+        return selected(problem, self.inner, huber, self.settings.most_rejected, progress)
 
-    def _trusted(self, problem: Problem, records: tuple[FactorRecords, ...], robust: RobustFit) -> tuple[Array, ...]:
+    def _trusted(self, problem: Problem, robust: RobustFit) -> tuple[Array, ...]:
         """1 for records that are evidence of the variances, 0 for suspects of a robust fit."""
         if self.settings.loss == "none":
             return robust.weights
-        distances = studentised_distances(problem, robust.solution.values, records, robust.weights)
+        distances = studentised_distances(problem, robust.solution.values, robust.weights)
         return tuple(np.where(beyond > 1, 0.0, 1.0) for beyond in distances.beyond())
 
 
@@ -580,14 +565,13 @@ def weighed(estimator: Estimator, settings: NoiseSettings) -> Estimator:
 
 def fit(
     problem: Problem,
-    records: Sequence[FactorRecords],
     estimator: Estimator,
     start: Array,
     progress: Progress = no_progress,
 ) -> WeighedFit:
     if isinstance(estimator, Weighing):
-        return estimator.fit(problem, records, start, progress)
-    return plain_fit(problem, records, estimator.solve(problem, records, start, progress))
+        return estimator.fit(problem, start, progress)
+    return plain_fit(problem, estimator.solve(problem, start, progress))
 
 
 @dataclass(frozen=True)
@@ -596,29 +580,23 @@ class _Held:
 
     solution: Solution
 
-    def solve(
-        self, problem: Problem, records: Sequence[FactorRecords], start: Array, progress: Progress = no_progress
-    ) -> Solution:
+    def solve(self, problem: Problem, start: Array, progress: Progress = no_progress) -> Solution:
         return self.solution
 
 
-def held_fit(
-    problem: Problem, records: Sequence[FactorRecords], estimator: Estimator, solution: Solution
-) -> WeighedFit:
+def held_fit(problem: Problem, estimator: Estimator, solution: Solution) -> WeighedFit:
     at = _Held(solution)
     own = replace(estimator, inner=at) if isinstance(estimator, Weighing) else at
-    return fit(problem, records, own, solution.values)
+    return fit(problem, own, solution.values)
 
 
-def plain_fit(problem: Problem, records: Sequence[FactorRecords], solution: Solution) -> WeighedFit:
-    return WeighedFit(solution, _estimate(problem, records, solution), tuple(records), ones(records))
+def plain_fit(problem: Problem, solution: Solution) -> WeighedFit:
+    return WeighedFit(solution, _estimate(problem, solution), problem, ones(problem))
 
 
-def _estimate(
-    problem: Problem, records: Sequence[FactorRecords], solution: Solution, acting: Influence | None = None
-) -> Estimate:
+def _estimate(problem: Problem, solution: Solution, acting: Influence | None = None) -> Estimate:
     """The estimate at a solution; where a solver gave up on the edge of what springs hold, there may be none."""
     try:
-        return estimate(problem, records, solution, acting)
+        return estimate(problem, solution, acting)
     except NotConvergedError as fault:
         raise fault if solution.verdict.converged else gave_up(solution.verdict) from fault

@@ -18,7 +18,7 @@ from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.measure.measurement import Measurement
 from armcal.problem.problem import Problem
-from armcal.problem.readings import disturbed_records
+from armcal.problem.readings import disturbed
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,9 @@ class TruthfulSimulator(Protocol):
 def measured_without_noise(request: SimulationRequest, commands: Dataset) -> Mapping[str, Array]:
     """What every instrument would read at these commands if the parameters' nominal values were the truth (SI)."""
     fixed = request.parameters.with_free(())
-    problem = Problem.build(
-        request.arms, request.measurements, fixed, request.environment, commands, evaluator="interpreted"
-    )
-    return problem.by_channel(problem.predict(fixed.nominal(), problem.records(commands)))
+    parts = (request.arms, request.measurements, fixed, request.environment, commands)
+    problem = Problem.build(*parts, evaluator="interpreted")
+    return problem.by_channel(problem.predict(fixed.nominal()))
 
 
 def measured_with_noise(
@@ -88,10 +87,10 @@ def measured_with_noise(
         sizes = [sd if length_noise is None or kind != "length" else length_noise for sd, kind in declared]
         rows = [random.normal(0.0, size, len(commands)) for size in sizes if factor.output_channels]
         noise.append(np.array(rows) if rows else np.zeros((len(sizes), len(commands))))
-    disturbed = disturbed_records(problem, fixed.nominal(), problem.records(read), noise)
+    read_off = disturbed(problem, fixed.nominal(), noise)
     measurements = {
         channel: factor_records.record[kernel.factor.channels.index(channel), : factor_records.count]
-        for kernel, factor_records in zip(problem.kernels, disturbed, strict=True)
+        for kernel, factor_records in zip(problem.kernels, read_off.records, strict=True)
         for channel in set(kernel.factor.output_channels) & set(kernel.factor.channels)
     }
     return {channel: measurements.get(channel, values) for channel, values in exact.items()}

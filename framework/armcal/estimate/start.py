@@ -30,7 +30,7 @@ from armcal.estimate.polish import descended
 from armcal.measure.instrument import Certifying, Proposing, Reading
 from armcal.measure.measurement import Carried, borrowed_names
 from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 from armcal.problem.rigid_alignment import (
     Alignment,
     Sighting,
@@ -100,18 +100,15 @@ class Placing:
                 moved[parameters.entries_of(name)] += step
         return moved
 
-    def reached(self, problem: Problem, records: Sequence[FactorRecords], sighting: Sighting, shown: Tools) -> Array:
+    def reached(self, problem: Problem, sighting: Sighting, shown: Tools) -> Array:
         """The value vector at which the instrument would see ``shown`` in the sighting's records, or nearest to it."""
         few = sighting.thinned(_POSES)
         at = np.searchsorted(sighting.chosen, few.chosen)
-        some = [replace(r, weight=0 * r.weight) for r in problem.subset(records, few.chosen)]
-        weight = problem.subset(records, few.chosen)[sighting.kernel].weight
-        some[sighting.kernel] = replace(
-            shown_instead(problem, some[sighting.kernel], sighting.kernel, shown.subset(at)), weight=weight
-        )
+        some = shown_instead(problem.subset(few.chosen), sighting.kernel, shown.subset(at))
+        alone = [np.full(some.count, float(number == sighting.kernel)) for number in range(len(some.records))]
         own = {name: replace(problem.parameters[name], prior_sd=None) for name in self.names}
         parameters = problem.parameters.replaced(own).with_free(self.names)
-        posed = PosedProblem(replace(problem, parameters=parameters, known_ties=()), some)
+        posed = PosedProblem(some.weighted(alone).with_parameters(parameters, tied=False))
         seen = replace(
             few, measured=shown.places[:, at], turned=few.turned if few.turned is None else shown.rotations[at]
         )
@@ -120,7 +117,7 @@ class Placing:
             try:
                 start = posed.x(_turned(parameters, random) if draw else parameters.nominal())
                 values = posed.values(descended(posed, start, _MOST_STEPS, _DAMPING, 1e-9))
-                off = seen.off(tools_of(posed.problem, values, some[sighting.kernel], sighting.kernel))
+                off = seen.off(tools_of(some, values, sighting.kernel))
             except NotConvergedError:
                 continue
             if off < least:
@@ -130,11 +127,11 @@ class Placing:
         return best
 
 
-def placings(problem: Problem, records: Sequence[FactorRecords], sighting: Sighting) -> tuple[Placing, Placing]:
+def placings(problem: Problem, sighting: Sighting) -> tuple[Placing, Placing]:
     """Of the free parameters without a prior, and of all free ones."""
-    poses = problem.subset(records, sighting.thinned(_POSES).chosen)[sighting.kernel]
+    poses = problem.subset(sighting.thinned(_POSES).chosen)
     nominal = problem.parameters.nominal()
-    here = tools_of(problem, nominal, poses, sighting.kernel)
+    here = tools_of(poses, nominal, sighting.kernel)
     size, motions, held = max(spread_of(here.places), 1e-9), list[_Motion](), list[_Motion]()
     for block in problem.parameters.free:
         if block.nuisance or block.unit not in ("m", "rad", "1"):
@@ -144,7 +141,7 @@ def placings(problem: Problem, records: Sequence[FactorRecords], sighting: Sight
         for unit in np.eye(block.domain.dof):
             moved = nominal.copy()
             moved[place] = block.domain.retract(np.array(block.nominal), step * unit)
-            there = tools_of(problem, moved, poses, sighting.kernel)
+            there = tools_of(poses, moved, sighting.kernel)
             moves.append(Tools((there.places - here.places) / step, (there.rotations - here.rotations) / step))
         for of_base, twist_of in ((True, _base_twist), (False, _tool_twist)):
             twists = [twist for twist in (twist_of(here, move, size) for move in moves) if twist is not None]
@@ -251,7 +248,7 @@ class Start:
         return tuple(starts) if self.taken else (parameters.nominal(), *starts)
 
 
-def aligned_start(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> Start:
+def aligned_start(problem: Problem, dataset: Dataset) -> Start:
     """The start that the records give: the configured one where nothing that may move is far off, or measured.
 
     Priors are kept: what has one is moved only within it, and is otherwise said to contradict the records.
@@ -263,37 +260,36 @@ def aligned_start(problem: Problem, records: Sequence[FactorRecords], dataset: D
         arms = {name for measurement in problem.blueprint.measurements.values() for name in measurement.arms}
         if len(arms) != 1 or not problem.increments:
             return as_configured
-        seen = [sighting_of(problem, records, dataset, i, MOST_RECORDS) for i in range(len(problem.kernels))]
+        seen = [sighting_of(problem, dataset, i, MOST_RECORDS) for i in range(len(problem.kernels))]
         sighting = max((s for s in seen if s is not None), key=lambda s: len(s.chosen), default=None)
         if sighting is None:
             return as_configured
-        placing, held = placings(problem, records, sighting)
-        tools = tools_of(problem, nominal, problem.subset(records, sighting.chosen)[sighting.kernel], sighting.kernel)
+        placing, held = placings(problem, sighting)
+        tools = tools_of(problem.subset(sighting.chosen), nominal, sighting.kernel)
         if not held.stands_anywhere:
             return as_configured
         chosen = placing if placing.stands_anywhere else held
         ranked = alignments(tools, sighting.measured, chosen.basis, sighting.turned)
-        return _chosen(problem, records, sighting, tools, chosen, ranked) if ranked else as_configured
+        return _chosen(problem, sighting, tools, chosen, ranked) if ranked else as_configured
     except NotConvergedError:
         return as_configured
 
 
 def _chosen(
     problem: Problem,
-    records: Sequence[FactorRecords],
     sighting: Sighting,
     tools: Tools,
     placing: Placing,
     ranked: Sequence[Alignment],
 ) -> Start:
     """The best alignment that the free parameters reach, if it is much better than the configuration."""
-    configured, some = sighting.off(tools), problem.subset(records, sighting.chosen)[sighting.kernel]
+    configured, some = sighting.off(tools), problem.subset(sighting.chosen)
     gauges = undetermined(tools, ranked[0], placing.basis)
     start = Start(problem, placing.names, (), ranked[0], configured, configured, False, gauges)
     if configured <= FAR * sighting.size:
         return start
-    reached = [placing.reached(problem, records, sighting, shown_by(a, tools, sighting)) for a in ranked]
-    left = [sighting.off(tools_of(problem, values, some, sighting.kernel)) for values in reached]
+    reached = [placing.reached(problem, sighting, shown_by(a, tools, sighting)) for a in ranked]
+    left = [sighting.off(tools_of(some, values, sighting.kernel)) for values in reached]
     order = np.argsort(left)
     best, start = reached[order[0]], replace(start, vectors=tuple(reached[i] for i in order))
     if min(left) * BETTER > configured:
@@ -304,9 +300,7 @@ def _chosen(
     nominal, parameters = problem.parameters.nominal(), problem.parameters
     for name in (name for name in placing.names if parameters[name].prior_sd is None):
         nominal[parameters.entries_of(name)] = best[parameters.entries_of(name)]
-    return replace(
-        start, problem=replace(problem, parameters=parameters.with_nominal(nominal)), left=min(left), taken=True
-    )
+    return replace(start, problem=problem.with_parameters(parameters.with_nominal(nominal)), left=min(left), taken=True)
 
 
 def shown_by(alignment: Alignment, tools: Tools, sighting: Sighting) -> Tools:
@@ -337,7 +331,7 @@ def pose_words(alignment: Alignment) -> str:
     return f"({x:.1f}, {y:.1f}, {z:.1f}) mm, roll, pitch, yaw ({roll:.2f}, {pitch:.2f}, {yaw:.2f}) deg"
 
 
-def with_proposals(start: Start, records: Sequence[FactorRecords], dataset: Dataset) -> Start:
+def with_proposals(start: Start, dataset: Dataset) -> Start:
     """The start with what measurements propose, where it is much nearer than the configuration.
 
     A parameter with a prior keeps its nominal value, and starts where it was proposed.
@@ -349,18 +343,16 @@ def with_proposals(start: Start, records: Sequence[FactorRecords], dataset: Data
     lenders_first = sorted(enumerate(measurements), key=lambda numbered: bool(borrowed_names(numbered[1])))
     for number, measurement in lenders_first:
         if isinstance(measurement, Proposing):
-            start = _with_proposal(start, records, dataset, number, measurement)
+            start = _with_proposal(start, dataset, number, measurement)
     return start
 
 
-def _with_proposal(
-    start: Start, records: Sequence[FactorRecords], dataset: Dataset, number: int, measurement: Proposing
-) -> Start:
+def _with_proposal(start: Start, dataset: Dataset, number: int, measurement: Proposing) -> Start:
     problem, name = start.problem, start.problem.kernels[number].factor.name
     parameters, nominal = problem.parameters, problem.parameters.nominal()
     before = start.vectors[0] if start.vectors else nominal
     own = _own(problem, name)
-    proposal = measurement.propose(_reading(problem, nominal, before, records, dataset, number))
+    proposal = measurement.propose(_reading(problem, nominal, before, dataset, number))
     if any(own[local].prior_sd is None for local in proposal.undetermined):
         hint = f"{proposal.close} Or give priors, or hold {', '.join(proposal.undetermined)}."
         raise ProblemError(f"{name}: {proposal.open}", where=dataset.where(), hint=hint)
@@ -372,21 +364,21 @@ def _with_proposal(
         vector[place] = value
         if own[local].prior_sd is None:
             moved[place] = value
-    configured, left = (_typical(problem, values, records, number) for values in (nominal, vector))
+    configured, left = (_typical(problem, values, number) for values in (nominal, vector))
     if left * BETTER > configured:
         return start
     names = (*start.names, *(own[local].name for local in proposal.values))
-    placed, vectors = replace(problem, parameters=parameters.with_nominal(moved)), (vector, *start.vectors)
+    placed, vectors = problem.with_parameters(parameters.with_nominal(moved)), (vector, *start.vectors)
     return replace(start, problem=placed, names=names, vectors=vectors, configured=configured, left=left, taken=True)
 
 
-def certificates(problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset) -> dict[str, str]:
+def certificates(problem: Problem, values: Array, dataset: Dataset) -> dict[str, str]:
     """What measurements show of whether another answer could be better, sentences by their names."""
     sentences = {}
     for number, kernel in enumerate(problem.kernels):
         measurement = problem.blueprint.measurements[kernel.factor.name]
         if isinstance(measurement, Certifying):
-            reading = _reading(problem, values, values, records, dataset, number)
+            reading = _reading(problem, values, values, dataset, number)
             sentences[kernel.factor.name] = measurement.certificate(reading)
     return {name: text for name, text in sentences.items() if text}
 
@@ -396,16 +388,14 @@ def _own(problem: Problem, name: str) -> dict[str, ParameterBlock]:
     return {b.name.removeprefix(f"{name}."): b for b in blocks if b.name.startswith(f"{name}.")}
 
 
-def _reading(
-    problem: Problem, own_values: Array, values: Array, records: Sequence[FactorRecords], dataset: Dataset, number: int
-) -> Reading:
+def _reading(problem: Problem, own_values: Array, values: Array, dataset: Dataset, number: int) -> Reading:
     """What a measurement read; arm and borrowed parameters are at ``values``, its own at ``own_values``."""
     name, parameters = problem.kernels[number].factor.name, problem.parameters
     own, lent = _own(problem, name), borrowed_names(problem.blueprint.measurements[name])
     borrowed = {local: values[parameters.entries_of(full)] for local, full in lent.items()}
-    seen = np.flatnonzero(records[number].measured)
+    seen = np.flatnonzero(problem.records[number].measured)
     return Reading(
-        carriers_of(problem, values, problem.subset(records, seen), dataset.subset(seen), number),
+        carriers_of(problem.subset(seen), values, dataset.subset(seen), number),
         {c.removeprefix(f"{name}."): dataset.column(c)[seen] for c in problem.kernels[number].factor.output_channels},
         {**{local: own_values[parameters.entries_of(block.name)] for local, block in own.items()}, **borrowed},
         frozenset(local for local, block in own.items() if block.free),
@@ -413,16 +403,14 @@ def _reading(
     )
 
 
-def carriers_of(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset, number: int
-) -> dict[str, Array]:
+def carriers_of(problem: Problem, values: Array, dataset: Dataset, number: int) -> dict[str, Array]:
     """What carries a measurement in each record (base_T_frame, N x 4 x 4, m): the tool, or frames of a still arm."""
     factor = problem.kernels[number].factor
     measurement, still = problem.blueprint.measurements[factor.name], np.tile(np.eye(4), (len(dataset), 1, 1))
     frames = {BASE_FRAME: still}
     for name in set(measurement.carriers.values()) if isinstance(measurement, Carried) else {TOOL_FRAME}:
         if name == TOOL_FRAME:
-            columns = problem.grouped[number].predict(values, records[number]).tools[0]
+            columns = problem.grouped[number].predict(values, problem.records[number]).tools[0]
             frames[name] = np.concatenate([columns.transpose(2, 1, 0), still[:, 3:]], axis=1)
         else:
             frames[name] = _frame(problem, values, dataset, measurement.arms[0], name)
@@ -442,8 +430,8 @@ def _frame(problem: Problem, values: Array, dataset: Dataset, of: str, name: str
     return np.asarray(shown.reshape(4, -1, 4).transpose(1, 0, 2))
 
 
-def _typical(problem: Problem, values: Array, records: Sequence[FactorRecords], number: int) -> float:
-    points = records[number].points_of(problem.kernels[number].factor) * records[number].measured
-    squares = np.sum(problem.residuals(values, records)[number] ** 2, axis=0)[points > 0]
+def _typical(problem: Problem, values: Array, number: int) -> float:
+    points = problem.records[number].points_of(problem.kernels[number].factor) * problem.records[number].measured
+    squares = np.sum(problem.residuals(values)[number] ** 2, axis=0)[points > 0]
     errors = np.sqrt(squares / points[points > 0])
     return float(np.median(np.where(np.isfinite(errors), errors, np.inf))) if len(errors) else np.inf

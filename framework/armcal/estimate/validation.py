@@ -64,29 +64,25 @@ def summarise(errors: Array) -> ErrorSummary:
     )
 
 
-def record_errors(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], training: Sequence[FactorRecords] | None = None
-) -> Array:
+def record_errors(problem: Problem, values: Array, training: Problem | None = None) -> Array:
     """How far each record's measurement lies from the prediction; root mean square over several measurements (N).
 
     In m, angles left out; of images, or angles alone, in their unit (``error_unit``). Groups that the problem holds,
     as those that no training record touched, are fitted to these records first: what is left is how far the records
-    of a group disagree. ``training`` are the records that determine how far drifting parameters had drifted; without
+    of a group disagree. ``training`` has the records that determine how far drifting parameters had drifted; without
     them they are at rest.
     """
-    return errors_and_turns(problem, values, records, training)[0]
+    return errors_and_turns(problem, values, training)[0]
 
 
-def errors_and_turns(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], training: Sequence[FactorRecords] | None = None
-) -> tuple[Array, Array | None]:
+def errors_and_turns(problem: Problem, values: Array, training: Problem | None = None) -> tuple[Array, Array | None]:
     """As ``record_errors``, and errors of orientations (rad, N): the angle of the turn that is left.
 
     None where no orientation is measured beside lengths.
     """
-    values = settled(problem, values, records)
-    raw = problem.residuals(values, records) if training is None else residuals(problem, values, records, training)
-    own = tuple(zip(problem.kernels, records, raw, strict=True))
+    values = settled(problem, values)
+    raw = problem.residuals(values) if training is None else residuals(problem, values, training)
+    own = tuple(zip(problem.kernels, problem.records, raw, strict=True))
     return _sizes(own, error_dimension(problem)), _sizes(own, "angle") if measures_turns(problem) else None
 
 
@@ -110,10 +106,10 @@ def _sizes(own: Sequence[tuple[Kernel, FactorRecords, Array]], counted: str) -> 
         return np.asarray(np.sqrt(squares / count))
 
 
-def errors_apart(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Array:
+def errors_apart(problem: Problem, values: Array) -> Array:
     """As ``record_errors`` at rest, of each measurement (measurements x N)."""
-    raw, counted = problem.residuals(values, records), error_dimension(problem)
-    own = zip(problem.kernels, records, raw, strict=True)
+    raw, counted = problem.residuals(values), error_dimension(problem)
+    own = zip(problem.kernels, problem.records, raw, strict=True)
     return np.array([_sizes(((kernel, record, rows),), counted) for kernel, record, rows in own])
 
 
@@ -209,20 +205,19 @@ def folds(count: int, number: int, seed: int, poses: Indices | None = None) -> t
 class FitTask:
     """A fit on some records, judged on others; small enough to send to another process."""
 
-    problem: Problem
+    problem: Problem  # of all records
     estimator: Estimator
     start: Array
-    records: tuple[FactorRecords, ...]
     split: Split
 
-    def parts(self) -> tuple[tuple[FactorRecords, ...], tuple[FactorRecords, ...]]:
-        train, held = (self.problem.subset(self.records, part) for part in (self.split.train, self.split.holdout))
-        return train, held
+    def parts(self) -> tuple[Problem, Problem]:
+        """Of the records that train, and of those that judge."""
+        return self.problem.subset(self.split.train), self.problem.subset(self.split.holdout)
 
     def trained(self) -> FitTask:
         """The task without the groups that no training record belongs to."""
-        train, _ = self.parts()
-        return replace(self, problem=restricted(self.problem, train))
+        held = restricted(self.problem.subset(self.split.train))
+        return replace(self, problem=held.with_records(self.problem.records))
 
 
 @dataclass(frozen=True)
@@ -267,7 +262,7 @@ def fit_and_judge(task: FitTask) -> JudgedFit:
     began, task = time.perf_counter(), task.trained()
     try:
         train, held = task.parts()
-        solution = task.estimator.solve(task.problem, train, task.start)
+        solution = task.estimator.solve(train, task.start)
         return judged_fit(task, solution, train, held, began)
     except NotConvergedError:
         return failed_fit(task, began)
@@ -276,12 +271,12 @@ def fit_and_judge(task: FitTask) -> JudgedFit:
 def judged_fit(
     task: FitTask,
     solution: Solution,
-    train: Sequence[FactorRecords],
-    held: Sequence[FactorRecords],
+    train: Problem,
+    held: Problem,
     began: float,
 ) -> JudgedFit:
-    judged, turns = errors_and_turns(task.problem, solution.values, held, train)
-    at_rest = record_errors(task.problem, solution.values, held)
+    judged, turns = errors_and_turns(held, solution.values, train)
+    at_rest = record_errors(held, solution.values)
     if not solution.verdict.converged:
         return failed_fit(task, began)
     return JudgedFit(judged, at_rest, turns, True, time.perf_counter() - began, values=solution.values)
@@ -296,7 +291,6 @@ def failed_fit(task: FitTask, began: float) -> JudgedFit:
 
 def cross_validate(
     problem: Problem,
-    records: Sequence[FactorRecords],
     splits: Sequence[Split],
     estimator: Estimator,
     start: Array,
@@ -304,9 +298,9 @@ def cross_validate(
     executor: Executor | None = None,
     judge: Callable[[FitTask], JudgedFit] = fit_and_judge,
 ) -> CrossValidation:
-    tasks = [FitTask(problem, estimator, start, tuple(records), split) for split in splits]
+    tasks = [FitTask(problem, estimator, start, split) for split in splits]
     fits = (executor or Sequential()).map(judge, tasks, lambda done: progress("cross-validation", done))
-    errors, at_rest, turns = np.full((3, records[0].count), np.nan)
+    errors, at_rest, turns = np.full((3, problem.count), np.nan)
     for split, fit in zip(splits, fits, strict=True):
         errors[split.holdout], at_rest[split.holdout] = fit.errors, fit.at_rest
         turns[split.holdout] = np.nan if fit.turns is None else fit.turns
@@ -326,16 +320,16 @@ class Halves:
     errors: Array  # of records by the fit to the other half, on average (K; thousandths, as errors are shown)
 
 
-def halves(problem: Problem, records: Sequence[FactorRecords], estimator: Estimator, start: Array) -> Halves | None:
+def halves(problem: Problem, estimator: Estimator, start: Array) -> Halves | None:
     """Fits to halves of records as these weigh; None where no such pose is free, or the records are few."""
     named = {n: f"{n}.{m.place[0]}" for n, m in problem.blueprint.measurements.items() if isinstance(m, Placed)}
-    free, count = set(problem.parameters.coordinate_names), records[0].count
+    free, count = set(problem.parameters.coordinate_names), problem.count
     placed = {name: pose for name, pose in named.items() if f"{pose}_x" in free}
     if not placed or count < _FEWEST_HALVED:
         return None
     apart, errors = {name: np.full((_HALVINGS, 2), np.nan) for name in placed}, np.full(_HALVINGS, np.nan)
     for number in range(_HALVINGS):
-        crossed = cross_validate(problem, records, folds(count, 2, number), estimator, start)
+        crossed = cross_validate(problem, folds(count, 2, number), estimator, start)
         one, other = (fit.values for fit in crossed.fits)
         if one is None or other is None:
             continue

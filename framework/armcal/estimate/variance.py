@@ -30,7 +30,7 @@ from armcal.errors import ProblemError
 from armcal.estimate.estimator import CONFIDENCE, degrees_of_freedom
 from armcal.estimate.identifiability import correlated_pairs
 from armcal.estimate.polish import bounded_step
-from armcal.problem.factor_records import by_covariance, correlation_of, noise_roots, transformed, whitening_of
+from armcal.problem.factor_records import by_covariance, noise_roots, transformed, whitening_of
 from armcal.problem.many_points import with_few_points
 from armcal.problem.problem import FactorRecords, NormalEquations, Problem
 
@@ -215,7 +215,6 @@ class VarianceComponents:
 def estimate_components(
     problem: Problem,
     values: Array,
-    records: Sequence[FactorRecords],
     axes: Axes = "together",
     of_joints: bool = True,
 ) -> VarianceComponents:
@@ -226,17 +225,17 @@ def estimate_components(
     Raises:
         ProblemError: there are not more equations than parameters and components, or parameters drift.
     """
-    problem, records = with_few_points(problem, records)
-    sources = [s for s in _sources(problem, values, records, axes) if of_joints or s.kind == "instrument"]
-    sizes = np.array([_mean_variance(source.bases, records) for source in sources])
+    problem = with_few_points(problem)
+    sources = [s for s in _sources(problem, values, axes) if of_joints or s.kind == "instrument"]
+    sizes = np.array([_mean_variance(source.bases, problem.records) for source in sources])
     joints = np.array([source.kind == "joint" for source in sources])
     seen = ~joints | (sizes > SMALLEST_SHARE * float(sizes[joints].max(initial=0.0)))
-    _require_freedom(problem, values, records, int(seen.sum()))
+    _require_freedom(problem, values, int(seen.sum()))
     chosen, sizes = [source for source, moves in zip(sources, seen, strict=True) if moves], sizes[seen]
-    terms = _terms(problem, values, records, [source.bases for source in chosen], sizes)
+    terms = _terms(problem, values, [source.bases for source in chosen], sizes)
     maximum = maximise(terms, problem.parameters.prior_information(), ~joints[seen])
     # Times the typical noise that is declared of the first measurement.
-    roots = noise_roots(problem.kernels[0].factor, records[0])
+    roots = noise_roots(problem.kernels[0].factor, problem.records[0])
     rms = np.sqrt(maximum.theta * np.mean(np.sum(roots**2, axis=2)))
     deviations = np.sqrt(np.maximum(np.diag(maximum.covariance), 0.0)) / sizes
     rows = zip(chosen, maximum.theta / sizes, deviations, maximum.theta / maximum.theta.sum(), rms, strict=True)
@@ -251,19 +250,19 @@ def estimate_components(
 def apply_components(
     problem: Problem,
     values: Array,
-    records: Sequence[FactorRecords],
     variance_components: VarianceComponents,
     axes: Axes,
-) -> tuple[FactorRecords, ...]:
-    sources = _sources(problem, values, records, axes)
+) -> Problem:
+    """The problem of records whitened by estimated variances."""
+    sources = _sources(problem, values, axes)
     variance = {c.name: c.sd**2 for c in variance_components.components}
     result = []
-    for place, (kernel, factor_records) in enumerate(zip(problem.kernels, records, strict=True)):
+    for place, (kernel, factor_records) in enumerate(zip(problem.kernels, problem.records, strict=True)):
         base = whitening_of(kernel.factor, factor_records)
         total = sum((variance.get(s.name, 0.0) * s.bases[place] for s in sources), np.array(0.0))
         padded = np.pad(total, ((0, 0), (0, 0), (0, base.shape[2] - factor_records.count)), mode="edge")
         result.append(replace(factor_records, whitening=transformed(by_covariance(padded), base)))
-    return tuple(result)
+    return problem.with_records(result)
 
 
 @dataclass(frozen=True)
@@ -276,9 +275,9 @@ class _Source:
     bases: list[Array]
 
 
-def _sources(problem: Problem, values: Array, records: Sequence[FactorRecords], axes: Axes) -> list[_Source]:
+def _sources(problem: Problem, values: Array, axes: Axes) -> list[_Source]:
     """Instruments, or their axes, then joints."""
-    pairs = list(zip(problem.kernels, records, strict=True))
+    pairs = list(zip(problem.kernels, problem.records, strict=True))
     nothing = [np.zeros((kernel.factor.rows,) * 2 + (record.count,)) for kernel, record in pairs]
     sources = []
     for place, (kernel, record) in enumerate(pairs):
@@ -293,7 +292,7 @@ def _sources(problem: Problem, values: Array, records: Sequence[FactorRecords], 
             bases = [own if i == place else none for i, none in enumerate(nothing)]
             sources.append(_Source(label, "instrument", "1", bases))
     joints = command_channels(problem.blueprint.arms)
-    slopes = problem.channel_slopes(values, records, list(joints))
+    slopes = problem.channel_slopes(values, list(joints))
     whitened = [
         transformed(whitening_of(kernel.factor, record)[:, :, : record.count], slope)
         for (kernel, record), slope in zip(pairs, slopes, strict=True)
@@ -313,13 +312,11 @@ def _mean_variance(basis: Sequence[Array], records: Sequence[FactorRecords]) -> 
     return total / max(count, 1)
 
 
-def _terms(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], bases: Sequence[list[Array]], sizes: Array
-) -> list[Term]:
+def _terms(problem: Problem, values: Array, bases: Sequence[list[Array]], sizes: Array) -> list[Term]:
     parameters = problem.parameters
     chain, moved = parameters.entries_jacobian(values), parameters.coordinates(parameters.local(values))
-    residuals, jacobians, terms = problem.whitened_residuals(values, records), problem.jacobians(values, records), []
-    for place, record in enumerate(records):
+    residuals, jacobians, terms = problem.whitened_residuals(values), problem.jacobians(values), []
+    for place, record in enumerate(problem.records):
         used = np.flatnonzero(record.weight[: record.count] > 0)
         jacobian = np.einsum("avn,vc->nac", jacobians[place][:, :, used], chain, optimize=True)
         own = np.stack([basis[place][:, :, used] / size for basis, size in zip(bases, sizes, strict=True)])
@@ -328,16 +325,16 @@ def _terms(
     return terms
 
 
-def _require_freedom(problem: Problem, values: Array, records: Sequence[FactorRecords], components: int) -> None:
-    if correlation_of(records) is not None:
+def _require_freedom(problem: Problem, values: Array, components: int) -> None:
+    if problem.correlation is not None:
         raise ProblemError(
             "variance components cannot be estimated beside drifting parameters.",
             hint="Take the drifts away, or set noise.estimate: false.",
         )
-    freedom = degrees_of_freedom(problem, values, records)
+    freedom = degrees_of_freedom(problem, values)
     if freedom <= 2 * components:
         raise ProblemError(
-            f"{problem.equations(records)} equations leave {freedom:.1f} degrees of freedom, too few to estimate "
+            f"{problem.equations()} equations leave {freedom:.1f} degrees of freedom, too few to estimate "
             f"{components} variance components from.",
             hint="Measure more poses, or set noise.estimate: false.",
         )

@@ -96,8 +96,8 @@ def whitened_rows(problem: Problem, values: Array, dataset: Dataset) -> Array:
     has more rows than there are coordinates, n triangular ones with the same information stand in for them.
     """
     chain = problem.parameters.entries_jacobian(values) * problem.parameters.scales()
-    records = as_predicted(problem, values, problem.records(as_seen(problem, values, dataset)[0]))
-    rows = np.array([row.T @ chain for jacobian in problem.jacobians(values, records) for row in jacobian])
+    shown = as_predicted(problem.of(as_seen(problem, values, dataset)[0]), values)
+    rows = np.array([row.T @ chain for jacobian in shown.jacobians(values) for row in jacobian])
     if len(rows) <= max(rows.shape[2], _FEW_ROWS):
         return rows
     triangles = np.asarray(np.linalg.qr(rows.transpose(1, 0, 2), mode="r"))

@@ -9,21 +9,19 @@ from armcal.arm.assembly import Arm
 from armcal.arm.pose_residual import OF_TOOL, PoseResidual, Postures
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 
 
-def corrected_records(
-    problem: Problem, records: Sequence[FactorRecords], arm: Arm, corrections: Array
-) -> tuple[FactorRecords, ...]:
-    """Records with corrections of an arm (6 + joints x N) in place of theirs."""
+def corrected(problem: Problem, arm: Arm, corrections: Array) -> Problem:
+    """The problem of records with corrections of an arm (6 + joints x N) in place of theirs."""
     result = []
-    for kernel, own in zip(problem.kernels, records, strict=True):
+    for kernel, own in zip(problem.kernels, problem.records, strict=True):
         content = own.record.copy()
         for channel, row in zip(arm.correction_channels, corrections, strict=True):
             if channel in kernel.factor.channels:
                 content[kernel.factor.channels.index(channel), : own.count] = row
         result.append(replace(own, record=content, state=own.state.copy()))
-    return tuple(result)
+    return problem.with_records(result)
 
 
 @dataclass(frozen=True)
@@ -37,17 +35,17 @@ class Moved:
     parts: Mapping[str, Array]
 
 
-def moved_by(problem: Problem, values: Array, records: Sequence[FactorRecords], arm: Arm) -> Moved:
+def moved_by(problem: Problem, values: Array, arm: Arm) -> Moved:
     """What the pose residual of an arm does in records that carry its corrections."""
     place = next(i for i, k in enumerate(problem.kernels) if arm.name in _arms_of(problem, k.factor.name))
-    own, channels = records[place], problem.kernels[place].factor.channels
+    own, channels = problem.records[place], problem.kernels[place].factor.channels
     size, known = len(arm.correction_channels), dict(zip(channels, own.record[:, : own.count], strict=True))
     corrections = np.array([known.get(channel, np.zeros(own.count)) for channel in arm.correction_channels])
 
     def tools(rows: Sequence[int]) -> Array:
         some = np.zeros((size, own.count))
         some[list(rows)] = corrections[list(rows)]
-        shown = problem.predict(values, corrected_records(problem, records, arm, some))[place]
+        shown = corrected(problem, arm, some).predict(values)[place]
         return np.asarray(shown.tools[_arms_of(problem, problem.kernels[place].factor.name).index(arm.name), 3])
 
     none, joints = tools(()), [i for i in range(len(OF_TOOL), size) if np.any(corrections[i])]
@@ -68,7 +66,6 @@ def sizes_of(covariances: Sequence[Array]) -> Array:
 def unexplained(
     problem: Problem,
     values: Array,
-    records: Sequence[FactorRecords],
     learned: Mapping[str, tuple[PoseResidual, Postures]] | None = None,
 ) -> list[Array]:
     """Covariance of residuals by what learned pose residuals do not know (N x n_r x n_r a factor; SI).
@@ -76,14 +73,14 @@ def unexplained(
     Those of ``learned``, by arm, take the place of the arms' own. Records must carry corrections; arms that have none,
     or whose pose residual has not learned, add nothing.
     """
-    count = records[0].count
+    count = problem.count
     total = [np.zeros((count, kernel.factor.rows, kernel.factor.rows)) for kernel in problem.kernels]
     for arm in problem.blueprint.arms.values():
         residual, postures = (learned or {}).get(arm.name, (arm.residual, None))
         if residual is None or not residual.is_learned:
             continue
-        slopes = problem.channel_slopes(values, records, arm.correction_channels)
-        for i, (kernel, own, slope) in enumerate(zip(problem.kernels, records, slopes, strict=True)):
+        slopes = problem.channel_slopes(values, arm.correction_channels)
+        for i, (kernel, own, slope) in enumerate(zip(problem.kernels, problem.records, slopes, strict=True)):
             known = dict(zip(kernel.factor.channels, own.record[:, : own.count], strict=True))
             whole = Dataset(("",) * own.count, known)
             here = arm.postures(whole, problem.blueprint.environment) if postures is None else postures

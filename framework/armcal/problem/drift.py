@@ -17,8 +17,8 @@ from armcal.base.dataset import Dataset
 from armcal.base.parameters import Drift, ParameterBlock
 from armcal.errors import DataError
 from armcal.problem.correlation import Correlation
-from armcal.problem.factor_records import correlation_of, noise_roots, unweighted
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.factor_records import noise_roots
+from armcal.problem.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -80,12 +80,11 @@ def _drifting(problem: Problem) -> list[tuple[ParameterBlock, Drift]]:
 
 def with_drift(
     problem: Problem,
-    records: Sequence[FactorRecords],
     dataset: Dataset,
     values: Array,
     along: Chain | None = None,
-) -> tuple[FactorRecords, ...]:
-    """The records of a dataset, correlated as drifting parameters demand; slopes are taken at ``values``.
+) -> Problem:
+    """The problem of a dataset with its records correlated as drifting parameters demand, by slopes at ``values``.
 
     ``along`` is the chain of a recording that has more records than these.
 
@@ -94,31 +93,28 @@ def with_drift(
     """
     along = along or chain(problem, dataset)
     if along is None:
-        return tuple(records)
+        return problem
     drifting = _drifting(problem)
-    shared = unweighted(records)
+    shared = problem.unweighted()
     place = {name: i for i, name in enumerate(problem.free_names)}
     chosen, sds = [place[block.name] for block, _ in drifting], np.array([drift.sd for _, drift in drifting])
     slopes, raw = [], []  # by states, each a standard deviation of a parameter's drift
-    for kernel, record, jacobian in zip(problem.kernels, shared, problem.jacobians(values, shared), strict=True):
+    for kernel, record, jacobian in zip(problem.kernels, shared.records, shared.jacobians(values), strict=True):
         slope = np.moveaxis(jacobian[:, chosen], 1, 2) * sds
         padding = ((0, 0), (0, record.record.shape[1] - record.count), (0, 0))
         slopes.append(np.pad(slope, padding))
         raw.append(np.pad(np.einsum("wrs,swz->rwz", noise_roots(kernel.factor, record), slope), padding))
     node = along.nodes(dataset)
-    node = np.pad(node, (0, len(records[0].weight) - len(node)), mode="edge")
+    node = np.pad(node, (0, len(problem.records[0].weight) - len(node)), mode="edge")
     correlation = Correlation(tuple(slopes), tuple(raw), node, along.apart([drift for _, drift in drifting]))
-    correlation = correlation.weighted([record.weight for record in records])
-    return tuple(replace(record, correlation=correlation) for record in records)
+    correlation = correlation.weighted([record.weight for record in problem.records])
+    return problem.with_records([replace(record, correlation=correlation) for record in problem.records])
 
 
-def residuals(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], training: Sequence[FactorRecords]
-) -> tuple[Array, ...]:
+def residuals(problem: Problem, values: Array, training: Problem) -> tuple[Array, ...]:
     """Raw residuals less the drift that the training records determine, one (n_r x N) a factor."""
-    raw = problem.residuals(values, records)
-    here, there = correlation_of(records), correlation_of(training)
+    raw, here, there = problem.residuals(values), problem.correlation, training.correlation
     if here is None or there is None:
         return raw
-    states = there.states([r[:, :, None] for r in problem.weighted_residuals(values, training)])
+    states = there.states([r[:, :, None] for r in training.weighted_residuals(values)])
     return here.taken_off(raw, states)

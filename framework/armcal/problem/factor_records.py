@@ -156,10 +156,6 @@ def weighted(records: Sequence[FactorRecords], weights: Sequence[Array]) -> tupl
     )
 
 
-def unweighted(records: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
-    return tuple(replace(record, weight=np.ones_like(record.weight), correlation=None) for record in records)
-
-
 def mean_shares(factor: Factor, factor_records: FactorRecords) -> list[Array]:
     """Of each group whose mean weighs more than its records say, what each record adds to a row (width).
 

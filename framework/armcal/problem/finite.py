@@ -1,7 +1,5 @@
 """Whether a problem predicts numbers at its nominal values, and which component does not."""
 
-from collections.abc import Sequence
-
 import casadi as ca
 import numpy as np
 
@@ -10,11 +8,10 @@ from armcal.arm.effects import JointCommand
 from armcal.base.dataset import Dataset
 from armcal.errors import DataError, ProblemError
 from armcal.plugins import refuse
-from armcal.problem.factor_records import FactorRecords
 from armcal.problem.problem import Problem
 
 
-def require_numbers(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> None:
+def require_numbers(problem: Problem, dataset: Dataset) -> None:
     """Refuse a problem whose residuals or derivatives are no numbers (NaN, infinite) at the nominal values.
 
     Raises:
@@ -23,7 +20,7 @@ def require_numbers(problem: Problem, records: Sequence[FactorRecords], dataset:
         ProblemError: another residual or a derivative is none; with measurement and record, or parameters.
     """
     nominal = problem.parameters.nominal()
-    for kernel, own, residual in zip(problem.kernels, records, problem.residuals(nominal, records), strict=True):
+    for kernel, own, residual in zip(problem.kernels, problem.records, problem.residuals(nominal), strict=True):
         lost = np.flatnonzero(own.measured & ~np.isfinite(residual).all(axis=0))
         if len(lost):
             record = dataset.ids[lost[0]]
@@ -38,7 +35,7 @@ def require_numbers(problem: Problem, records: Sequence[FactorRecords], dataset:
                 "values.",
                 hint="Correct its outputs or residual, the arm model, or a spring's law there.",
             )
-    slopes = np.diag(problem.normal_equations(nominal, records).hessian)
+    slopes = np.diag(problem.normal_equations(nominal).hessian)
     if names := [name for name, slope in zip(problem.free_names, slopes, strict=True) if not np.isfinite(slope)]:
         raise ProblemError(
             f"the derivative of the residuals by {', '.join(names)} is no number (NaN or infinite) at the nominal "

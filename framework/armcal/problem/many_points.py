@@ -1,6 +1,5 @@
 """Measurements of many points: few of them, enough to judge how records err; and those an instrument would see."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,20 +15,20 @@ from armcal.problem.problem import Problem
 FEW_POINTS = 12
 
 
-def with_few_points(problem: Problem, records: Sequence[FactorRecords]) -> tuple[Problem, tuple[FactorRecords, ...]]:
-    """The problem and its records with at most so many points of each measurement, spread over all of them.
+def with_few_points(problem: Problem) -> Problem:
+    """The problem with at most so many points of each measurement, spread over all of them.
 
-    The same objects where nothing is to be left out, and where a drift correlates the records.
+    The same object where nothing is to be left out, and where a drift correlates the records.
     """
     many = [kernel.factor.points is not None and len(kernel.factor.points) > FEW_POINTS for kernel in problem.kernels]
-    if not any(many) or any(record.correlation is not None for record in records):
-        return problem, tuple(records)
+    if not any(many) or problem.correlation is not None:
+        return problem
     pairs = [
         _thinned(kernel.factor, record) if thin else (kernel.factor, record)
-        for kernel, record, thin in zip(problem.kernels, records, many, strict=True)
+        for kernel, record, thin in zip(problem.kernels, problem.records, many, strict=True)
     ]
     kernels = tuple(replace(kernel, factor=factor) for kernel, (factor, _) in zip(problem.kernels, pairs, strict=True))
-    return replace(problem, kernels=kernels), tuple(record for _, record in pairs)
+    return Problem(replace(problem.compiled, kernels=kernels), tuple(record for _, record in pairs))
 
 
 def _thinned(factor: Factor, record: FactorRecords) -> tuple[Factor, FactorRecords]:
@@ -58,7 +57,8 @@ def _thinned(factor: Factor, record: FactorRecords) -> tuple[Factor, FactorRecor
 def as_seen(problem: Problem, values: Array, dataset: Dataset) -> tuple[Dataset, Mask]:
     """The dataset with readings of points out of view missing (NaN), and which records have any reading left (N)."""
     channels, limited, seen = dict(dataset.channels), False, np.zeros(len(dataset), dtype=bool)
-    for kernel, grouped, record in zip(problem.kernels, problem.grouped, problem.records(dataset), strict=True):
+    for grouped, record in problem.of(dataset).pairs:
+        kernel = grouped.kernel
         own, measurement = kernel.factor.expressed, problem.blueprint.measurements[kernel.factor.name]
         if own.margin is None or kernel.points is None or not isinstance(measurement, LimitedView):
             seen[:] |= bool(kernel.factor.output_channels)

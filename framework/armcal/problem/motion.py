@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.problem.kernel import Kernel
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 
 ORDER_CHANNELS = ("sequence", "time")
 _STEP_M = 1e-3  # So small that a load that hangs there hardly stands elsewhere
@@ -36,7 +36,7 @@ class Motion:
     by_load: tuple[Array, ...] = ()
 
     @classmethod
-    def of(cls, problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset) -> Motion:
+    def of(cls, problem: Problem, values: Array, dataset: Dataset) -> Motion:
         arms = problem.blueprint.arms
         channels = tuple(command_channels(arms))
         blocks = {b.name: values[problem.parameters.entries_of(b.name)] for b in problem.parameters.blocks}
@@ -44,9 +44,9 @@ class Motion:
         for name, arm in arms.items():
             commands = arm.joint_commands([dataset.column(channel) for channel in arm.command_channels])
             loads[name] = site_loads(arm, blocks, np.array(commands), acting)
-        slopes = problem.channel_slopes(values, records, channels)
-        elastic = any(len(record.state) for record in records)
-        return cls(channels, slopes, loads, _by_load(problem, values, records, dataset) if elastic else ())
+        slopes = problem.channel_slopes(values, channels)
+        elastic = any(len(record.state) for record in problem.records)
+        return cls(channels, slopes, loads, _by_load(problem, values, dataset) if elastic else ())
 
     def subset(self, chosen: Indices) -> Motion:
         loads = {
@@ -85,7 +85,7 @@ def _acting(problem: Problem, dataset: Dataset) -> dict[str, Array]:
     }
 
 
-def _by_load(problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset) -> tuple[Array, ...]:
+def _by_load(problem: Problem, values: Array, dataset: Dataset) -> tuple[Array, ...]:
     """Raw residual by ``LOADS``, by a problem whose records all carry their loads; ``records`` are in equilibrium."""
     plan, acting = problem.blueprint, _acting(problem, dataset)
     loaded = replace(dataset, channels={**dataset.channels, **acting})
@@ -93,9 +93,9 @@ def _by_load(problem: Problem, values: Array, records: Sequence[FactorRecords], 
     other = Problem.build(*parts, "interpreted", plan.groups)
 
     def slopes(of: Dataset) -> tuple[Array, ...]:
-        here = zip(other.records(of), records, strict=True)
+        here = zip(other.of(of).records, problem.records, strict=True)
         at_rest = [replace(factor_records, state=before.state.copy()) for factor_records, before in here]
-        whole = other.channel_slopes(values, at_rest, LOAD_CHANNELS[:4])
+        whole = other.with_records(at_rest).channel_slopes(values, LOAD_CHANNELS[:4])
         return tuple(map(_of_points, problem.kernels, other.kernels, whole))
 
     g = np.array([acting[f"gravity_{axis}"] for axis in "xyz"])

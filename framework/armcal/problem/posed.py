@@ -4,20 +4,18 @@ A solver of smooth problems moves ``x`` (n), increments in their typical scales.
 coordinates in their typical scales, in which priors are quadratic and a semidefinite block is a cone.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from armcal.base.arrays import Array
 from armcal.errors import NotConvergedError
-from armcal.problem.problem import FactorRecords, NormalEquations, Problem
+from armcal.problem.problem import NormalEquations, Problem
 
 
 class PosedProblem:
-    """Half the squared whitened residuals of some records plus priors."""
+    """Half the squared whitened residuals of a problem plus priors."""
 
-    def __init__(self, problem: Problem, records: Sequence[FactorRecords]) -> None:
-        self.problem, self.records = problem, records
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
         self.scales = problem.parameters.increment_scales()
         self.coordinate_scales = problem.parameters.scales()
         self._prior = problem.parameters.prior_information() * self.coordinate_scales**2
@@ -42,13 +40,13 @@ class PosedProblem:
     def cost(self, x: Array) -> float:
         """Residuals and priors; infinite where a record has no elastic equilibrium."""
         try:
-            return self.problem.cost(self.values(x), self.records) + self._prior_cost(x)
+            return self.problem.cost(self.values(x)) + self._prior_cost(x)
         except NotConvergedError:
             return float("inf")
 
     def model(self, x: Array) -> NormalEquations:
         """Cost, gradient and Gauss-Newton Hessian by ``x``."""
-        data = self.problem.normal_equations(self.values(x), self.records)
+        data = self.problem.normal_equations(self.values(x))
         gradient, hessian = self._chained(x, data)
         curvature = self.problem.parameters.curvature(self._entry_gradient(x, data.gradient))
         hessian = hessian + curvature * np.outer(self.scales, self.scales)
@@ -57,7 +55,7 @@ class PosedProblem:
     def convex_model(self, x: Array) -> NormalEquations:
         """Cost, gradient and Gauss-Newton Hessian by ``c``."""
         chain = self.problem.parameters.entries_jacobian(self.values(x)) * self.coordinate_scales
-        data = self.problem.normal_equations(self.values(x), self.records).chained(chain)
+        data = self.problem.normal_equations(self.values(x)).chained(chain)
         gradient = data.gradient + self._prior * self.coordinates(x)
         return NormalEquations(data.cost + self._prior_cost(x), gradient, data.hessian + np.diag(self._prior))
 
@@ -73,8 +71,8 @@ class PosedProblem:
 
     def exact_hessian(self, x: Array) -> Array:
         """The Hessian by ``x`` with the curvature of the residuals."""
-        data = self.problem.normal_equations(self.values(x), self.records)
-        exact = NormalEquations(0.0, data.gradient, self.problem.exact_hessian(self.values(x), self.records))
+        data = self.problem.normal_equations(self.values(x))
+        exact = NormalEquations(0.0, data.gradient, self.problem.exact_hessian(self.values(x)))
         curvature = self.problem.parameters.curvature(self._entry_gradient(x, data.gradient))
         return self._chained(x, exact)[1] + curvature * np.outer(self.scales, self.scales)
 

@@ -4,7 +4,6 @@ Rank is judged there. Where a Jacobian depends on measured numbers (a bearing, a
 turn undetermined directions into seemingly determined ones.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import casadi as ca
@@ -20,49 +19,51 @@ _MOST_STEPS = 12
 _AT_ZERO = 1e-6  # In units of the noise: a residual below this is none
 
 
-def projected(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
-    """Records whose residuals are zero at these values, for judging rank.
+def projected(problem: Problem, values: Array) -> Problem:
+    """The problem of records whose residuals are zero at these values, for judging rank.
 
     Measured numbers become what the model predicts; where nothing is measured but the joints (a contact), the joint
     angles move to the nearest ones that fit. A record that no angles fit is left as it is. Records that a Jacobian
     does not depend on that way are returned as they are, the same objects.
     """
-    result = as_predicted(problem, values, records)
-    return tuple(
-        factor_records if _measured(grouped.kernel.factor) else _fitting_joints(grouped, values, factor_records)
-        for grouped, factor_records in zip(problem.grouped, result, strict=True)
+    shown = as_predicted(problem, values)
+    return shown.with_records(
+        [
+            record if _measured(grouped.kernel.factor) else _fitting_joints(grouped, values, record)
+            for grouped, record in shown.pairs
+        ]
     )
 
 
-def as_predicted(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
+def as_predicted(problem: Problem, values: Array) -> Problem:
     if not any(_bilinear(kernel.factor.expressed) for kernel in problem.kernels):
-        return tuple(records)
-    predicted = predicted_records(problem, values, records)
-    return tuple(
-        after if _bilinear(kernel.factor.expressed) else before
-        for kernel, before, after in zip(problem.kernels, records, predicted, strict=True)
+        return problem
+    shown = zip(problem.kernels, problem.records, predicted(problem, values).records, strict=True)
+    return problem.with_records(
+        [after if _bilinear(kernel.factor.expressed) else before for kernel, before, after in shown]
     )
 
 
-def predicted_records(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[FactorRecords, ...]:
-    predicted = []
-    for kernel, before, shown in zip(problem.kernels, records, problem.predict(values, records), strict=True):
+def predicted(problem: Problem, values: Array) -> Problem:
+    """The problem of records with the readings that the values predict."""
+    result = []
+    for kernel, before, shown in zip(problem.kernels, problem.records, problem.predict(values), strict=True):
         record = before.record.copy()
         for row in _measured(kernel.factor):
             readings = shown.outputs[kernel.factor.output_channels.index(kernel.factor.channels[row])]
             record[row, : before.count] = readings
             record[row, before.count :] = readings[-1] if before.count else 0.0
-        predicted.append(replace(before, record=record))
-    return tuple(predicted)
+        result.append(replace(before, record=record))
+    return problem.with_records(result)
 
 
-def factor_at_zero(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> Array:
+def factor_at_zero(problem: Problem, values: Array) -> Array:
     """R (m x n) with R'R = J'J of the whitened residuals by coordinates, of the records projected onto the model."""
-    return problem.triangular_factor(values, projected(problem, values, records))
+    return projected(problem, values).triangular_factor(values)
 
 
-def fits(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[Mask, ...]:
-    residuals = problem.residuals(values, records)
+def fits(problem: Problem, values: Array) -> tuple[Mask, ...]:
+    residuals = problem.residuals(values)
     return tuple(
         np.ones(residual.shape[1], dtype=bool)
         if _measured(kernel.factor)

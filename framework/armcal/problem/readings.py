@@ -22,15 +22,15 @@ _EXACT = 1e-9  # In units of the noise
 _LEAST_SLOPE = 1e-6  # Of the largest one: a residual that changes less with every reading is none of theirs
 
 
-def reading_slopes(problem: Problem, values: Array, records: Sequence[FactorRecords]) -> tuple[Array | None, ...]:
+def reading_slopes(problem: Problem, values: Array) -> tuple[Array | None, ...]:
     """How readings change with residuals, one (N x outputs x n_r; SI) a factor, at the readings in the records.
 
     None of a factor that reads nothing, and of one of whose residual some part depends on no reading. A reading that
     no residual depends on has slopes of zero: nothing is known of its noise.
     """
-    problem.residuals(values, records)  # leaves the states in equilibrium
+    problem.residuals(values)  # leaves the states in equilibrium
     result: list[Array | None] = []
-    for grouped, factor_records in zip(problem.grouped, records, strict=True):
+    for grouped, factor_records in problem.pairs:
         factor = grouped.kernel.factor
         if factor.output_channels:
             slopes = grouped.channel_slopes(values, factor_records, factor.output_channels)[
@@ -42,20 +42,17 @@ def reading_slopes(problem: Problem, values: Array, records: Sequence[FactorReco
     return tuple(result)
 
 
-def disturbed_records(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], noise: Sequence[Array]
-) -> tuple[FactorRecords, ...]:
-    """The records with readings whose residuals differ by ``noise`` (n_r x N a factor) from those that they have.
+def disturbed(problem: Problem, values: Array, noise: Sequence[Array]) -> Problem:
+    """With readings whose residuals differ by ``noise`` (n_r x N a factor) from those that the records have.
 
     Raises:
         ProblemError: the residual of a measurement depends on something else than its readings.
     """
-    before, moved, missing = problem.residuals(values, records), tuple(records), list(noise)
+    before, moved, missing = problem.residuals(values), problem, list(noise)
     for _ in range(_STEPS):
-        slopes = reading_slopes(problem, values, moved)
-        parts = zip(problem.kernels, moved, slopes, missing, strict=True)
-        moved = tuple(_stepped(kernel.factor, record, slope, off) for kernel, record, slope, off in parts)
-        residuals = problem.residuals(values, moved)
+        parts = zip(problem.kernels, moved.records, reading_slopes(moved, values), missing, strict=True)
+        moved = problem.with_records([_stepped(k.factor, record, slope, off) for k, record, slope, off in parts])
+        residuals = moved.residuals(values)
         missing = [start + added - now for start, added, now in zip(before, noise, residuals, strict=True)]
         if all(
             np.abs(off / np.array(kernel.factor.noise)[:, None]).max(initial=0.0) < _EXACT
@@ -102,10 +99,8 @@ def readings_by_residual(by_reading: Array, noise: Array) -> Array | None:
     return np.asarray(np.linalg.pinv(whitened / sizes) / sizes[:, None] / noise)
 
 
-def with_joint_noise(
-    problem: Problem, records: Sequence[FactorRecords], values: Array, noise_scale: float = 1.0
-) -> tuple[FactorRecords, ...]:
-    """The records whitened by the noise of residuals and of joints together; the same where no joint has any.
+def with_joint_noise(problem: Problem, values: Array, noise_scale: float = 1.0) -> Problem:
+    """With records whitened by the noise of residuals and of joints together; the same where no joint has any.
 
     The covariance of a residual is its own plus S diag(sd^2) S', with S its derivative by the joints at these values,
     those of the other record where a measurement lies between two. Records that name the same other one share its
@@ -123,14 +118,14 @@ def with_joint_noise(
         if arm.joint_noise and dimension == "angle"
     }
     if not stated:
-        return tuple(records)
+        return problem
     deviations = np.array(list(stated.values())) / min(noise_scale, 1.0)
-    slopes = problem.channel_slopes(values, records, list(stated))
+    slopes = problem.channel_slopes(values, list(stated))
     result = []
-    for kernel, record, slope in zip(problem.kernels, records, slopes, strict=True):
+    for kernel, record, slope in zip(problem.kernels, problem.records, slopes, strict=True):
         own = whitening_of(kernel.factor, record)
         padded = np.pad(slope, ((0, 0), (0, 0), (0, own.shape[2] - record.count)), mode="edge")
         scaled = transformed(own, padded * deviations[:, None])
         covariance = np.einsum("ikn,jkn->ijn", scaled, scaled) + np.eye(len(own))[:, :, None]
         result.append(replace(record, whitening=transformed(by_covariance(covariance), own)))
-    return tuple(result)
+    return problem.with_records(result)

@@ -9,7 +9,7 @@ Gauss-Newton steps whose weights fall with the distance [Huber1981], so that a f
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
@@ -19,24 +19,24 @@ from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.quaternions import nearest_turn
 from armcal.measure.groups import OTHER
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 
 _STEP = 1e-4
 
 
-def along(problem: Problem, values: Array, poses: Sequence[FactorRecords], direction: Array) -> Array:
+def along(problem: Problem, values: Array, direction: Array) -> Array:
     """How tools move along a direction of the parameters in typical scales (tools x 3 x N), by differences."""
     parameters = problem.parameters
     here = parameters.coordinates(parameters.local(values))
     step = _STEP * direction * parameters.scales()
     sides = [parameters.retract(parameters.from_coordinates(here + sign * step)) for sign in (1.0, -1.0)]
-    up, down = (tools(problem, side, poses)[0] for side in sides)
+    up, down = (tools(problem, side)[0] for side in sides)
     return np.asarray((up - down) / (2 * _STEP))
 
 
-def tools(problem: Problem, values: Array, poses: Sequence[FactorRecords]) -> tuple[Array, Array]:
+def tools(problem: Problem, values: Array) -> tuple[Array, Array]:
     """All tools, one for each measurement and arm: places (tools x 3 x N, m) and axes (tools x axis x 3 x N)."""
-    tools = np.concatenate([shown.tools for shown in problem.predict(values, poses)])
+    tools = np.concatenate([shown.tools for shown in problem.predict(values)])
     return tools[:, 3], tools[:, :3]
 
 
@@ -290,9 +290,7 @@ class Sighting:
         return float(np.sqrt(np.median(squares)))
 
 
-def sighting_of(
-    problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, number: int, most: int
-) -> Sighting | None:
+def sighting_of(problem: Problem, dataset: Dataset, number: int, most: int) -> Sighting | None:
     """At most so many records of a measurement; None of one that reads no positions of a single arm in a frame."""
     factor = problem.kernels[number].factor
     channels = factor.position_channels
@@ -300,13 +298,13 @@ def sighting_of(
         return None
     if any(OTHER in name for name in factor.channels) or len(problem.blueprint.measurements[factor.name].arms) != 1:
         return None
-    whole = np.flatnonzero(records[number].measured)
+    whole = np.flatnonzero(problem.records[number].measured)
     chosen = whole[:: max(1, -(-len(whole) // most))] if len(whole) else whole
     if not len(chosen):
         return None
-    some, values = problem.subset(records, chosen), problem.parameters.nominal()
-    measured, shown = dataset.stacked(channels)[:, chosen], problem.predict(values, some)[number].outputs[:3]
-    if not np.allclose(problem.residuals(values, some)[number][:3], measured - shown, atol=_SAME_M):
+    some, values = problem.subset(chosen), problem.parameters.nominal()
+    measured, shown = dataset.stacked(channels)[:, chosen], some.predict(values)[number].outputs[:3]
+    if not np.allclose(some.residuals(values)[number][:3], measured - shown, atol=_SAME_M):
         return None
     quaternion = [f"{factor.name}.{part}" for part in _QUATERNION]
     reads_turn = set(quaternion) <= set(factor.output_channels) and all(map(dataset.has, quaternion))
@@ -314,9 +312,9 @@ def sighting_of(
     return Sighting(number, chosen, measured, turned)
 
 
-def tools_of(problem: Problem, values: Array, record: FactorRecords, number: int) -> Tools:
+def tools_of(problem: Problem, values: Array, number: int) -> Tools:
     """What a measurement's arm shows in each of its records: of the body if its rotation is read, else of the tool."""
-    shown = problem.grouped[number].predict(values, record)
+    shown = problem.grouped[number].predict(values, problem.records[number])
     parts = [channel.rpartition(".")[2] for channel in problem.kernels[number].factor.output_channels]
     if set(_QUATERNION) <= set(parts):
         return Tools(shown.outputs[:3], _rotations(shown.outputs[[parts.index(part) for part in _QUATERNION]]))
@@ -328,9 +326,10 @@ def _rotations(quaternions: Array) -> Array:
     return np.asarray(Rotation.from_quat(quaternions[[1, 2, 3, 0]].T).as_matrix())
 
 
-def shown_instead(problem: Problem, record: FactorRecords, number: int, shown: Tools) -> FactorRecords:
-    """A measurement's records as if its instrument had seen this."""
-    factor, changed = problem.kernels[number].factor, record.record.copy()
+def shown_instead(problem: Problem, number: int, shown: Tools) -> Problem:
+    """The problem as if the instrument of one measurement had seen this."""
+    factor, record = problem.kernels[number].factor, problem.records[number]
+    changed = record.record.copy()
     turned = Rotation.from_matrix(shown.rotations).as_quat()[:, [3, 0, 1, 2]].T
     readings = dict(zip((*"xyz", *_QUATERNION), (*shown.places, *turned), strict=True))
     for row, channel in enumerate(factor.channels):
@@ -338,6 +337,5 @@ def shown_instead(problem: Problem, record: FactorRecords, number: int, shown: T
         if name == factor.name and part in readings and channel in factor.output_channels:
             changed[row, : record.count] = readings[part]
             changed[row, record.count :] = readings[part][-1]
-    return FactorRecords(
-        record.count, changed, record.weight, record.state.copy(), record.whitening, None, record.group, record.applies
-    )
+    own = replace(record, record=changed, state=record.state.copy(), correlation=None, present=None)
+    return problem.with_record(number, own)

@@ -71,19 +71,19 @@ def nominal_errors(run: FittedRecords, splits: Sequence[Split]) -> NominalErrors
     acting = problem.weighted(run.fitted.records, run.fitted.weights)
     names = placing_names(problem, acting)
     shown, values = _placed(problem, names, acting, problem.parameters.nominal())
-    errors, turns = errors_and_turns(shown, values, run.records)
+    errors, turns = errors_and_turns(shown.with_records(run.records), values)
     rival, rival_turns = np.full((2, len(run.dataset)), np.nan)
     rival[held], rival_turns[held] = errors[held], np.nan if turns is None else turns[held]
     for split in splits:
         fold, there = _placed(problem, names, problem.subset(acting, split.train), values)
         judged = train[split.holdout]
-        off, turned = errors_and_turns(fold, there, problem.subset(run.records, judged))
+        off, turned = errors_and_turns(fold.with_records(problem.subset(run.records, judged)), there)
         rival[judged], rival_turns[judged] = off, np.nan if turned is None else turned
     crossed: tuple[Array, Array | None] = rival, rival_turns
     if not _found(run, names, errors):
         shown, values = untrained(problem), problem.parameters.nominal()
-        errors, turns = crossed = errors_and_turns(shown, values, run.records)
-    residual = problem.residuals(settled(shown, values, run.records), run.records)
+        errors, turns = crossed = errors_and_turns(shown.with_records(run.records), values)
+    residual = problem.residuals(settled(shown.with_records(run.records), values), run.records)
     if {block.name for block in problem.parameters.free if not block.nuisance} == names:
         rival, rival_turns = np.full((2, len(rival)), np.nan)
     both = None if turns is None or crossed[1] is None else (turns, crossed[1], rival_turns)
@@ -92,11 +92,11 @@ def nominal_errors(run: FittedRecords, splits: Sequence[Split]) -> NominalErrors
 
 def _placed(problem: Problem, names: set[str], records: Sequence[FactorRecords], start: Array) -> tuple[Problem, Array]:
     groups = {block.name for block in problem.parameters.free if block.nuisance}
-    own = restricted(with_free(problem, names | groups), records)
+    own = restricted(with_free(problem, names | groups).with_records(records))
     if not own.parameters.free:
         return own, start
     try:
-        posed = PosedProblem(own, records)
+        posed = PosedProblem(own.with_records(records))
         return own, posed.values(descended(posed, posed.x(start), _MOST_STEPS, _DAMPING, _ENOUGH))
     except NotConvergedError:
         return own, start
@@ -107,7 +107,7 @@ def _found(run: FittedRecords, names: set[str], placed: Array) -> bool:
     problem = run.problem
     if run.start.taken or not any(unconfigured(problem, name) for name in names):
         return run.start.taken
-    configured = errors_and_turns(untrained(problem), problem.parameters.nominal(), run.records)[0]
+    configured = errors_and_turns(untrained(problem).with_records(run.records), problem.parameters.nominal())[0]
     return bool(np.nanmedian(placed) * BETTER < np.nanmedian(configured))
 
 
@@ -170,8 +170,8 @@ def errors_of(
     dimensions = [dimension for kernel in problem.kernels for dimension in kernel.factor.dimensions]
     columns = _columns(problem)
     try:
-        before, after = nominal_errors(plain, splits), settled(problem, values, records)
-        errors, turns = errors_and_turns(problem, values, records, fitted.records)
+        before, after = nominal_errors(plain, splits), settled(problem.with_records(records), values)
+        errors, turns = errors_and_turns(problem.with_records(records), values, fitted.problem)
         turned = None
         if turns is not None and before.turns is not None:
             judged_turns = np.full(len(turns), np.nan)
@@ -184,12 +184,13 @@ def errors_of(
             calibrated_mm=errors * _MM,
             cross_validated_mm=judged,
             nominal_residual_mm=_known(before.residual, records) * _MM,
-            calibrated_residual_mm=_known(residuals(problem, after, records, fitted.records), records) * _MM,
+            calibrated_residual_mm=_known(residuals(problem.with_records(records), after, fitted.problem), records)
+            * _MM,
             position_mm=problem.predict(values, records)[0].tools[0, 3] * _MM,
             nominal_crossed_mm=before.crossed * _MM,
             rival_mm=before.rival * _MM,
             failed_folds=0 if judged_by is None else judged_by.failed_folds,
-            at_rest_mm=record_errors(problem, values, records) * _MM if drifts else None,
+            at_rest_mm=record_errors(problem.with_records(records), values) * _MM if drifts else None,
             cross_validated_at_rest_mm=judged_at_rest if drifts else None,
             residual_columns=("dx_mm", "dy_mm", "dz_mm") if dimensions == ["length"] * 3 else columns,
             unit=error_unit(problem),

@@ -1,6 +1,6 @@
 """Fixed parameters that the records of an experiment would rather have free, confirmed on records held out."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -51,12 +51,12 @@ def fixed_parameters(experiment: Experiment, ready: Prepared, progress: Progress
     groups, evaluator = ready.problem.blueprint.groups, experiment.settings.evaluator
     built = (system.arms, system.measurements, freer, system.environment, ready.dataset, evaluator, groups)
     wide = Problem.build(*built)
-    train, narrow = ready.split.train, replace(wide, parameters=parameters)
-    records = wide.subset(acting(wide, wide.records(ready.dataset), ready.dataset), train)
+    train, narrow = ready.split.train, wide.with_parameters(parameters)
+    records = acting(wide, ready.dataset).subset(train).records
     start = next(iter(ready.start.values(ready.problem)), parameters.nominal())
-    fitted = fit(narrow, records, experiment.estimator, start, progress)
+    fitted = fit(narrow.with_records(records), experiment.estimator, start, progress)
     values = fitted.solution.values
-    chosen = freeing(wide, own, values, fitted.records)
+    chosen = freeing(wide.with_records(fitted.records), own, values)
     others = tuple(one.name for one in chosen.others)
     if not chosen.gaining:
         return FixedParameters(float("nan"), (), (), others)
@@ -64,8 +64,8 @@ def fixed_parameters(experiment: Experiment, ready: Prepared, progress: Progress
     names = [one.name for one in chosen.gaining]
 
     def errors_with(count: int) -> Array:
-        problem = replace(wide, parameters=parameters.with_free([*own, *names[:count]]))
-        return cross_validate(problem, records, splits, experiment.estimator, values, progress).errors
+        problem = wide.with_parameters(parameters.with_free([*own, *names[:count]]))
+        return cross_validate(problem.with_records(records), splits, experiment.estimator, values, progress).errors
 
     counts = sorted({*range(min(len(names), _MOST_STEPS) + 1), len(names)})
     errors, best = {count: errors_with(count) for count in counts}, 0

@@ -282,7 +282,7 @@ def verdict_of(
     evidence = gather(run, judged, system, settings.validation.limit)
     drifts = _AT_REST if any(block.drift is not None for block in problem.parameters.free) else ""
     inner = estimator.inner if isinstance(estimator, Weighing) else estimator
-    parts = halves(problem, acting, inner, estimate.values) if estimate.verdict.converged else None
+    parts = halves(problem.with_records(acting), inner, estimate.values) if estimate.verdict.converged else None
     gross, moved = list[Finding](), _accuracies(run, parts)
     if estimate.verdict.converged:
         gross = _gross(run, acting, errors, judged, evidence)
@@ -334,7 +334,7 @@ def _accuracies(run: FittedRecords, parts: Halves | None) -> list[Finding]:
     if not estimate.verdict.converged or not estimate.names:
         return []
     problem, train = run.problem, run.split.train
-    shown = certificates(problem, estimate.values, problem.subset(run.records, train), run.dataset.subset(train))
+    shown = certificates(problem.with_records(run.records).subset(train), estimate.values, run.dataset.subset(train))
     texts = [*known_accuracies(problem, estimate, parts), *(f"{name}: {text}" for name, text in shown.items())]
     return [Finding("note", text) for text in texts]
 
@@ -372,8 +372,9 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
     problem, estimate, dataset = run.problem, run.fitted.estimate, run.dataset
     if not estimate.verdict.converged:
         return Evidence(unit=error_unit(problem), name=error_name(problem))
-    few, records = with_few_points(problem, run.records)
-    position, motion = recorded_position(dataset), Motion.of(few, estimate.values, records, dataset)
+    few = with_few_points(problem.with_records(run.records))
+    records = few.records
+    position, motion = recorded_position(dataset), Motion.of(few, estimate.values, dataset)
     judged = Judged(judged_mm, few.residuals(estimate.values, records), position)
     limit_mm = None if limit is None else limit * _MM
     missed = large_errors(few, records, estimate, dataset, motion, judged, limit_mm)
@@ -384,7 +385,8 @@ def gather(run: FittedRecords, judged_mm: Array, system: System, limit: float | 
         alone = priors_alone(problem, estimate, *poses)
     acting = problem.weighted(run.fitted.records, run.fitted.weights)
     held = contradictions(problem, estimate, _for_held(problem, acting))
-    few, acting = with_few_points(problem, acting)
+    few = with_few_points(problem.with_records(acting))
+    acting = few.records
     own = (training, motion.subset(train), position[train])
     effects = [e for arm in system.description["arms"].values() for e in (arm.get("effects") or {}).values()]
     wider = freed(few, [parameter.name for one in held for parameter in one.parameters])
@@ -424,7 +426,8 @@ def _gross(
     own = thinned(np.arange(len(train)), MOST_RECORDS)
     wider = freed(problem, [parameter.name for one in evidence.contradictions for parameter in one.parameters])
     scales = held_scales(wider, estimate, _for_held(problem, acting))
-    problem, acting = with_few_points(problem, problem.subset(acting, own))
+    problem = with_few_points(problem.with_records(acting).subset(own))
+    acting = problem.records
     rows = FitRows.of(problem, acting, estimate)
     dataset = run.dataset.subset(looked_at)
     position = recorded_position(run.dataset)[looked_at]
@@ -476,12 +479,12 @@ def _by_weights(
     if fitted.components is None or fitted.as_declared is None:
         return []
     if estimated is not None and fitted.components.mostly_joints:
-        declared = halves(problem, problem.weighted(run.training, fitted.weights), estimator, fitted.as_declared)
+        declared = halves(problem.with_records(run.training).weighted(fitted.weights), estimator, fitted.as_declared)
         assert declared is not None
         return [f for name in estimated.apart for f in steadier_weights(name, estimated, declared, errors.unit)]
     if not len(run.split.holdout):
         return []
-    declared_mm = record_errors(problem, fitted.as_declared, run.records) * _MM
+    declared_mm = record_errors(problem.with_records(run.records), fitted.as_declared) * _MM
     return worse_than_declared(judged_mm, declared_mm, errors.unit)
 
 

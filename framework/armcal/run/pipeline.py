@@ -117,10 +117,12 @@ def _uncertainty(context: RunContext, run: FittedRecords) -> tuple[Bootstrap | N
     if settings.bootstrap and estimate.verdict.converged and estimate.names:
         with context.watch.stage("bootstrap"):
             poses = experiment.poses(run.dataset.subset(run.split.train))
-            resampled = bootstrap(run.problem, run.training, experiment.estimator, estimate, settings, *parts, poses)
+            resampled = bootstrap(
+                run.problem.with_records(run.training), experiment.estimator, estimate, settings, *parts, poses
+            )
     if settings.profile and estimate.verdict.converged:
         with context.watch.stage("profile"):
-            profiled = profiles(run.problem, run.fitted, experiment.estimator, settings.profile, *parts)
+            profiled = profiles(run.fitted, experiment.estimator, settings.profile, *parts)
     return resampled, profiled
 
 
@@ -131,16 +133,21 @@ def _fitted(context: RunContext, ready: Prepared) -> WeighedFit:
     with context.watch.stage("fit"):
         starts = ready.start.values(problem)
         named = any(finding.grade == "bad" for finding in ready.findings)
-        given_up = [hopeless(problem, ready.training, data, start, named) for start in starts]
+        given_up = [hopeless(problem.with_records(ready.training), data, start, named) for start in starts]
         left = [start for start, hopeless_from in zip(starts, given_up, strict=True) if hopeless_from is None]
         if not left:
-            return plain_fit(problem, ready.training, next(given for given in given_up if given is not None))
-        fitted = fit(problem, ready.training, estimator, left[0], progress)
+            return plain_fit(
+                problem.with_records(ready.training), next(given for given in given_up if given is not None)
+            )
+        fitted = fit(problem.with_records(ready.training), estimator, left[0], progress)
         for start in left[1:]:
             solution = fitted.solution
-            if solution.verdict.converged and typical_off(problem, ready.training, data, solution.values) <= FAR:
+            if (
+                solution.verdict.converged
+                and typical_off(problem.with_records(ready.training), data, solution.values) <= FAR
+            ):
                 break  # no other start can be much better
-            other = fit(problem, ready.training, estimator, start, progress)
+            other = fit(problem.with_records(ready.training), estimator, start, progress)
             costs = [problem.cost(one.solution.values, ready.training) for one in (fitted, other)]
             better = other.solution.verdict.converged and costs[1] < costs[0]
             fitted = other if better or not fitted.solution.verdict.converged else fitted
@@ -169,10 +176,10 @@ def _with_pose_residual(context: RunContext, run: FittedRecords) -> tuple[Fitted
         if outcome.residual is None:
             return run, outcome
         arms = outcome.system(experiment.system).arms
-        problem = replace(run.problem, blueprint=replace(run.problem.blueprint, arms=arms))
-        run = replace(run, problem=problem, records=acting(problem, problem.records(run.dataset), run.dataset))
-        again = held_fit(problem, run.training, experiment.estimator, run.fitted.solution)
-        moved = moved_by(problem, again.estimate.values, run.records, arms[outcome.arm])
+        problem = acting(run.problem.with_arms(arms).of(run.dataset), run.dataset)
+        run = replace(run, problem=problem, records=problem.records)
+        again = held_fit(problem.with_records(run.training), experiment.estimator, run.fitted.solution)
+        moved = moved_by(problem.with_records(run.records), again.estimate.values, arms[outcome.arm])
         return replace(run, fitted=_widened(run, again)), replace(outcome, moved=moved)
 
 
@@ -203,9 +210,9 @@ def _validated(
             crossed = outcome.crossed, outcome.splits
         elif experiment.settings.validation.folds:
             splits, start = folds_of(experiment, run), problem.parameters.nominal()
-            training = problem.subset(run.records, run.split.train)
-            parts = (training, splits, estimator, start, context.progress, context.executor, fit_and_predict)
-            crossed = cross_validate(problem, *parts), splits
+            training = problem.with_records(run.records).subset(run.split.train)
+            parts = (splits, estimator, start, context.progress, context.executor, fit_and_predict)
+            crossed = cross_validate(training, *parts), splits
         intervals = interval_result(problem, run.fitted, run.records, run.split, estimator, crossed, run.dataset)
         return errors_of(run, crossed, before), intervals
 
@@ -226,6 +233,6 @@ def _prediction(
         covariance=covariance_rows(fitted.estimate.covariance),
         stretches=stretch_records(intervals.stretches),
         columns={str(name): str(own) for name, own in columns.items()},
-        recording=recording_record(run.problem, run.dataset.subset(run.split.train), fitted.records),
+        recording=recording_record(fitted.problem, run.dataset.subset(run.split.train)),
         ranges=ranges,
     )

@@ -32,7 +32,7 @@ from armcal.estimate.validation import (
 from armcal.io.parallel import Executor
 from armcal.measure.groups import PairedMeasurement
 from armcal.measure.instrument import Contact
-from armcal.problem.corrected import Moved, corrected_records, sizes_of, unexplained
+from armcal.problem.corrected import Moved, corrected, sizes_of, unexplained
 from armcal.problem.problem import FactorRecords, Problem
 from armcal.run.experiment import Experiment
 
@@ -219,10 +219,10 @@ def learned_residual(
     stretches = tuple(Split(np.setdiff1d(np.arange(count), part), part) for part in pieces)
     judge = partial(judged_with, layer=replace(layer, residual=learned))
     parts = (experiment.estimator, fitted.estimate.values, progress, executor, judge)
-    crossed = cross_validate(problem, training, splits, *parts)
+    crossed = cross_validate(problem.with_records(training), splits, *parts)
     if crossed.failed_folds:
         return replace(nothing, why=f"{crossed.failed_folds} of {len(splits)} fits without a fold did not converge")
-    along = cross_validate(problem, training, stretches, *parts)
+    along = cross_validate(problem.with_records(training), stretches, *parts)
     at_random, gains = _compared(crossed, splits)
     in_stretches, _ = _compared(along, stretches, together=True)
     unknown = _unknown(crossed, splits)
@@ -274,30 +274,30 @@ def judged_with(task: FitTask, layer: Layer) -> JudgedFit:
     began, task = time.perf_counter(), task.trained()
     try:
         train, held = task.parts()
-        fitted = fit(task.problem, train, task.estimator, task.start)
+        fitted = fit(train, task.estimator, task.start)
         plain = judged_fit(task, fitted.solution, train, held, began)
         if not plain.converged:
             return plain
         learned = layer.learned(task.problem, fitted, fitted.records, task.split.train)
-        before = errors_apart(task.problem, fitted.solution.values, held)
+        before = errors_apart(held, fitted.solution.values)
         arm = task.problem.blueprint.arms[layer.arm]
         if learned is not None:
             train, held = (
-                corrected_records(task.problem, own, arm, learned.corrections(layer.postures.subset(places)))
+                corrected(own, arm, learned.corrections(layer.postures.subset(places)))
                 for own, places in ((train, task.split.train), (held, task.split.holdout))
             )
-            fitted = held_fit(task.problem, train, task.estimator, fitted.solution)
+            fitted = held_fit(train, task.estimator, fitted.solution)
         judged = judged_fit(task, fitted.solution, train, held, began)
         if not judged.converged:
             return judged
-        alike = whitened_like(task.problem, fitted, held, task.estimator)
+        alike = whitened_like(task.problem, fitted, held.records, task.estimator)
         held_residuals = missed(predictor(task.problem, fitted), alike)
         own = {} if learned is None else {layer.arm: (learned, layer.postures.subset(task.split.holdout))}
-        unknown = tuple(unexplained(task.problem, fitted.solution.values, held, own))
+        unknown = tuple(unexplained(held, fitted.solution.values, own))
     except NotConvergedError:
         return failed_fit(task, began)
     judged = replace(judged, held_residuals=held_residuals, unknown=unknown, without=plain.at_rest)
-    gains = before - errors_apart(task.problem, fitted.solution.values, held)
+    gains = before - errors_apart(held, fitted.solution.values)
     return replace(judged, seconds=time.perf_counter() - began, gains=gains)
 
 
@@ -307,7 +307,7 @@ def model_errors(
     """What a fit leaves of its records, at rest where something drifts; None where no record shows the tool."""
     values = fitted.estimate.values
     raw = problem.whitened(problem.residuals(values, records), records)
-    by_correction = problem.channel_slopes(values, records, arm.correction_channels)
+    by_correction = problem.with_records(records).channel_slopes(values, arm.correction_channels)
     count = len(arm.correction_channels)
     columns = [problem.whitened([slope[:, i] for slope in by_correction], records) for i in range(count)]
     acting = [np.sqrt(np.where(own.measured, weight, 0.0)) for own, weight in zip(records, fitted.weights, strict=True)]

@@ -92,7 +92,7 @@ def prepare(
     """
     ready = assemble(experiment, watch, accept, progress, dataset)
     with watch.stage("check"), noted(ready.warnings):
-        problems = require_solvable(ready.problem, ready.training, ready.problem.parameters.nominal())
+        problems = require_solvable(ready.problem.with_records(ready.training), ready.problem.parameters.nominal())
     return replace(ready, warnings=(*ready.warnings, *problems))
 
 
@@ -122,16 +122,16 @@ def _assembled(experiment: Experiment, dataset: Dataset, watch: Stopwatch, accep
     with watch.stage("build"):
         settings = (experiment.parameters, system.environment)
         problem = Problem.build(system.arms, system.measurements, *settings, dataset, experiment.settings.evaluator)
-        records = problem.records(dataset)
-        start = with_proposals(aligned_start(problem, records, dataset), records, dataset)
-        problem = started(start.problem, records)
-        require_numbers(problem, records, dataset)
-        records = acting(problem, records, dataset)
+        start = with_proposals(aligned_start(problem, dataset), dataset)
+        problem = started(start.problem)
+        require_numbers(problem, dataset)
+        problem = acting(problem, dataset)
+        records = problem.records
     with watch.stage("check"):
         unlearned(system)
         require_loads(experiment, dataset)
         heavy = mass_findings(system)
-        mixed_up, named = check_permuted_axes(problem, records, dataset, accept), mislabelled(problem, records, dataset)
+        mixed_up, named = check_permuted_axes(problem, records, dataset, accept), mislabelled(problem, dataset)
         check_reach(problem, records, dataset)
         split = split_of(experiment, dataset)
         if not len(split.train):
@@ -140,7 +140,7 @@ def _assembled(experiment: Experiment, dataset: Dataset, watch: Stopwatch, accep
             where = experiment.source.where(("validation", "limit"))
             hint = "Leave it out: records are explained that miss by far more than the median."
             raise ConfigError("found a length, and nothing measured is a length.", where=where, hint=hint)
-        problem = restricted(problem, problem.subset(records, split.train))
+        problem = restricted(problem.subset(split.train)).with_records(records)
         profiled(problem, experiment.settings.uncertainty.profile)
     texts = (*experiment.warnings, *dataset.warnings, *start.warnings, *named, *(one.text for one in heavy))
     ready = Prepared(dataset, problem, records, split, texts, start, (*mixed_up, *heavy))
@@ -149,9 +149,10 @@ def _assembled(experiment: Experiment, dataset: Dataset, watch: Stopwatch, accep
     return ready
 
 
-def acting(problem: Problem, records: tuple[FactorRecords, ...], dataset: Dataset) -> tuple[FactorRecords, ...]:
-    records = with_joint_noise(problem, records, problem.parameters.nominal())
-    return with_drift(problem, records, dataset, problem.parameters.nominal())
+def acting(problem: Problem, dataset: Dataset) -> Problem:
+    """The problem with the noise of joints, and with what drifts."""
+    nominal = problem.parameters.nominal()
+    return with_drift(with_joint_noise(problem, nominal), dataset, nominal)
 
 
 def split_of(experiment: Experiment, dataset: Dataset) -> Split:

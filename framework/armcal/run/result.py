@@ -109,7 +109,7 @@ def noise_result(problem: Problem, fit: WeighedFit, dataset: Dataset, split: Spl
         row = dataset.rows[i] if dataset.rows else 0
         numbers = (suspect.distance, suspect.limit, suspect.weight, float(errors_mm[i]))
         suspicious.append(SuspiciousRecord(row, dataset.ids[i], suspect.measurement, *numbers))
-    scatter = residual_spread(problem, fit.estimate, fit.records, dataset.subset(split.train))
+    scatter = residual_spread(problem.with_records(fit.records), fit.estimate, dataset.subset(split.train))
     return NoiseResult(fit.loss, weights, tuple(suspicious), fit.components, len(fit.rounds), scatter)
 
 
@@ -150,9 +150,9 @@ def run_groups(experiment: Experiment, run: FittedRecords, errors: RecordErrors)
     if label is None or not (label in dataset.extra or (label == PAYLOAD and dataset.has(PAYLOAD))):
         return RunGroups((), keys)
     labels = np.array(group_texts(dataset, label))
-    before = _distances(problem, settled(untrained(problem), problem.parameters.nominal(), records))
+    before = _distances(problem, settled(untrained(problem).with_records(records), problem.parameters.nominal()))
     # Distances are judged by what the records of each socket say, not by what the known distance made of them.
-    after = _distances(problem, settled(untrained(problem), run.fitted.estimate.values, records))
+    after = _distances(problem, settled(untrained(problem).with_records(records), run.fitted.estimate.values))
     result = []
     for name in sorted(set(labels.tolist()) - {""}):
         inside = labels == name

@@ -57,7 +57,7 @@ def with_images(experiment: Experiment, dataset: Dataset, folder: Path, progress
     true, stood = simulator.stood(experiment.simulation_request, dataset)
     fixed = true.parameters.with_free(())
     problem = Problem.build(true.arms, true.measurements, fixed, true.environment, stood, "interpreted")
-    records, values, files = problem.records(stood), fixed.nominal(), tuple(f"{name}.png" for name in dataset.ids)
+    records, values, files = problem.of(stood).records, fixed.nominal(), tuple(f"{name}.png" for name in dataset.ids)
     for number, kernel in enumerate(problem.kernels):
         name = kernel.factor.name
         if name not in drawing:
@@ -68,7 +68,7 @@ def with_images(experiment: Experiment, dataset: Dataset, folder: Path, progress
         full = {b.name.removeprefix(f"{name}."): b.name for b in fixed.blocks if b.name.startswith(f"{name}.")}
         full |= borrowed_names(drawing[name])  # of another camera's boards
         own = {local: values[fixed.entries_of(block)] for local, block in full.items()}
-        frames = carriers_of(problem, values, problem.subset(records, np.arange(len(stood))), stood, number)
+        frames = carriers_of(problem.with_records(records).subset(np.arange(len(stood))), values, stood, number)
         for done, content in enumerate(drawing[name].rendered(frames, own), start=1):
             write_over({place / files[done - 1]: content})
             progress("drawing", done / len(dataset))

@@ -274,8 +274,8 @@ def _groups(labels: Sequence[str], dataset: Dataset, settings: StudySettings) ->
 
 
 def _require_solvable(ready: Prepared, rows: Indices) -> None:
-    problem = restricted(ready.problem, ready.problem.subset(ready.records, rows))
-    require_solvable(problem, problem.subset(ready.records, rows), problem.parameters.nominal())
+    problem = restricted(ready.problem.with_records(ready.records).subset(rows))
+    require_solvable(problem, problem.parameters.nominal())
 
 
 def _trainings(groups: Mapping[str, Indices], settings: StudySettings, poses: Indices) -> list[_Training]:
@@ -316,7 +316,9 @@ def _fits(
     tasks = []
     for name, split in plan:
         start = problems[name].parameters.nominal()
-        task = FitTask(problems[name], study.experiments[name].estimator, start, ready[name].records, split)
+        task = FitTask(
+            problems[name].with_records(ready[name].records), study.experiments[name].estimator, start, split
+        )
         tasks.append((task, layers[name]))
     with watch.stage("fits"):
         return executor.map(_fit, tasks, lambda done: progress("fits", done))
@@ -364,7 +366,7 @@ def _judged(name: str, ready: Prepared, fits: Sequence[JudgedFit], whole: _Train
 def _nominal(ready: Prepared) -> tuple[Array, Array | None]:
     """Errors (mm) and, where they are measured, turns (deg) without calibration."""
     problem = untrained(ready.problem)
-    errors, turns = errors_and_turns(problem, problem.parameters.nominal(), ready.records)
+    errors, turns = errors_and_turns(problem.with_records(ready.records), problem.parameters.nominal())
     return errors * _MM, None if turns is None else np.degrees(turns)
 
 

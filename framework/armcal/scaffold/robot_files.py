@@ -108,7 +108,7 @@ def _choose_free(experiment: Experiment, robot: Robot, target: Mapping[str, floa
     values = experiment.parameters.nominal()  # as drawn, not where the records place it: springs would seem loaded
     for name, place in target.items():
         values[parameters.entries_of(name)] = place
-    triangle = factor_at_zero(ready.problem, values, ready.training)
+    triangle = factor_at_zero(ready.problem.with_records(ready.training), values)
     free = [block.name for block in parameters.free]
     preferred = [
         [name for name in free if any(fnmatch.fnmatchcase(name, glob) for glob in globs)] for globs in robot.preferred

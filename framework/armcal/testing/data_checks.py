@@ -21,7 +21,7 @@ from armcal.estimate.online import Gaussian, Linearised, Observation, OnlineEsti
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.measure.measurement import Channel
 from armcal.measure.reader import ReadRequest, requested_channels
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 from armcal.testing.checking import RESULTS, ContractError, NotRun, Subject, check, expect
 from armcal.testing.planar import (
     ARM,
@@ -169,7 +169,6 @@ _POSES, _TOLERANCE = 12, 1e-6
 _TRUTH = {"a1": 0.31, "a2": 0.243, "theta1": 0.05, "theta2": -0.08, "side": 0.02}
 _UPPER_SIDE_M, _PRIOR_SD_M = 0.015, 4e-4
 _SIDE = f"{ARM}.planar.side"
-_Posed = tuple[Problem, tuple[FactorRecords, ...]]
 
 
 @check("estimator", needed=True)
@@ -177,21 +176,21 @@ def it_converges_to_the_truth_and_keeps_to_the_bounds(s: Subject) -> None:
     s.posed = _posed(Interval(upper=_UPPER_SIDE_M))
     solution = _solved(s.built, s.posed)
     expect(solution.verdict.converged, f"found the verdict {solution.verdict.status!r}, expected convergence")
-    s.posed[0].parameters.check(solution.values)
+    s.posed.parameters.check(solution.values)
     _expect_near(solution, {**_TRUTH, "side": _UPPER_SIDE_M})
 
 
 @check("estimator")
 def it_weighs_records_and_priors(s: Subject) -> None:
     """``side`` is then the weighted mean of y and of its prior at zero, by which nothing else moves."""
-    (problem, records), random = _posed(Interval(), _PRIOR_SD_M), np.random.default_rng(6)
-    noisy = records[0].record.copy()
+    problem, random = _posed(Interval(), _PRIOR_SD_M), np.random.default_rng(6)
+    noisy = problem.records[0].record.copy()
     noisy[:, :_POSES] += random.normal(0.0, 3 * NOISE_M, (len(noisy), _POSES))
     weights = random.uniform(0.2, 5.0, _POSES)
-    weighted = problem.weighted((replace(records[0], record=noisy),), (weights,))
+    weighted = problem.with_records((replace(problem.records[0], record=noisy),)).weighted((weights,))
     y = noisy[problem.kernels[0].factor.channels.index(f"{TRACKER}.y"), :_POSES]
     mean = weights @ y / (weights.sum() + (NOISE_M / _PRIOR_SD_M) ** 2)
-    _expect_near(_solved(s.built, (problem, weighted)), {"side": mean})
+    _expect_near(_solved(s.built, weighted), {"side": mean})
 
 
 @check("estimator")
@@ -205,7 +204,7 @@ def cut_short_it_reports_that_it_did_not_converge(s: Subject) -> None:
 RESULTS["estimator"] = lambda s, estimator: _solved(estimator, s.posed).values
 
 
-def _posed(side: Interval, prior_sd: float | None = None) -> _Posed:
+def _posed(side: Interval, prior_sd: float | None = None) -> Problem:
     """Exact tip positions; ``side`` moves y alone, so neither its bound nor its prior disturbs the rest."""
     arms, measurements = planar_arms([ARM]), {TRACKER: Tip()}
     parameters = all_parameters(arms)
@@ -215,14 +214,12 @@ def _posed(side: Interval, prior_sd: float | None = None) -> _Posed:
     records = dataset({**moved.channels, **exact})
     block = replace(parameters[_SIDE], domain=side, prior_sd=prior_sd)
     parameters = parameters.replaced({_SIDE: block}).with_free(parameters.names)
-    problem = Problem.build(arms, measurements, parameters, GRAVITY, records, "interpreted")
-    return problem, problem.records(records)
+    return Problem.build(arms, measurements, parameters, GRAVITY, records, "interpreted")
 
 
-def _solved(estimator: Estimator, posed: _Posed) -> Solution:
-    problem, records = posed
+def _solved(estimator: Estimator, problem: Problem) -> Solution:
     start = problem.parameters.nominal()
-    solution = estimator.solve(problem, records, start)
+    solution = estimator.solve(problem, start)
     expect(bool(np.array_equal(start, problem.parameters.nominal())), "it changed the start that it was given")
     return solution
 

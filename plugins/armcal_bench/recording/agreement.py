@@ -41,8 +41,8 @@ from armcal.planning.suggestion import suggest
 from armcal.problem.factor_records import declared
 from armcal.problem.many_points import as_seen
 from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.projection import factor_at_zero, projected
+from armcal.problem.problem import Problem
+from armcal.problem.projection import factor_at_zero
 from armcal.problem.readings import with_joint_noise
 from armcal.run.experiment import Experiment
 from armcal.run.judging import known_accuracies, own_deviations
@@ -111,17 +111,15 @@ class QuickFitter:
         system = experiment.system
         parameters = experiment.parameters
         problem = Problem.build(system.arms, contacts, parameters, system.environment, dataset, "interpreted")
-        records = problem.records(dataset)
-        problem, proposed = _placed(problem, records, dataset, known)
-        self.problem = started(problem, records)
-        nominal = self.problem.parameters.nominal()
-        self.records = with_joint_noise(self.problem, records, nominal)
+        problem, proposed = _placed(problem, dataset, known)
+        problem = started(problem)
+        self.problem = with_joint_noise(problem, problem.parameters.nominal())
         weak_priors = {
             block.name: replace(block, prior_sd=block.scale * (_FAR if block.nuisance or block.name in proposed else 1))
             for block in self.problem.parameters.free
             if block.prior_sd is None
         }
-        self._weak = replace(self.problem, parameters=self.problem.parameters.replaced(weak_priors))
+        self._weak = self.problem.with_parameters(self.problem.parameters.replaced(weak_priors))
         parameters, start = self._weak.parameters, self._weak.parameters.nominal()
         for block in parameters.free:
             if len(known.get(block.name, ())) == block.size:
@@ -135,14 +133,14 @@ class QuickFitter:
     def fit(self, used: Mask) -> Fitted:
         """Fit some of the postures (N), from where the last fit ended."""
         parameters = self._weak.parameters
-        records = self._weak.weighted(self.records, [used.astype(float)] * len(self.records))
-        posed = PosedProblem(self._weak, records)
+        problem = _used(self._weak, used)
+        posed = PosedProblem(problem)
         self._x = descended(posed, self._x, _MOST_STEPS, _DAMPING, _AT_REST)
         values = posed.values(self._x)
-        triangle = self._weak.triangular_factor(values, records)
-        spent, equations = InverseInformation.of(triangle, parameters).spent, self._weak.equations(records)
+        triangle = problem.triangular_factor(values)
+        spent, equations = InverseInformation.of(triangle, parameters).spent, problem.equations()
         freedom = max(equations - spent, 0.0) + _DECLARED_COUNTS
-        squares = 2 * self._weak.cost(values, records)
+        squares = 2 * problem.cost(values)
         scale = max(float(np.sqrt((squares + _DECLARED_COUNTS) / freedom)), _LEAST_SCALE)
         independent = sum(self._numbers(one) for one in np.flatnonzero(used).tolist()) / max(equations, 1)
         root = InverseInformation.of(triangle / scale, parameters).root
@@ -150,13 +148,13 @@ class QuickFitter:
 
     def predicted(self, fitted: Fitted, one: int) -> PredictedResidual:
         """Of a posture that was not fitted."""
-        records = self._weak.subset(self.records, np.array([one], dtype=np.intp))
+        problem = self._weak.subset(np.array([one], dtype=np.intp))
         to_half = self._weak.parameters.entries_jacobian(fitted.values) @ fitted.half
         factors = zip(
-            [kernel.factor for kernel in self._weak.kernels],
-            records,
-            self._weak.whitened_residuals(fitted.values, records),
-            self._weak.jacobians(fitted.values, records),
+            [kernel.factor for kernel in problem.kernels],
+            problem.records,
+            problem.whitened_residuals(fitted.values),
+            problem.jacobians(fitted.values),
             strict=True,
         )
         residuals, reaches, whitenings = [], [], []
@@ -178,7 +176,7 @@ class QuickFitter:
 
     def _numbers(self, one: int) -> int:
         count = 0
-        for kernel, record in zip(self._weak.kernels, self.records, strict=True):
+        for kernel, record in zip(self._weak.kernels, self._weak.records, strict=True):
             if record.weight[one] > 0:
                 rows = kernel.factor.rows if record.present is None else int(record.present[:, one].sum())
                 count += rows if kernel.points is None else min(rows, _POSE_NUMBERS)
@@ -188,10 +186,9 @@ class QuickFitter:
         """Of each fitted posture how far it lies from a fit without it, to first order: the square in units of what is
         expected, and how many numbers that are."""
         to_half = self._weak.parameters.entries_jacobian(fitted.values) @ fitted.half / fitted.scale
-        residuals = self._weak.whitened_residuals(fitted.values, self.records)
-        jacobians = self._weak.jacobians(fitted.values, self.records)
+        residuals, jacobians = self._weak.whitened_residuals(fitted.values), self._weak.jacobians(fitted.values)
         rows: dict[int, list[tuple[Array, Array]]] = {}
-        for record, residual, jacobian in zip(self.records, residuals, jacobians, strict=True):
+        for record, residual, jacobian in zip(self._weak.records, residuals, jacobians, strict=True):
             reach = np.einsum("rvb,vc->brc", jacobian, to_half)
             for one in np.flatnonzero(fitted.used & (record.weight[: record.count] > 0)).tolist():
                 rows.setdefault(one, []).append((residual[:, one], reach[one]))
@@ -205,8 +202,13 @@ class QuickFitter:
         return distances
 
 
+def _used(problem: Problem, used: Mask) -> Problem:
+    """With nothing but some of the postures counted (N)."""
+    return problem.weighted([used.astype(float)] * len(problem.records))
+
+
 def _placed(
-    problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, known: Mapping[str, tuple[float, ...]]
+    problem: Problem, dataset: Dataset, known: Mapping[str, tuple[float, ...]]
 ) -> tuple[Problem, frozenset[str]]:
     """The problem about what instruments find by themselves of their free parameters, and the names of these."""
     finders = [name for name, m in problem.blueprint.measurements.items() if isinstance(m, Proposing)]
@@ -217,9 +219,9 @@ def _placed(
         parameters, nominal = problem.parameters, problem.parameters.nominal()
         for block in own:
             nominal[parameters.entries_of(block.name)] = known[block.name]
-        problem = replace(problem, parameters=parameters.with_nominal(nominal))
+        problem = problem.with_parameters(parameters.with_nominal(nominal))
     else:
-        start = with_proposals(Start(problem), records, dataset)
+        start = with_proposals(Start(problem), dataset)
         if not start.taken:
             raise ProblemError(
                 "the images are too few to find the camera by.", hint="Take more, each turned otherwise."
@@ -254,19 +256,17 @@ class Knowledge:
     vary: tuple[str, ...]  # joints that would add most if they were moved more, the best first
 
 
-def knowledge(
-    experiment: Experiment, problem: Problem, records: Sequence[FactorRecords], dataset: Dataset
-) -> Knowledge:
+def knowledge(experiment: Experiment, problem: Problem, dataset: Dataset) -> Knowledge:
     """Judge a dataset's postures, those that would train a run.
 
     Raises:
         ArmcalError: it cannot be judged.
     """
     train = _training(experiment, dataset)
-    problem, training = _restricted(problem, records, train)
+    problem = restricted(problem.subset(train))
     if not problem.parameters.free:
         return Knowledge(0, 0, len(train), (), ())
-    triangle = factor_at_zero(problem, problem.parameters.nominal(), training)
+    triangle = factor_at_zero(problem, problem.parameters.nominal())
     scaled = triangle * problem.parameters.scales()
     rank, free = numerical_rank(scaled), scaled.shape[1]
     missing: tuple[str, ...] = ()
@@ -275,21 +275,19 @@ def knowledge(
     return Knowledge(rank, free, len(train), missing, _joints_to_vary(problem, dataset.subset(train), scaled, rank))
 
 
-def explained(
-    experiment: Experiment, problem: Problem, records: Sequence[FactorRecords], dataset: Dataset
-) -> tuple[str, ...]:
+def explained(experiment: Experiment, problem: Problem, dataset: Dataset) -> tuple[str, ...]:
     """Everything that is not determined, or hardly, with why: gauges too, which no posture would determine.
 
     Raises:
         ArmcalError: it cannot be judged.
     """
-    problem, training = _restricted(problem, records, _training(experiment, dataset))
+    problem = restricted(problem.subset(_training(experiment, dataset)))
     if not problem.parameters.free:
         return ()
     values = problem.parameters.nominal()
-    known = identify_from(factor_at_zero(problem, values, training), problem.parameters)
-    lines = [str(undetermined) for undetermined in explain(problem, values, training, known)]
-    if scale_is_unseen(problem, values, training, known):
+    known = identify_from(factor_at_zero(problem, values), problem.parameters)
+    lines = [str(undetermined) for undetermined in explain(problem, values, known)]
+    if scale_is_unseen(problem, values, known):
         lines.insert(0, f"{UNSEEN_SCALE}; {GIVE_A_LENGTH}")
     hardly = [f"{combination}: hardly determined (sd {sd:.2g} typical scales)" for combination, sd in known.hardly]
     return (*lines, *hardly)
@@ -303,13 +301,6 @@ def _training(experiment: Experiment, dataset: Dataset) -> np.ndarray[tuple[int]
     elif settings.holdout and settings.train_ids is None and len(dataset) > 2:
         chosen = hold_out(len(dataset), settings.holdout, settings.seed, experiment.poses(dataset)).train
     return chosen if len(chosen) else np.arange(len(dataset), dtype=np.intp)
-
-
-def _restricted(
-    problem: Problem, records: Sequence[FactorRecords], train: np.ndarray[tuple[int], np.dtype[np.intp]]
-) -> tuple[Problem, tuple[FactorRecords, ...]]:
-    training = problem.subset(records, train)
-    return restricted(problem, training), training
 
 
 def _joints_to_vary(problem: Problem, dataset: Dataset, scaled: Array, rank: int) -> tuple[str, ...]:
@@ -330,8 +321,7 @@ def _joints_to_vary(problem: Problem, dataset: Dataset, scaled: Array, rank: int
         try:
             channels = {**both.channels, channel: both.column(channel) + step * signs}
             seen, _ = as_seen(problem, values, replace(both, channels=channels))
-            moved = projected(problem, values, problem.records(seen))
-            rows = problem.triangular_factor(values, moved) * scales
+            rows = factor_at_zero(problem.of(seen), values) * scales
         except ArmcalError:
             continue
         gains[channel] = float(np.linalg.slogdet(base + rows.T @ rows)[1] - np.linalg.slogdet(base)[1])
@@ -370,9 +360,9 @@ def advice(fitter: QuickFitter, fitted: Fitted, dataset: Dataset, joints: Mappin
     problem = fitter.problem
     if not all(kernel.factor.output_channels for kernel in problem.kernels) or not problem.parameters.free:
         return Advice()
-    acting = problem.weighted(fitter.records, [fitted.used.astype(float)] * len(fitter.records))
-    made = estimate(problem, acting, Solution(fitted.values, _QUICK))
-    made = widened(problem, acting, made, np.arange(len(dataset)))
+    acting = _used(problem, fitted.used)
+    made = estimate(acting, Solution(fitted.values, _QUICK))
+    made = widened(problem, acting.records, made, np.arange(len(dataset)))
     best = suggest(problem, dataset.subset(np.flatnonzero(fitted.used)), made, joints, 1)
     own = {f"{n}.{local}": sd for n in problem.blueprint.measurements for local, sd in own_deviations(made, n).items()}
     finite = {name: sd for name, sd in own.items() if np.isfinite(sd) and sd > 0}
@@ -574,7 +564,7 @@ class Assessor:
             return ()
         try:
             experiment, dataset, fitter = self._fitter(postures)
-            return explained(experiment, fitter.problem, fitter.records, dataset)
+            return explained(experiment, fitter.problem, dataset)
         except _UNFIT as fault:
             return (str(fault),)
 
@@ -584,7 +574,7 @@ class Assessor:
         try:
             experiment, dataset, fitter = self._fitter(postures)
             agreement = judge(AgreementJudge(fitter, [p.place for p in postures]))
-            known = knowledge(experiment, fitter.problem, fitter.records, dataset)
+            known = knowledge(experiment, fitter.problem, dataset)
             outlook = Advice()
             if agreement.fitted is not None:
                 outlook = advice(fitter, agreement.fitted, dataset, self._joints)

@@ -26,7 +26,7 @@ from armcal.io.lines import StandardOutput
 from armcal.measure.csv_writer import write_csv
 from armcal.plugins import PluginRegistry, discover
 from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal.run.outputs import calibration_content
 from armcal.run.pipeline import calibrate
@@ -194,10 +194,8 @@ def recalibrated(plan: MissionPlan, mission: Mission, calibration: Path, folder:
 class GaussNewton:
     """An estimator for fits that start near their solution: some damped steps, then undamped ones to the last digit."""
 
-    def solve(
-        self, problem: Problem, records: Sequence[FactorRecords], start: Array, progress: Progress = no_progress
-    ) -> Solution:
-        posed = PosedProblem(problem, tuple(records))
+    def solve(self, problem: Problem, start: Array, progress: Progress = no_progress) -> Solution:
+        posed = PosedProblem(problem)
         near = descended(posed, posed.x(start), _FIRST_STEPS, _DAMPING, _ENOUGH)
         values = posed.values(polish(posed, near))
         return Solution(values, SolverVerdict("Gauss-Newton", "at rest", True, _FIRST_STEPS, 0.0))
@@ -215,7 +213,7 @@ def refits(plan: MissionPlan, parameters: Parameters, mission: Mission) -> dict[
         return {}
     parts = (system.arms, system.measurements, parameters, system.environment, mission.records)
     problem = Problem.build(*parts, plan.experiment.settings.evaluator)
-    records, launch = problem.records(mission.records), parameters.nominal()
+    launch = parameters.nominal()
     everything = [first]
     while (following := max(int(_GROWTH * everything[-1]), everything[-1] + settings.every)) <= count:
         everything.append(following)
@@ -223,19 +221,19 @@ def refits(plan: MissionPlan, parameters: Parameters, mission: Mission) -> dict[
         "refit": [(0, last) for last in everything],
         "refit_recent": [(last - first, last) for last in range(first, count + 1, settings.every)],
     }
-    earliest = robust_fit(problem, problem.subset(records, np.arange(first)), [launch])
+    earliest = robust_fit(problem.subset(np.arange(first)), [launch])
     made: dict[str, Series] = {}
     for name, (_, *later) in spans.items():
         series = [(0.0, launch), (float(mission.times[first - 1]), earliest)]
         for begin, end in later:
             starts = series[-1][1], launch
-            values = robust_fit(problem, problem.subset(records, np.arange(begin, end)), starts)
+            values = robust_fit(problem.subset(np.arange(begin, end)), starts)
             series.append((float(mission.times[end - 1]), values))
         made[name] = series
     return made
 
 
-def robust_fit(problem: Problem, records: Sequence[FactorRecords], starts: Sequence[Array]) -> Array:
+def robust_fit(problem: Problem, starts: Sequence[Array]) -> Array:
     """The values of a Cauchy fit; from the next start if the one before leads to residuals beyond the noise.
 
     The smallest median residual wins. The first start itself, if none leads anywhere.
@@ -244,7 +242,7 @@ def robust_fit(problem: Problem, records: Sequence[FactorRecords], starts: Seque
     for start in starts:
         try:
             first = Solution(start, SolverVerdict("start", "", True, 0, 0.0))
-            fit = reweighted(problem, records, GaussNewton(), first, "cauchy")
+            fit = reweighted(problem, GaussNewton(), first, "cauchy")
         except NotConvergedError:
             continue
         if max(fit.scales) < best:
@@ -291,10 +289,10 @@ def error_curve(
     poses, instruments = random_poses(plan, mission), dict([next(iter(system.measurements.items()))])
     parts = (system.arms, instruments, free, system.environment, poses)
     problem = Problem.build(*parts, plan.experiment.settings.evaluator, groups={})
-    records, seen = problem.records(poses), np.zeros((len(times), len(poses), 3))
+    seen = np.zeros((len(times), len(poses), 3))
     for i, camera in enumerate(truth.camera_T_base_at(times)):
-        seen[i] = -problem.residuals(true[i], records)[0].T @ camera[:3, :3].T + camera[:3, 3]
-    errors = {name: _errors(problem, poses, of_one, times, seen) for name, of_one in series.items()}
+        seen[i] = -problem.residuals(true[i])[0].T @ camera[:3, :3].T + camera[:3, 3]
+    errors = {name: _errors(problem, of_one, times, seen) for name, of_one in series.items()}
     begun = np.searchsorted([time for time, _ in log.levels], times, side="right") - 1
     levels = tuple(log.levels[i][1] for i in begun)
     return ErrorCurve(times, np.isin(times, hours), np.isin(times, mission.times), errors, levels)
@@ -313,14 +311,14 @@ def random_poses(plan: MissionPlan, mission: Mission) -> Dataset:
     return Dataset(tuple(map(str, range(count))), channels, source="random poses")
 
 
-def _errors(problem: Problem, poses: Dataset, series: Series, times: Array, seen: Array) -> Array:
+def _errors(problem: Problem, series: Series, times: Array, seen: Array) -> Array:
     """Of a calibration whose springs do not hold the arm, and which predicts nothing: as much as the tips lie apart."""
-    errors, used, records = np.zeros(len(times)), -1, problem.records(poses)
+    errors, used = np.zeros(len(times)), -1
     for i, newest in enumerate(np.searchsorted([time for time, _ in series], times, side="right") - 1):
         if newest != used:
             used, now = newest, np.full_like(seen[i], np.nan)
             with suppress(NotConvergedError):
-                now = -problem.residuals(series[newest][1], records)[0].T
+                now = -problem.residuals(series[newest][1])[0].T
         off = float(np.linalg.norm(now - seen[i], axis=1).mean())
         errors[i] = off if np.isfinite(off) else float(np.linalg.norm(np.ptp(seen[i], axis=0)))
     return errors

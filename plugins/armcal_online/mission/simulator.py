@@ -432,10 +432,7 @@ def measured_while_moving(
     parameters = truth.parameters.with_nominal(values[0]).with_free(moving)
     parts = (request.arms, request.measurements, parameters, request.environment, commands)
     problem = Problem.build(*parts, evaluator="interpreted")
-    records = problem.records(commands)
-    shown = [
-        problem.by_channel(problem.predict(row, problem.subset(records, np.array([i])))) for i, row in enumerate(values)
-    ]
+    shown = [problem.by_channel(problem.subset(np.array([i])).predict(row)) for i, row in enumerate(values)]
     cameras = truth.camera_T_base_at(times)
     exact = {name: np.concatenate([one[name] for one in shown]) for name in shown[0]}
     for name in request.measurements:

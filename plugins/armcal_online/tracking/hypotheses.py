@@ -34,7 +34,7 @@ from armcal.base.quaternions import quaternion_matrix
 from armcal.calibration.calibration import Calibration
 from armcal.errors import ArmcalError
 from armcal.estimate.online import Gaussian, Linearised
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 
 from armcal_online.tracking.belief import Belief, ProcessNoise, StateSpace
 from armcal_online.tracking.observer import JointNoise, Observer, Reading
@@ -148,19 +148,19 @@ def find_steps(calibration: Calibration, observer: Observer, values: Array) -> S
         names = [channel for kernel in problem.kernels for channel in kernel.factor.channels]
         others = {name: np.full(len(poses), rest.get(name, 0.0)) for name in names}
         complete = Dataset(poses.ids, {**others, **poses.channels, **read})
-        records = problem.records(complete)
-        jacobians = problem.jacobians(values, records)
+        problem = problem.of(complete)
+        jacobians = problem.jacobians(values)
         rows = [np.moveaxis(j, 2, 0).reshape(-1, j.shape[1]) for j in jacobians]  # record by record
         slopes = space.by_coordinates(values, -np.concatenate(rows))
         commanded = {f"{arm.name}.{joint}": dimension for arm in arms for joint, dimension in arm.commanded.items()}
-        by_joint = _whitened(problem, values, records, list(commanded))
+        by_joint = _whitened(problem, values, list(commanded))
         motions = -np.concatenate([block.reshape(-1, len(commanded)) for block in by_joint])
         steps = {
             channel: _joint_step(channel, dimension, moved, slopes, space.names)
             for (channel, dimension), moved in zip(commanded.items(), motions.T, strict=True)
         }
         factors = [kernel.factor.name for kernel in problem.kernels]
-        motions_of = {name: _sensor_motion(problem, values, records, name, complete, slopes) for name in factors}
+        motions_of = {name: _sensor_motion(problem, values, name, complete, slopes) for name in factors}
     except ArmcalError:
         return Steps((), (), {})
     return Steps(
@@ -190,10 +190,8 @@ def _probing_poses(arms: Iterable[Arm]) -> Dataset:
     return Dataset(tuple(str(i) for i in range(_POSES)), channels)
 
 
-def _whitened(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], channels: Sequence[str]
-) -> list[Array]:
-    slopes = zip(problem.kernels, problem.channel_slopes(values, records, channels), strict=True)
+def _whitened(problem: Problem, values: Array, channels: Sequence[str]) -> list[Array]:
+    slopes = zip(problem.kernels, problem.channel_slopes(values, channels), strict=True)
     return [np.moveaxis(slope / np.array(kernel.factor.noise)[:, None, None], 2, 0) for kernel, slope in slopes]
 
 
@@ -230,7 +228,7 @@ def _combination(slopes: Array, moved: Array) -> Array | None:
 
 
 def _sensor_motion(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], instance: str, poses: Dataset, slopes: Array
+    problem: Problem, values: Array, instance: str, poses: Dataset, slopes: Array
 ) -> tuple[Array, tuple[str, ...]] | None:
     """How the free parameters make a rigid motion of an instrument's frame; None for one that reads no position."""
     position, turn = ([f"{instance}.{axis}" for axis in axes] for axes in (_AXES[:3], ("qw", "qx", "qy", "qz")))
@@ -238,7 +236,7 @@ def _sensor_motion(
         return None
     channels = position + (turn if all(poses.has(channel) for channel in turn) else [])
     moved = []
-    for kernel, block in zip(problem.kernels, _whitened(problem, values, records, channels), strict=True):
+    for kernel, block in zip(problem.kernels, _whitened(problem, values, channels), strict=True):
         rows = np.zeros((*block.shape[:2], len(_AXES)))
         if kernel.factor.name == instance:
             for k in range(len(poses)):

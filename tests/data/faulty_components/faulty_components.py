@@ -294,7 +294,7 @@ class Estimator:
     def __init__(self, settings: Any) -> None:
         pass
 
-    def solve(self, problem: Any, records: Any, start: Any, progress: Any = None) -> Any:
+    def solve(self, problem: Any, start: Any, progress: Any = None) -> Any:
         return Solution(start, SolverVerdict("lazy", "done", self.converged, 0, 0.0))
 
 
@@ -303,10 +303,10 @@ class Unconverged(Estimator):
 
 
 class BoundBreaker(Estimator):
-    def solve(self, problem: Any, records: Any, start: Any, progress: Any = None) -> Any:
+    def solve(self, problem: Any, start: Any, progress: Any = None) -> Any:
         return Solution(start + 1, SolverVerdict("bold", "done", True, 0, 0.0))
 
 
 class Raising(Estimator):
-    def solve(self, problem: Any, records: Any, start: Any, progress: Any = None) -> Any:
+    def solve(self, problem: Any, start: Any, progress: Any = None) -> Any:
         raise ZeroDivisionError("no step")

@@ -122,8 +122,8 @@ class Newton:
     def __init__(self, settings: Any) -> None:
         self.settings = settings
 
-    def solve(self, problem: Any, records: Any, start: Any, progress: Any = no_progress) -> Any:
-        posed = PosedProblem(problem, self.taken(problem, records))
+    def solve(self, problem: Any, start: Any, progress: Any = no_progress) -> Any:
+        posed = PosedProblem(self.taken(problem))
         low, high = posed.bounds()
         x, count, moved = np.clip(self.start(posed, start), low, high), 0, math.inf
         while count < self.settings.max_iterations and moved > 1e-12:
@@ -132,8 +132,8 @@ class Newton:
             moved, x, count = float(np.abs(there - x).max()), there, count + 1
         return Solution(posed.values(x), SolverVerdict("newton", "done", self.verdict(moved), count, 0.0))
 
-    def taken(self, problem: Any, records: Any) -> Any:
-        return records
+    def taken(self, problem: Any) -> Any:
+        return problem
 
     def start(self, posed: Any, start: Any) -> Any:
         return posed.x(start)
@@ -160,13 +160,13 @@ class AlwaysConverged(Newton):
 
 
 class IgnoresWeights(Newton):
-    def taken(self, problem: Any, records: Any) -> Any:
-        return problem.weighted(records, [1 / each.weight[: each.count] for each in records])
+    def taken(self, problem: Any) -> Any:
+        return problem.weighted([1 / each.weight[: each.count] for each in problem.records])
 
 
 class IgnoresPriors(Newton):
     def model(self, posed: Any, x: Any) -> Any:
-        found = posed.problem.normal_equations(posed.values(x), posed.records)
+        found = posed.problem.normal_equations(posed.values(x))
         scales = posed.coordinate_scales
         return scales * found.gradient, found.hessian * np.outer(scales, scales)
 
@@ -176,8 +176,8 @@ class StartsFromTheLastAnswer(Newton):
 
     last: Any = None
 
-    def solve(self, problem: Any, records: Any, start: Any, progress: Any = no_progress) -> Any:
-        found = super().solve(problem, records, start, progress)
+    def solve(self, problem: Any, start: Any, progress: Any = no_progress) -> Any:
+        found = super().solve(problem, start, progress)
         nudged = found.values if self.last is None else found.values + 1e-9
         self.last = found.values
         return Solution(np.minimum(nudged, found.values + 1e-9), found.verdict)

@@ -98,7 +98,7 @@ def test_undistorted_places_project_back(lens: str, distortion: tuple[float, ...
 @pytest.mark.slow
 def test_points_evaluate_as_one_long_expression(experiment: Experiment, dataset: Dataset) -> None:
     problem, few = problem_of(experiment, dataset), np.arange(5)
-    values, records = away(problem), problem.subset(problem.records(dataset), few)
+    values, records = away(problem), problem.of(dataset).subset(few).records
     (kernel,), plan = problem.kernels, problem.blueprint
     measurement = plan.measurements["camera"]
     unrolled = build_factor(
@@ -107,13 +107,16 @@ def test_points_evaluate_as_one_long_expression(experiment: Experiment, dataset:
     order = [kernel.factor.channels.index(channel) for channel in unrolled.channels]
     free = values[list(problem.parameters.free_entries)]
     function = unrolled.linearise_function
-    (residual,), (jacobian,) = problem.residuals(values, records), problem.jacobians(values, records)
+    (residual,), (jacobian,) = (
+        problem.with_records(records).residuals(values),
+        problem.with_records(records).jacobians(values),
+    )
     noise = np.array(kernel.factor.noise)
     for i in few:
         _, expected, slopes = (np.asarray(x) for x in function(free, records[0].record[order, i], np.zeros(0)))
         assert np.allclose(residual[:, i], expected.ravel(), atol=1e-13)
         assert np.allclose(jacobian[:, :, i] * noise[:, None], slopes.T, atol=1e-10)
-    shown = problem.predict(values, records)[0].outputs
+    shown = problem.with_records(records).predict(values)[0].outputs
     read = dataset.stacked(kernel.factor.output_channels)[:, few]
     assert np.allclose(read - shown, residual, atol=1e-13)
 
@@ -125,15 +128,15 @@ def test_a_lost_corner_costs_its_rows_alone(experiment: Experiment, dataset: Dat
         channels[f"camera.v_{corner}"][5] = np.nan
     lost = replace(dataset, channels=channels)
     problem = problem_of(experiment, lost)
-    values, whole, records = away(problem), problem.records(dataset), problem.records(lost)
-    assert problem.equations(whole) - problem.equations(records) == 2 + 108
-    (before,), (after,) = problem.residuals(values, whole), problem.residuals(values, records)
+    values, whole, records = away(problem), problem.of(dataset).records, problem.of(lost).records
+    assert problem.with_records(whole).equations() - problem.with_records(records).equations() == 2 + 108
+    (before,), (after,) = problem.with_records(whole).residuals(values), problem.with_records(records).residuals(values)
     assert not after[14:16, 3].any() and np.array_equal(
         np.delete(after[:, 3], [14, 15]), np.delete(before[:, 3], [14, 15])
     )
-    (jacobian,) = problem.jacobians(values, records)
+    (jacobian,) = problem.with_records(records).jacobians(values)
     assert not jacobian[14:16, :, 3].any() and jacobian[13, :, 3].any()
-    errors = record_errors(problem, values, records)
+    errors = record_errors(problem.with_records(records), values)
     own = before[:, 3].reshape(-1, 2)[np.arange(54) != 7]
     assert errors[3] == pytest.approx(np.sqrt(np.sum(own**2) / 53))
     assert np.isnan(errors[5]) and np.isfinite(np.delete(errors, 5)).all()
@@ -141,12 +144,12 @@ def test_a_lost_corner_costs_its_rows_alone(experiment: Experiment, dataset: Dat
 
 def test_few_points_keep_their_own_rows(experiment: Experiment, dataset: Dataset) -> None:
     problem = problem_of(experiment, dataset)
-    values, records = away(problem), problem.records(dataset)
-    small, few = with_few_points(problem, records)
+    problem, values = problem.of(dataset), away(problem)
+    small = with_few_points(problem)
     rows = [problem.kernels[0].factor.output_channels.index(c) for c in small.kernels[0].factor.output_channels]
     assert len(rows) == 24
-    assert np.array_equal(small.residuals(values, few)[0], problem.residuals(values, records)[0][rows])
-    assert np.allclose(small.jacobians(values, few)[0], problem.jacobians(values, records)[0][rows], atol=1e-12)
+    assert np.array_equal(small.residuals(values)[0], problem.residuals(values)[0][rows])
+    assert np.allclose(small.jacobians(values)[0], problem.jacobians(values)[0][rows], atol=1e-12)
 
 
 def test_what_is_behind_or_outside_is_not_seen(experiment: Experiment, dataset: Dataset) -> None:
@@ -205,5 +208,5 @@ def test_a_hand_that_did_not_turn_is_refused_with_the_motion_that_is_missing(dat
     records = Dataset(tuple(map(str, range(12))), {**still, **moved, **shown})
     problem = problem_of(experiment, records)
     with pytest.raises(ProblemError, match="hardly turned") as refused:
-        with_proposals(Start(problem), problem.records(records), records)
+        with_proposals(Start(problem.of(records)), records)
     assert "30 deg" in refused.value.hint

@@ -46,4 +46,4 @@ def _tools(experiment: armcal.Experiment, dataset: armcal.Dataset, parameters: o
     """Where the tool is in each record (3 x N, m)."""
     system, fixed = experiment.system, parameters.with_free(())  # type: ignore[attr-defined]
     problem = Problem.build(system.arms, system.measurements, fixed, system.environment, dataset, "interpreted")
-    return problem.predict(fixed.nominal(), problem.records(dataset))[0].tools[0, 3]
+    return problem.of(dataset).predict(fixed.nominal())[0].tools[0, 3]

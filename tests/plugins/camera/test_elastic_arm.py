@@ -15,10 +15,11 @@ CONFIG = Path(__file__).parents[3] / "configs" / "so101" / "camera.yaml"
 
 def test_slopes_by_loads_of_few_points_are_those_of_all() -> None:
     experiment = armcal.Experiment.load(CONFIG, ["arms.arm.effects.spring.compliance_rad_per_Nm=0.05"])
-    problem, records = (ready := assemble(experiment, Stopwatch())).problem, ready.training
-    few, thinned = with_few_points(problem, records)
+    ready = assemble(experiment, Stopwatch())
+    problem = ready.problem.with_records(ready.training)
+    few = with_few_points(problem)
     values, dataset = problem.parameters.nominal(), ready.dataset.subset(ready.split.train)
-    of_all, of_few = (Motion.of(p, values, r, dataset) for p, r in ((problem, records), (few, thinned)))
+    of_all, of_few = (Motion.of(p, values, dataset) for p in (problem, few))
     whole, part = problem.kernels[0].factor, few.kernels[0].factor
     assert whole.rows > part.rows == 2 * FEW_POINTS
     rows = [whole.output_channels.index(channel) for channel in part.output_channels]
