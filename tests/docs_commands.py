@@ -307,7 +307,7 @@ def load_everything() -> None:
     import matplotlib.pyplot  # noqa: F401
     from armcal.functions import compiler
     from armcal.plugins import discover
-    from armcal.report import page  # noqa: F401
+    from armcal.report import page, run_document  # noqa: F401
     from armcal.run import pipeline  # noqa: F401
 
     discover()

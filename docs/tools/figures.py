@@ -17,10 +17,9 @@ FIGURES = ROOT / "docs" / "figures"
 SECTIONS = {
     "verdict": "header",
     "accuracy": "#accuracy",
-    "intervals": "#intervals",
-    "distribution": "#distribution",
+    "corrections": "#corrections",
+    "joints": "#joints",
     "records": "#records",
-    "parameters": "#parameters",
 }
 """Each picture of the report page, and the part of report.html that it shows."""
 WIDTH = 1000

@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from armcal.measure.instrument import InstrumentSettings as InstrumentSettings
     from armcal.measure.measurement import Channel as Channel
     from armcal.plugins import use_plugins as use_plugins
-    from armcal.report.sections import ReportSection as ReportSection
+    from armcal.report.document import ReportSection as ReportSection
     from armcal.run.pipeline import calibrate as calibrate
     from armcal.run.result import RunResult as RunResult
 
@@ -87,7 +87,7 @@ _FOR_PLUGINS = {
     "armcal.measure.instrument": "Contact Instrument InstrumentSettings",
     "armcal.measure.measurement": "Channel",
     "armcal.plugins": "use_plugins",
-    "armcal.report.sections": "ReportSection",
+    "armcal.report.document": "ReportSection",
 }
 """What plugins are made of."""
 _HOMES = {name: home for homes in (_FOR_USERS, _FOR_PLUGINS) for home, names in homes.items() for name in names.split()}

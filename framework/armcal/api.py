@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,8 @@ from armcal.diagnose.verdict import Verdict
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
 from armcal.io.parallel import Executor
-from armcal.report import plugin_sections, render
+from armcal.report.page import page
+from armcal.report.run_document import plugin_sections, run_document
 from armcal.run import experiment, outputs
 from armcal.run.pipeline import calibrate
 from armcal.run.result import RunResult
@@ -77,8 +77,8 @@ class Run:
         Raises:
             InputError: the folder holds other things, or cannot be written.
         """
-        sections = plugin_sections(self.result, self.experiment.registry)
-        outputs.write(self.result, self.experiment, Path(folder), partial(render, sections=sections), accept)
+        document = run_document(self.result, plugin_sections(self.result, self.experiment.registry)[0])
+        outputs.write(self.result, self.experiment, Path(folder), page(document), accept)
         return Path(folder)
 
 

@@ -170,7 +170,7 @@ _KINDS = {
     "camera": _kind("cameras", "Camera(settings)", "devices.live:LiveCamera"),
     "bench": _kind("benches", "Bench(settings)", "devices.simulated:SimulatedBench"),
     "command": _kind("commands", "Command", "hooks:Command"),
-    "report_section": _kind("report_sections", "Section(result)", "report.sections:SectionMaker"),
+    "report_section": _kind("report_sections", "Section(result)", "report.run_document:SectionMaker"),
 }
 COMPONENTS: Mapping[str, ComponentKind] = MappingProxyType(_KINDS)
 """The kinds of component."""

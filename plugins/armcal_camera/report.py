@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -12,10 +11,9 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.errors import ArmcalError
 from armcal.io.plain_files import input_bytes
-from armcal.report import svg
+from armcal.report.document import Figure, Marks, Panel, Part, ReportSection, Table
 from armcal.report.numbers import significant
-from armcal.report.sections import ReportSection
-from armcal.report.svg import Axis, Box, Figure
+from armcal.report.plot import nice_step
 from armcal.run.result import RunResult
 
 from armcal_camera.images import MOST_BYTES, grey_image, opencv
@@ -28,37 +26,26 @@ _MOST_VECTORS, _WORST, _MOST_BYTES = 4000, 8, 200_000
 _DRAWN, _ENLARGED = 3, 20.0
 _SHORTEST, _LONGEST = 0.004, 0.06  # Of the width of an image: arrows of typical length that can be seen, and told apart
 _WIDTH_PX, _QUALITIES = 480, (70, 45, 25, 10)
-_COLOURS = {"seen": "#ffd400", "predicted": "#00c2ff", "arrow": "#ff4fa3"}
-_CROSS = "m-3 0h6m-3-3v6"
 
 
 def cameras(result: RunResult) -> ReportSection | None:
     described = result.system.description["measurements"]
-    start, parts, count = 0, list[str](), sum(section["type"] == "camera" for section in described.values())
+    start, parts, count = 0, list[Part](), sum(section["type"] == "camera" for section in described.values())
     for name, measurement in result.system.measurements.items():
         rows = len(measurement.noise())
         if described[name]["type"] == "camera":
             own = result.errors.calibrated_residual_mm[start : start + rows]
             residuals = residuals_of(result, name, cast("Camera", measurement), own)
-            parts += _of_camera(residuals, _MOST_BYTES // count)
+            parts += [_over_the_sensor(residuals), _by_image(residuals), *drawn_images(residuals, _MOST_BYTES // count)]
         start += rows
-    return ReportSection("Cameras", "".join(parts)) if parts else None
+    return ReportSection("Cameras", parts=parts) if parts else None
 
 
-def _of_camera(residuals: CameraResiduals, most_bytes: int) -> list[str]:
-    figure, errors = _over_the_sensor(residuals), residuals.by_image
+def _by_image(residuals: CameraResiduals) -> Table:
+    errors, seen = residuals.by_image, np.isfinite(residuals.off[0]).sum(axis=0)
     order = [int(i) for i in np.argsort(-np.nan_to_num(errors))[:_WORST]]
-    rows = "".join(
-        f"<tr><td>{escape(residuals.images[i])}</td><td>{significant(float(errors[i]))}</td>"
-        f"<td>{int(np.isfinite(residuals.off[0, :, i]).sum())}</td></tr>"
-        for i in order
-    )
-    table = (
-        f"<table><thead><tr><th>image</th><th>rms, px</th><th>corners</th></tr></thead><tbody>{rows}</tbody></table>"
-    )
-    heading = f"<h3>{escape(residuals.name)}</h3>"
-    over = f"<figure>{figure.wide}<figcaption>{escape(figure.caption)}</figcaption></figure>"
-    return [heading, over, table, drawn_images(residuals, most_bytes)]
+    rows = [(residuals.images[i], significant(float(errors[i])), str(seen[i])) for i in order]
+    return Table(f"{residuals.name}: the images with the largest errors", ("Image", "rms, px", "Corners"), rows)
 
 
 def _over_the_sensor(residuals: CameraResiduals) -> Figure:
@@ -67,25 +54,21 @@ def _over_the_sensor(residuals: CameraResiduals) -> Figure:
     places, off = residuals.seen[:, there], residuals.off[:, there]
     step = max(1, places.shape[1] // _MOST_VECTORS)
     places, off = places[:, ::step], off[:, ::step]
-    low, high = places.min(axis=1), places.max(axis=1)
     typical = float(np.median(np.linalg.norm(off, axis=0)))
-    enlarged = svg.nice_step(0.02 * float(max(high - low)) / max(typical, 1e-9))
+    enlarged = nice_step(0.02 * float(np.ptp(places, axis=1).max()) / max(typical, 1e-9))
     caption = (
         f"Where corners were seen, all images together; lines are measured minus predicted, "
         f"{significant(enlarged, 1)} times enlarged (median {significant(typical)} px). Lines of neighbours that agree "
         "mean that the lens differs from its model; all lines of an image alike, that the arm stood elsewhere."
     )
+    marks = [Marks("vector", _lines(places, places + enlarged * off)), Marks("dot small", places)]
+    panel = Panel("", marks, "u, px", "v, px", equal=True, down=True)
+    return Figure(f"{residuals.name}: reprojection residuals over the sensor", caption, caption, [panel], columns=1)
 
-    def draw(width: float) -> tuple[float, list[str]]:
-        box = Box(58, 12, width - 16, 12 + (width - 74) * float((high - low)[1] / (high - low)[0]))
-        x, y = Axis(low[0], high[0], box.left, box.right), Axis(low[1], high[1], box.top, box.bottom)
-        tips = places + enlarged * off
-        parts = svg.frame(box, x, y, ("u, px", "v, px"), (6, 5))
-        parts.append(svg.segments(x.at(places[0]), y.at(places[1]), x.at(tips[0]), y.at(tips[1]), "vector"))
-        return box.bottom + 48, [*parts, svg.dots(x.at(places[0]), y.at(places[1]), "dot small")]
 
-    title = "Reprojection residuals over the sensor"
-    return svg.both(f"camera-{residuals.name}", (title, caption, caption), draw)
+def _lines(starts: Array, ends: Array) -> Array:
+    """Lines between places (2 x N each), as one that breaks (2 x 3N)."""
+    return np.stack([starts, ends, np.full(starts.shape, np.nan)], axis=2).reshape(2, -1)
 
 
 @dataclass(frozen=True)
@@ -116,16 +99,8 @@ def residuals_of(result: RunResult, name: str, camera: Camera, residual: Array) 
     return CameraResiduals(name, result.dataset.ids, places, off, size, result.dataset.files.get(name, ()))
 
 
-@dataclass(frozen=True)
-class _Photo:
-    """An image as a data address, and its width and height (px)."""
-
-    address: str
-    size: tuple[float, float]
-
-
-def drawn_images(residuals: CameraResiduals, most_bytes: int) -> str:
-    """The worst images and a typical one with the corners seen and predicted, as HTML; empty if nothing was seen.
+def drawn_images(residuals: CameraResiduals, most_bytes: int) -> list[Part]:
+    """The worst images and a typical one with the corners seen and predicted; nothing if none was seen.
 
     Where an image was not read, or is no longer there, the corners stand alone.
 
@@ -136,14 +111,13 @@ def drawn_images(residuals: CameraResiduals, most_bytes: int) -> str:
     errors = residuals.by_image
     order = [int(i) for i in np.argsort(-np.nan_to_num(errors, nan=-1.0)) if np.isfinite(errors[i])]
     if not order:
-        return ""
+        return []
     worst, typical = order[:_DRAWN], order[len(order) // 2]
     shown = [(i, "typical" if i == typical else "worst") for i in dict.fromkeys([*worst, typical])]
-    figures = "".join(_figure(residuals, i, word, most_bytes // len(shown)) for i, word in shown)
-    marks = (("seen", "seen"), ("predicted", "predicted"), ("arrow", "from predicted to seen"))
-    key = ", ".join(f'<b style="background:{_COLOURS[c]};padding:0 .5em"></b> {words}' for c, words in marks)
-    times = significant(_enlarged(residuals), 1)
-    return f'<p>Single images: {key} ({times} times as long).</p><div class="two">{figures}</div>'
+    panels = [_image(residuals, i, word, most_bytes // len(shown)) for i, word in shown]
+    caption = f"Arrows, from predicted to seen, are {significant(_enlarged(residuals), 1)} times as long."
+    said = "; ".join(panel.title for panel in panels)
+    return [Figure(f"{residuals.name}: single images", said, caption, panels)]
 
 
 def _enlarged(residuals: CameraResiduals) -> float:
@@ -151,7 +125,7 @@ def _enlarged(residuals: CameraResiduals) -> float:
     typical, extent = float(np.nanmedian(residuals.by_image)), _extent(residuals)[0]
     if _SHORTEST * extent <= _ENLARGED * typical <= _LONGEST * extent:
         return _ENLARGED
-    return svg.nice_step(_SHORTEST * extent / max(typical, 1e-9) * 3)
+    return nice_step(_SHORTEST * extent / max(typical, 1e-9) * 3)
 
 
 def _extent(residuals: CameraResiduals) -> tuple[float, float]:
@@ -162,33 +136,25 @@ def _extent(residuals: CameraResiduals) -> tuple[float, float]:
     return 1.05 * float(u), 1.05 * float(v)
 
 
-def _figure(residuals: CameraResiduals, index: int, word: str, most_bytes: int) -> str:
+def _image(residuals: CameraResiduals, index: int, word: str, most_bytes: int) -> Panel:
     photo = _photo(residuals.files[index], most_bytes) if residuals.files else None
-    width, height = photo.size if photo else _extent(residuals)
-    scale, name = svg.HALF / width, residuals.images[index]
-    shape = (float(svg.HALF), height * scale)
-    back = svg.rect(0, 0, *shape, "#3a424d")
-    if photo:
-        back = f'<image href="{photo.address}" width="{shape[0]:.0f}" height="{shape[1]:.1f}"/>'
+    backdrop, size = photo or ("", _extent(residuals))
     seen = residuals.seen[:, :, index]
     predicted = seen - residuals.off[:, :, index]
     there = np.isfinite(predicted).all(axis=0)
-    seen, predicted = (scale * (corners[:, there] + 0.5) for corners in (seen, predicted))
-    tips = predicted + _enlarged(residuals) * (seen - predicted)
-    style = '<g style="stroke:{};stroke-width:{};stroke-linecap:round">{}</g>'
+    seen, predicted = seen[:, there] + 0.5, predicted[:, there] + 0.5
     marks = [
-        style.format(_COLOURS["arrow"], 1.4, svg.segments(predicted[0], predicted[1], tips[0], tips[1], "")),
-        style.format(_COLOURS["predicted"], 1.2, svg.marks(predicted[0], predicted[1], _CROSS, "")),
-        style.format(_COLOURS["seen"], 3, svg.dots(seen[0], seen[1], "")),
+        Marks("arrow", _lines(predicted, predicted + _enlarged(residuals) * (seen - predicted)), name="arrow"),
+        Marks("dot predicted", predicted, name="predicted"),
+        Marks("dot seen", seen, name="seen"),
     ]
     error = significant(float(residuals.by_image[index]))
-    words = f"{name} ({word}): {error} px rms, {int(there.sum())} corners"
-    drawn = svg.document(f"camera-{residuals.name}-{index}", shape, words, words, [back, *marks])
-    return f"<figure>{drawn}<figcaption>{escape(words)}</figcaption></figure>"
+    title = f"{residuals.images[index]} ({word}): {error} px rms, {int(there.sum())} corners"
+    return Panel(title, marks, bare=True, backdrop=backdrop, size=size)
 
 
-def _photo(path: str, most_bytes: int) -> _Photo | None:
-    """A small copy of an image file; None where it cannot be read any more."""
+def _photo(path: str, most_bytes: int) -> tuple[str, tuple[float, float]] | None:
+    """A small copy of an image file as a data address, and the size of the file (px); None if unreadable."""
     try:
         grey, cv2 = grey_image(input_bytes(Path(path), MOST_BYTES, "an image"), path), opencv()
     except ArmcalError:
@@ -199,5 +165,5 @@ def _photo(path: str, most_bytes: int) -> _Photo | None:
     for quality in _QUALITIES:
         content = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
         if len(content) * 4 / 3 <= most_bytes:
-            return _Photo(f"data:image/jpeg;base64,{base64.b64encode(content).decode()}", (width, height))
+            return f"data:image/jpeg;base64,{base64.b64encode(content).decode()}", (width, height)
     return None

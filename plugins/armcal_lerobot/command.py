@@ -138,7 +138,7 @@ def compare(console: Console, dataset: Path, second: Path | None, out: Path | No
 
     Offset, gain, backlash and delay from recorded data, with intervals; of two data sets also what differs.
     """
-    from armcal_lerobot.comparison import compare_content, page, show_compare
+    from armcal_lerobot.comparison import compare_content, document
     from armcal_lerobot.recordings import open_recording
     from armcal_lerobot.tracking import read_motion
 
@@ -153,12 +153,13 @@ def compare(console: Console, dataset: Path, second: Path | None, out: Path | No
     if gripper and units == "percent" and file is None:
         raise InputError("found numbers in percent, expected degrees for mm.", hint="Give --calibration FILE as well.")
     content = {"data": [str(folder) for folder in (dataset, second) if folder], **compare_content(motions, gripper)}
-    console.result(content)
-    show_compare(console, content)
+    shown = document(content, command_line())
+    console.show(shown)
     if out is not None:
         from armcal.io.plain_files import write_over
+        from armcal.report.page import page
 
-        write_over({out: page(content, command_line()).encode()})
+        write_over({out: page(shown).encode()})
         console.line(f"page: {out}")
 
 

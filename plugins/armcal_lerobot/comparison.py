@@ -15,8 +15,7 @@ from armcal.base.arrays import Array
 from armcal.calibration.joint_zeros import Zero
 from armcal.cli.common import Console
 from armcal.errors import DataError, InputError, Location
-from armcal.report.page import rendered
-from armcal.version import __version__
+from armcal.report.document import Code, Document, Section, Table
 from scipy.stats import t as student
 
 from armcal_lerobot.motor_file import (
@@ -451,7 +450,6 @@ LIMITS_OF_DATA = (
     "run)."
 )
 _FIGURES = ("delay_s", "gain", "offset", "backlash", "load")
-Table = tuple[str, tuple[str, ...], list[list[str]]]  # Caption, headings and rows
 
 
 def compare_content(motions: Sequence[Motion], gripper: Gripper | None) -> dict[str, Any]:
@@ -478,18 +476,15 @@ def compare_content(motions: Sequence[Motion], gripper: Gripper | None) -> dict[
     return {**content, "between": {"motors": motors, "findings": shift_findings(moved, *motions)}}
 
 
-def show_compare(console: Console, content: Mapping[str, Any]) -> None:
+def document(content: Mapping[str, Any], command: str) -> Document:
     """The tables, what was found, and what the data cannot say."""
-    for caption, headings, rows in _tables(content):
-        console.table(caption, headings, rows)
-    for text in _sentences(content):
-        console.line(text)
-
-
-def page(content: Mapping[str, Any], command: str) -> str:
     names = " and ".join(Path(folder).name for folder in content["data"])
-    shown = {"title": names, "sentences": _sentences(content), "tables": _tables(content)}
-    return rendered("compare.html.j2", {**shown, "command": command, "version": __version__}, Path(__file__).parent)
+    first, *others = _sentences(content)
+    sections = [
+        Section("State against command", parts=_tables(content), name="tables", level="always"),
+        Section("How to reproduce this", parts=[Code(command)], name="reproduce"),
+    ]
+    return Document(f"Leader and follower: {names}", first, sections, summary=others, data=content)
 
 
 def _content(motion: Motion, followed: Sequence[Tracking], gripper: Gripper | None) -> dict[str, Any]:
@@ -517,7 +512,8 @@ def _tables(content: Mapping[str, Any]) -> list[Table]:
         name, motors = Path(folder).name, of_set["motors"]
         rows = [[motor, *_followed(entry), _shown(entry["delay_s"], 1000, 0)] for motor, entry in motors.items()]
         caption = f"State against command, 95 % intervals: {name}"
-        tables.append((caption, ("motor", "unit", "gain", "offset", "backlash", "delay, ms"), rows))
+        headings = ("motor", "unit", "gain", "offset", "backlash", "delay, ms")
+        tables.append(Table(caption, headings, rows, left=("unit",)))
         loaded = {motor: entry for motor, entry in motors.items() if entry["load"] or "offset_mm" in entry}
         rows = [
             [motor, _shown(entry["load"], 1, 2), *(_mm(entry.get(f"{key}_mm")) for key in ("offset", "backlash"))]
@@ -525,7 +521,7 @@ def _tables(content: Mapping[str, Any]) -> list[Table]:
         ]
         if rows:
             at_gripper = ("motor", "deg per N m", "offset, mm", "backlash, mm")
-            tables.append((f"By gravity, and at the gripper: {name}", at_gripper, rows))
+            tables.append(Table(f"By gravity, and at the gripper: {name}", at_gripper, rows))
     if "between" in content:
         motors = content["between"]["motors"]
         rows = [
@@ -533,7 +529,7 @@ def _tables(content: Mapping[str, Any]) -> list[Table]:
             for motor, entry in motors.items()
         ]
         shown = ("motor", "unit", "begins", "mm", "offset", "backlash")
-        tables.append(("The second data set less the first", shown, rows))
+        tables.append(Table("The second data set less the first", shown, rows, left=("unit",)))
     return tables
 
 

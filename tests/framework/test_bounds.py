@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.calibration.calibration_file import parameter_records
-from armcal.cli.run import _compliances, _matrices
+from armcal.cli.console import Screen
 from armcal.diagnose.evidence_findings import shift_findings
 from armcal.estimate.estimator import Estimate, estimate
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.problem.problem import Problem
-from armcal.report.tables import parameter_rows
+from armcal.report.run_tables import parameter_rows, parameters_table, principal_table
 from armcal.run.experiment import Experiment
-from rich.console import Console
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 NOISE_M = 0.0005
@@ -95,9 +94,9 @@ def test_names_and_values_pair(beyond: Estimate) -> None:
 
 def printed(table) -> str:
     """As a terminal shows it."""
-    console = Console(file=StringIO(), width=120)
-    console.print(table)
-    return console.file.getvalue()
+    screen = Screen(file=StringIO(), width=120)
+    screen.part(table, verbose=True)
+    return screen.file.getvalue()
 
 
 def test_compliances_of_a_stiff_arm_are_printed_with_their_digits(beyond: Estimate) -> None:
@@ -106,7 +105,7 @@ def test_compliances_of_a_stiff_arm_are_printed_with_their_digits(beyond: Estima
     values, covariance = beyond.values.copy(), beyond.covariance * 1e-12
     values[beyond.free_entries[place]], covariance[place, place] = 5.04e-6, (2e-7) ** 2
     stiff = replace(beyond, values=values, unconstrained=values[list(beyond.free_entries)], covariance=covariance)
-    row = next(line for line in printed(_compliances(stiff_result(stiff))).splitlines() if "k3" in line)
+    row = next(line for line in printed(parameters_table(parameter_rows(stiff))).splitlines() if "k3" in line)
     assert "0.00000504" in row and "0.00000020" in row
 
 
@@ -115,16 +114,14 @@ def test_principal_compliances_of_a_stiff_arm_are_printed_with_their_digits() ->
     loaded = Experiment.load(CONFIGS / "demo.yaml", ["parameters.free=[arm.flex.C2]", flex])
     values, parameters = loaded.parameters.nominal(), loaded.parameters
 
-    class Result:
-        estimate = type("Estimate", (), {"parameters": parameters, "values": values})()
-
-    row = next(line for line in printed(_matrices(Result())).splitlines() if "arm.flex.C2" in line)
+    row = next(
+        line
+        for line in printed(
+            principal_table(type("Estimate", (), {"parameters": parameters, "values": values})())
+        ).splitlines()
+        if "arm.flex.C2" in line
+    )
     assert row.count("4.00e-06") == 3
-
-
-def stiff_result(found: Estimate):
-    """A run's result as far as the table of compliances reads it."""
-    return type("Result", (), {"estimate": found})()
 
 
 @pytest.mark.slow

@@ -12,7 +12,8 @@ import pytest
 import yaml
 from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
-from armcal.report import render
+from armcal.report.page import page as page_of
+from armcal.report.run_document import run_document
 from armcal.run import outputs
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
@@ -106,7 +107,7 @@ def test_every_output_tells_of_the_wrong_records(spoilt, robust_run, plain_run, 
     assert told["error_mm"]["calibrated"]["holdout"]["max"] > 0.9 * OFF_MM
     assert all(re.search(rf"suspicious: row \d+, record {name}:", shown) for name in listed)
     text = (out / "report.html").read_text()
-    heading = "<h3>Suspicious records</h3>"
+    heading = ">Suspicious records</h2>"
     assert heading in text and heading not in (by_least_squares / "report.html").read_text()
     kept = yaml.safe_load((out / "calibration.yaml").read_text())["noise"]
     assert kept == told["noise"]
@@ -158,7 +159,7 @@ def test_components_reach_every_output(repository, tmp_path):
     assert found["tracker"]["sd"] == pytest.approx(1, abs=0.15), "the simulated noise is the declared one"
     assert sum(c["share"] for c in found.values()) == pytest.approx(1)
     assert "Most of the residual variance comes from the instruments" in " ".join(shown.split())
-    assert "<h3>Variance components</h3>" in (tmp_path / "out" / "report.html").read_text()
+    assert ">Variance components</h2>" in (tmp_path / "out" / "report.html").read_text()
     assert yaml.safe_load((tmp_path / "out" / "calibration.yaml").read_text())["noise"] == told["noise"]
     Calibration.load(tmp_path / "out" / "calibration.yaml")
 
@@ -200,7 +201,7 @@ def test_bad_settings_are_refused_at_their_place(repository, tmp_path, override,
 def test_the_report_escapes_what_a_suspicious_record_is_called(rejected):
     result = rejected[0]
     odd = replace(result.noise.suspicious[0], record_id="<b>x</b>")
-    page = render(replace(result, noise=replace(result.noise, suspicious=(odd,))))
+    page = page_of(run_document(replace(result, noise=replace(result.noise, suspicious=(odd,)))))
     assert "&lt;b&gt;x&lt;/b&gt;" in page and "<b>x</b>" not in page
     assert json.dumps(outputs.metrics(result))
 

@@ -16,7 +16,7 @@ from armcal.config.yaml_source import load_variants
 from armcal.errors import ConfigError, NotConvergedError, ProblemError
 from armcal.estimate.validation import FitTask, fit_and_judge, folds
 from armcal.io.parallel import Sequential, Workers
-from armcal.report.study_page import conclusions
+from armcal.report.study_document import conclusions
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from armcal.run.study import Study, compare
@@ -339,7 +339,7 @@ def test_a_variant_whose_fits_fail_is_never_chosen(place: Path) -> None:
     assert any("lengths" in text and "not chosen" in text for text in result.warnings)
     done = armcal("study", str(path), "--out", str(place / "out"), "--set", FAST[0], "--json")
     shown = armcal("study", str(path), "--out", str(place / "shown"), "--set", FAST[0])
-    assert "(\u2013)" in shown.output and "not chosen" in shown.output
+    assert "(-)" in shown.output and "not chosen" in shown.output
     assert done.exit_code == 0 and json.loads(done.stdout)["variants"][3]["error_mm"]["cross_validated"]["mean"] is None
     alone = re.sub(r"    (none|angles): .*\n", "", SMALL).replace("extends: angles, ", "")
     with pytest.raises(NotConvergedError, match="of every variant"):

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import click
 
@@ -19,6 +19,9 @@ from armcal.estimate.estimator import Progress, no_progress
 from armcal.io.parallel import parse_executor
 from armcal.plugins import PluginRegistry, discover
 from armcal.version import JSON_SCHEMA
+
+if TYPE_CHECKING:
+    from armcal.report.document import Document
 
 F = TypeVar("F", bound=Callable[..., Any])
 FILE = click.Path(path_type=Path)
@@ -53,6 +56,11 @@ class Console:
     def result(self, content: Mapping[str, Any]) -> None:
         if self.json:
             click.echo(as_json({**JSON_SCHEMA, **content}))
+
+    def show(self, document: "Document", **more: Any) -> None:
+        """A result: its data as JSON where that is asked for, with ``more``, else what a terminal shows of it."""
+        self.result({**document.data, **more})
+        self.out.document(document, self.verbose)
 
     def line(self, text: str, style: str = "") -> None:
         self.out.print(text, style=style, soft_wrap=True)

@@ -3,9 +3,10 @@
 import io
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import click
+from rich.box import SIMPLE_HEAD
 from rich.console import Console, ConsoleOptions, Group, RenderableType
 from rich.padding import Padding
 from rich.segment import Segment
@@ -14,6 +15,10 @@ from rich.text import Text
 
 from armcal.base.config_text import shown
 
+if TYPE_CHECKING:  # `armcal --help` must not wait for what documents import
+    from armcal.report.document import Document, Part
+
+_STYLES = {"bad": "bold red", "warning": "yellow", "note": "", "good": "green"}
 _CUT = "\u2026"  # What rich ends a word with that its column has no room for
 
 
@@ -62,6 +67,43 @@ class Screen(Console):
             fitting.append(as_list(part) if any(_CUT in piece.text for line in lines for piece in line) else part)
         super().print(*fitting, **more)
 
+    def document(self, document: "Document", verbose: bool) -> None:
+        """The headline, what to do, and the sections that a terminal shows."""
+        from armcal.report.document import Table as Rows
+
+        self.print(document.headline, style="bold")
+        for part in document.summary:
+            self.part(part, verbose)
+        for section in document.sections:
+            if section.level == "always" or (verbose and section.level == "verbose"):
+                if verbose and not isinstance(section.parts[0], Rows):
+                    self.print(f"\n{section.title}", style="bold")
+                for part in section.parts:
+                    self.part(part, verbose)
+
+    def part(self, part: "Part", verbose: bool) -> None:
+        from armcal.diagnose.large_errors import Finding
+        from armcal.report.document import Table as Rows
+        from armcal.report.numbers import in_ascii
+
+        if isinstance(part, str):
+            self.print(part)
+        elif isinstance(part, Rows):
+            kept = [i for i, heading in enumerate(part.headings) if heading not in part.page_only]
+            table = columned(part.caption, [part.headings[i] for i in kept], part.left)
+            for row in part.rows:
+                table.add_row(*(in_ascii(row[i]) for i in kept))
+            self.print(table)
+        elif isinstance(part, Finding):
+            text = Text(part.text)
+            if part.test and verbose:
+                text.append(f" ({part.test})", style="dim")
+            if part.action:
+                text.append(f"\nTo do: {part.action}")
+            grid = Table.grid(padding=(0, 2, 0, 0))
+            grid.add_row(Text(part.grade, style=_STYLES[part.grade]), text)
+            self.print(grid)
+
     def on_broken_pipe(self) -> None:
         """Nobody reads any longer: said to nobody."""
         self.quiet = True
@@ -69,7 +111,7 @@ class Screen(Console):
 
 def columned(title: str, columns: Iterable[str], left: Sequence[str] = ()) -> Table:
     """A table of numbers, which stand to the right; the first column and those of ``left`` hold words."""
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for place, column in enumerate(columns):
         table.add_column(column, justify="left" if not place or column in left else "right")
     return table

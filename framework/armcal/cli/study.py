@@ -7,7 +7,8 @@ import click
 from armcal.cli.common import FILE, Console, command_line, data, overrides, parallel, speaking
 from armcal.io.folder import reserved
 from armcal.io.parallel import Executor
-from armcal.report.study_page import PAGE_ONLY, conclusions, render_study, study_tables
+from armcal.report.page import page
+from armcal.report.study_document import study_document
 from armcal.run import study_result
 from armcal.run.prepare import Stopwatch
 from armcal.run.study import Study, compare
@@ -38,13 +39,7 @@ def study(
         console.detail(f"{v.name}: {v.fit_seconds:.2f} s for the fit on all records, {v.seconds:.2f} s for all fits")
     result.seconds["total"] = watch.total()
     sources = {name: experiment.source for name, experiment in configured.experiments.items()}
-    kept.place(study_result.files(result, configured.source, sources, render_study(result)))
-    console.result({**result.as_dict(), "folder": str(folder)})
-    for table in study_tables(result):
-        places = [i for i, (name, _) in enumerate(table.headings) if name not in PAGE_ONLY]
-        names, rows = [table.headings[i] for i in places], [[row[i] for i in places] for row in table.rows]
-        words = [name for name, is_number in names if not is_number]
-        console.table(f"{result.name}: {table.caption}", [name for name, _ in names], rows, left=words)
-    for sentence in conclusions(result):
-        console.line(sentence)
+    document = study_document(result)
+    kept.place(study_result.files(result, configured.source, sources, page(document)))
+    console.show(document, folder=str(folder))
     console.line(f"page: {folder / 'study.html'}  ({watch.total():.1f} s)")

@@ -11,6 +11,7 @@ NONE = "\u2013"
 MINUS = "\u2212"
 _TIMES = "\u00d7"
 _MOST_DECIMALS = 9
+_ASCII = {MINUS: "-", NONE: "-", "≤": "up to", "≥": "from", "\u202f": " ", "\u2007": " ", "\u2008": " "}
 
 
 def fixed(value: float | None, decimals: int, signed: bool = False) -> str:
@@ -62,6 +63,13 @@ def plural(number: int, noun: str) -> str:
 
 def unbroken(words: str) -> str:
     return re.sub(r"(\d) (mm|%|times)", "\\1\u00a0\\2", words)
+
+
+def in_ascii(text: str) -> str:
+    """The same for terminals that have no more than letters."""
+    for sign, word in _ASCII.items():
+        text = text.replace(sign, word)
+    return text.strip()
 
 
 def duration(seconds: float) -> str:

@@ -1,7 +1,6 @@
 """What a run leaves behind: a directory that explains itself, written so that a crash leaves the old one whole."""
 
 import warnings
-from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -62,9 +61,7 @@ def calibration_name(result: RunResult, accepted: bool) -> str:
     return f"calibration.yaml{DO_NOT_USE_SUFFIX}" if result.verdict.bad and not accepted else "calibration.yaml"
 
 
-def write(
-    result: RunResult, experiment: Experiment, folder: Path, render: Callable[[RunResult], str], accepted: bool = False
-) -> None:
+def write(result: RunResult, experiment: Experiment, folder: Path, page: str, accepted: bool = False) -> None:
     """Write all files; those of an earlier run in the same place move to ``earlier/``.
 
     Raises:
@@ -72,14 +69,14 @@ def write(
         ArmcalError: the calibration cannot be read back; everything else is written.
     """
     with reserved(folder) as held:
-        place(held, result, experiment, render, accepted)
+        place(held, result, experiment, page, accepted)
 
 
 def place(
     held: folders.Reservation,
     result: RunResult,
     experiment: Experiment,
-    render: Callable[[RunResult], str],
+    page: str,
     accepted: bool = False,
 ) -> None:
     """Write all files into a reserved folder.
@@ -98,7 +95,7 @@ def place(
         "experiment.yaml": dump(experiment.source.data),
         "residuals.csv": residuals_text(result),
         "metrics.json": as_json(metrics(result)) + "\n",
-        "report.html": render(result),
+        "report.html": page,
         "log.txt": log_text(result),
         calibration_name(result, accepted): sealed(calibration_content(result, experiment, accepted)),
     }

@@ -5,7 +5,6 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,8 @@ from armcal.estimate.simulation import measured_without_noise
 from armcal.measure.csv_writer import write_csv
 from armcal.plugins import PluginRegistry
 from armcal.problem.projection import factor_at_zero
-from armcal.report import plugin_sections, render
+from armcal.report.page import page
+from armcal.report.run_document import plugin_sections, run_document
 from armcal.run import outputs
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
@@ -177,8 +177,8 @@ def try_out(folder: Path, registry: PluginRegistry, command: str = "", progress:
     watch, experiment = Stopwatch(), Experiment.load(folder / SIMULATED, registry=registry)
     result = calibrate(experiment, command, progress, watch)
     result.seconds["total"] = watch.total()
-    sections = plugin_sections(result, registry)
-    outputs.write(result, experiment, folder / RESULTS, partial(render, sections=sections))
+    document = run_document(result, plugin_sections(result, registry)[0])
+    outputs.write(result, experiment, folder / RESULTS, page(document))
     held_out = (of["holdout"].mean for of in (result.table.nominal, result.table.calibrated))
     return Trial(result, *(math.nan if error is None else error for error in held_out))
 

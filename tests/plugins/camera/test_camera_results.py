@@ -195,7 +195,7 @@ def test_a_camera_that_is_not_there_is_refused(calibration: Path) -> None:
 
 def test_report_and_verdict_speak_of_pixels_and_of_the_camera(run: Run, calibration: Path) -> None:
     page = (calibration.parent / "report.html").read_text()
-    assert "Reprojection residuals over the sensor" in page
+    assert "reprojection residuals over the sensor" in page
     assert run.verdict.headline.startswith("Reprojection error") and " px" in run.verdict.headline
     texts = [finding.text for finding in run.verdict.findings]
     assert any(text.startswith("camera: its place on the hand is known to") for text in texts)

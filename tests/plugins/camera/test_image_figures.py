@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from armcal.report.document import Document, Figure
+from armcal.report.page import page
 from armcal_camera.report import CameraResiduals, cameras, drawn_images
 
 PIXELS = np.array([[100.0, 300, 500], [80, 200, 320]])
@@ -28,28 +30,31 @@ def test_the_worst_and_a_typical_image_are_copied_small(tmp_path: Path) -> None:
     paths = [str(tmp_path / f"{i}.png") for i in range(5)]
     for path in paths[:4]:  # the worst is no longer there
         cv2.imwrite(path, np.random.default_rng(1).integers(0, 255, (960, 1280), np.uint8))
-    html = drawn_images(residuals(tuple(paths)), 200_000)
-    copies = re.findall(r"data:image/jpeg;base64,([^\"]*)", html)
+    (figure,) = drawn_images(residuals(tuple(paths)), 200_000)
+    assert isinstance(figure, Figure)
+    copies = [panel.backdrop.partition("base64,")[2] for panel in figure.panels if panel.backdrop]
     assert len(copies) == 2 and sum(map(len, copies)) < 200_000
     assert cv2.imdecode(np.frombuffer(base64.b64decode(copies[0]), np.uint8), 0).shape == (360, 480)
-    words = re.findall(r"<figcaption>(.*?)</figcaption>", html)
-    assert words[0] == "&lt;e&gt; (worst): 12.7 px rms, 3 corners" and len(words) == 3
-    assert not drawn_images(residuals(tuple(paths)), 100).count("base64")
+    assert figure.panels[0].title == "<e> (worst): 12.7 px rms, 3 corners" and len(figure.panels) == 3
+    assert figure.panels[1].size == (1280, 960) and copies[0] in page(Document("", "", [], picture=figure))
+    (bare,) = drawn_images(residuals(tuple(paths)), 100)
+    assert isinstance(bare, Figure) and not any(panel.backdrop for panel in bare.panels)
 
 
 def test_arrows_run_from_predicted_through_seen_20_times_as_long() -> None:
-    html = drawn_images(residuals(error=0.5), 1)
-    assert "(20 times as long)" in html and "<image" not in html
-    segment = re.search(r'd="M([\d.]+) ([\d.]+)L([\d.]+) ([\d.]+)', html)
-    assert segment is not None
-    scale, (x, _, tip, _) = 504 / 640, map(float, segment.groups())
-    assert x == pytest.approx(scale * (100 - 4.5 + 0.5), abs=0.06)
-    assert tip - x == pytest.approx(20 * scale * 4.5, abs=0.11)
+    (figure,) = drawn_images(residuals(error=0.5), 1)
+    assert isinstance(figure, Figure) and "20 times as long" in figure.caption
+    arrow = figure.panels[0].marks[0]
+    assert arrow.xy[0][:2].tolist() == pytest.approx([100 - 4.5 + 0.5, 100 - 4.5 + 0.5 + 20 * 4.5])
+    drawn = page(Document("", "", [], picture=figure))
+    segment = re.search(r'class="arrow" d="M([\d.]+) [\d.]+L([\d.]+) ', drawn.partition('viewBox="0 0 400')[2])
+    assert segment is not None and "<image" not in drawn
+    assert float(segment[1]) == pytest.approx(400 / 640 * 96, abs=0.06)
 
 
 def test_errors_that_would_not_be_seen_are_drawn_longer() -> None:
-    html = drawn_images(residuals(error=0.01), 1)
-    assert "(500 times as long)" in html
+    (figure,) = drawn_images(residuals(error=0.01), 1)
+    assert isinstance(figure, Figure) and "500 times as long" in figure.caption
 
 
 def test_a_camera_that_saw_nothing_has_no_images() -> None:

@@ -12,7 +12,8 @@ import pytest
 
 pytest.importorskip("pyarrow")
 from armcal.plugins import discover
-from armcal_lerobot.comparison import compare_content, findings_of, gripper_error, page, shift_findings, shifts
+from armcal.report.page import page
+from armcal_lerobot.comparison import compare_content, document, findings_of, gripper_error, shift_findings, shifts
 from armcal_lerobot.recordings import open_recording
 from armcal_lerobot.rest_records import Gripper
 from armcal_lerobot.tracking import Motion, Tracking, read_motion, trackings
@@ -208,7 +209,7 @@ def test_mm_at_the_gripper(tmp_path: Path, gripper: Gripper) -> None:
 
 def test_the_page_stands_alone(planted_motion: Motion, gripper: Gripper) -> None:
     content = {"data": ["a<b"], **compare_content([planted_motion], gripper)}
-    html = page(content, "armcal lerobot compare")
+    html = page(document(content, "armcal lerobot compare"))
     assert "a&lt;b" in html and "wrist_roll is inverted" in html and "<script" not in html
     assert not re.search(r'(src|href)="(?!data:)', html)
     json.dumps(content)

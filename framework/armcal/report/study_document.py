@@ -1,47 +1,45 @@
-"""The page of a study: its tables and figures, what to conclude, and which records gain and lose."""
+"""What a study says, as a document: what to conclude, its tables and figures, which records gain and lose."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
-from armcal.report import svg
+from armcal.report.document import Code, Document, Figure, Marks, Panel, Part, Section, Table
 from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural, significant
-from armcal.report.page import rendered
-from armcal.report.svg import MONO, Axis, Box, Figure
-from armcal.report.tables import TextTable, provenance_facts
+from armcal.report.run_tables import provenance_facts
 from armcal.run.study_result import Cell, StudyResult, VariantResult
-from armcal.version import __version__
 
-PAGE_ONLY = ("Train 95 %", "RMS", "Max", "Fit", "Turn 95 %")
-"""Columns of ``study_tables`` for which a terminal has no room."""
 _SAME_MM = 1e-6
 _FEW_GROUPS = 3
-_ROW = 34.0
 _LOG_FROM = 6.0
-_DIAMOND = "m-4.2 0l4.2-4.2l4.2 4.2l-4.2 4.2z"
 
 
-def render_study(result: StudyResult) -> str:
-    """One self-contained HTML file."""
-    title = f"{result.name}: {plural(len(result.variants), 'variant')}"
-    content: dict[str, Any] = {
-        "result": result,
-        "title": title + (f", trained at one {result.group_by}, judged at another" if result.cells else ""),
-        "sentences": conclusions(result),
-        "tables": study_tables(result),
-        "figures": [_by_group(result), _ladder(result)] if result.cells else [_ladder(result)],
-        "changes": [(v.name, v.change) for v in result.variants if v.change],
-        "version": __version__,
-        "facts": [fact for fact in provenance_facts(result.provenance) if not fact.long],
-        "seconds": [(name, duration(value)) for name, value in result.seconds.items()],
-    }
-    return rendered("study.html.j2", content)
-
-
-def study_tables(result: StudyResult) -> list[TextTable]:
-    """Errors by what was trained and judged at, where records are grouped; then the variants."""
-    return [_cells(result), _variants(result)] if result.cells else [_variants(result)]
+def study_document(result: StudyResult) -> Document:
+    title = f"Study: {result.name}: {plural(len(result.variants), 'variant')}"
+    title += f", trained at one {result.group_by}, judged at another" if result.cells else ""
+    first, *others = conclusions(result)
+    tables: list[Part] = [_cells(result), _variants(result)] if result.cells else [_variants(result)]
+    figures = [_by_group(result), _ladder(result)] if result.cells else [_ladder(result)]
+    changes: list[Part] = []
+    for variant in result.variants:
+        if (change := variant.change) is not None:
+            words = f"{variant.name} against {change.against}, {result.unit}."
+            for gain, pairs in (("Gain most", change.most_helped), ("Lose most", change.most_hurt)):
+                words += f" {gain}: {', '.join(f'{i} ({fixed(x, 3, signed=True)})' for i, x in pairs) or 'none'}."
+            changes.append(words)
+    facts = [*provenance_facts(result.provenance), *((name, duration(took)) for name, took in result.seconds.items())]
+    origin: list[Part] = [
+        Code(result.command),
+        Table("Provenance, and time taken", ("What", "Value"), facts, left=("Value",)),
+    ]
+    sections = [
+        Section("Side by side", parts=tables, name="table", level="always"),
+        Section("Errors", parts=figures, name="figures"),
+        Section("Which records gain and lose most", parts=changes, name="records"),
+        Section("Warnings", parts=result.warnings, name="warnings"),
+        Section("How to reproduce this", parts=origin, name="reproduce", folded=True),
+    ]
+    return Document(title, first, [s for s in sections if s.parts], summary=others, data=result.as_dict())
 
 
 def conclusions(result: StudyResult) -> list[str]:
@@ -111,7 +109,7 @@ def _transfers(result: StudyResult) -> list[str]:
     return texts
 
 
-def _variants(result: StudyResult) -> TextTable:
+def _variants(result: StudyResult) -> Table:
     rows = []
     for v in result.variants:
         moved = [NONE] * 3
@@ -129,7 +127,7 @@ def _variants(result: StudyResult) -> TextTable:
     words += f" drawn {result.repeats} times" if result.repeats > 1 else ""
     turns = ("Turn, deg", "Turn 95 %") if any(v.turns for v in result.variants) else ()
     names = ("Free", "Train", "Train 95 %", "Mean", "RMS", "95 %", "Max", "Change", "± se", "Helps", *turns, "Fit")
-    return TextTable(words, (("Variant", False), *((n, True) for n in names)), tuple(rows))
+    return Table(words, ("Variant", *names), rows, page_only=("Train 95 %", "RMS", "Max", "Fit", "Turn 95 %"))
 
 
 def _rows(result: StudyResult) -> dict[tuple[str, tuple[str, ...]], list[Cell]]:
@@ -145,7 +143,7 @@ def _trained(trained: Sequence[str], result: StudyResult) -> str:
     return " and ".join(trained) or "nominal"
 
 
-def _cells(result: StudyResult) -> TextTable:
+def _cells(result: StudyResult) -> Table:
     """A row for each variant and what it was trained at, errors at each group beside one another."""
     decimals = common_decimals([c.errors.mean for c in result.cells], most=3)
     few, rows = len(result.groups) <= _FEW_GROUPS, []
@@ -163,13 +161,13 @@ def _cells(result: StudyResult) -> TextTable:
         ]
         rows.append((variant, words, *figures))
     names = ["mean", *(["95 %"] if few else []), *(["turn mean, deg"] if result.cells[0].turns else [])]
-    headings = [("Variant", False), ("Trained at", False)]
-    headings += [(f"{group}, {name}" if len(names) > 1 else group, True) for group in result.groups for name in names]
+    headings = ["Variant", "Trained at"]
+    headings += [f"{group}, {name}" if len(names) > 1 else group for group in result.groups for name in names]
     counts = ", ".join(f"{n} at {group}" for group, n in result.groups.items())
     caption = f"{'Error' if few else 'Mean error'}, {result.unit}; "
     caption += f"{'simulated' if result.simulated else 'measured'} records: {counts}. "
     caption += f"Cross-validated; with *, judged at another {result.group_by} than it trained at"
-    return TextTable(caption, tuple(headings), tuple(rows))
+    return Table(caption, headings, rows, left=("Trained at",))
 
 
 def _shown(value: float | None, unit: str) -> str:
@@ -178,72 +176,48 @@ def _shown(value: float | None, unit: str) -> str:
 
 def _ladder(result: StudyResult) -> Figure:
     """Errors of each variant."""
-    rows = {
-        v.name: [(v.train.mean, "hollow", ""), (v.crossed.mean, "solid", ""), (v.crossed.p95, "diamond", "")]
-        for v in result.variants
+    names = [v.name for v in result.variants]
+    styles = {
+        "dot": ("mean, cross-validated", [v.crossed.mean for v in result.variants]),
+        "dot before": ("mean, training records", [v.train.mean for v in result.variants]),
+        "dot holdout": ("95 %, cross-validated", [v.crossed.p95 for v in result.variants]),
     }
     said = "; ".join(
         f"{v.name}: mean {_said(v.crossed.mean)}, 95 % {_said(v.crossed.p95)} {result.unit}" for v in result.variants
     )
-    entries = [
-        ('<circle cx="11" cy="0" r="5" class="solid"/>', "mean, cross-validated"),
-        ('<circle cx="11" cy="0" r="5" class="hollow"/>', "mean, training records"),
-        (f'<path class="diamond" d="M11 0{_DIAMOND}"/>', "95 %, cross-validated"),
-    ]
-    return _dots(rows, ("Errors by variant", said, "The further left, the better."), f"error, {result.unit}", entries)
+    marks = [(style, name, list(enumerate(numbers))) for style, (name, numbers) in styles.items()]
+    return _dots(names, marks, ("Errors by variant", said, "The further left, the better."), f"error, {result.unit}")
 
 
 def _by_group(result: StudyResult) -> Figure:
     """Mean error at each group, by variant and by what it was trained at."""
-    few = len(result.groups) <= _FEW_GROUPS
-    rows = {
-        f"{variant}, {_trained(trained, result)}": [
-            (c.errors.mean, "solid" if c.seen else "hollow", c.judged if few else "") for c in cells
-        ]
-        for (variant, trained), cells in _rows(result).items()
-    }
+    rows = _rows(result)
+    names = [f"{variant}, {_trained(trained, result)}" for variant, trained in rows]
+    cells = [(place, cell) for place, own in enumerate(rows.values()) for cell in own]
     texts = [(f"{c.variant}, {_trained(c.trained, result)}", c.judged, _said(c.errors.mean)) for c in result.cells]
     said = "; ".join(f"{trained}, judged at {at}: {mean} {result.unit}" for trained, at, mean in texts)
-    caption = "Mean errors. A filled dot: of records that also trained (cross-validated); a ring: of others."
-    return _dots(rows, (f"Errors by {result.group_by}", said, caption), f"mean error, {result.unit}", [])
+    marks = [
+        (style, f"judged {words}", [(place, cell.errors.mean) for place, cell in cells if cell.seen == seen])
+        for style, words, seen in (("dot", "where it trained too", True), ("dot holdout", "elsewhere", False))
+    ]
+    caption = "Mean errors, of records that also trained by cross-validation."
+    return _dots(names, marks, (f"Errors by {result.group_by}", said, caption), f"mean error, {result.unit}")
 
 
 def _dots(
-    rows: Mapping[str, Sequence[tuple[float | None, str, str]]],
+    names: Sequence[str],
+    numbers: Sequence[tuple[str, str, Sequence[tuple[int, float | None]]]],
     words: tuple[str, str, str],
     label: str,
-    entries: Sequence[tuple[str, str]],
 ) -> Figure:
-    """Numbers of each row on one axis, marked by class, with a text at each; ``words``: title, description, caption."""
-    known = {name: [(x, style, text) for x, style, text in row if x is not None] for name, row in rows.items()}
-    numbers = [x for row in known.values() for x, _, _ in row]
-    high = max(numbers, default=1.0) or 1.0
-    low = min((x for x in numbers if x > 0), default=high)
-
-    def draw(width: float) -> tuple[float, list[str]]:
-        narrow = width <= svg.NARROW
-        most = 16 if narrow else 40
-        left = MONO * max(len(svg.shorten(name, most)) for name in known) + 18
-        top, parts = svg.legend(left, width - left - 8, entries) if entries else (4.0, [])
-        box = Box(left, top + 4, width - 14, top + 4 + _ROW * len(known))
-        x = Axis(0, high * 1.05, box.left, box.right)
-        if high / low > _LOG_FROM:
-            x = Axis(low * 0.85, high * 1.15, box.left, box.right, log=True)
-        parts += svg.frame(box, x, None, (label, ""), (4 if narrow else 8, 0))
-        for place, (name, row) in enumerate(known.items()):
-            y = box.top + _ROW * (place + 0.5)
-            parts.append(svg.text(left - 9, y + 4, svg.shorten(name, most), "mono", "end"))
-            ends = [x.of(number) for number, _, _ in row] or [left]
-            parts.append(svg.line(min(ends), y, max(ends), y, "stem"))
-            for number, ((_, style, text), at) in enumerate(zip(row, ends, strict=False)):
-                if style == "diamond":
-                    parts.append(svg.marks(np.array([at]), np.array([y]), _DIAMOND, style))
-                else:
-                    parts.append(svg.circle(at, y, 5, style))
-                parts.append(svg.text(at, y + (16 if number % 2 else -8), text, "tick", "middle") if text else "")
-        return box.bottom + 44, parts
-
-    return svg.both("ladder" if entries else "groups", words, draw)
+    """Numbers of each row on one axis: style, name, and pairs of row and number; ``words``: title, said, caption."""
+    marks = []
+    for style, name, pairs in numbers:
+        known = [(x, float(place)) for place, x in pairs if x is not None]
+        marks.append(Marks(style, np.array(known).reshape(-1, 2).T, name=name))
+    whole = np.concatenate([m.xy[0] for m in marks])
+    log = len(whole) > 0 and float(whole.min()) > 0 and float(whole.max() / whole.min()) > _LOG_FROM
+    return Figure(*words, [Panel("", marks, label, rows=names, log=log)], columns=1)
 
 
 def _said(value: float | None) -> str:

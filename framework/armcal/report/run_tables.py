@@ -1,0 +1,312 @@
+"""Tables of a run: errors, parameters, records, intervals."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from armcal.base.arrays import Indices
+from armcal.base.domains import Semidefinite, symmetric
+from armcal.base.units import shown_unit
+from armcal.estimate.bootstrap import Bootstrap
+from armcal.estimate.estimator import Estimate
+from armcal.estimate.prediction import LEVELS
+from armcal.estimate.validation import ErrorSummary
+from armcal.report.document import Table
+from armcal.report.numbers import MINUS, NONE, common_decimals, count, decimals_for, entry_unit, fixed, significant
+from armcal.run.errors import ErrorTable
+from armcal.run.judging import IntervalResult
+from armcal.run.result import GroupError, RunResult
+
+SETS = {"train": "training", "holdout": "held out", "cross_validated": "cross-validated"}
+MOST_LISTED = 50  # of records set aside and of correlated pairs; the rest is counted
+_WORST = 10
+_FIGURE_SPACE, _POINT_SPACE = "\u2007", "\u2008"
+_RECORDINGS = {"same": "calibrated recording", "new": "new recording"}
+_ENDS = {"crossed": "", "bound": "at its bound", "open": "does not end as far as was looked"}
+
+
+def errors_table(caption: str, errors: ErrorTable) -> Table:
+    """Of each set that has records, errors of the nominal and the calibrated arm, and without knowledge of a drift."""
+    models = (("nominal", errors.nominal), ("calibrated", errors.calibrated), ("drift unknown", errors.at_rest))
+    shown: list[tuple[str, str, ErrorSummary]] = []
+    for key, words in SETS.items():
+        if key in errors.calibrated and errors.calibrated[key].count:
+            shown += [(words, model, own[key]) for model, own in models if key in own]
+    decimals = common_decimals((x for _, _, s in shown for x in (s.mean, s.max)), most=3)
+    rows = [
+        (
+            words if model == "nominal" else "",
+            count(own.count) if model == "nominal" else "",
+            model,
+            *(fixed(x, decimals) for x in (own.mean, own.rms, own.p95, own.max)),
+        )
+        for words, model, own in shown
+    ]
+    strong = [i for i, (_, model, _) in enumerate(shown) if model == "calibrated"]
+    headings = ("Records", "Count", "Arm", "Mean", "RMS", "95 %", "Max")
+    return Table(caption, headings, rows, left=("Arm",), strong=strong)
+
+
+def groups_table(groups: Sequence[GroupError], unit: str) -> Table:
+    """What the records of each group miss each other by, before and after; and known distances, where any is known."""
+    distances = any(group.distance_error_mm is not None for group in groups)
+    numbers = [
+        [g.nominal_error_mm, g.error_mm, *([g.nominal_distance_error_mm, g.distance_error_mm] if distances else [])]
+        for g in groups
+    ]
+    decimals = common_decimals(x for row in numbers for x in row)
+    rows = []
+    for group, row in zip(groups, numbers, strict=True):
+        part = "judged" if not group.trained else "trained" if group.trained == group.records else "both"
+        rows.append((group.name, part, str(group.records), *(fixed(x, decimals) for x in row)))
+    headings = ["Group", "Part", "Records", "Nominal", "Calibrated"]
+    headings += ["Distance, nominal", "Distance, calibrated"] if distances else []
+    caption = f"By group, mean, {unit}: how far its records lie apart"
+    caption += "; and how far known distances within it are missed" if distances else ""
+    return Table(caption, headings, rows, left=("Part",))
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """One free parameter, in words; ``held`` where only a prior holds it, or nothing."""
+
+    name: str
+    unit: str
+    nominal: str
+    value: str
+    correction: str
+    sd: str
+    interval: str
+    at_bound: bool
+    determined: bool
+    held: bool
+
+    @property
+    def remark(self) -> str:
+        words = ["at its bound"] if self.at_bound else []
+        words += ["not determined"] if not self.determined else ["held by its prior"] if self.held else []
+        return ", ".join(words)
+
+
+def parameter_rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
+    """One row a free canonical entry, numbers aligned at their points."""
+    nominal, numbers, decimals = estimate.parameters.nominal(), [], []
+    units = [entry_unit(b, suffix) for b in estimate.parameters.free for suffix in b.domain.entries]
+    for i, entry in enumerate(estimate.free_entries):
+        own = (estimate.values[entry], nominal[entry], estimate.deviations[i])
+        value, before, sd = (float(number) * shown_unit(units[i])[0] for number in own)
+        # Two digits of the standard deviation; five of the value where there is none, three decimals of a zero.
+        size = sd if math.isfinite(sd) and sd > 0 else max(abs(value), abs(before)) / 1000
+        numbers.append((value, before, sd))
+        decimals.append(decimals_for(size) if size else 3)
+    rows, widest = [], max(decimals, default=0)
+    for i, (name, (value, before, sd), digits) in enumerate(zip(estimate.names, numbers, decimals, strict=True)):
+        factor, unit = shown_unit(units[i])
+        padding = _FIGURE_SPACE * (widest - digits) + (_POINT_SPACE if digits == 0 < widest else "")
+        written = [fixed(value, digits), fixed(before, digits), fixed(value - before, digits, True), fixed(sd, digits)]
+        interval = estimate.intervals[i]
+        lower, upper = (fixed(float(end) * factor, digits) for end in (interval.lower, interval.upper))
+        words = f"{lower} to {upper}" if math.isfinite(sd) else NONE
+        if math.isfinite(sd) and interval.bound:
+            words = f"≤ {upper}" if interval.bound == "lower" else f"≥ {lower}"
+        shown, was, moved, deviation = (text if text == NONE else text + padding for text in written)
+        flags = (name in estimate.at_bound, math.isfinite(sd), not estimate.identified_by_data[i])
+        rows.append(ParameterRow(name, unit, was, shown, moved, deviation, words, *flags))
+    return tuple(rows)
+
+
+def parameters_table(rows: Sequence[ParameterRow]) -> Table:
+    cells = [(r.name, r.nominal, r.value, r.correction, r.sd, r.interval, r.unit, r.remark) for r in rows]
+    headings = ("Parameter", "Nominal", "Calibrated", "Correction", "sd", "95 % interval", "Unit", "Remark")
+    caption = "Free parameters, with standard deviation (sd) and 95 % interval; one-sided next to a bound"
+    return Table(caption, headings, cells, left=("Unit", "Remark"), page_only=("Nominal", "Correction"))
+
+
+def principal_table(estimate: Estimate) -> Table | None:
+    """Eigenvalues of compliances that are matrices."""
+    factor, unit = shown_unit("rad_per_Nm")
+    rows = []
+    for block in estimate.parameters.free:
+        if isinstance(block.domain, Semidefinite):
+            sizes = np.linalg.eigvalsh(symmetric(estimate.values[estimate.parameters.entries_of(block.name)]))
+            rows.append((block.name, *(significant(factor * max(size, 0.0)) for size in sizes)))
+    return Table(f"Principal compliances, {unit}", ("Parameter", "Stiffest", "", "Softest"), rows) if rows else None
+
+
+def fixed_table(estimate: Estimate) -> Table | None:
+    rows = []
+    for block in estimate.parameters.blocks:
+        if not block.free:
+            values = estimate.values[estimate.parameters.entries_of(block.name)]
+            for name, suffix, value in zip(block.entry_names, block.domain.entries, values, strict=True):
+                factor, unit = shown_unit(entry_unit(block, suffix))
+                rows.append((name, f"{float(value) * factor:.7g}".replace("-", MINUS), unit))
+    return Table("Fixed parameters", ("Parameter", "Value", "Unit"), rows, left=("Unit",)) if rows else None
+
+
+def worst_records(result: RunResult) -> Indices:
+    errors = result.errors.calibrated_mm
+    ranked = np.where(np.isnan(errors), np.inf, errors)
+    return np.argsort(-ranked, kind="stable")[:_WORST].astype(np.intp)
+
+
+def worst_table(result: RunResult, worst: Indices) -> Table:
+    errors, data, turns = result.errors, result.dataset, result.errors.turns
+    train, holdout = set(result.split.train.tolist()), set(result.split.holdout.tolist())
+    crossed = bool(np.isfinite(errors.cross_validated_mm).any())
+    columns = {"Nominal": errors.nominal_mm, "Calibrated": errors.calibrated_mm}
+    columns |= {"Cross-validated": errors.cross_validated_mm} if crossed else {}
+    if turns is not None:
+        columns |= {"Nominal, deg": turns.nominal_deg, "Calibrated, deg": turns.calibrated_deg}
+        columns |= {"Cross-validated, deg": turns.cross_validated_deg} if crossed else {}
+    decimals = {name: common_decimals(numbers[worst].tolist()) for name, numbers in columns.items()}
+    rows = []
+    for i in worst.tolist():
+        role = "train" if i in train else "holdout" if i in holdout else "not used"
+        numbers = (fixed(float(own[i]), decimals[name]) for name, own in columns.items())
+        rows.append((data.ids[i], str(data.rows[i]) if data.rows else NONE, role, *numbers))
+    caption = f"The records with the largest calibrated error, {errors.unit}"
+    return Table(caption, ("Record", "Source row", "Role", *columns), rows, left=("Role",))
+
+
+def large_errors_table(result: RunResult) -> Table | None:
+    missed, unit = result.evidence.large_errors, result.errors.unit
+    if missed is None or not missed.beyond:
+        return None
+    rows = [
+        (m.record_id, str(m.row or NONE), fixed(m.error_mm, 2), "; ".join(m.reasons), m.advice)
+        for m in missed.explained
+    ]
+    caption = f"{count(missed.beyond)} of {count(missed.judged)} records that judge, with an error "
+    caption += f"{missed.in_words(unit)} by fits that did not see them"
+    headings = ("Record", "Source row", f"Error, {unit}", "What is unusual", "What to do")
+    return Table(caption, headings, rows, left=headings[3:])
+
+
+def moved_table(result: RunResult) -> Table | None:
+    """How far the pose residual moves the tool, by part."""
+    outcome = result.pose_residual
+    if outcome is None or outcome.moved is None:
+        return None
+    parts = {"altogether": outcome.moved.altogether, **outcome.moved.parts}
+    numbers = {name: (1000 * float(own.mean()), 1000 * float(own.max())) for name, own in parts.items()}
+    decimals = common_decimals((x for pair in numbers.values() for x in pair), most=3)
+    rows = [(name, *(fixed(x, decimals) for x in pair)) for name, pair in numbers.items()]
+    caption = "How far the pose residual moves the tool, mm: altogether, and by what it adds to the tool and each joint"
+    return Table(caption, ("Part", "Mean", "Max"), rows, strong=(0,))
+
+
+def coverage_table(intervals: IntervalResult) -> Table | None:
+    """Shares covered by the intervals of cross-validated and held-out records, in this and in a new recording."""
+    rows: list[tuple[str, ...]] = []
+    for words, shares in (("Cross-validated", intervals.crossed), ("Held out", intervals.holdout)):
+        for name, share in shares.items():
+            label = f"{words}, {_RECORDINGS[name]}" if len(shares) > 1 else words
+            radius = share.stretched_radius if share.stretched else share.raw_radius
+            rows.append((label, count(share.records), *_percent([*share.stated, radius])))
+            rows.append(("before", "", *_percent([*share.raw, share.raw_radius])))
+    caption = (
+        "Share of numbers (of positions in the last column) inside their prediction intervals, by fits that did not "
+        "see them; below, before the intervals were stretched"
+    )
+    levels = (*(f"{100 * level:g} %" for level in LEVELS), "95 % radius")
+    strong = range(0, len(rows), 2)
+    return Table(caption, ("Records", "Count", *levels), rows, strong=strong) if rows else None
+
+
+def _percent(shares: Sequence[float | None]) -> tuple[str, ...]:
+    return tuple(NONE if share is None else f"{100 * share:.1f} %" for share in shares)
+
+
+def profiles_table(result: RunResult) -> Table:
+    rows = []
+    for profile in result.profiles:
+        factor, unit = shown_unit(result.estimate.parameters[profile.name].unit)
+        width = max(factor * max(profile.upper - profile.lower, 1e-12), 1e-12)
+        digits = max(2, 1 - int(np.floor(np.log10(width))))
+        ends = f"{fixed(factor * profile.lower, digits)} to {fixed(factor * profile.upper, digits)}"
+        sides = (("lower", profile.lower_end), ("upper", profile.upper_end))
+        remarks = [f"{side} end {_ENDS[end]}" for side, end in sides if _ENDS[end]]
+        if profile.better:
+            remarks.append("a better fit was found on the way: try more starts")
+        rows.append((profile.name, fixed(factor * profile.value, digits), ends, unit, "; ".join(remarks)))
+    caption = "95 % intervals; everything else was fitted again, within bounds, for each value"
+    headings = ("Parameter", "Calibrated", "95 % interval", "Unit", "Remark")
+    return Table(caption, headings, rows, left=("Unit", "Remark"))
+
+
+def bootstrap_table(estimate: Estimate, bootstrap: Bootstrap) -> Table:
+    """How sure each parameter is, in SI, by curvature and by refits."""
+    how = f"blocks of {bootstrap.block}" if bootstrap.method == "blocks" else "parametric"
+    failed = f", {bootstrap.failed} more did not converge" if bootstrap.failed else ""
+    rows = []
+    for i, name in enumerate(bootstrap.names):
+        sd, low, high = (float(x) for x in (bootstrap.deviations[i], *bootstrap.intervals[i]))
+        digits = decimals_for(sd) or 5
+        numbers = [float(estimate.values[estimate.free_entries[i]]), float(estimate.deviations[i]), sd]
+        rows.append((name, *(fixed(x, digits) for x in numbers), f"{fixed(low, digits)} to {fixed(high, digits)}"))
+    caption = f"Bootstrap, {len(bootstrap.values)} refits{failed}; {how}"
+    return Table(caption, ("Parameter", "Value", "sd", "Bootstrap sd", "Bootstrap 95 % interval"), rows)
+
+
+def suspicious_table(result: RunResult) -> Table | None:
+    noise, unit = result.noise, result.errors.unit
+    rows = [
+        (
+            s.record_id,
+            str(s.row or NONE),
+            s.measurement,
+            fixed(s.deviations, 1),
+            fixed(s.limit, 1),
+            fixed(s.error_mm, 2),
+            s.fate,
+        )
+        for s in noise.suspicious[:MOST_LISTED]
+    ]
+    caption = f"{count(len(noise.suspicious))} suspicious records, farther from the fit than noise allows (1 % over all"
+    caption += f"); loss {noise.loss}" + _more(len(noise.suspicious), "in residuals.csv")
+    headings = ("Record", "Source row", "Measurement", "Distance, sd", "Limit, sd", f"Error, {unit}", "In the fit")
+    return Table(caption, headings, rows, left=("Measurement", "In the fit")) if rows else None
+
+
+def aside_table(result: RunResult) -> Table | None:
+    aside = result.dataset.set_aside
+    rows = [(str(record.row), record.record_id, record.reason) for record in aside[:MOST_LISTED]]
+    caption = f"{count(len(aside))} records set aside" + _more(len(aside))
+    return Table(caption, ("Source row", "Record", "Why"), rows, left=("Record", "Why")) if rows else None
+
+
+def _more(total: int, where: str = "") -> str:
+    return f"; {count(total - MOST_LISTED)} more {where}".rstrip() if total > MOST_LISTED else ""
+
+
+def scatter_table(result: RunResult) -> Table | None:
+    """Variance components in a customary unit, the largest share first."""
+    rows: list[tuple[str, ...]] = []
+    components = result.noise.components
+    for c in sorted(components.components if components else (), key=lambda c: -c.share):
+        factor, unit = {"rad": (180 / np.pi, "deg"), "m": (1000.0, "mm")}.get(c.unit, (1.0, "\u00d7 declared noise"))
+        sd, lower, upper = (fixed(factor * x, 3) for x in (c.sd, c.lower, c.upper))
+        rows.append((c.name, f"{100 * c.share:.1f} %", sd, unit, f"{lower} to {upper}", fixed(1000 * c.rms, 3)))
+    caption = (
+        "Estimated standard deviations (restricted maximum likelihood); a joint's is what acts like an angle error"
+    )
+    headings = ("Component", "Share", "sd", "Unit", "95 % interval", f"In a residual, {result.errors.unit}")
+    return Table(caption, headings, rows, left=("Unit",)) if rows else None
+
+
+def provenance_facts(provenance: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Names and values, those of mappings one by one."""
+    facts: list[tuple[str, str]] = []
+    for key, value in provenance.items():
+        name = f"{prefix}{key}".replace("_", " ")
+        if isinstance(value, Mapping):
+            facts += provenance_facts(value, f"{name}: ")
+        elif isinstance(value, (list, tuple)):
+            facts.append((name, ", ".join(str(item) for item in value) or NONE))
+        else:
+            facts.append((name, NONE if value is None or value == "" else str(value)))
+    return facts
