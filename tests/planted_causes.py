@@ -12,11 +12,12 @@ from armcal.diagnose.residual_structure import ResidualStructure, structure
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.robust import fit
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
-from armcal.problem.motion import Motion, recorded_position
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal_ipopt.estimator import IpoptEstimator
 from scipy.spatial.transform import Rotation
+
+from tests.fits import fit_of
 
 DEG = np.pi / 180
 NOISE_M = 1e-4
@@ -202,19 +203,15 @@ def dataset_of(q: np.ndarray, points: np.ndarray) -> Dataset:
     return Dataset(tuple(str(i) for i in range(len(q))), channels)
 
 
-def fitted(base: Experiment, cause: Cause, dataset: Dataset) -> tuple[Problem, tuple, Estimate]:
+def fitted(base: Experiment, cause: Cause, dataset: Dataset) -> tuple[Problem, Estimate]:
     system = base.system
     parameters = base.parameters.with_free(free_of(cause))
     problem = Problem.build(system.arms, system.measurements, parameters, system.environment, dataset, "interpreted")
-    records = problem.of(dataset).records
-    found = fit(problem.with_records(records), IpoptEstimator(IpoptEstimator.Settings()), parameters.nominal())
-    return problem, records, found.estimate
+    return problem, fit(problem, IpoptEstimator(IpoptEstimator.Settings()), parameters.nominal()).estimate
 
 
 def left(base: Experiment, cause: Cause, dataset: Dataset) -> ResidualStructure:
-    problem, records, estimate = fitted(base, cause, dataset)
-    motion = Motion.of(problem.with_records(records), estimate.values, dataset)
-    found = structure(problem, records, estimate, dataset, motion, recorded_position(dataset))
+    found = structure(fit_of(*fitted(base, cause, dataset), dataset))
     assert found is not None
     return found
 

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from armcal.calibration.compensation.request import Commands as Commands
     from armcal.calibration.compensation.request import Options as Options
     from armcal.calibration.compensation.request import Targets as Targets
+    from armcal.diagnose.checks import Finding as Finding
     from armcal.errors import ArmcalError as ArmcalError
     from armcal.errors import InputError as InputError
     from armcal.errors import NotConvergedError as NotConvergedError
@@ -84,6 +85,7 @@ _FOR_PLUGINS = {
     "armcal.base.domains": "Interval",
     "armcal.base.parameters": "scalar",
     "armcal.base.settings": "Angle Compliance Force Length Length3 Mass Temperature Torque",
+    "armcal.diagnose.checks": "Finding",
     "armcal.measure.instrument": "Contact Instrument InstrumentSettings",
     "armcal.measure.measurement": "Channel",
     "armcal.plugins": "use_plugins",

@@ -74,6 +74,7 @@ REGISTRATIONS = {
     "armcal_register_joint_streams": "Live joint readings of arms that are guided by hand.",
     "armcal_register_cameras": "Live cameras: what they see while an arm stands.",
     "armcal_register_benches": "Simulated benches: what stands in for board, arm and tracker in a rehearsal.",
+    "armcal_register_checks": "Checks: what a plugin asks of the data or of a fit, and says in the verdict.",
     "armcal_register_commands": "Commands: what ``armcal NAME`` runs, a click command, imported when it is called.",
     "armcal_register_report_sections": "Report sections: what a plugin adds to ``report.html`` of each run.",
 }
@@ -169,6 +170,7 @@ _KINDS = {
     "joints": _kind("joint_streams", "Stream(settings)", "devices.live:JointStream", "devices.live:RestStream"),
     "camera": _kind("cameras", "Camera(settings)", "devices.live:LiveCamera"),
     "bench": _kind("benches", "Bench(settings)", "devices.simulated:SimulatedBench"),
+    "check": _kind("checks", "check(fit)", "diagnose.checks:CheckFunction"),
     "command": _kind("commands", "Command", "hooks:Command"),
     "report_section": _kind("report_sections", "Section(result)", "report.run_document:SectionMaker"),
 }

@@ -352,7 +352,7 @@ def compare(subject: ArmToJudge, model: str, visits: Visits, frame: _Frame) -> C
     tools = tools_of(problem, parameters.nominal(), 0)
     if frame == "stated":
         with noted(["where the instrument may stand anywhere, give --frame found."]):
-            check_reach(problem, problem.records, dataset)
+            check_reach(problem, dataset)
     if model == "nominal":
         refuse_strangers(visits, sighting.measured.T, float(np.median(np.linalg.norm(tools.places, axis=0))))
     if frame == "found":

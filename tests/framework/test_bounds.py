@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from armcal.calibration.calibration_file import parameter_records
 from armcal.cli.console import Screen
-from armcal.diagnose.evidence_findings import shift_findings
+from armcal.diagnose.verdict import shift_findings
 from armcal.estimate.estimator import Estimate, estimate
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.problem.problem import Problem

@@ -12,17 +12,16 @@ import oracle
 import pytest
 from armcal.cli.main import cli
 from armcal.diagnose.dependences import predicted_positions
-from armcal.diagnose.evidence import Evidence
-from armcal.diagnose.evidence_findings import neighbour_findings, structure_findings
-from armcal.diagnose.large_errors import Finding
-from armcal.diagnose.residual_structure import LEVEL, UNLISTED, structure
+from armcal.diagnose.held import contradictions
+from armcal.diagnose.outliers import large_errors, suspicious_ids
+from armcal.diagnose.residual_structure import LEVEL, UNLISTED, neighbour_findings, structure, structure_findings
 from armcal.diagnose.score_tests import FitRows
-from armcal.diagnose.unseen import scale_deviation
-from armcal.diagnose.verdict import _in_short
+from armcal.diagnose.unseen import rounding, scale_deviation
+from armcal.diagnose.verdict import _in_short, suggestions
 from armcal.estimate.robust import fit
-from armcal.problem.motion import Motion, recorded_position
 from armcal_ipopt.estimator import IpoptEstimator
 from click.testing import CliRunner
+from fits import fit_of, fit_that_found
 from noise_cases import NOISE_M, posed
 
 DEG = np.pi / 180
@@ -94,10 +93,10 @@ def found_in(lrm, name, seed, in_order=False):
     points = measured(name, seed, q, came)
     columns = {f"arm.approach.q{i + 1}": came[:, i] for i in range(6) if name != "hysteresis"}
     problem, records, start = posed(lrm, q, points, oracle.OPTION_1, **columns)
-    estimate = fit(problem.with_records(records), IpoptEstimator(IpoptEstimator.Settings()), start).estimate
+    problem = problem.with_records(records)
+    estimate = fit(problem, IpoptEstimator(IpoptEstimator.Settings()), start).estimate
     dataset = lrm.dataset(q, points, **columns)
-    motion = Motion.of(problem.with_records(records), estimate.values, dataset)
-    return structure(problem, records, estimate, dataset, motion, recorded_position(dataset))
+    return structure(fit_of(problem, estimate, dataset))
 
 
 def graded(found, name):
@@ -148,7 +147,8 @@ def test_in_short_nothing_is_left_only_where_no_function_of_the_pose_is(smooth):
     def short(predicted, times=1.0):
         sure = SimpleNamespace(**solved, noise_scale=times, degrees_of_freedom=100)
         left = replace(found, structures=(), lag_after_p=1.0, predictable=predicted)
-        return " ".join(_in_short("", sure, Finding("good", ""), Evidence(left), "", ()))
+        nothing = {contradictions: (), rounding: None, large_errors: None, suspicious_ids: [], suggestions: ()}
+        return " ".join(_in_short(fit_that_found(sure, {structure: left, **nothing}, unit="mm"), ""))
 
     assert "is not noise: other records predict it" in short(found.predictable)
     assert "nothing" not in short(found.predictable) and "nothing" not in short(None)
@@ -176,8 +176,9 @@ def test_how_large_an_unseen_scale_may_be_is_not_a_matter_of_chance(lrm):
         points = exact + noise * np.random.default_rng(2).normal(size=exact.shape)
         problem, records, start = posed(lrm, q, points, oracle.OPTION_1)
         estimate = fit(problem.with_records(records), IpoptEstimator(IpoptEstimator.Settings()), start).estimate
-        read = predicted_positions(problem, estimate.values, records, lrm.dataset(q, points))
-        found.append(scale_deviation(problem, FitRows.of(problem, records, estimate), read, 1.0, estimate.values))
+        problem = problem.with_records(records)
+        read = predicted_positions(problem, estimate.values, lrm.dataset(q, points))
+        found.append(scale_deviation(problem, FitRows.of(problem, estimate), read, 1.0, estimate.values))
     assert found[1] == pytest.approx(found[0], rel=0.15)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
-from armcal.diagnose.evidence_findings import _what_neighbours_cost
+from armcal.diagnose.residual_structure import _what_neighbours_cost
 from armcal.diagnose.score_tests import widened
 from armcal.estimate.estimator import Estimate, estimate
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
@@ -45,7 +45,7 @@ def estimates(order: str, seeds: range, count: int) -> list[tuple[Estimate, Esti
         plain = estimate(
             problem.with_records(records), loaded.estimator.solve(problem.with_records(records), parameters.nominal())
         )
-        wide = widened(problem, records, plain, places)
+        wide = widened(problem.with_records(records), plain, places)
         found.append((plain, wide, (plain.values - parameters.nominal())[free]))
     return found
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import oracle
 import pytest
 from armcal.base.parameters import Drift
 from armcal.cli.main import cli
-from armcal.diagnose.evidence import Evidence
+from armcal.diagnose.held import contradictions
+from armcal.diagnose.residual_structure import structure
+from armcal.diagnose.unseen import rounding
 from armcal.diagnose.verdict import LEVEL, _good_for, _size
 from armcal.errors import DataError
 from armcal.estimate.estimator import estimate
@@ -22,6 +25,7 @@ from armcal.problem.drift import residuals, with_drift
 from armcal_cvxpy.estimator import CvxpyEstimator
 from armcal_ipopt.estimator import IpoptEstimator
 from click.testing import CliRunner
+from fits import fit_that_found
 from scipy.stats import binom
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
@@ -390,10 +394,10 @@ def test_a_drift_as_stated_is_no_error_of_the_model(lrm, seeds):
     warned = 0
     for seed in seeds:
         problem, records = posed(lrm, recorded(lrm, 50, seed, PLANTED), PLANTED)
-        fit = estimate(
-            problem.with_records(records), SOLVER.solve(problem.with_records(records), problem.parameters.nominal())
-        )
-        finding = _size(fit, np.ones(1), Evidence())
+        problem = problem.with_records(records)
+        fit = estimate(problem, SOLVER.solve(problem, problem.parameters.nominal()))
+        none = {structure: None, contradictions: (), rounding: None}
+        finding = _size(fit_that_found(fit, none, unit="mm", errors=SimpleNamespace(calibrated_mm=np.ones(1))))
         assert finding.grade == "warning" or "model explains the data" in finding.text
         warned += finding.grade == "warning"
     low, high = binom.ppf([1e-3, 1 - 1e-3], len(seeds), LEVEL / 2)

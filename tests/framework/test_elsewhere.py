@@ -8,14 +8,14 @@ from pathlib import Path
 import contact_oracle as co
 import numpy as np
 from armcal.base.dataset import Dataset
-from armcal.diagnose.evidence import elsewhere
-from armcal.diagnose.unseen import Elsewhere, elsewhere_findings
+from armcal.diagnose.unseen import Elsewhere, away, away_from_contacts, elsewhere
 from armcal.estimate.polish import started
 from armcal.estimate.robust import fit
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from armcal_contact.contacts import BallInSocket
 from armcal_ipopt.estimator import IpoptEstimator
+from fits import fit_that_found
 
 IPOPT = IpoptEstimator(IpoptEstimator.Settings())
 NOISE = 1e-3
@@ -47,10 +47,10 @@ def test_the_tool_is_off_away_from_the_sockets_by_as_much_as_is_said() -> None:
         ball = BallInSocket(BallInSocket.Settings.si(noise=NOISE), ("arm",))
         problem, records = co.Bench({"arm": co.the_arm(co.ELBOW)}, {"balls": ball}, FREE).problem(co.dataset(parts))
         problem = started(problem.with_records(records))
-        estimate = fit(problem.with_records(records), IPOPT, problem.parameters.nominal()).estimate
-        away = elsewhere(problem, estimate, Dataset(tuple(map(str, range(100))), co.joints(poses)))
-        assert away is not None
-        stated.append(away.rms_mm)
+        estimate = fit(problem, IPOPT, problem.parameters.nominal()).estimate
+        found = away_from_contacts(problem, estimate, Dataset(tuple(map(str, range(100))), co.joints(poses)))
+        assert found is not None
+        stated.append(found.rms_mm)
         true.append(1e3 * off(poses, co.by_name(problem.parameters, estimate.values)))
     ratio = np.sqrt(np.mean(np.square(true)) / np.mean(np.square(stated)))
     assert 0.7 < ratio < 1.4
@@ -58,9 +58,9 @@ def test_the_tool_is_off_away_from_the_sockets_by_as_much_as_is_said() -> None:
 
 def test_it_is_no_warning_but_stands_before_how_well_postures_at_one_place_agree() -> None:
     """Sound contacts always agree better than the tool is known: a warning of it comes with each of them."""
-    (note,) = elsewhere_findings(Elsewhere(0.3, 400, ""))
+    (note,) = away(fit_that_found(None, {elsewhere: Elsewhere(0.3, 400, "")}))
     assert note.grade == "note" and "known to 0.30 mm" in note.text
-    assert elsewhere_findings(None) == []
+    assert away(fit_that_found(None, {elsewhere: None})) == []
     run = Experiment.load(BALL, ["evaluator=interpreted"])
     assert re.match(
         r"Away from the contacts the tool is known to 0\.1\d mm .*\. Postures at one place agree within \+- 0\.1\d mm",

@@ -29,5 +29,5 @@ def test_a_known_distance_of_sockets_keeps_the_size_of_the_arm_from_taking_up_th
     solution = IpoptEstimator(IpoptEstimator.Settings()).solve(
         problem.with_records(records), problem.parameters.nominal()
     )
-    rows = FitRows.of(problem, records, SimpleNamespace(values=solution.values))
+    rows = FitRows.of(problem, SimpleNamespace(values=solution.values))
     assert np.linalg.norm(rows.slopes.T @ rows.residual) < 1e-6 * np.linalg.norm(rows.slopes)

@@ -15,7 +15,7 @@ from armcal.measure.csv_writer import write_csv
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 from armcal.run.fixed_parameters import FixedParameters, fixed_parameters
-from armcal.run.prepare import Stopwatch, assemble
+from armcal.run.pipeline import Stopwatch, assemble
 from armcal.scaffold.robot import read_rows, robot_of_rows
 from armcal.scaffold.robot_files import SIMULATED, write_robot
 from click.testing import CliRunner
@@ -103,7 +103,7 @@ def test_what_free_parameters_do_already_is_no_candidate(folder: Path) -> None:
     assert {"arm.mdh.theta1", "arm.mdh.d1"} <= set(names)
     assert not [name for name in names if name in own or name.startswith("statics.")]
     wide = assemble(loaded(folder, (), f"parameters.free={json.dumps([*own, *names])}"), Stopwatch())
-    chosen = freeing(wide.problem.with_records(wide.training), own, wide.problem.parameters.nominal())
+    chosen = freeing(wide.training, own, wide.problem.parameters.nominal())
     seen = {one.name for one in (*chosen.gaining, *chosen.others)}
     assert not {"arm.mdh.theta1", "arm.mdh.d1"} & seen
     assert all(np.all(one.sd > 0) for one in (*chosen.gaining, *chosen.others))

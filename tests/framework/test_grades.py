@@ -11,7 +11,7 @@ import numpy as np
 import planted_mistakes
 import pytest
 from armcal.cli.main import cli
-from armcal.diagnose.gross_findings import overfitted
+from armcal.diagnose.gross import overfitted
 from armcal.planning.suggestion import Suggestion, is_worth_measuring
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate

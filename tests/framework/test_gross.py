@@ -9,12 +9,11 @@ from typing import cast
 import numpy as np
 import pytest
 from armcal.cli.main import cli
-from armcal.diagnose.gross import Figure, figure_of
-from armcal.diagnose.gross_findings import computed_findings, size_findings
+from armcal.diagnose.fit import Prepared
+from armcal.diagnose.gross import Figure, computed_findings, figure_of, size_findings
 from armcal.estimate.estimator import Estimate
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import calibrate
-from armcal.run.prepare import Prepared, Stopwatch, assemble
+from armcal.run.pipeline import Stopwatch, assemble, calibrate
 from click.testing import CliRunner
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -36,7 +35,7 @@ def size(ready: Prepared, zero_rad: float, factor: float) -> float:
         own = parameters.entries_of(block.name)
         values[own] = values[own] * factor if block.unit == "m" else zero_rad
     known = SimpleNamespace(values=values, covariance=np.zeros((len(parameters.free_entries),) * 2))
-    figure = figure_of(ready.problem, cast(Estimate, known), ready.training)
+    figure = figure_of(ready.training, cast(Estimate, known))
     assert bool(size_findings(figure)) == (factor != 1.0)
     return figure.size
 

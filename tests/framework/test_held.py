@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.diagnose.held import HeldParameter, clustered_variance
+from armcal.diagnose.residual_structure import structure
 from armcal.diagnose.score_tests import FitRows
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
@@ -49,5 +50,6 @@ def test_what_records_do_not_show_has_no_deviation_and_is_stated_with_unit() -> 
 def test_play_that_is_held_at_none_reads_no_approach_and_stops_no_run() -> None:
     """The fit of thirty ruler points reads the approach of four joints alone; the fifth has no play to be freed."""
     config = Path(__file__).resolve().parents[2] / "configs" / "so101" / "ruler.yaml"
-    structure = calibrate(Experiment.load(config, ["evaluator=interpreted", "validation.folds=0"])).evidence.structure
-    assert structure is not None and structure.tested > 20
+    fit = calibrate(Experiment.load(config, ["evaluator=interpreted", "validation.folds=0"])).fit
+    left = fit.of(structure)
+    assert left is not None and left.tested > 20

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import oracle
 import pytest
-from armcal.diagnose.unseen import hidden_payload, hidden_payload_findings
+from armcal.diagnose.unseen import hidden_payload, payload
 from armcal.estimate.robust import fit
-from armcal.problem.motion import Motion
 from armcal_ipopt.estimator import IpoptEstimator
+from fits import fit_of, fit_that_found
 from noise_cases import NOISE_M, posed
 
 COUNT = 60
@@ -23,14 +23,13 @@ def fitted(lrm, **columns):
     q = random.uniform(-1, 1, (COUNT, 6)) * np.deg2rad([100, 50, 100, 100, 100, 50])
     points = oracle.tip(oracle.published(), q) + NOISE_M * random.normal(size=(COUNT, 3))
     problem, records, start = posed(lrm, q, points, oracle.OPTION_1, **columns)
-    estimate = fit(problem.with_records(records), IpoptEstimator(IpoptEstimator.Settings()), start).estimate
-    return problem, records, estimate, lrm.dataset(q, points, **columns)
+    problem = problem.with_records(records)
+    estimate = fit(problem, IpoptEstimator(IpoptEstimator.Settings()), start).estimate
+    return problem, estimate, lrm.dataset(q, points, **columns)
 
 
-def hidden(problem, records, estimate, dataset):
-    return hidden_payload(
-        problem, records, estimate, dataset, Motion.of(problem.with_records(records), estimate.values, dataset)
-    )
+def hidden(problem, estimate, dataset):
+    return hidden_payload(fit_of(problem, estimate, dataset))
 
 
 @pytest.mark.slow
@@ -47,7 +46,7 @@ def test_its_deviation_is_how_fast_the_misfit_grows_with_an_assumed_payload(lrm)
     curvature = (sums[0] - 2 * sums[1] + sums[2]) / step**2
     assert found.sd / run[2].noise_scale == pytest.approx(np.sqrt(2 / curvature), rel=0.1)
     assert all(name.startswith("arm.spring.k") for name in found.by[:2])
-    text = hidden_payload_findings(found)[0].text
+    text = payload(fit_that_found(None, {hidden_payload: found}))[0].text
     assert f"up to {2000 * found.sd:.2g} g" in text and found.by[0] in text
 
 

@@ -24,7 +24,7 @@ def judged(seen: np.ndarray):
     problem = problem_of(loaded, dataset)
     records = problem.of(dataset).records
     fitted = fit(problem.with_records(records).subset(np.arange(40)), loaded.estimator, loaded.parameters.nominal())
-    return predictor(problem, fitted), problem.with_records(records).subset(np.arange(40, 60)).records
+    return predictor(fitted), problem.with_records(records).subset(np.arange(40, 60)).records
 
 
 @pytest.mark.slow

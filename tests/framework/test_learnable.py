@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from armcal.diagnose.evidence_findings import _remedies
 from armcal.diagnose.predictable import Carrier, Predictable
+from armcal.diagnose.residual_structure import _remedies
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate

@@ -32,9 +32,9 @@ def without_priors():
 @pytest.mark.slow
 def test_it_is_the_posterior_without_the_record() -> None:
     """Values and drift together, each record in turn taken out of the information."""
-    problem, fitted, joint, known = without_priors()
-    (spread,) = predictor(problem, fitted).left_out(fitted.records, "same")
-    (own,) = predictor(problem, fitted).spreads(fitted.records, "same")
+    _, fitted, joint, known = without_priors()
+    (spread,) = predictor(fitted).left_out(fitted.records, "same")
+    (own,) = predictor(fitted).spreads(fitted.records, "same")
     information = joint.T @ joint + known
     scale = (fitted.estimate.noise_scale * NOISE) ** 2
     for i in range(len(joint) // 3):
@@ -47,8 +47,8 @@ def test_it_is_the_posterior_without_the_record() -> None:
 
 @pytest.mark.slow
 def test_a_record_that_weighed_less_is_missed_less() -> None:
-    problem, fitted, *_ = without_priors()
-    by = predictor(problem, fitted)
+    _, fitted, *_ = without_priors()
+    by = predictor(fitted)
     (whole,), (own,) = by.left_out(fitted.records, "same"), by.spreads(fitted.records, "same")
     weight = fitted.records[0].weight.copy()
     weight[0], weight[1] = 0.0, 0.5
@@ -64,7 +64,7 @@ def test_where_nothing_drifts_both_recordings_are_the_same() -> None:
     dataset = loaded.read().subset(np.arange(20))
     problem = problem_of(loaded, dataset)
     fitted = fit(problem.of(dataset), loaded.estimator, loaded.parameters.nominal())
-    by = predictor(problem, fitted)
+    by = predictor(fitted)
     (same,), (new,) = by.left_out(fitted.records, "same"), by.left_out(fitted.records, "new")
     assert np.array_equal(same.covariance, new.covariance)
     # What records hold of what is known of themselves sums to the number of values.
@@ -81,8 +81,8 @@ def test_a_record_alone_in_telling_something_is_not_predicted_without_it() -> No
     problem = problem_of(loaded, dataset)
     records = problem.of(dataset).records
     fitted = fit(problem.with_records(records), loaded.estimator, loaded.parameters.nominal())
-    (spread,) = predictor(problem, fitted).left_out(fitted.records, "same")
-    (own,) = predictor(problem, fitted).spreads(fitted.records, "same")
+    (spread,) = predictor(fitted).left_out(fitted.records, "same")
+    (own,) = predictor(fitted).spreads(fitted.records, "same")
     assert np.isfinite(spread.covariance).all()
     assert (spread.deviations > 3 * own.deviations).any(axis=0).all()
 
@@ -90,7 +90,7 @@ def test_a_record_alone_in_telling_something_is_not_predicted_without_it() -> No
 @pytest.mark.parametrize("recording", ["same", "new"])
 def test_the_order_of_records_does_not_matter(recording: str) -> None:
     *_, problem, _, _, _, fitted = drifting_problem()
-    by, count = predictor(problem, fitted), fitted.records[0].count
+    by, count = predictor(fitted), fitted.records[0].count
     turned = problem.with_records(fitted.records).subset(np.arange(count)[::-1]).records
     (forth,), (back,) = by.left_out(fitted.records, recording), by.left_out(turned, recording)
     assert np.allclose(forth.covariance, back.covariance[::-1], rtol=1e-10)

@@ -7,9 +7,10 @@ from types import SimpleNamespace
 
 import pytest
 from armcal.arm.statics import MassSpec
+from armcal.diagnose.data import masses as checked_masses
 from armcal.errors import ConfigError, NotConvergedError
 from armcal.run.experiment import Experiment
-from armcal.run.prepare import Stopwatch, assemble, mass_findings
+from armcal.run.pipeline import Stopwatch, assemble
 
 DEMO = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "demo.yaml"
 LINKS = ("link1", "link2", "link3", "link4", "link5", "link6", "target", "holder")
@@ -33,7 +34,7 @@ def test_what_hangs_or_pulls_loads_them(loaded: str) -> None:
 @pytest.mark.slow
 def test_grams_read_as_kilograms_are_said_before_the_fit_and_in_the_verdict() -> None:
     experiment = Experiment.load(DEMO, ["arms.arm.links.link2.mass_g=177000", "evaluator=interpreted"])
-    (finding,) = mass_findings(experiment.system)
+    (finding,) = checked_masses(experiment)
     assert finding.grade == "warning" and "link2: 177 kg" in finding.text and "Are these grams?" in finding.text
     try:
         ready = assemble(experiment, Stopwatch(), accept=True)
@@ -70,4 +71,4 @@ def test_arms_as_they_are_sold_are_not_warned_of(name: str, length: float, masse
     for factor, warned in ((1.0, False), (1000.0, True)):
         own = tuple(MassSpec(f"link{i}", factor * mass, (0.0, 0.0, 0.0), "tool") for i, mass in enumerate(masses))
         system = SimpleNamespace(arms={"arm": SimpleNamespace(masses=own, length=length)})
-        assert bool(mass_findings(system)) is warned, name
+        assert bool(checked_masses(SimpleNamespace(system=system))) is warned, name

@@ -6,8 +6,8 @@ import contact_oracle as co
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
-from armcal.diagnose.evidence_findings import worse_than_nominal
-from armcal.diagnose.majority import FEWEST, moved_findings, moved_groups
+from armcal.diagnose.gross import worse_than_nominal
+from armcal.diagnose.outliers import FEWEST, moved_findings, moved_groups
 from armcal.estimate.polish import mislabelled, settled, started, untrained
 from armcal_contact.contacts import BallInSocket, BallInSocketSettings
 
@@ -34,7 +34,7 @@ def found(shift_m: float, before: int, count: int = 20, seed: int = 0):
     problem, records = co.Bench({"arm": co.the_arm(co.ELBOW)}, {"balls": ball}).problem(data)
     problem = started(problem.with_records(records))
     values = settled(untrained(problem).with_records(records), problem.parameters.nominal())
-    return moved_groups(problem, values, records)
+    return moved_groups(problem, values)
 
 
 @pytest.mark.parametrize("before", [4, 7, 15])

@@ -19,8 +19,7 @@ from armcal.cli.new_robot import direction, place
 from armcal.errors import InputError
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import calibrate
-from armcal.run.prepare import Stopwatch, prepare
+from armcal.run.pipeline import Stopwatch, calibrate, prepare
 from armcal.scaffold.plugin_files import number, word
 from armcal.scaffold.robot import RobotJoint, Row, read_rows, robot_of_rows, robot_of_urdf
 from armcal.scaffold.robot_files import RECORDS, SIMULATED, _levels, write_robot

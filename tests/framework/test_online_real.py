@@ -205,7 +205,7 @@ def test_without_gate_and_process_noise_the_filter_ends_where_a_batch_over_all_d
 
     A batch and a filter agree where both take records for independent, so nothing is widened for neighbours alike.
     """
-    monkeypatch.setattr("armcal.run.pipeline.widened", lambda problem, records, estimate, position: estimate)
+    monkeypatch.setattr("armcal.run.pipeline.widened", lambda problem, estimate, position: estimate)
     first = calibrated("option1", written(poses, tmp_path, "odd.csv", 1), tmp_path)
     noise_mm = 0.5 * float(first.record.noise["scale"])
     declared = f"measurements.tracker.noise_mm={noise_mm!r}"

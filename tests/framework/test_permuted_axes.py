@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.cli.main import cli
+from armcal.diagnose.fit import Prepared
 from armcal.diagnose.permuted_axes import find_permuted_axes
 from armcal.diagnose.readings import within
 from armcal.errors import DataError, NotConvergedError
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import calibrate
-from armcal.run.prepare import Prepared, Stopwatch, assemble
+from armcal.run.pipeline import Stopwatch, assemble, calibrate
 from armcal_contact.contacts import BallInSocket
 from click.testing import CliRunner
 from scipy.optimize import minimize
@@ -41,7 +41,7 @@ def changed(dataset: Dataset, **columns: str) -> Dataset:
 
 
 def told(ready: Prepared, dataset: Dataset) -> tuple[str, ...]:
-    found = find_permuted_axes(ready.problem, ready.problem.of(dataset).records, dataset)
+    found = find_permuted_axes(ready.problem.of(dataset), dataset)
     return () if found is None else found.readings
 
 
@@ -200,7 +200,7 @@ def test_a_joint_that_turns_the_other_way_is_named_from_sockets(turned: int | No
     )
     ball = BallInSocket(BallInSocket.Settings.si(noise=1e-4), ("arm",))
     problem, records = co.Bench({"arm": co.the_arm(co.ELBOW)}, {"balls": ball}).problem(data)
-    found = find_permuted_axes(problem, records, data)
+    found = find_permuted_axes(problem.with_records(records), data)
     assert (found and found.readings) == (None if turned is None else (f"the sign of q{turned} reversed",))
 
 
@@ -272,7 +272,7 @@ def test_a_fit_against_a_wall_ends(demo: Prepared, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(ipopt.PosedProblem, "cost", walled)
     monkeypatch.setattr(ipopt.PosedProblem, "model", counted)
     estimator = ipopt.IpoptEstimator(ipopt.IpoptSettings())
-    found = estimator.solve(demo.problem.with_records(demo.training), start)
+    found = estimator.solve(demo.training, start)
     assert not found.verdict.converged and "stuck" in found.verdict.status
     assert len(asked) < 1000
 
@@ -301,7 +301,7 @@ def test_a_lost_fit_whose_residuals_cannot_be_taken_says_what_to_look_at(monkeyp
 def test_a_record_without_equilibrium_leaves_the_others_as_they_were(demo: Prepared) -> None:
     """So that the next trial point starts where the last good one ended."""
     problem, nominal = demo.problem, demo.problem.parameters.nominal()
-    records = problem.with_records(demo.records).subset(np.arange(40)).records
+    records = problem.subset(np.arange(40)).records
     expected = problem.with_records(records).residuals(nominal)[0]
     before, soft = records[0].state.copy(), nominal.copy()
     for i in range(7):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.cli.main import cli
-from armcal.diagnose.evidence_findings import worse_than_nominal
+from armcal.diagnose.gross import worse_than_nominal
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from armcal.run.result import RunResult

@@ -8,9 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from armcal.diagnose.dependences import LACK, repeats_of
-from armcal.diagnose.evidence_findings import neighbour_findings, repeat_findings, structure_findings
 from armcal.diagnose.predictable import time_kernels
-from armcal.diagnose.residual_structure import ResidualStructure
+from armcal.diagnose.residual_structure import (
+    ResidualStructure,
+    neighbour_findings,
+    repeat_findings,
+    structure_findings,
+)
 from armcal.diagnose.score_tests import FitRows
 from planted_causes import CAUSES, COUNT, DEG, LIMITS, Cause, experiment, graded, joint, left, recording, when
 

@@ -16,8 +16,7 @@ from armcal.diagnose.readings import check_reach
 from armcal.errors import ConfigError
 from armcal.estimate.validation import folds, hold_out
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import calibrate
-from armcal.run.prepare import Stopwatch, assemble
+from armcal.run.pipeline import Stopwatch, assemble, calibrate
 from click.testing import CliRunner
 from planted_mistakes import (
     DEMO,
@@ -98,12 +97,12 @@ def test_a_tip_near_the_origin_of_its_frame_is_in_no_other_unit(tmp_path: Path) 
     path = PRINTED.write(data, tmp_path / "data.csv")
     ready = assemble(Experiment.load(PRINTED.config, QUICK, path), Stopwatch())
     problem, nominal = ready.problem, ready.problem.parameters.nominal()
-    shown = problem.with_records(ready.records).predict(nominal)[0].outputs[:3, 7]
+    shown = problem.predict(nominal)[0].outputs[:3, 7]
     origin = shown - (tips(data)[:, 7] - shown) / 9
     for axis, place in zip("xyz", origin, strict=True):
         nominal[problem.parameters.entries_of(f"arm.mdh.base_{axis}")] -= place
     moved = problem.with_parameters(problem.parameters.with_nominal(nominal))
-    check_reach(moved, ready.records, with_tips(data, tips(data) - origin[:, None]))
+    check_reach(moved, with_tips(data, tips(data) - origin[:, None]))
 
 
 @pytest.mark.slow

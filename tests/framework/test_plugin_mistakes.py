@@ -309,6 +309,6 @@ def test_a_fault_is_placed_in_any_process(tmp_path: Path) -> None:
 
 
 def test_armcals_own_faults_keep_their_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("armcal.run.prepare.check_reach", lambda *_: 1 / 0)
+    monkeypatch.setattr("armcal.run.pipeline.mislabelled", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         ended(tmp_path, EFFECT, effects=MINE, free="arm.mine.s2")

@@ -10,16 +10,15 @@ import numpy as np
 import oracle
 import pytest
 from armcal.cli.main import cli
-from armcal.diagnose.evidence import Evidence
-from armcal.diagnose.evidence_findings import percent, structure_findings
 from armcal.diagnose.predictable import FEWEST_POSES, LEVEL, predictable
-from armcal.diagnose.residual_structure import structure
+from armcal.diagnose.residual_structure import percent, structure, structure_findings
 from armcal.diagnose.score_tests import FitRows, linear_fit
 from armcal.diagnose.verdict import _left
 from armcal.estimate.robust import fit
-from armcal.problem.motion import Motion, recorded_position
+from armcal.problem.motion import Motion
 from armcal_ipopt.estimator import IpoptEstimator
 from click.testing import CliRunner
+from fits import fit_of
 from noise_cases import FEW, NOISE_M, posed
 from scipy.stats import binom
 
@@ -46,7 +45,7 @@ class Residuals:
 
     def __init__(self, problem, records, estimate, motion, dataset):
         self.problem, self.motion, self.dataset = problem, motion, dataset
-        self.rows = FitRows.of(problem, records, estimate)
+        self.rows = FitRows.of(problem.with_records(records), estimate)
         pair = np.zeros(len(self.rows.residual), dtype=np.intp), np.ones(len(dataset) - 1, dtype=bool)
         self.basis = linear_fit(self.rows.slopes, self.rows.residual, pair[0], self.rows.by_record, pair[1])[1]
 
@@ -133,10 +132,11 @@ def test_of_too_few_poses_nothing_is_known_however_often_they_were_repeated(lrm)
     """Each pose was measured four times, and errs alike each time: no other pose says so."""
     parts = fitted(lrm, COUNT, FEWEST_POSES - 1)
     assert Residuals(*parts).judged() is None
-    problem, records, estimate, motion, dataset = parts
-    left = structure(problem, records, estimate, dataset, motion, recorded_position(dataset))
+    problem, records, estimate, _, dataset = parts
+    own = fit_of(problem.with_records(records), estimate, dataset)
+    left = own.of(structure)
     assert any("too few distinct poses" in finding.text for finding in structure_findings(left))
-    assert all("nothing" not in sentence for sentence in _left(Evidence(left), estimate))
+    assert all("nothing" not in sentence for sentence in _left(own))
     none = structure_findings(None)
     assert "too few" in none[0].text and none[0].grade == "note"
 

@@ -36,8 +36,7 @@ from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.problem.drift import with_drift
 from armcal.problem.motion import recorded_position
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import calibrate
-from armcal.run.prepare import Stopwatch, prepare
+from armcal.run.pipeline import Stopwatch, calibrate, prepare
 from click.testing import CliRunner, Result
 from drifting import DEMO, DRIFTING, FREE, dense_drift, dense_slopes, drifting_problem, problem_of
 
@@ -70,7 +69,7 @@ def test_covariances_are_those_of_dense_gaussian_conditioning(drifting) -> None:
     """Values and innovations as one Gaussian vector: its posterior after the training, mapped to new records."""
     loaded, dataset, problem, records, train, held, fitted = drifting
     found = fitted.estimate
-    by = predictor(problem, fitted)
+    by = predictor(fitted)
     plain = [replace(each, correlation=None) for each in records]
     slopes = dense_slopes(problem, found.values, plain)
     drift = dense_drift(loaded, dataset.column("sequence"), dense_slopes(problem, loaded.parameters.nominal(), plain))
@@ -106,13 +105,13 @@ def test_without_priors_it_is_the_joint_posterior(drifting) -> None:
     posterior = scale[:, None] * np.linalg.inv(scaled.T @ scaled + known) * scale
     new = joint[rows_h]
     whole = fitted.estimate.noise_scale**2 * (new @ posterior @ new.T + 5e-4**2 * np.eye(len(new)))
-    (spread,) = predictor(problem, fitted).spreads(problem.with_records(records).subset(held).records, "same")
+    (spread,) = predictor(fitted).spreads(problem.with_records(records).subset(held).records, "same")
     assert np.allclose(spread.deviations.T.ravel(), np.sqrt(np.diag(whole)), rtol=2e-2)
 
 
 def test_nothing_told_of_the_drift_counts_all_of_it(drifting) -> None:
     loaded, _, problem, records, _, held, fitted = drifting
-    by, found = predictor(problem, fitted), fitted.estimate
+    by, found = predictor(fitted), fitted.estimate
     new = problem.with_records(records).subset(held).records
     plain = [replace(each, correlation=None) for each in new]
     slopes = dense_slopes(problem, found.values, plain)
@@ -131,7 +130,7 @@ def test_nothing_told_of_the_drift_counts_all_of_it(drifting) -> None:
 
 def test_the_order_of_new_records_does_not_matter(drifting) -> None:
     *_, problem, records, _, held, fitted = drifting
-    by, turned = predictor(problem, fitted), held[::-1]
+    by, turned = predictor(fitted), held[::-1]
     for recording in ("same", "new"):
         (forth,), (back,) = (
             by.spreads(problem.with_records(records).subset(own).records, recording) for own in (held, turned)
@@ -147,7 +146,7 @@ def test_a_record_counts_its_own_noise() -> None:
     problem = problem_of(loaded, dataset)
     records = problem.of(dataset).records
     fitted = fit(problem.with_records(records), loaded.estimator, loaded.parameters.nominal())
-    (spread,) = predictor(problem, fitted).spreads(records, "same")
+    (spread,) = predictor(fitted).spreads(records, "same")
     deviations = spread.deviations / (fitted.estimate.noise_scale * noise)
     assert (deviations > 1).all() and (deviations < 1.5).all()
 
@@ -194,7 +193,7 @@ def test_intervals_hold_their_share_when_the_model_is_true() -> None:
         train = problem.with_records(records).subset(chosen).records
         fitted = fit(problem.with_records(train), loaded.estimator, loaded.parameters.nominal())
         held = problem.with_records(records).subset(np.setdiff1d(np.arange(100), chosen)).records
-        for name, each in score(predictor(problem, fitted), held).items():
+        for name, each in score(predictor(fitted), held).items():
             scores[name].append(each)
     for name, tolerance in (("same", 0.03), ("new", 0.05)):
         for level in LEVELS:
@@ -401,13 +400,10 @@ def test_what_is_kept_predicts_as_the_fit_itself(extra: tuple[str, ...], tmp_pat
     records = with_drift(problem.of(dataset), dataset, loaded.parameters.nominal()).records
     train = problem.with_records(records).subset(split.train).records
     fitted = fit(problem.with_records(train), loaded.estimator, loaded.parameters.nominal())
-    acting, position = (
-        problem.with_records(fitted.records).weighted(fitted.weights).records,
-        recorded_position(dataset)[split.train],
-    )
-    fitted = replace(fitted, estimate=widened(problem, acting, fitted.estimate, position))
-    by = predictor(problem, fitted)
-    alike = whitened_like(problem, fitted, records, loaded.estimator)
+    acting, position = fitted.problem.weighted(fitted.weights), recorded_position(dataset)[split.train]
+    fitted = replace(fitted, estimate=widened(acting, fitted.estimate, position))
+    by = predictor(fitted)
+    alike = whitened_like(problem.with_records(records), fitted, loaded.estimator).records
     for recording, spreads in ((name, by.spreads(alike, name)) for name in ("same", "new")):
         found = kept.plus_minus(dataset, recording)
         deviations = np.array([found.deviations[f"tracker.{axis}"] for axis in "xyz"])

@@ -5,8 +5,7 @@ from __future__ import annotations
 import contact_oracle as co
 import numpy as np
 import pytest
-from armcal.diagnose.gross import Figure, Proportion, proportion
-from armcal.diagnose.gross_findings import size_findings
+from armcal.diagnose.gross import Figure, Proportion, proportion, size_findings
 from armcal.estimate.polish import started
 from armcal.estimate.robust import fit
 from armcal_contact.contacts import BallInSocket
@@ -34,7 +33,7 @@ def test_a_known_distance_that_is_wrong_lengthens_all_links_in_proportion(factor
     problem, records = co.Bench({"arm": co.the_arm(co.ELBOW)}, {"balls": ball}, FREE).problem(co.dataset(parts))
     problem = started(problem.with_records(records))
     estimate = fit(problem.with_records(records), IPOPT, problem.parameters.nominal()).estimate
-    lengths = proportion(problem, estimate, records)
+    lengths = proportion(problem, estimate)
     assert lengths is not None and lengths.share == pytest.approx(factor - 1, abs=3 * lengths.sd)
     assert lengths.is_clear == (factor > 1)
 

@@ -11,6 +11,8 @@ import zlib
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -18,14 +20,35 @@ from armcal.base.dataset import Dataset, SetAside
 from armcal.base.domains import Interval, Pose, Semidefinite
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
 from armcal.config.system import StaticsSettings, System
-from armcal.diagnose.verdict import Verdict, judge
+from armcal.diagnose.coverage import IntervalResult, intervals
+from armcal.diagnose.fit import Fit, Prepared, RecordErrors
+from armcal.diagnose.held import contradictions
+from armcal.diagnose.outliers import large_errors, noise_of, suspicious
+from armcal.diagnose.residual_structure import depends, structure
+from armcal.diagnose.unseen import determined, elsewhere, hidden_payload, priors_alone, rounding
+from armcal.diagnose.verdict import (
+    Verdict,
+    bounds,
+    conditioned,
+    converged,
+    correlated,
+    freedom,
+    in_all,
+    new_recording,
+    next_poses,
+    noise,
+    shifts,
+    suggestions,
+)
 from armcal.estimate.estimator import Estimate, SolverVerdict
 from armcal.estimate.identifiability import analyse
-from armcal.estimate.validation import Split, hold_out, summarise
+from armcal.estimate.start import Start
+from armcal.estimate.validation import Split, hold_out
+from armcal.problem.problem import Problem
 from armcal.report.page import page as page_of
 from armcal.report.run_document import run_document
-from armcal.run.errors import ErrorTable, RecordErrors
 from armcal.run.result import RunResult
+from fits import fit_that_found
 
 SECTIONS = ("verdict", "accuracy", "parameters", "data", "reproduce")
 
@@ -122,7 +145,6 @@ def result_of(
     if count > 100:
         after[:, 41] *= 4
     split = hold_out(count, holdout, 3)
-    words = f"{len(split.holdout)} records that did not train"
     errors = RecordErrors(
         np.linalg.norm(before, axis=0),
         np.linalg.norm(after, axis=0),
@@ -134,25 +156,14 @@ def result_of(
         np.linalg.norm(before, axis=0),
     )
     found = estimate_of(parameters or blocks(), freedom=max(3 * count - 28, 1), undetermined=undetermined)
+    fit = fit_known(found, errors, split, _dataset(count, position, ids))
+    checks = (converged, determined, conditioned, bounds, shifts, noise, freedom, depends, correlated, suspicious)
     return RunResult(
         name=name,
         command="armcal calibrate configs/picobot.yaml --out runs/picobot",
-        system=System({}, {}, StaticsSettings(), {}),
-        dataset=_dataset(count, position, ids),
-        split=split,
-        estimate=found,
-        errors=errors,
-        table=_table(errors, split),
-        verdict=judge(
-            found,
-            errors.calibrated_mm,
-            split.train,
-            errors.calibrated_mm[split.holdout],
-            words,
-            _dataset(count, position, ids).ids,
-        ),
+        fit=fit,
+        verdict=in_all(fit, [finding for check in (*checks, next_poses) for finding in check(fit)]),
         warnings=("arm.mdh.d2 and arm.mdh.d3 are nearly parallel: a prior holds their difference.",),
-        backend="casadi, generated C (gcc -O2)",
         seconds={"read": 0.021, "compile": 1.312, "solve": 0.412, "report": 0.2, "total": 1.945},
         provenance={
             "config": "configs/picobot.yaml",
@@ -160,6 +171,22 @@ def result_of(
             "versions": {"armcal": "0.1.0", "python": "3.11.2", "casadi": "3.6.5", "numpy": "1.26.4"},
         },
     )
+
+
+def fit_known(
+    found: Estimate,
+    errors: RecordErrors,
+    split: Split,
+    dataset: Dataset,
+    backend: str = "casadi, generated C (gcc -O2)",
+) -> Fit:
+    system, problem = System({}, {}, StaticsSettings(), {}), SimpleNamespace(backend=backend)
+    ready = Prepared(system, dataset, cast(Problem, problem), split, cast(Start, None))
+    nothing = (structure, priors_alone, rounding, large_errors, elsewhere, new_recording, hidden_payload)
+    analyses = {**dict.fromkeys(nothing), contradictions: (), suggestions: (), intervals: IntervalResult()}
+    analyses[noise_of] = np.ones(len(dataset)), 3.0
+    judged = np.where(np.isin(np.arange(len(dataset)), split.holdout), errors.calibrated_mm, np.nan)
+    return fit_that_found(found, analyses, ready, errors=errors, judged_mm=judged, unit="mm", name="Tip", drifts=False)
 
 
 def _dataset(count: int, position: np.ndarray, ids: tuple[str, ...] | None) -> Dataset:
@@ -171,22 +198,6 @@ def _dataset(count: int, position: np.ndarray, ids: tuple[str, ...] | None) -> D
         sha256="9f" * 32,
         set_aside=(SetAside(17, "p0016", "tracker lost the target"), SetAside(99, "p0098", "x_mm is empty")),
         warnings=("the column temperature has no unit and is not used",),
-    )
-
-
-def _table(errors: RecordErrors, split: Split) -> ErrorTable:
-    held = np.isfinite(errors.cross_validated_mm)
-    return ErrorTable(
-        nominal={
-            "train": summarise(errors.nominal_mm[split.train]),
-            "holdout": summarise(errors.nominal_mm[split.holdout]),
-            "cross_validated": summarise(errors.nominal_mm[held]),
-        },
-        calibrated={
-            "train": summarise(errors.calibrated_mm[split.train]),
-            "holdout": summarise(errors.calibrated_mm[split.holdout]),
-            "cross_validated": summarise(errors.cross_validated_mm[held]),
-        },
     )
 
 
@@ -281,7 +292,8 @@ def test_what_users_write_is_escaped() -> None:
     result = result_of(40, parameters, ids=ids, name=bad)
     result.errors.calibrated_mm[0] = 50.0
     data = replace(result.dataset, source=bad, set_aside=(SetAside(1, bad, bad),), warnings=(bad,))
-    hostile = replace(result, dataset=data, command=bad, backend=bad, warnings=(bad,), provenance={bad: {bad: bad}})
+    fit = fit_known(result.estimate, result.errors, result.split, data, bad)
+    hostile = replace(result, fit=fit, command=bad, warnings=(bad,), provenance={bad: {bad: bad}})
     html = render(hostile)
     checked(html)
     assert "<script" not in html and "<i>" not in html and "<b>" not in html
@@ -303,14 +315,15 @@ def test_few_records(count: int) -> None:
         errors = RecordErrors(none, none, none, wide, wide, wide, none, none)
         split = Split(np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp))
         data = Dataset((), {})
-        result = replace(result, errors=errors, split=split, dataset=data, table=_table(errors, split))
+        result = replace(result, fit=fit_known(result.estimate, errors, split, data))
     checked(render(result))
 
 
 def test_no_free_parameter_and_nothing_known() -> None:
     fixed = Parameters(tuple(replace(b, free=False) for b in blocks().blocks))
-    known = replace(result_of(), estimate=estimate_of(fixed), table=ErrorTable({}, {}))
-    result = replace(known, provenance={}, seconds={}, warnings=(), verdict=Verdict("Nothing was free.", ()))
+    known = result_of()
+    fit = fit_known(estimate_of(fixed), known.errors, known.split, known.dataset)
+    result = replace(known, fit=fit, provenance={}, seconds={}, warnings=(), verdict=Verdict("Nothing was free.", ()))
     page = checked(render(result))
     assert "No parameter was free" in page.text
 
@@ -322,7 +335,8 @@ def test_undetermined_parameters_and_numbers_that_are_none() -> None:
     page = checked(render(result))
     assert "not determined" in page.text
     assert "rest on priors alone" in page.text and "arm.spring.k6 alone" in page.text
-    checked(render(replace(result, estimate=replace(result.estimate, degrees_of_freedom=0, noise_scale=float("nan")))))
+    none = replace(result.estimate, degrees_of_freedom=0, noise_scale=float("nan"))
+    checked(render(replace(result, fit=fit_known(none, result.errors, result.split, result.dataset))))
 
 
 def test_blocks_of_several_entries() -> None:

@@ -12,14 +12,13 @@ import pytest
 from armcal.arm.loading import holding_efforts, site_loads
 from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.dataset import Dataset
-from armcal.diagnose.evidence import priors_alone, unseen_poses
-from armcal.diagnose.evidence_findings import determined_finding
-from armcal.diagnose.large_errors import Judged, large_errors
+from armcal.diagnose.outliers import large_errors
 from armcal.diagnose.residual_structure import LEVEL, MOST_RECORDS, structure
 from armcal.diagnose.score_tests import DRAWS, family_test, linear_fit, own_basis
+from armcal.diagnose.unseen import determined_finding, priors_alone, tip_by_priors, unseen_poses
 from armcal.estimate.robust import fit
-from armcal.problem.motion import Motion, recorded_position
 from armcal_ipopt.estimator import IpoptEstimator
+from fits import fit_of
 from noise_cases import FEW, NOISE_M, posed
 from planted_arms import SLIDE, Case
 from scipy.stats import f as f_distribution
@@ -56,11 +55,10 @@ def recording(lrm, count=150, seed=0, stood=None, moved=None, noise=NOISE_M, nam
 
 def looked_at(problem, records, start, dataset, **more):
     """What is left in a fit's residuals."""
-    found = fit(problem.with_records(records), IPOPT, start)
+    problem = problem.with_records(records)
+    found = fit(problem, IPOPT, start)
     assert found.estimate.verdict.converged
-    motion = Motion.of(problem.with_records(records), found.estimate.values, dataset)
-    acting = problem.with_records(found.records).weighted(found.weights).records
-    return structure(problem, acting, found.estimate, dataset, motion, recorded_position(dataset), **more)
+    return structure(fit_of(problem, found.estimate, dataset, found, **more))
 
 
 def on_joint(number, turn):
@@ -242,7 +240,7 @@ def test_records_of_no_weight_tell_nothing(lrm):
 
 @pytest.mark.slow
 def test_what_the_model_has_is_told_to_be_loosened_not_added(lrm):
-    found = looked_at(*planted(lrm, "backlash", 7), modelled=frozenset({"approach_backlash"}))
+    found = looked_at(*planted(lrm, "backlash", 7), effects=("approach_backlash",))
     assert found.structures[0].effect.endswith("(it is in the model: free it, or loosen its prior)")
 
 
@@ -343,11 +341,9 @@ def large_errors_of(lrm, spoil, limit=None):
     columns = {name: dataset.column(name).copy() for name in dataset.channels}
     spoil(columns, dataset.stacked([f"arm.q{i}" for i in range(1, 7)]).T)
     dataset = replace(dataset, channels=columns)
-    records = problem.of(dataset).records
-    raw = problem.with_records(records).residuals(found.values)
-    errors = 1000 * np.linalg.norm(raw[0], axis=0)
-    motion = Motion.of(problem.with_records(records), found.values, dataset)
-    return large_errors(problem, records, found, dataset, motion, Judged(errors, raw, np.arange(120)), limit)
+    problem = problem.of(dataset)
+    errors = 1000 * np.linalg.norm(problem.residuals(found.values)[0], axis=0)
+    return large_errors(fit_of(problem, found, dataset, limit_mm=limit, judged_mm=errors))
 
 
 @pytest.mark.slow
@@ -400,13 +396,13 @@ def test_whether_the_tip_depends_on_what_priors_hold(lrm, poses_seen):
     freed = experiment.parameters.with_free(free)
     held = tuple(replace(block, prior_sd=block.scale) if block.free else block for block in freed.blocks)
     problem = lrm.problem(experiment, dataset, "interpreted", replace(freed, blocks=held))
-    found = fit(problem.of(dataset), IPOPT, problem.parameters.nominal()).estimate
+    found = fit(problem, IPOPT, problem.parameters.nominal()).estimate
     assert found.identifiability.undetermined
-    joints = [f"arm.q{i}" for i in range(1, 7)]
-    alone = priors_alone(problem, found, *(unseen_poses(dataset, joints, between) for between in (False, True)))
+    own = fit_of(problem, found, dataset)
+    alone = priors_alone(own)
     for worst in (alone.worst_mm, alone.between_mm):
         assert (worst > 1) if poses_seen == "two" else (worst < 1e-9)
-    assert priors_alone(problem, found, dataset, dataset).between_mm < 1e-6
+    assert tip_by_priors(own, dataset) < 1e-6
 
 
 def test_what_positions_at_their_ends_leave_open_shows_between_them(lrm):
@@ -425,10 +421,9 @@ def test_what_positions_at_their_ends_leave_open_shows_between_them(lrm):
     freed = experiment.parameters.with_free(free)
     held = tuple(replace(block, prior_sd=block.scale) if block.free else block for block in freed.blocks)
     problem = lrm.problem(experiment, dataset, "interpreted", replace(freed, blocks=held))
-    found = fit(problem.of(dataset), IPOPT, problem.parameters.nominal()).estimate
+    found = fit(problem, IPOPT, problem.parameters.nominal()).estimate
     assert len(found.identifiability.undetermined) == 1
-    joints = [f"arm.q{i}" for i in range(1, 7)]
-    alone = priors_alone(problem, found, *(unseen_poses(dataset, joints, between) for between in (False, True)))
+    alone = priors_alone(fit_of(problem, found, dataset))
     assert alone.worst_mm < 1e-6 and alone.between_mm > 0.5
     finding = determined_finding(found, alone, 0.5)
     assert finding.grade == "warning" and "between its recorded positions" in finding.text
@@ -450,5 +445,6 @@ def test_unseen_poses_are_of_what_was_recorded_although_an_arm_is_not_in_all_rec
 
 def test_without_priors_nothing_is_said_to_be_held_by_them(lrm):
     problem, records, start, dataset = recording(lrm, 60, 1)
-    found = fit(problem.with_records(records), IPOPT, start).estimate
-    assert priors_alone(problem, found, dataset, dataset) is None
+    problem = problem.with_records(records)
+    found = fit(problem, IPOPT, start).estimate
+    assert priors_alone(fit_of(problem, found, dataset)) is None

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
+from armcal.diagnose.unseen import rounding
 from armcal.estimate.simulation import SimulationRequest
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
@@ -37,9 +38,9 @@ def test_rounded_angles_are_named_with_what_they_leave(
     data = rounded(arm, step)
     path, off = arm.write(data, tmp_path / "data.csv"), tips(data) - tips(visited(arm, data))
     result = calibrate(Experiment.load(arm.config, (), path))
-    rounding = result.evidence.rounding
-    assert rounding is not None and rounding.joints == tuple(arm.joints)
-    assert rounding.leaves == pytest.approx(1000 * np.sqrt(np.mean(np.sum(off**2, axis=0))), rel=0.15)
+    found = result.fit.of(rounding)
+    assert found is not None and found.joints == tuple(arm.joints)
+    assert found.leaves == pytest.approx(1000 * np.sqrt(np.mean(np.sum(off**2, axis=0))), rel=0.15)
     texts = {finding.grade: finding.text for finding in reversed(result.verdict.findings)}
     assert "rounding of the recorded joints would leave as much" in texts["warning"]
     assert f"All recorded angles of q1, q2, q3 are multiples of {words}." in result.verdict.paragraph

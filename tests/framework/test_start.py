@@ -13,11 +13,12 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.cli.check import gravity_lines
 from armcal.cli.main import cli
+from armcal.diagnose.fit import Prepared
 from armcal.diagnose.permuted_axes import find_permuted_axes
 from armcal.estimate.start import Start, aligned_start, placings
 from armcal.problem.rigid_alignment import Alignment, Tools, alignments, hand_eye, sighting_of, tools_of, undetermined
 from armcal.run.experiment import Experiment
-from armcal.run.prepare import Prepared, Stopwatch, assemble
+from armcal.run.pipeline import Stopwatch, assemble
 from click.testing import CliRunner
 from planted_mistakes import with_tips
 from scipy.spatial.transform import Rotation
@@ -156,7 +157,7 @@ def test_mistakes_are_named_in_any_frame(anywhere: Prepared, change, words: str)
         dataset, channels={**dataset.channels, **{f"tracker.{a}": r for a, r in zip(AXES, wrong, strict=True)}}
     )
     start = aligned_start(anywhere.problem.of(dataset), dataset)
-    found = find_permuted_axes(start.problem, start.problem.of(dataset).records, dataset)
+    found = find_permuted_axes(start.problem.of(dataset), dataset)
     assert found is not None and len(found.readings) == 1 and found.readings[0].startswith((words, f"the {words}"))
     assert found.as_given_mm > 3 * found.left_mm
 
@@ -172,7 +173,7 @@ def test_a_tracker_that_was_moved_in_the_middle_is_named_with_the_record(anywher
     both = np.where(np.arange(len(dataset)) >= since, moved, dataset.stacked(names))
     dataset = replace(dataset, channels={**dataset.channels, **dict(zip(names, both, strict=True))})
     start = aligned_start(anywhere.problem.of(dataset), dataset)
-    found = find_permuted_axes(start.problem, start.problem.of(dataset).records, dataset)
+    found = find_permuted_axes(start.problem.of(dataset), dataset)
     assert (
         found is not None
         and f"from record {dataset.ids[since]} on taken for those in another frame" in found.readings[0]
@@ -246,7 +247,7 @@ def test_a_hundred_frames_and_targets_end_where_the_true_ones_do(name: str, tmp_
     """Each is fitted from the configuration, which knows nothing of them, and from the truth: to the same cost."""
     ready, experiment = studied(name, tmp_path)
     problem, nominal, alike = ready.problem, ready.problem.parameters.nominal(), 0
-    tools = tools_of(problem.with_records(ready.records), nominal, 0)
+    tools = tools_of(problem, nominal, 0)
     measured = ready.dataset.stacked([f"tracker.{axis}" for axis in AXES])
     for seed in range(100):
         random = np.random.default_rng(seed)
@@ -260,9 +261,7 @@ def test_a_hundred_frames_and_targets_end_where_the_true_ones_do(name: str, tmp_
             found.problem.with_records(problem.of(dataset).records), found.values(found.problem)[0]
         )
         there = problem.of(with_tips(ready.dataset, moved)).records
-        start = placings(
-            problem.with_records(ready.records), sighting_of(problem.with_records(ready.records), ready.dataset, 0, 300)
-        )[0]
+        start = placings(problem, sighting_of(problem, ready.dataset, 0, 300))[0]
         true = experiment.estimator.solve(
             problem.with_records(there), start.with_target(problem.parameters, nominal, offset)
         )
@@ -293,7 +292,7 @@ def test_mistakes_are_named_and_clean_recordings_are_not_suspected(name: str, tm
 
     def said(dataset: Dataset) -> str:
         start = aligned_start(problem.of(dataset), dataset)
-        reading = find_permuted_axes(start.problem, start.problem.of(dataset).records, dataset)
+        reading = find_permuted_axes(start.problem.of(dataset), dataset)
         return "" if reading is None else " | ".join(reading.readings)
 
     for seed in range(6):

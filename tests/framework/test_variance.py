@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import oracle
 import pytest
-from armcal.diagnose.evidence_findings import worse_than_declared
-from armcal.diagnose.large_errors import component_findings
+from armcal.diagnose.gross import worse_than_declared
+from armcal.diagnose.outliers import component_findings
 from armcal.errors import ProblemError
 from armcal.estimate.robust import NoiseSettings, fit, weighed
 from armcal.estimate.variance import Term, _evaluate, apply_components, estimate_components, maximise
 from armcal.problem.factor_records import by_covariance, transformed
 from armcal.run.experiment import Experiment
-from armcal.run.prepare import Stopwatch, prepare
+from armcal.run.pipeline import Stopwatch, prepare
 from armcal_ipopt.estimator import IpoptEstimator
 from noise_cases import NOISE_M, deviations_off, measured, posed
 from planted_mistakes import three_joint_arm
@@ -288,10 +288,7 @@ def test_a_fit_with_estimated_variances_keeps_the_one_by_the_declared_noise(tmp_
     path = arm.write(arm.recording(1), tmp_path / "data.csv")
     plain, weighing = (Experiment.load(arm.config, (f"noise.estimate={flag}",), path) for flag in ("false", "true"))
     ready = prepare(plain, Stopwatch())
-    one, other = (
-        fit(ready.problem.with_records(ready.training), e.estimator, ready.start.values(ready.problem)[0])
-        for e in (plain, weighing)
-    )
+    one, other = (fit(ready.training, e.estimator, ready.start.values(ready.problem)[0]) for e in (plain, weighing))
     assert one.as_declared is None and np.array_equal(other.as_declared, one.estimate.values)
     assert not np.array_equal(other.estimate.values, one.estimate.values)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.cli.main import cli
-from armcal.diagnose.large_errors import outlier_findings, suspicious_in_short, suspicious_records
+from armcal.diagnose.outliers import outlier_findings, suspicious_in_short, suspicious_records
 from armcal.diagnose.verdict import _good_for
 from armcal.estimate.estimator import estimate
 from armcal.estimate.identifiability import POOR_CONDITION, analyse

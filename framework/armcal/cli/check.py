@@ -14,11 +14,13 @@ from armcal.base.units import digits, to_unit
 from armcal.cli.common import FILE, Console, data, overrides, speaking
 from armcal.cli.console import say
 from armcal.config.system import System
+from armcal.diagnose.data import gravity
+from armcal.diagnose.fit import Prepared
 from armcal.errors import ProblemError
 from armcal.estimate.identifiability import Identifiability, identify, require_solvable
 from armcal.estimate.start import Start, pose_words
 from armcal.run.experiment import Experiment
-from armcal.run.prepare import Prepared, Stopwatch, assemble, gravity_findings
+from armcal.run.pipeline import Stopwatch, assemble
 
 _MM = 1000.0
 _TILTED = 0.05  # Of gravity: what changes by less where the base was found is not worth a line
@@ -36,16 +38,14 @@ def check(console: Console, config: Path, data: Path | None, overrides: tuple[st
     with console.progress() as progress:
         ready = assemble(experiment, Stopwatch(), progress=progress)
     start = ready.problem.parameters.nominal()
-    known = identify(ready.problem.with_records(ready.training), start)
+    known = identify(ready.training, start)
     refused: ProblemError | None = None
     try:
-        ready = replace(
-            ready, warnings=(*ready.warnings, *require_solvable(ready.problem.with_records(ready.training), start))
-        )
+        ready = replace(ready, warnings=(*ready.warnings, *require_solvable(ready.training, start)))
     except ProblemError as fault:
         refused = fault
-    gravity = [f"{finding.text} {finding.action}" for finding in gravity_findings(experiment.system, ready.dataset)]
-    ready = replace(ready, warnings=(*ready.warnings, *gravity))
+    texts = [f"{finding.text} {finding.action}" for finding in gravity(ready)]
+    ready = replace(ready, warnings=(*ready.warnings, *texts))
     for text in ready.warnings:
         console.warn(text)
     content = _content(experiment, ready, known)
@@ -97,7 +97,7 @@ def _content(experiment: Experiment, ready: Prepared, known: Identifiability) ->
             "holdout": len(ready.split.holdout),
             "set_aside": [{"row": a.row, "id": a.record_id, "reason": a.reason} for a in ready.dataset.set_aside],
         },
-        "equations": ready.problem.equations(ready.training),
+        "equations": ready.training.equations(),
         "parameters": {
             "all": list(every.coordinate_names),
             "free": list(known.names),

@@ -82,7 +82,7 @@ class Screen(Console):
                     self.part(part, verbose)
 
     def part(self, part: "Part", verbose: bool) -> None:
-        from armcal.diagnose.large_errors import Finding
+        from armcal.diagnose.checks import Finding
         from armcal.report.document import Table as Rows
         from armcal.report.numbers import in_ascii
 

@@ -12,6 +12,7 @@ from armcal.base.arrays import Array
 from armcal.base.config_text import finite
 from armcal.base.parameters import Parameters
 from armcal.cli.common import FILE, Console, data, overrides, speaking
+from armcal.diagnose.fit import Prepared
 from armcal.errors import ConfigError, Location
 from armcal.estimate.identifiability import (
     CAUSES,
@@ -32,7 +33,7 @@ from armcal.planning.criterion import observability
 from armcal.problem.projection import factor_at_zero
 from armcal.run.experiment import Experiment
 from armcal.run.fixed_parameters import FixedParameters, FreedStep, fixed_parameters
-from armcal.run.prepare import Prepared, Stopwatch, assemble
+from armcal.run.pipeline import Stopwatch, assemble
 
 
 @click.command()
@@ -72,7 +73,7 @@ def identify(
     if not parameters.free:
         raise ConfigError("no parameter is free.", where=Location(str(config)), hint="Name some under parameters.free.")
     preferred = _preferred(parameters, prefer)
-    triangle = factor_at_zero(ready.problem.with_records(ready.training), parameters.nominal())
+    triangle = factor_at_zero(ready.training, parameters.nominal())
     known = identify_from(triangle, parameters)
     content = _content(experiment, ready, triangle, known)
     if minimal or prefer or most is not None or max_sd is not None:
@@ -107,12 +108,12 @@ def _preferred(parameters: Parameters, globs: Sequence[str]) -> list[tuple[str, 
 
 
 def _content(experiment: Experiment, ready: Prepared, triangle: Array, known: Identifiability) -> dict[str, Any]:
-    parameters, problem = ready.problem.parameters, ready.problem
-    equations = problem.equations(ready.training)
+    parameters = ready.problem.parameters
+    equations = ready.training.equations()
     covariance = expected_covariance(triangle, parameters)
     deviation = np.sqrt(np.diag(covariance))
     indices = observability(known.singular_values[: known.rank], equations).as_dict() if known.rank else None
-    explained = explain(problem.with_records(ready.training), parameters.nominal(), known)
+    explained = explain(ready.training, parameters.nominal(), known)
     return {
         "experiment": experiment.name,
         "records": len(ready.split.train),

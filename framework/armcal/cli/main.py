@@ -22,6 +22,7 @@ COMMANDS = {
     "new": ("armcal.cli.new:new", "Begin a robot's files, or a plugin of your own."),
     "run": ("armcal.cli.run:run", "Calibrate: load, check, fit, validate, report."),
     "check": ("armcal.cli.check:check", "Everything that can be known before solving."),
+    "checks": ("armcal.cli.checks:checks", "What each run asks of its data and its fit, and how surely."),
     "identify": ("armcal.cli.identify:identify", "Which parameters the poses determine; a minimal set of them."),
     "study": (
         "armcal.cli.study:study",

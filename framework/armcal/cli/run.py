@@ -15,8 +15,7 @@ from armcal.report.page import page
 from armcal.report.run_document import plugin_sections, run_document
 from armcal.run import outputs
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import calibrate
-from armcal.run.prepare import Stopwatch
+from armcal.run.pipeline import Stopwatch, calibrate
 from armcal.run.result import RunResult
 
 

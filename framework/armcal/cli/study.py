@@ -10,7 +10,7 @@ from armcal.io.parallel import Executor
 from armcal.report.page import page
 from armcal.report.study_document import study_document
 from armcal.run import study_result
-from armcal.run.prepare import Stopwatch
+from armcal.run.pipeline import Stopwatch
 from armcal.run.study import Study, compare
 
 

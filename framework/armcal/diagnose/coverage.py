@@ -11,13 +11,19 @@ scores of the other folds give (cross-conformal [Vovk2015]).
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtri
 
+from armcal.arm.assembly import command_channels
 from armcal.base.arrays import Array, Indices
-from armcal.diagnose.large_errors import Finding
+from armcal.base.dataset import Dataset
+from armcal.base.units import readable
+from armcal.diagnose.checks import Finding
+from armcal.diagnose.dependences import MOST_LEVELS
+from armcal.diagnose.fit import Fit
 from armcal.errors import NotConvergedError
 from armcal.estimate.bootstrap import automatic_block_length, standard_error_of_mean
 from armcal.estimate.estimator import Estimator
@@ -40,6 +46,7 @@ from armcal.problem.problem import FactorRecords, Problem
 Residuals = tuple[Array, ...]  # Raw residuals, one (n_r x N) a factor
 FEWEST = 40  # Judged records for a stretch to be found
 LEVEL = 0.05
+_MM = 1000.0
 _MEANT = {"same": "", "new": " without the known drift, as in a new recording,"}
 
 
@@ -117,9 +124,9 @@ def level_name(level: float) -> str:
     return f"{100 * level:g}"
 
 
-def predictor(problem: Problem, fitted: WeighedFit) -> Predictor:
-    estimate = fitted.estimate
-    drift = KnownDrift.by(problem.with_records(fitted.records), estimate.values)
+def predictor(fitted: WeighedFit) -> Predictor:
+    problem, estimate = fitted.problem, fitted.estimate
+    drift = KnownDrift.by(problem, estimate.values)
     return Predictor(
         problem, estimate.values, estimate.covariance, estimate.noise_scale, estimate.degrees_of_freedom, drift
     )
@@ -157,15 +164,11 @@ def scored(problem: Problem, residuals: Residuals, spreads: Sequence[Spread]) ->
     return Scores(np.vstack(errors), np.array(reaches).reshape(-1, count), freedom)
 
 
-def whitened_like(
-    problem: Problem, fitted: WeighedFit, held: Sequence[FactorRecords], estimator: Estimator
-) -> tuple[FactorRecords, ...]:
+def whitened_like(held: Problem, fitted: WeighedFit, estimator: Estimator) -> Problem:
     """Records with the noise that the fit estimated, if it did."""
     if fitted.components is None or not isinstance(estimator, Weighing):
-        return tuple(held)
-    return apply_components(
-        problem.with_records(held), fitted.solution.values, fitted.components, estimator.settings.axes
-    ).records
+        return held
+    return apply_components(held, fitted.solution.values, fitted.components, estimator.settings.axes)
 
 
 def fit_and_predict(task: FitTask) -> JudgedFit:
@@ -179,8 +182,7 @@ def fit_and_predict(task: FitTask) -> JudgedFit:
         judged = judged_fit(task, fitted.solution, train, held, began)
         if not judged.converged:
             return judged
-        alike = whitened_like(task.problem, fitted, held.records, task.estimator)
-        own = missed(predictor(task.problem, fitted), alike)
+        own = missed(predictor(fitted), whitened_like(held, fitted, task.estimator).records)
         return replace(judged, held_residuals=own, seconds=time.perf_counter() - began)
     except NotConvergedError:
         return failed_fit(task, began)
@@ -192,7 +194,7 @@ def besides(scores: Scores, places: Indices) -> Scores:
     return replace(scores, errors=errors)
 
 
-def collected(
+def _collected(
     splits: Sequence[Split], residuals: Sequence[Mapping[Recording, Residuals]], count: int
 ) -> dict[Recording, Residuals]:
     """The residuals of all folds in the order of the records; nan where a fold has none."""
@@ -291,3 +293,176 @@ def _worth(held: Array) -> float:
     if not np.isfinite(error) or error == 0:
         return float(held.shape[1])
     return float(np.clip(share * (1 - share) / error**2, 1.0, np.isfinite(held).sum()))
+
+
+def predictions(fit: Fit) -> Predictor:
+    return predictor(fit.fitted)
+
+
+_NAMED: Mapping[Recording, str] = {"same": "same_recording", "new": "new_recording"}
+
+
+@dataclass(frozen=True)
+class IntervalResult:
+    """Prediction intervals of a run, each by recording: the calibration's own, and where something drifts a new one.
+
+    Attributes:
+        stretches: what half widths are multiplied by, from cross-validation; empty without.
+        crossed: shares held of training records, by folds that did not see them; stretched from the other folds.
+        half_width_mm: of 90 % intervals of a position coordinate, median over all records; stretched.
+        scores: of cross-validated and held-out records, in dataset order; nan elsewhere.
+    """
+
+    stretches: Mapping[Recording, Stretch] = field(default_factory=dict)
+    crossed: Mapping[Recording, Coverage] = field(default_factory=dict)
+    holdout: Mapping[Recording, Coverage] = field(default_factory=dict)  # shares held of held-out records
+    half_width_mm: Mapping[Recording, float] = field(default_factory=dict)
+    radius_mm: Mapping[Recording, float] = field(default_factory=dict)  # of 95 % radii of positions, likewise
+    scores: Mapping[Recording, Scores] = field(default_factory=dict)
+    levels: int = 0  # each joint stood at no more angles than these, and nothing states its error between them; else 0
+
+    @property
+    def judged(self) -> tuple[Mapping[Recording, Coverage], str]:
+        """What judges best, and what it is in words: held-out records, else cross-validated ones."""
+        return (self.holdout, "held-out records") if self.holdout else (self.crossed, "cross-validated records")
+
+    def findings(self) -> list[Finding]:
+        coverages, words = self.judged
+        state = (
+            "State what the joints are off between those angles as arms.NAME.joint_noise_deg, or measure poses between."
+        )
+        typical = [Finding("note", self._typical(), "", state if self.levels else "")] if self.half_width_mm else []
+        return [*typical, *(coverage_finding(own, words, name) for name, own in coverages.items())]
+
+    def _typical(self) -> str:
+        """How wide the intervals are."""
+        half, radius = self.half_width_mm, self.radius_mm
+        first: Recording = "new" if "new" in half else "same"
+        text = "In the median pose, of poses like the recorded ones, a prediction is good to "
+        text += f"+- {readable(half[first])} mm a coordinate (90 %), "
+        text += f"{readable(radius[first])} mm in all (95 %)"
+        if first == "new":
+            text += f"; within this recording to +- {readable(half['same'])} mm and {readable(radius['same'])} mm"
+        text += ", the measurement's noise included."
+        if self.levels:
+            text += f" Each joint stood at {self.levels} angles at most: what it is off between them is not included."
+        return text
+
+    def as_dict(self) -> dict[str, Any]:
+        content = {}
+        for name in self.half_width_mm:
+            content[_NAMED[name]] = {
+                "half_width_90_mm": self.half_width_mm[name],
+                "radius_95_mm": self.radius_mm[name],
+                "stretch": self.stretches[name].as_dict() if name in self.stretches else None,
+                "cross_validated": self.crossed[name].as_dict() if name in self.crossed else None,
+                "holdout": self.holdout[name].as_dict() if name in self.holdout else None,
+            }
+        return content
+
+
+def intervals(fit: Fit) -> IntervalResult:
+    """How wide prediction intervals are; nothing of a fit that did not converge."""
+    problem, split = fit.problem, fit.split
+    if not fit.converged or problem.blueprint.groups:
+        return IntervalResult()  # a contact reads nothing that could be predicted
+    by, alike = fit.of(predictions), whitened_like(problem, fit.fitted, fit.estimator)
+    scores, shares, stretches = _crossed(fit)
+    holdout: dict[Recording, Coverage] = {}
+    if len(split.holdout):
+        for name, own in score(by, alike.subset(split.holdout).records).items():
+            shares_held = coverage(own, [stretches.get(name)] * len(split.holdout))
+            if shares_held is not None:
+                holdout[name] = shares_held
+            scores = {**scores, name: _filled(scores.get(name), own, split.holdout, len(fit.dataset))}
+    spreads: dict[Recording, Sequence[Spread]] = {"same": by.spreads(alike.records, "same")}
+    if by.drifts:
+        spreads["new"] = by.spreads(alike.records, "new")
+    places = [i for i, kernel in enumerate(problem.kernels) if is_position(kernel)]
+    typical = {
+        name: _typical([spread[i].of(POSITION) for i in places], stretches.get(name))
+        for name, spread in spreads.items()
+    }
+    return IntervalResult(
+        stretches,
+        shares,
+        holdout,
+        {name: half for name, (half, _) in typical.items()} if places else {},
+        {name: radius for name, (_, radius) in typical.items()} if places else {},
+        scores,
+        _levels(problem, fit.dataset),
+    )
+
+
+def _levels(problem: Problem, dataset: Dataset) -> int:
+    """The most angles at which any turning joint stood; 0 where they are many, or an arm states its joints' noise."""
+    arms = problem.blueprint.arms
+    channels = [channel for channel, dimension in command_channels(arms).items() if dimension == "angle"]
+    counts = [len(np.unique(np.round(dataset.column(channel), 9))) for channel in channels]
+    most = max(counts, default=0)
+    return most if most <= MOST_LEVELS and not any(arm.joint_noise for arm in arms.values()) else 0
+
+
+def _crossed(
+    fit: Fit,
+) -> tuple[dict[Recording, Scores], dict[Recording, Coverage], dict[Recording, Stretch]]:
+    """Scores in dataset order, the shares they hold by stretches of other folds, and the stretches from all of them.
+
+    Residuals of the folds are put in units of what the whole fit would have predicted for the record: a fold with fewer
+    records claims less, and by its own claims would let the whole fit claim too much.
+    """
+    if fit.crossed is None:
+        return {}, {}, {}
+    by, fitted, split, folds = fit.of(predictions), fit.fitted, fit.split, fit.ready.folds
+    held_residuals = _collected(folds, [one.held_residuals for one in fit.crossed.fits], len(split.train))
+    # What the pose residuals of folds did not know of the records that they did not see; None without any.
+    unknown: list[Array] | None = None
+    for one, fold in zip(fit.crossed.fits, folds, strict=True):
+        if one.unknown is None:
+            continue
+        if unknown is None:
+            unknown = [np.zeros((fitted.problem.count, *block.shape[1:])) for block in one.unknown]
+        for whole, block in zip(unknown, one.unknown, strict=True):
+            whole[fold.holdout] = block
+    scores = {
+        name: scored(by.problem, own, by.left_out(fitted.records, name, unknown))
+        for name, own in held_residuals.items()
+    }
+    shares: dict[Recording, Coverage] = {}
+    for name, own in scores.items():
+        others: list[Stretch | None] = [None] * len(split.train)
+        for part in folds:
+            apart = stretch(besides(own, part.holdout))
+            for i in part.holdout:
+                others[i] = apart
+        share = coverage(own, others)
+        if share is not None:
+            shares[name] = share
+    # Nothing is stretched whose share was not judged.
+    sure = [name for name, share in shares.items() if share.stretched is not None]
+    stretches = {name: s for name in sure if (s := stretch(scores[name])) is not None}
+    return {n: _filled(None, own, split.train, len(fit.dataset)) for n, own in scores.items()}, shares, stretches
+
+
+def _filled(before: Scores | None, own: Scores, places: Indices, count: int) -> Scores:
+    result = before
+    if result is None:
+        errors, reaches = (np.full((len(rows), count), np.nan) for rows in (own.errors, own.reaches))
+        result = Scores(errors, reaches, np.ones(count))
+    result.errors[:, places], result.reaches[:, places], result.freedom[places] = own.errors, own.reaches, own.freedom
+    return result
+
+
+def _typical(spreads: Sequence[Spread], widened: Stretch | None) -> tuple[float, float]:
+    """Median half width of a 90 % interval of a coordinate, and of a 95 % radius (mm)."""
+    if not spreads:
+        return float("nan"), float("nan")
+    factor = widened.coordinates[LEVELS.index(STATED)] if widened else 1.0
+    radius = widened.radius if widened and widened.radius is not None else 1.0
+    half = np.concatenate([spread.half_widths(STATED).ravel() for spread in spreads])
+    radii = np.concatenate([spread.radius() for spread in spreads])
+    return float(np.median(half)) * factor * _MM, float(np.median(radii)) * radius * _MM
+
+
+def covered(fit: Fit) -> list[Finding]:
+    return fit.of(intervals).findings()

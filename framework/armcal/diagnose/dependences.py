@@ -28,7 +28,7 @@ from armcal.diagnose.score_tests import FitRows
 from armcal.estimate.freeing import candidates
 from armcal.measure.measurement import NamesMistakes
 from armcal.problem.motion import Motion, recorded_order
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 
 MOST_LEVELS = 12  # Levels of a joint are separated one by one up to so many; beyond, by a cubic
 _SLOW = 3
@@ -487,15 +487,13 @@ def _of_instrument(here: Records, read: Sequence[Array]) -> Iterator[Dependence]
     yield Dependence("scale", "axes", "", words, "", known, columns((0, 1), (0, 2), (1, 2)), labels, "rad")
 
 
-def predicted_positions(
-    problem: Problem, values: Array, records: Sequence[FactorRecords], dataset: Dataset
-) -> tuple[Array, ...]:
+def predicted_positions(problem: Problem, values: Array, dataset: Dataset) -> tuple[Array, ...]:
     """What each factor should read of a position (3 x N; m), 0 where it reads none; nothing (0 x N) of other factors.
 
     Not what it does read: the noise of that would be taken for a scale.
     """
     positions = []
-    for kernel, off in zip(problem.kernels, problem.residuals(values, records), strict=True):
+    for kernel, off in zip(problem.kernels, problem.residuals(values), strict=True):
         channels = kernel.factor.position_channels
         read = bool(channels) and all(map(dataset.has, channels))
         positions.append(np.nan_to_num(dataset.stacked(channels) - off[:3]) if read else np.zeros((0, len(dataset))))

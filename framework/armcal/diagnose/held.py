@@ -12,12 +12,12 @@ import numpy as np
 from scipy.special import stdtr
 
 from armcal.base.arrays import Array
-from armcal.diagnose.large_errors import Finding
+from armcal.diagnose.checks import Finding
+from armcal.diagnose.fit import Fit, thinned
 from armcal.diagnose.score_tests import FitRows, unbiased_roots
-from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import Measure
 from armcal.measure.measurement import HasScale, Mistake, NamesMistakes
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 
 Moves = Mapping[str, tuple[Array, ...]]
 """How raw residuals move with each increment of a parameter, by its name (n_r x N x k a factor)."""
@@ -60,19 +60,22 @@ class Contradiction:
     parameters: tuple[HeldParameter, ...]
 
 
-def contradictions(problem: Problem, estimate: Estimate, records: Sequence[FactorRecords]) -> tuple[Contradiction, ...]:
-    """Mistakes that instruments name and that are there always; ``records`` with the weights they had in the fit.
+def contradictions(fit: Fit) -> tuple[Contradiction, ...]:
+    """Mistakes that instruments name and that are there always.
 
     Each parameter is judged beside all others of such mistakes, so that a lens does not pass for a bent board.
     """
-    named, many = list[tuple[Mistake, str, list[str]]](), len(problem.blueprint.measurements) > 1
+    if not fit.converged:
+        return ()
+    problem, named = fit.problem, list[tuple[Mistake, str, list[str]]]()
+    many = len(problem.blueprint.measurements) > 1
     for instance, measurement in problem.blueprint.measurements.items():
         for one in measurement.mistakes() if isinstance(measurement, NamesMistakes) else ():
             if one.course == "always":
                 own = [problem.parameters[f"{instance}.{name}"] for name in one.parameters]
                 words = f"{instance}: {one.words}" if many else one.words
                 named.append((one, words, [block.name for block in own if not block.free]))
-    judged = held_parameters(problem, estimate, records, [name for *_, names in named for name in names])
+    judged = _held_parameters(fit, problem, [name for *_, names in named for name in names])
     off = {name: one for name, one in judged.items() if one.p_value < MISTAKEN}
     return tuple(
         Contradiction(words, mistake.measure, tuple(off[name] for name in names if name in off))
@@ -81,22 +84,25 @@ def contradictions(problem: Problem, estimate: Estimate, records: Sequence[Facto
     )
 
 
-def held_scales(
-    problem: Problem, estimate: Estimate, records: Sequence[FactorRecords]
-) -> list[tuple[HeldParameter, str]]:
+def with_contradicted(fit: Fit, problem: Problem) -> Problem:
+    """The problem with what records contradict free."""
+    return freed(problem, [parameter.name for one in fit.of(contradictions) for parameter in one.parameters])
+
+
+def held_scales(fit: Fit) -> list[tuple[HeldParameter, str]]:
+    problem = with_contradicted(fit, fit.problem)
     scaled = [(f"{n}.{m.scale}", m) for n, m in problem.blueprint.measurements.items() if isinstance(m, HasScale)]
     checks = {n: m.scale_check for n, m in scaled if n in problem.parameters.names and not problem.parameters[n].free}
-    return [(one, checks[name]) for name, one in held_parameters(problem, estimate, records, list(checks)).items()]
+    return [(one, checks[name]) for name, one in _held_parameters(fit, problem, list(checks)).items()]
 
 
-def held_parameters(
-    problem: Problem, estimate: Estimate, records: Sequence[FactorRecords], names: Sequence[str]
-) -> dict[str, HeldParameter]:
+def _held_parameters(fit: Fit, problem: Problem, names: Sequence[str]) -> dict[str, HeldParameter]:
     """Where records put parameters of one number each that a fit held, by name, each beside the others."""
     if not names:
         return {}
-    wider = freed(problem, names)
-    rows, coordinates = FitRows.of(wider, records, estimate), wider.parameters.coordinate_names
+    some = fit.acting.subset(thinned(np.arange(fit.acting.count), MOST_RECORDS))
+    estimate, wider = fit.estimate, freed(problem, names).with_records(some.records)
+    rows, coordinates = FitRows.of(wider, estimate), wider.parameters.coordinate_names
     lengths = np.maximum(np.linalg.norm(rows.slopes, axis=0), 1e-300)
     left, sizes, right = np.linalg.svd(rows.slopes / lengths, full_matrices=False)
     kept, at = sizes > _RANK * sizes[0], [coordinates.index(name) for name in names]
@@ -159,20 +165,19 @@ def freed(problem: Problem, names: Sequence[str]) -> Problem:
     return replace(problem, compiled=compiled)
 
 
-def moves_of(problem: Problem, values: Array, records: Sequence[FactorRecords], held: Sequence[str]) -> Moves:
+def moves_of(problem: Problem, values: Array, held: Sequence[str]) -> Moves:
     wider = freed(problem, held)
-    bare = [replace(one, weight=np.sign(one.weight), whitening=None, correlation=None) for one in records]
+    bare = [replace(one, weight=np.sign(one.weight), whitening=None, correlation=None) for one in problem.records]
     chain, parts = wider.parameters.entries_jacobian(values), []
-    for kernel, block in zip(wider.kernels, wider.jacobians(values, bare), strict=True):
+    for kernel, block in zip(wider.kernels, wider.with_records(bare).jacobians(values), strict=True):
         noise = np.array(kernel.factor.noise)[:, None, None]
         parts.append(noise * np.einsum("rvn,vc->rnc", block, chain))
     return {name: tuple(part[:, :, own] for part in parts) for name, own in wider.parameters.coordinates_of.items()}
 
 
-def contradiction_findings(contradictions: Sequence[Contradiction]) -> list[Finding]:
-    """What the verdict says of them."""
+def instruments(fit: Fit) -> list[Finding]:
     findings = []
-    for one in contradictions:
+    for one in fit.of(contradictions):
         text = f"{one.words[:1].upper()}{one.words[1:]}: {'; '.join(map(str, one.parameters))} (1 sd)."
         freedom = min(parameter.freedom for parameter in one.parameters)
         test = (

@@ -113,19 +113,16 @@ class _Seen:
         return replace(self, sighting=self.sighting.subset(every), records=records, rows=rows)
 
 
-def find_permuted_axes(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> PermutedAxes | None:
+def find_permuted_axes(problem: Problem, dataset: Dataset) -> PermutedAxes | None:
     """The first measurement whose positions, as they stand, do not fit, but do with one exchange undone.
 
-    ``records`` are those of the dataset, their noise as declared.
+    The problem is of the dataset, its noise as declared.
     """
     for number, kernel in enumerate(problem.kernels):
         try:
-            seen = _seen(problem, records, dataset, number)
+            seen = _seen(problem, dataset, number)
             arms = [problem.blueprint.arms[name] for name in problem.blueprint.measurements[kernel.factor.name].arms]
-            if seen is None:
-                permuted = _of_contact(problem, records, number, arms)
-            else:
-                permuted = _of(problem, records, seen, arms[0])
+            permuted = _of_contact(problem, number, arms) if seen is None else _of(problem, seen, arms[0])
         except NotConvergedError:
             continue
         if permuted is not None:
@@ -133,11 +130,9 @@ def find_permuted_axes(problem: Problem, records: Sequence[FactorRecords], datas
     return None
 
 
-def _of_contact(
-    problem: Problem, records: Sequence[FactorRecords], number: int, arms: Sequence[Arm]
-) -> PermutedAxes | None:
+def _of_contact(problem: Problem, number: int, arms: Sequence[Arm]) -> PermutedAxes | None:
     """Of a contact: how far apart single records put what they touch together, by the nominal arm, however read."""
-    kernel, own, nominal = problem.kernels[number], records[number], problem.blueprint.parameters.nominal()
+    kernel, own, nominal = problem.kernels[number], problem.records[number], problem.blueprint.parameters.nominal()
     if kernel.factor.output_channels or not is_place(kernel.factor.nuisance_names):
         return None
 
@@ -147,7 +142,7 @@ def _of_contact(
         except NotConvergedError:
             return np.inf
 
-    reach = spread_of(tools(problem.with_records(records), nominal)[0][0])
+    reach = spread_of(tools(problem, nominal)[0][0])
     if not MISSES * reach < (as_given := left({})) < np.inf:
         return None
     # Another unit of angles would put all tools near one place, whatever they touch.
@@ -164,29 +159,30 @@ def _of_contact(
     return PermutedAxes(kernel.factor.name, words, as_given * _MM, best.left * _MM, True, adapted=False)
 
 
-def _seen(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset, number: int) -> _Seen | None:
+def _seen(problem: Problem, dataset: Dataset, number: int) -> _Seen | None:
     """A measurement that gives positions in the base frame, at most so many records of it; None of another.
 
     Records without both neighbours are left out, unless these are most.
     """
-    sighting = sighting_of(problem.with_records(records), dataset, number, _MOST_RECORDS)
+    sighting = sighting_of(problem, dataset, number, _MOST_RECORDS)
     if sighting is None:
         return None
-    every, rows = _neighbours(dataset, records[number], problem.kernels[number].factor.position_channels, sighting)
+    every, rows = _neighbours(problem, dataset, sighting)
     sighting = sighting.subset(every)
     if 3 * len(sighting.chosen) < _EQUATIONS * max(problem.increments, 6):
         return None
-    own = replace(problem.subset(records, sighting.chosen)[number], whitening=None, correlation=None)
+    own = replace(problem.subset(sighting.chosen).records[number], whitening=None, correlation=None)
     noise = np.array(problem.kernels[number].factor.noise[:3])
     return _Seen(sighting, own, rows, None, noise, tuple(dataset.ids[i] for i in sighting.chosen))
 
 
 def _neighbours(
-    dataset: Dataset, record: FactorRecords, channels: Sequence[str], sighting: Sighting
+    problem: Problem, dataset: Dataset, sighting: Sighting
 ) -> tuple[Indices, tuple[tuple[str, Array], ...]]:
     """Which of the records to look at, and what was measured one row before and after each of these (3 x n each)."""
+    channels = problem.kernels[sighting.kernel].factor.position_channels
     lines = np.array(dataset.rows or range(len(dataset)))
-    whole = np.flatnonzero(record.measured)
+    whole = np.flatnonzero(problem.records[sighting.kernel].measured)
     place, positions = {line: i for i, line in zip(whole, lines[whole], strict=True)}, dataset.stacked(channels)
     beside = np.array([[place.get(lines[i] + step, -1) for i in sighting.chosen] for step in (-1, 1)])
     both = np.flatnonzero((beside >= 0).all(axis=0))
@@ -197,21 +193,21 @@ def _neighbours(
     return both, tuple((f"the {w} taken for each row's", moved) for w, moved in rows)
 
 
-def _of(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, arm: Arm) -> PermutedAxes | None:
+def _of(problem: Problem, seen: _Seen, arm: Arm) -> PermutedAxes | None:
     straight = _positions(problem, seen, {}, problem.parameters.nominal())
     if straight is None:
         return None
     spread = max(spread_of(seen.measured), spread_of(straight.predicted))
     as_given = straight.left(seen.measured)
     if as_given > MISSES * spread:
-        placing = placings(problem.with_records(records), seen.sighting)[0]
+        placing = placings(problem, seen.sighting)[0]
         seen = replace(seen, placing=placing if placing.stands_anywhere else None)
         as_given = min(as_given, _left(problem, seen, {}, seen.measured, np.inf))
     if as_given <= MISSES * spread:
         return None
     enough = min(FITS * spread, as_given / MUCH_BETTER)
     readings = [*_single(problem, seen, arm, straight, enough), *_in_two_frames(problem, seen)]
-    explained = _explained(problem, records, seen, readings, enough)
+    explained = _explained(problem, seen, readings, enough)
     if not explained:
         if seen.placing is None:
             turn, shift = rigid_fit(straight.predicted, seen.measured)
@@ -220,14 +216,14 @@ def _of(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, arm: Ar
             words = f"the arm's base elsewhere by {apart}"
             left = straight.left(turn.T @ (seen.measured - shift[:, None]))
             read = _Reading(left, words, False, {}, turn.T @ (seen.measured - shift[:, None]))
-            explained = _explained(problem, records, seen, [read], enough)
+            explained = _explained(problem, seen, [read], enough)
             if explained and straight.can_move(turn, shift):
                 return None  # the fit moves the base there by itself
         if not explained:
             few = seen.thinned(_SEVERAL_RECORDS)
             if _left(problem, few, {}, few.measured, np.inf) <= MISSES * spread:
                 return None  # as they stand, the records that are looked at fit: a few others are off
-            explained = _explained(problem, records, few, list(_several(problem, few, arm, enough)), enough)
+            explained = _explained(problem, few, list(_several(problem, few, arm, enough)), enough)
     if not explained:
         return None
     (best, left), name = explained[0], problem.kernels[seen.sighting.kernel].factor.name
@@ -236,7 +232,7 @@ def _of(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, arm: Ar
 
 
 def _explained(
-    problem: Problem, records: Sequence[FactorRecords], seen: _Seen, readings: Sequence[_Reading], enough: float
+    problem: Problem, seen: _Seen, readings: Sequence[_Reading], enough: float
 ) -> list[tuple[_Reading, float]]:
     """Readings that explain the records once they are fitted, the likeliest first, and what each then leaves (m).
 
@@ -246,10 +242,10 @@ def _explained(
     if not likely:
         return []
     noise, explained = float(np.linalg.norm(seen.noise)), []
-    worse = _fitted(problem, records, seen, {}, seen.measured) / spread_of(seen.measured)
+    worse = _fitted(problem, seen, {}, seen.measured) / spread_of(seen.measured)
     for reading in likely:
         measured = reading.measured
-        left = reading.left if measured is None else _fitted(problem, records, seen, reading.read_as, measured)
+        left = reading.left if measured is None else _fitted(problem, seen, reading.read_as, measured)
         spread = kept_spread(seen.measured if measured is None else measured, seen.measured)
         share, better = _EXPLAINS if worse <= _HOPELESS else _EXPLAINS_HOPELESS
         if left <= min(max(_NOISE * noise, share * spread), spread * worse / better):
@@ -257,11 +253,11 @@ def _explained(
     return explained
 
 
-def _fitted(problem: Problem, records: Sequence[FactorRecords], seen: _Seen, read_as: Wires, measured: Array) -> float:
+def _fitted(problem: Problem, seen: _Seen, read_as: Wires, measured: Array) -> float:
     """What a short fit of a reading typically leaves (median, m); infinite where it leads far from the nominal arm."""
     number = seen.sighting.kernel
     values, measured, _ = _placed(problem, seen, read_as, measured)
-    some = [*problem.subset(records, seen.sighting.chosen)]
+    some = [*problem.subset(seen.sighting.chosen).records]
     some = [replace(one, weight=0 * one.weight, whitening=None, correlation=None) for one in some]
     own = rewired(problem.kernels[number].factor.channels, seen.records, read_as)
     rows, unturned = np.zeros(len(problem.kernels[number].factor.noise)), np.tile(np.eye(3), (own.count, 1, 1))

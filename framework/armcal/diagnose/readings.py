@@ -132,13 +132,13 @@ def unit_mistaken(factor: float) -> str:
     return next(f"{own} among {other}" for (own, size), (other, taken) in pairs if np.isclose(taken / size, factor))
 
 
-def check_reach(problem: Problem, records: Sequence[FactorRecords], dataset: Dataset) -> None:
+def check_reach(problem: Problem, dataset: Dataset) -> None:
     """Positions ten times farther out, or nearer, than the model's: a unit is wrong, of all records or of some.
 
     Raises:
         DataError: which, and as which unit they are read.
     """
-    shown = problem.predict(problem.parameters.nominal(), records)
+    shown = problem.predict(problem.parameters.nominal())
     for kernel, own in zip(problem.kernels, shown, strict=True):
         channels = kernel.factor.output_channels
         if [channel.rpartition(".")[2] for channel in channels] != ["x", "y", "z"]:

@@ -14,7 +14,7 @@ likelihood, and is as likely as a cause that leaves more than the declared noise
 by one, each in the presence of the others.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -22,9 +22,10 @@ import numpy as np
 from scipy.special import chdtri
 
 from armcal.base.arrays import Array, Indices, Mask
-from armcal.base.dataset import Dataset
-from armcal.base.units import SMALLEST_SHOWN
+from armcal.base.units import SMALLEST_SHOWN, digits, readable
+from armcal.diagnose.checks import Finding, Grade
 from armcal.diagnose.dependences import (
+    TIMES_REPEATS,
     Dependence,
     NoiseTrend,
     Records,
@@ -35,10 +36,13 @@ from armcal.diagnose.dependences import (
     predicted_positions,
     repeats_of,
 )
-from armcal.diagnose.held import moves_of
+from armcal.diagnose.fit import Fit
+from armcal.diagnose.held import moves_of, with_contradicted
 from armcal.diagnose.predictable import (
     CLEAR,
+    FEWEST_POSES,
     IMITATED,
+    MOST_OF_MEDIAN,
     Kernels,
     Predictable,
     TimeOrPose,
@@ -48,14 +52,14 @@ from armcal.diagnose.predictable import (
     smooth,
     time_kernels,
 )
-from armcal.diagnose.score_tests import FamilyTest, Fit, FitRows, family_test, linear_fit, own_basis
+from armcal.diagnose.predictable import LEVEL as PREDICTED_LEVEL
+from armcal.diagnose.score_tests import FamilyTest, FitRows, LinearFit, family_test, linear_fit, own_basis
 from armcal.estimate.bootstrap import automatic_block_length
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.freeing import candidates
 from armcal.estimate.identifiability import Measure
 from armcal.measure.groups import pose_numbers
-from armcal.problem.motion import Motion
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 
 UNLISTED = "something that is none of these"
 CHANCE = "nothing: it may be chance"
@@ -221,35 +225,29 @@ class ResidualStructure:
         return tuple(s for s in self.structures if s.falls_mm >= least)
 
 
-def structure(
-    problem: Problem,
-    records: Sequence[FactorRecords],
-    estimate: Estimate,
-    dataset: Dataset,
-    motion: Motion,
-    position: Indices,
-    modelled: frozenset[str] = frozenset(),
-) -> ResidualStructure | None:
-    """Test the residuals of a fit to records, with the weights they had; None where there are too few to judge.
-
-    ``motion`` is how the arm stands in them, ``position`` how many of all records were recorded before each (N),
-    ``modelled`` the types of the effects that the model has.
-    """
-    taking_part = np.any([record.weight[: record.count] > 0 for record in records], axis=0)
+def structure(fit: Fit) -> ResidualStructure | None:
+    """Test the residuals of a fit to records, with the weights they had; None where there are too few to judge."""
+    if not fit.converged:
+        return None
+    problem, estimate = with_contradicted(fit, fit.few_acting), fit.estimate
+    dataset, position = fit.ready.trained, fit.position[fit.split.train]
+    taking_part = np.any([record.weight[: record.count] > 0 for record in problem.records], axis=0)
     chosen = _looked_at(np.flatnonzero(taking_part), position)
     if len(chosen) < FEWEST_RECORDS:
         return None
-    records, dataset, position = problem.subset(records, chosen), dataset.subset(chosen), position[chosen]
-    rows, read = FitRows.of(problem, records, estimate), predicted_positions(problem, estimate.values, records, dataset)
-    fit, basis, block = _fit_of(rows, len(dataset), np.diff(position) == 1)
-    motion = motion.subset(chosen)
+    problem, dataset, position = problem.subset(chosen), dataset.subset(chosen), position[chosen]
+    rows, read = FitRows.of(problem, estimate), predicted_positions(problem, estimate.values, dataset)
+    linear, basis, block = _fit_of(rows, len(dataset), np.diff(position) == 1)
+    motion = fit.motion.subset(fit.split.train[chosen])
     place = next((own for own in read if len(own)), np.zeros((0, len(dataset))))
-    moves = moves_of(problem, estimate.values, records, candidates(problem.parameters))
+    moves = moves_of(problem, estimate.values, candidates(problem.parameters))
     causes = [*dependences(problem, motion, dataset, moves), *outside(problem, motion, dataset, read, moves)]
     causes, columns = _named_once(problem, causes, [rows.columns(one.columns) for one in causes])
     kernels = pose_kernels(problem, dataset), time_kernels(len(dataset))
-    contest = Contest(causes, columns, fit.residual, basis, rows.by_record, fit.block * _FOLDS // fit.blocks, *kernels)
-    structures, first, last = _search(rows, fit, contest, modelled)
+    contest = Contest(
+        causes, columns, linear.residual, basis, rows.by_record, linear.block * _FOLDS // linear.blocks, *kernels
+    )
+    structures, first, last = _search(rows, linear, contest, _modelled(fit))
     residual, whole = contest.beside(tuple(structures))
     predicted = predictable(problem, rows, basis, motion, dataset)
     lags = first.lag_one, first.lag_adjusted, last.lag_one, last.lag_adjusted
@@ -260,10 +258,17 @@ def structure(
         _alike(residual, whole, rows, contest) if last.lag_adjusted <= LEVEL else None,
         predicted and replace(predicted, imitated=contest.time_imitated()),
         noise_trend(residual, whole, rows.by_record, Records(dataset, motion), place),
-        repeats_of(fit.residual, basis, rows, pose_numbers(dataset, motion.channels), contest.pose),
-        rows.mean_error(fit.residual) * _MM,
+        repeats_of(linear.residual, basis, rows, pose_numbers(dataset, motion.channels), contest.pose),
+        rows.mean_error(linear.residual) * _MM,
         *(len(first.adjusted), len(dataset), block),
     )
+
+
+def _modelled(fit: Fit) -> frozenset[str]:
+    """The types of the effects that the model has."""
+    arms = fit.system.description.get("arms") or {}
+    effects = [effect for arm in arms.values() for effect in (arm.get("effects") or {}).values()]
+    return frozenset(str(effect.get("type")) for effect in effects)
 
 
 def _named_once(
@@ -301,7 +306,7 @@ def _looked_at(candidates: Indices, position: Indices) -> Indices:
     return np.concatenate([run[:most] for run in runs])
 
 
-def _fit_of(rows: FitRows, count: int, consecutive: Mask) -> tuple[Fit, Array, int]:
+def _fit_of(rows: FitRows, count: int, consecutive: Mask) -> tuple[LinearFit, Array, int]:
     """The linear fit, an orthonormal basis of its slopes, and how many records a block has.
 
     Blocks are as long as errors resemble their neighbours', and neither too many nor too few. The rows of priors and
@@ -317,7 +322,7 @@ def _fit_of(rows: FitRows, count: int, consecutive: Mask) -> tuple[Fit, Array, i
 
 
 def _search(
-    rows: FitRows, fit: Fit, contest: Contest, modelled: frozenset[str]
+    rows: FitRows, fit: LinearFit, contest: Contest, modelled: frozenset[str]
 ) -> tuple[dict[int, Structure], FamilyTest, FamilyTest]:
     """Causes one after another as long as one is significant, then each set against all others and chance.
 
@@ -420,3 +425,207 @@ def _size(one: Dependence, coefficients: Array) -> str:
         late_ms = float(f"{1000 * numbers[0]:.2g}")
         return f"joints {'late' if late_ms > 0 else 'early'} by about {abs(late_ms):g} ms, to first order"
     return ", ".join(f"{label}: {shown(float(n))}" for label, n in zip(one.labels, numbers, strict=True))
+
+
+_MOST_TOLD = 5
+_LIKELY = 0.05  # A cause with less of the odds is not named first
+_NO_NOISE = 0.01
+"""Of the declared noise: residuals below it are a simulation's without noise, and how they vary means nothing."""
+
+
+def depends(fit: Fit) -> list[Finding]:
+    return structure_findings(fit.of(structure), fit.unit) if fit.converged else []
+
+
+def neighbours(fit: Fit) -> list[Finding]:
+    return neighbour_findings(fit.of(structure), fit.estimate, fit.unit)
+
+
+def structure_findings(structure: ResidualStructure | None, unit: str = "mm") -> list[Finding]:
+    """What residuals still depend on."""
+    if structure is None:
+        text = "The training records are too few to tell whether the model lacks anything."
+        return [Finding("note", text, f"at least {FEWEST_RECORDS} records", "Measure more poses.")]
+    blocks = f", blocks of {structure.block} records" if structure.block > 1 else ""
+    level = f"{100 * structure.level:g} % over all {structure.tested} dependences{blocks}"
+    test, kept = f"score test, {level}, and likelier than chance", structure.worthwhile
+    findings = [_structure_finding(s, structure, unit, test) for s in kept]
+    if not findings and not structure.is_predictable:
+        text = f"None of the {structure.tested} causes that were tested explains the remaining error."
+        if structure.structures:
+            few = len(structure.structures)
+            text += f" {few} {'would' if few == 1 else 'would each'} lower it by less than 1 %."
+        findings.append(Finding("good", text, test))
+    if kept and structure.more:
+        text = "Residuals depend on more than these; model them first, then look again."
+        findings.append(Finding("note", text, test))
+    return [_predictable_finding(structure), *findings, *_scatter(structure), *repeat_findings(structure, unit)]
+
+
+def _predictable_finding(structure: ResidualStructure) -> Finding:
+    """What other records predict of the residuals, whatever its cause is."""
+    predicted = structure.predictable
+    if predicted is None:
+        text = "There are too few distinct poses to test whether the pose still predicts the residuals."
+        return Finding("note", text, f"at least {FEWEST_POSES} distinct poses", "Measure more poses.")
+    test = (
+        f"{predicted.records} records of {predicted.poses} poses, each predicted by the poses of other folds; "
+        f"residuals with random signs, {100 * PREDICTED_LEVEL:g} %; errors beyond {MOST_OF_MEDIAN:g} times the median "
+        "are cut"
+    )
+    if not predicted.above_chance:
+        return Finding("good", "Other poses predict no more of the residuals than chance does.", test)
+    grade: Grade = "warning" if predicted.falls >= WORTHWHILE else "note"
+    listed = ", ".join(f"{carrier.words} ({percent(carrier.share)})" for carrier in predicted.carriers)
+    text = f"{predicted_in_short(predicted)} Of it: {listed}."
+    if predicted.is_in_order:
+        text += f" The poses were visited in an order, and time alone predicts {percent(predicted.by_time)}: these data"
+        text += " do not show which of them is the cause."
+    named = sum(s.falls_mm for s in structure.worthwhile) / max(structure.mean_mm, 1e-12)
+    first = "Model what is named beside this, then look again. " if named > predicted.falls / 2 else ""
+    return Finding(grade, text, test, first + " ".join(_remedies(predicted)))
+
+
+def predicted_in_short(predicted: Predictable) -> str:
+    share = f"{percent(predicted.share)} of the variance of the residuals is not noise"
+    names = [carrier.words for carrier in predicted.carriers]
+    listed = " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+    return f"{share}: other records predict it, mostly from {listed} (chance: below {percent(predicted.chance)})."
+
+
+def _remedies(predicted: Predictable) -> Iterator[str]:
+    """What takes up what each kind of carrier predicts."""
+    kinds = {carrier.kind for carrier in predicted.carriers}
+    if predicted.is_in_order:
+        yield _TELL_APART["open"]
+        return
+    if "joint" in kinds and predicted.learnable:
+        yield "Learn it: arms.NAME.residual: {type: gaussian_process}; or free what armcal identify --fixed recommends."
+    elif "joint" in kinds:
+        if predicted.learnable is False:
+            yield "A pose residual cannot learn it from these records: that takes positions or poses of the tool."
+        yield "Free what armcal identify --fixed recommends, or add effects to these joints; more poses show more."
+    if "time" in kinds:
+        yield "Let the base drift (parameters.drift); record the temperature, and repeat one pose from time to time."
+    if "temperature" in kinds:
+        yield "Add thermal_length, or measure at one temperature."
+    if "payload" in kinds:
+        yield "Weigh the payload; add or free compliance."
+    if "approach" in kinds:
+        yield "Add or free approach_backlash on these joints."
+
+
+def percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share >= 0.095 else f"{100 * share:.1g} %" if share > 0.0005 else "0.1 %"
+
+
+def _structure_finding(s: Structure, structure: ResidualStructure, unit: str, test: str) -> Finding:
+    """One cause if it is clearly the likeliest, else all that it does not beat."""
+    falls = f"would fall by {readable(s.falls_mm)} {unit}"
+    falls = f"the mean training residual of {readable(structure.mean_mm)} {unit} {falls}"
+    what = s.words + (f" ({s.size})" if s.size else "")
+    test = f"p {_p(s.p_value)}, {test}; odds among all of them and what is none of them"
+    if not s.alternatives:
+        model = f"Model it: {s.effect}. " if s.effect else "No effect of armcal models this. "
+        text = f"Residuals still depend on {what}: modelled, {falls}. It has {_share(s.odds)} of the odds."
+        return Finding("warning", text, test, f"{model}To be sure: {s.measure}.")
+    named = [what, *s.alternatives] if s.odds >= _LIKELY else [s.alternatives[0], what, *s.alternatives[1:]]
+    more = len(named) - _MOST_TOLD
+    text = f"Residuals still depend on {'; or on '.join(named[:_MOST_TOLD])}"
+    text += f"; or on {more} more (metrics.json). " if more > 0 else ". "
+    text += f"These data do not identify which. Modelled as {s.words}, which has {_share(s.odds)} of the odds, {falls}."
+    model = f" Then model it: {s.effect}." if s.effect and s.kind not in ("order", "step") else ""
+    return Finding("warning", text, test, f"To find out: {s.measure}.{model}")
+
+
+def _share(odds: float) -> str:
+    return "over 99 %" if odds > 0.99 else "less than 1 %" if odds < 0.01 else f"{100 * odds:.0f} %"
+
+
+def _scatter(structure: ResidualStructure) -> list[Finding]:
+    """What the size of residuals depends on."""
+    noise = structure.noise
+    if noise is None or noise.high < _NO_NOISE:
+        return []
+    text = f"The spread of the residuals depends on {'; or on '.join([noise.words, *noise.alternatives[:_MOST_TOLD]])}:"
+    text += f" from {digits(noise.low, 2)} to {digits(noise.high, 2)} times the declared noise, in the thirds of the"
+    text += " records with the least and the most of it. Either the noise varies, or the model errs more there."
+    test = f"regression of squared residuals, p {_p(noise.p_value)} over everything looked at"
+    action = (
+        "Repeat a pose at both ends of it: if repeats spread equally, the model is the cause; else state noise by "
+        "record."
+    )
+    return [Finding("warning", text, test, action)]
+
+
+def repeat_findings(structure: ResidualStructure, unit: str) -> list[Finding]:
+    """What repeats say of the rest."""
+    repeats = structure.repeats
+    if repeats is None or not repeats.exceeded:
+        return []
+    text = (
+        f"Repeats of a pose scatter by {readable(repeats.scatter_mm)} {unit}, residuals are "
+        f"{readable(repeats.left_mm)} {unit} (root mean squares): "
+    )
+    test = f"lack of fit, F over {repeats.records} records of {repeats.poses} poses, p {_p(repeats.p_value)}, and "
+    test += f"{TIMES_REPEATS:g} times"
+    if repeats.shared or structure.is_predictable or structure.worthwhile:
+        text += "the model lacks something, which poses nearby share."
+        action = "Free what armcal identify --fixed recommends, add effects, and state masses for what sags."
+    else:
+        text += "the rest is no noise of the instrument, but the model's error, or what differs from stop to stop."
+        action = "Drive to some poses again, from elsewhere: what then differs is the arm's."
+    return [Finding("warning", text, test, action)]
+
+
+def neighbour_findings(structure: ResidualStructure | None, estimate: Estimate, unit: str = "mm") -> list[Finding]:
+    """Whether records that follow one another miss alike, why, and whether that made intervals wider."""
+    if structure is None:
+        return []
+    test = f"lag-one correlation, {100 * structure.level:g} % over all dependences and this"
+    if structure.lag_p > structure.level:
+        return [Finding("good", "Residuals of neighbouring records do not correlate.", test)]
+    text = f"Residuals of neighbouring records correlate by {structure.lag_one:.2f}"
+    if structure.lag_after_p > structure.level:
+        return [Finding("note", f"{text}; what was found above explains it.", test)]
+    after = f", by {structure.lag_after:.2f} still beside what was found" if structure.structures else ""
+    text += f"{after}: they are not noise. {_what_neighbours_cost(estimate)}"
+    alike = structure.alike
+    if alike is None:
+        return [Finding("warning", text, test, _TELL_APART["open"])]
+    text += (
+        f" {_WHY[alike.cause]}predicted from the other records, a smooth function of time has an error of "
+        f"{readable(alike.time_mm)} {unit} and one of the pose {readable(alike.pose_mm)} {unit} (log odds against "
+        f"noise {alike.time:.0f} and {alike.pose:.0f})"
+    )
+    if max(alike.time_imitated, alike.pose_imitated) > IMITATED:
+        shares = f"the pose predicts {_share(alike.time_imitated)} of the first, time {_share(alike.pose_imitated)} of "
+        text += f"; as the poses were visited in an order, {shares}the second"
+    return [Finding("warning", f"{text}.", test, _TELL_APART[alike.cause])]
+
+
+def _what_neighbours_cost(estimate: Estimate) -> str:
+    factors = estimate.widened
+    if not factors:
+        return "In the order in which these poses were measured that does not widen the intervals of the parameters."
+    widest = int(np.argmax(factors))
+    return (
+        "Intervals that assume independent errors would be too narrow; those of the parameters are wider, by a factor "
+        f"of {float(np.median(factors)):.1f} (median), at most {max(factors):.1f} ({estimate.names[widest]})."
+    )
+
+
+_WHY = {
+    "time": "It goes with time, not with the pose: ",
+    "pose": "It goes with the pose, not with time: ",
+    "open": "Whether time or the pose is the cause is not known: ",
+}
+_TELL_APART = {
+    "time": "Let the base drift (parameters.drift); repeat one pose at the start, in the middle and at the end.",
+    "pose": "The model lacks an effect of pose; visiting the poses in random order would show it plainly.",
+    "open": "Repeat some of the first poses at the end: only time changes them. Visit others in random order.",
+}
+
+
+def _p(p: float) -> str:
+    return f"{p:.3f}" if p >= 0.01 else f"below {0.005 if p < 0.005 else 0.01:g}"

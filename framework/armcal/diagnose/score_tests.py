@@ -23,9 +23,9 @@ from scipy.linalg import solve_triangular
 from scipy.special import fdtrc, ndtr
 
 from armcal.base.arrays import Array, Indices, Mask
+from armcal.diagnose.fit import Fit, thinned
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.prediction import POSITION, is_position
-from armcal.problem.factor_records import correlation_of
 from armcal.problem.many_points import with_few_points
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -47,14 +47,13 @@ class FitRows:
     positions: tuple[bool, ...]
 
     @classmethod
-    def of(cls, problem: Problem, records: Sequence[FactorRecords], estimate: Estimate) -> Self:
-        """The rows at an estimate; ``records`` with the weights they had."""
+    def of(cls, problem: Problem, estimate: Estimate) -> Self:
+        """The rows at an estimate; of records with the weights they had."""
         values, parameters = estimate.values, problem.parameters
-        count, scales = records[0].count, parameters.scales()
+        count, scales = problem.count, parameters.scales()
         chain = parameters.entries_jacobian(values) * scales
-        parts = [np.einsum("rvn,vc->rnc", block, chain) for block in problem.jacobians(values, records)]
-        weighted = problem.weighted_residuals(values, records)
-        shared = correlation_of(records)
+        parts = [np.einsum("rvn,vc->rnc", block, chain) for block in problem.jacobians(values)]
+        weighted, shared = problem.weighted_residuals(values), problem.correlation
         drifted = [np.zeros((*r.shape, 0)) for r in weighted] if shared is None else shared.shared()
         drifted = [slope[:, :count] for slope in drifted]
         drift = np.zeros(0)
@@ -76,13 +75,14 @@ class FitRows:
         ties = np.hstack([tied.jacobian @ chain, np.zeros((len(tied.residual), len(drift)))])
         sizes = [len(residual) for residual in weighted]
         numbers = np.arange(sum(sizes) * count).reshape(sum(sizes), count)
+        pairs = [(grouped.kernel.factor, record) for grouped, record in problem.pairs]
         return cls(
             np.vstack([*slopes, ties, below]),
             np.concatenate([*data, tied.residual, moved[held], drift]),
             np.tile(np.arange(count), sum(sizes)),
             numbers.T,
-            tuple(_whitening(k.factor.noise, record) for k, record in zip(problem.kernels, records, strict=True)),
-            tuple(record.points_of(k.factor).astype(float) for k, record in zip(problem.kernels, records, strict=True)),
+            tuple(_whitening(factor.noise, record) for factor, record in pairs),
+            tuple(record.points_of(factor).astype(float) for factor, record in pairs),
             tuple(is_position(kernel) for kernel in problem.kernels),
         )
 
@@ -114,6 +114,12 @@ class FitRows:
         return np.asarray(np.sqrt(np.mean(squares, axis=0)))
 
 
+def sampled_rows(fit: Fit) -> tuple[Problem, FitRows]:
+    """Rows of not too many training records, and the problem that they are of."""
+    problem = with_few_points(fit.acting.subset(thinned(np.arange(len(fit.split.train)))))
+    return problem, FitRows.of(problem, fit.estimate)
+
+
 def _whitening(noise: Sequence[float], records: FactorRecords) -> Array:
     """What makes raw residuals rows (n_r x n_r x N)."""
     root = np.sqrt(records.weight[: records.count])
@@ -133,7 +139,7 @@ _COLUMNS_AT_ONCE = 12  # Their products with the draws, block by block, stay in 
 
 
 @dataclass(frozen=True)
-class Fit:
+class LinearFit:
     """A fit as its last linear step: all rows whitened, those of priors and drifts behind those of the data."""
 
     residual: Array  # at the solution (rows)
@@ -154,11 +160,13 @@ class Fit:
         return replace(self, draws=self.draws[:, :FEWER_DRAWS])
 
 
-def linear_fit(slopes: Array, residual: Array, block: Indices, records: Indices, neighbours: Mask) -> tuple[Fit, Array]:
+def linear_fit(
+    slopes: Array, residual: Array, block: Indices, records: Indices, neighbours: Mask
+) -> tuple[LinearFit, Array]:
     lengths = np.linalg.norm(slopes, axis=0)
     basis = np.linalg.qr(slopes / np.where(lengths > 0, lengths, 1.0))[0]
     noise = np.random.default_rng(0).normal(size=(len(residual), DRAWS))
-    return Fit(residual, noise, block, records, neighbours).without(basis), basis
+    return LinearFit(residual, noise, block, records, neighbours).without(basis), basis
 
 
 def own_basis(columns: Array, basis: Array) -> tuple[Array, Array]:
@@ -185,7 +193,7 @@ class FamilyTest:
     lag_adjusted: float  # its p-value in the same family; 1 where there are too few neighbours
 
 
-def family_test(fit: Fit, bases: Sequence[Array]) -> FamilyTest:
+def family_test(fit: LinearFit, bases: Sequence[Array]) -> FamilyTest:
     """Test the residual against orthonormal bases (rows x k each), and against its neighbours.
 
     By fewer draws first: where those show that nothing is near significance, more would not change it.
@@ -196,7 +204,7 @@ def family_test(fit: Fit, bases: Sequence[Array]) -> FamilyTest:
     return _by_all_draws(fit, bases)
 
 
-def _by_all_draws(fit: Fit, bases: Sequence[Array]) -> FamilyTest:
+def _by_all_draws(fit: LinearFit, bases: Sequence[Array]) -> FamilyTest:
     both = np.column_stack([fit.residual, fit.draws])
     lag, lag_p = _neighbours(fit, both)
     own, least, by_size = np.ones(len(bases)), lag_p[1:], dict[int, list[int]]()
@@ -215,7 +223,7 @@ def _by_all_draws(fit: Fit, bases: Sequence[Array]) -> FamilyTest:
     return FamilyTest(adjusted[:-1], share, lag, float(adjusted[-1]))
 
 
-def _ratios(bases: Sequence[Array], both: Array, fit: Fit) -> Array:
+def _ratios(bases: Sequence[Array], both: Array, fit: LinearFit) -> Array:
     """F of sums of block products by their own spread (bases x draws), of bases that have equally many columns.
 
     T = s' (sum of s_b s_b')^-1 s lies between 0 and the number of blocks B, and (B - k)/k T/(B - T) follows F(k, B - k)
@@ -240,7 +248,7 @@ def _ratios(bases: Sequence[Array], both: Array, fit: Fit) -> Array:
     return np.asarray((fit.blocks - size) / size * statistics / np.maximum(fit.blocks - statistics, 1e-9))
 
 
-def _by_block(columns: Array, fit: Fit) -> Array:
+def _by_block(columns: Array, fit: LinearFit) -> Array:
     order, sizes = np.argsort(fit.block, kind="stable"), np.bincount(fit.block)
     place = np.arange(len(order)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
     blocks = np.zeros((len(sizes), int(sizes.max()), columns.shape[1]))
@@ -252,7 +260,7 @@ def _p_value(size: int, spare: int, ratio: Array) -> Array:
     return np.asarray(np.maximum(fdtrc(size, spare, ratio), _SMALLEST_P))
 
 
-def _neighbours(fit: Fit, both: Array) -> tuple[float, Array]:
+def _neighbours(fit: LinearFit, both: Array) -> tuple[float, Array]:
     first = np.flatnonzero(fit.neighbours)
     if len(first) < 10:
         return 0.0, np.ones(both.shape[1])
@@ -273,24 +281,21 @@ _SHARES = (0.1, 0.25, 0.5, 0.75, 0.9, 0.98)
 _DISTANCES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 
 
-def widened(problem: Problem, records: Sequence[FactorRecords], estimate: Estimate, position: Indices) -> Estimate:
+def widened(problem: Problem, estimate: Estimate, position: Indices) -> Estimate:
     """The estimate with the wider covariance where neighbouring residuals correlate (5 %), and it is wider by a tenth.
 
     Args:
-        problem: of the fit.
-        records: it was fitted to, with the weights they had.
+        problem: of the records that were fitted, with the weights they had.
         estimate: what it found.
         position: how many of all records were recorded before each (N).
     """
-    estimate = _of_alike_points(problem, records, estimate)
-    problem = with_few_points(problem.with_records(records))
-    records = problem.records
-    taking_part = np.any([record.weight[: record.count] > 0 for record in records], axis=0)
+    estimate, problem = _of_alike_points(problem, estimate), with_few_points(problem)
+    taking_part = np.any([record.weight[: record.count] > 0 for record in problem.records], axis=0)
     chosen = np.flatnonzero(taking_part)
     chosen = chosen[np.argsort(position[chosen], kind="stable")][:_MOST_RECORDS]
     if len(chosen) < FEWEST_RECORDS or not estimate.names or not estimate.verdict.converged:
         return estimate
-    rows, place = FitRows.of(problem, problem.subset(records, chosen), estimate), position[chosen]
+    rows, place = FitRows.of(problem.subset(chosen), estimate), position[chosen]
     block = np.zeros(len(rows.residual), dtype=np.intp)
     fit, _ = linear_fit(rows.slopes, rows.residual, block, rows.by_record, np.diff(place) == 1)
     if family_test(fit, []).lag_adjusted > LEVEL:
@@ -308,7 +313,7 @@ def widened(problem: Problem, records: Sequence[FactorRecords], estimate: Estima
     return _wider(judged, factors[: problem.increments], factors[problem.increments :])
 
 
-def _of_alike_points(problem: Problem, records: Sequence[FactorRecords], estimate: Estimate) -> Estimate:
+def _of_alike_points(problem: Problem, estimate: Estimate) -> Estimate:
     """The estimate with the wider covariance where the points of a record err alike, as by a lens or a detector.
 
     By one factor, the mean over all combinations of parameters: that of the sandwich of the weights and of the own
@@ -317,7 +322,7 @@ def _of_alike_points(problem: Problem, records: Sequence[FactorRecords], estimat
     """
     if all(kernel.factor.points is None for kernel in problem.kernels) or not estimate.names:
         return estimate
-    rows = FitRows.of(problem, records, estimate)
+    rows = FitRows.of(problem, estimate)
     basis = np.linalg.qr(rows.slopes)[0]
     together = 0.0
     for own, root in unbiased_roots(rows, basis):

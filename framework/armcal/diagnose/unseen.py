@@ -18,18 +18,23 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
+from armcal.arm.assembly import command_channels
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.units import digits, display_unit, from_unit, readable, si_unit, to_unit, unit
-from armcal.diagnose.gross import MOST_RECORDS, Figure, thinned
-from armcal.diagnose.held import OFF, HeldParameter
-from armcal.diagnose.large_errors import Finding, first_few
+from armcal.diagnose.checks import Finding, first_few
+from armcal.diagnose.dependences import predicted_positions
+from armcal.diagnose.fit import Fit, thinned
+from armcal.diagnose.gross import Figure, figure
+from armcal.diagnose.held import OFF, HeldParameter, held_scales
 from armcal.diagnose.predictable import CLEAR
-from armcal.diagnose.score_tests import FitRows
+from armcal.diagnose.residual_structure import structure
+from armcal.diagnose.score_tests import FitRows, sampled_rows
 from armcal.estimate.estimator import Estimate
+from armcal.planning.candidates import whitened_rows
 from armcal.problem.motion import LOADS, Motion
-from armcal.problem.problem import FactorRecords, Problem
-from armcal.problem.rigid_alignment import apart_from
+from armcal.problem.problem import Problem
+from armcal.problem.rigid_alignment import along, apart_from, tools, unseen_motions
 
 LEVEL = 0.05
 COMPARABLE = 2.0  # Variances, each less than so many times the other
@@ -55,27 +60,21 @@ class Rounding:
     log_odds: float  # of this rounding beside even noise, against even noise alone
 
 
-def rounding(
-    problem: Problem,
-    records: Sequence[FactorRecords],
-    estimate: Estimate,
-    dataset: Dataset,
-    motion: Motion,
-    predicted: float,
-) -> Rounding | None:
+def rounding(fit: Fit) -> Rounding | None:
     """The likeliest rounding that explains what a fit leaves beyond the declared noise; None where none does.
 
-    Args:
-        problem: of the fit.
-        records: those that trained, with the weights they had and the noise as declared.
-        estimate: what was found.
-        dataset, motion: of the same records.
-        predicted: which share of the residuals' variance other records predict: that is no rounding.
+    What other records predict of the residuals is no rounding.
     """
-    share = min(1.0, max(estimate.degrees_of_freedom, 1.0) / max(problem.equations(records), 1))
-    chosen = thinned(np.arange(len(dataset)), MOST_RECORDS)
-    records, dataset, motion = problem.subset(records, chosen), dataset.subset(chosen), motion.subset(chosen)
-    rows = FitRows.of(problem, records, estimate)
+    if not fit.converged:
+        return None
+    left, train, estimate = fit.of(structure), fit.split.train, fit.estimate
+    predicted = left.predictable.share if left and left.is_predictable and left.predictable else 0.0
+    problem = fit.few.subset(train).weighted(fit.fitted.weights)
+    dataset, motion = fit.ready.trained, fit.motion.subset(train)
+    share = min(1.0, max(estimate.degrees_of_freedom, 1.0) / max(problem.equations(), 1))
+    chosen = thinned(np.arange(len(dataset)))
+    problem, dataset, motion = problem.subset(chosen), dataset.subset(chosen), motion.subset(chosen)
+    rows = FitRows.of(problem, estimate)
     left = rows.residual[rows.by_record] / np.sqrt(share)
     count = int(np.count_nonzero(left))
     variance = float(np.sum(left**2)) / max(count, 1)
@@ -129,23 +128,23 @@ def _log_odds(left: Array, errors: Array) -> float:
     return float(present * (np.log(variance) + 1) - min(both)) / 2
 
 
-def rounding_findings(rounded: Rounding | None, of_errors: str = "mm") -> list[Finding]:
-    """What the verdict says of it; ``of_errors`` is the unit of errors."""
-    if rounded is None:
+def rounded(fit: Fit) -> list[Finding]:
+    rounds = fit.of(rounding)
+    if rounds is None:
         return []
-    arms = list(dict.fromkeys(channel.partition(".")[0] for channel in rounded.joints))
-    names = [channel if len(arms) > 1 else channel.partition(".")[2] for channel in rounded.joints]
-    turning, step = unit(rounded.unit).dimension == "angle", digits(to_unit(rounded.step, rounded.unit), 4)
+    arms = list(dict.fromkeys(channel.partition(".")[0] for channel in rounds.joints))
+    names = [channel if len(arms) > 1 else channel.partition(".")[2] for channel in rounds.joints]
+    turning, step = unit(rounds.unit).dimension == "angle", digits(to_unit(rounds.step, rounds.unit), 4)
     text = (
         f"All recorded {'angles' if turning else 'travels'} of {first_few(names, len(names))} are multiples of {step} "
-        f"{rounded.unit}. If they were rounded while the arm stood between them, that alone leaves "
-        f"{digits(rounded.leaves)} {of_errors} (root mean square); the fit leaves {digits(rounded.residual)} "
-        f"{of_errors}, spread over poses and directions as errors of rounding are."
+        f"{rounds.unit}. If they were rounded while the arm stood between them, that alone leaves "
+        f"{digits(rounds.leaves)} {fit.unit} (root mean square); the fit leaves {digits(rounds.residual)} "
+        f"{fit.unit}, spread over poses and directions as errors of rounding are."
     )
     test = f"variances within a factor of {COMPARABLE:g}; likelihood against even noise, over 20 to 1"
     action = "Record where the joints stand, with all digits."
     if turning:
-        sd = digits(to_unit(rounded.step / np.sqrt(12), "deg"))
+        sd = digits(to_unit(rounds.step / np.sqrt(12), "deg"))
         keys = " and ".join(f"arms.{arm}.joint_noise_deg: {sd}" for arm in arms)
         action += f" If that cannot be, state what they are off by: {keys}."
     return [
@@ -179,6 +178,16 @@ class Elsewhere:
     @property
     def in_words(self) -> str:
         return f"Away from the contacts the tool is known to {readable(self.rms_mm)} mm (root mean square)"
+
+
+def scale(fit: Fit) -> list[Finding]:
+    if not fit.converged:
+        return []
+    problem, rows = fit.of(sampled_rows)
+    estimate, dataset = fit.estimate, fit.dataset.subset(thinned(fit.split.train))
+    read = predicted_positions(problem, estimate.values, dataset)
+    sd = scale_deviation(problem, rows, read, estimate.noise_scale, estimate.values)
+    return scale_findings(fit.of(figure), sd, fit.of(held_scales), by_distances=not any(map(len, read)))
 
 
 def scale_deviation(
@@ -258,14 +267,15 @@ def _unseen(sd: float, figure: Figure) -> str:
     return f"of up to {200 * sd:.2g} % would not show ({digits(2 * sd * figure.reach_mm, 2)} mm at the arm's reach)"
 
 
-def hidden_payload(
-    problem: Problem, records: Sequence[FactorRecords], estimate: Estimate, dataset: Dataset, motion: Motion
-) -> HiddenPayload | None:
+def hidden_payload(fit: Fit) -> HiddenPayload | None:
     """By a fit's weighted training records; None where no payload moves the arm, or records or parameters state it."""
-    is_free = any("payload" in block.name for block in problem.parameters.free)
-    if not motion.by_load or is_free or any(name.startswith("payload") for name in dataset.channels):
+    if not fit.converged:
         return None
-    rows, at = FitRows.of(problem, records, estimate), LOADS.index("mass")
+    problem, motion, estimate = fit.few_acting, fit.motion.subset(fit.split.train), fit.estimate
+    is_free = any("payload" in block.name for block in problem.parameters.free)
+    if not motion.by_load or is_free or any(name.startswith("payload") for name in fit.dataset.channels):
+        return None
+    rows, at = FitRows.of(problem, estimate), LOADS.index("mass")
     mass = rows.columns([slope[:, at, :, None] for slope in motion.by_load])[:, 0]
     sizes = np.linalg.norm(rows.slopes, axis=0)
     shares = np.linalg.lstsq(rows.slopes / np.maximum(sizes, 1e-300), mass, rcond=1e-9)[0]
@@ -278,7 +288,8 @@ def hidden_payload(
     return HiddenPayload(estimate.noise_scale / max(left, 1e-300), 1 - left / whole, tuple(names[i] for i in most))
 
 
-def hidden_payload_findings(hidden: HiddenPayload | None) -> list[Finding]:
+def payload(fit: Fit) -> list[Finding]:
+    hidden = fit.of(hidden_payload)
     if hidden is None:
         return []
     text = (
@@ -289,7 +300,8 @@ def hidden_payload_findings(hidden: HiddenPayload | None) -> list[Finding]:
     return [Finding("note", text, test, "Weigh what hangs on the tool, and state it: statics.payload_g.")]
 
 
-def elsewhere_findings(away: Elsewhere | None) -> list[Finding]:
+def away(fit: Fit) -> list[Finding]:
+    away = fit.of(elsewhere)
     if away is None:
         return []
     text = f"{away.in_words}: the error of contacts is only by how much postures at one place disagree."
@@ -297,3 +309,162 @@ def elsewhere_findings(away: Elsewhere | None) -> list[Finding]:
     test += f", up to {away.up_to}" if away.up_to else ""
     action = "If that is too little: train on more places, farther apart, with the joints turned as far as they go."
     return [Finding("note", text, test, action)]
+
+
+UNSEEN_POSES = 400  # That are looked at, of each kind
+UP_TO_FRAMES = "where the base stands and which point of the tool is meant"
+FEW_NAMED = 2  # So many combinations that only priors hold are named in the verdict; armcal identify names all
+MOST_TOLD = 5
+NEGLIGIBLE_SHARE = 0.1  # Of the typical error: what moves the tip by less than this does not matter to it
+_MM = 1000.0
+
+
+@dataclass(frozen=True)
+class PriorsAlone:
+    """What combinations that only priors hold do to the tip.
+
+    Attributes:
+        between_mm: the same at any pose: where joints stand between recorded positions too, approached from either
+            recorded side.
+    """
+
+    worst_mm: float  # the largest standard deviation of the tip that they leave, over the poses looked at
+    between_mm: float
+    poses: int  # how many unseen poses of each kind were looked at
+    up_to: str = ""  # motions that were left out, because nothing that was measured sees them; empty where none were
+
+
+def unseen_poses(dataset: Dataset, channels: Sequence[str], between: bool = False) -> Dataset:
+    """Poses that combine what single joints did in the records: a joint's command and approach are of one of them.
+
+    ``between``: a joint stands anywhere between its recorded ends instead, approached as in any of its records.
+    """
+    random = np.random.default_rng(0)
+    together = random.integers(0, len(dataset), UNSEEN_POSES)
+    values = {name: column[together] for name, column in dataset.channels.items()}
+    for channel in channels:
+        arm, _, joint = channel.partition(".")
+        known = np.flatnonzero(np.isfinite(dataset.column(channel)))  # of two arms one may not be recorded
+        if not len(known):
+            continue
+        drawn = known[random.integers(0, len(known), UNSEEN_POSES)]
+        for own in (channel, f"{arm}.approach.{joint}"):
+            if dataset.has(own):
+                values[own] = dataset.column(own)[drawn]
+        if between:
+            recorded = dataset.column(channel)[known]
+            values[channel] = random.uniform(recorded.min(), recorded.max(), UNSEEN_POSES)
+    return Dataset(tuple(str(i) for i in range(UNSEEN_POSES)), values)
+
+
+def priors_alone(fit: Fit) -> PriorsAlone | None:
+    """How far the tip at both kinds of ``unseen_poses`` depends on combinations that the data does not determine.
+
+    None if there are none, or if no prior holds one of them.
+    """
+    if not fit.converged or not len(fit.estimate.identifiability.null):
+        return None
+    channels = [*command_channels(fit.problem.blueprint.arms)]
+    at, between = (tip_by_priors(fit, unseen_poses(fit.ready.trained, channels, own)) for own in (False, True))
+    if at is None or between is None:
+        return None
+    return PriorsAlone(at, max(at, between), UNSEEN_POSES, "" if _position_rows(fit.problem) else UP_TO_FRAMES)
+
+
+def tip_by_priors(fit: Fit, poses: Dataset) -> float | None:
+    """The largest standard deviation (mm) of the tip that combinations leave which only priors hold; None: none does.
+
+    Their covariance is what the priors give them, V (V'PV)^-1 V' over the undetermined directions V.
+    """
+    null, scales = fit.estimate.identifiability.null, fit.estimate.parameters.scales()
+    information = null * (scales**2 * fit.estimate.parameters.prior_information()) @ null.T
+    if np.linalg.cond(information) > 1 / np.finfo(float).eps:
+        return None
+    moved = _tip_motions(fit.problem, fit.estimate.values, poses, null)
+    variance = np.einsum("trnk,kl,trnl->tn", moved, np.asarray(np.linalg.inv(information)), moved)
+    return float(np.sqrt(np.max(np.maximum(variance, 0.0)))) * _MM
+
+
+def elsewhere(fit: Fit) -> Elsewhere | None:
+    """How far tools at unseen poses are off for the parameters' uncertainty; None where no record is a contact."""
+    if not fit.converged or not fit.problem.blueprint.groups:
+        return None
+    poses = unseen_poses(fit.ready.trained, [*command_channels(fit.problem.blueprint.arms)])
+    return away_from_contacts(fit.problem, fit.estimate, poses)
+
+
+def away_from_contacts(problem: Problem, estimate: Estimate, poses: Dataset) -> Elsewhere | None:
+    scales = estimate.parameters.scales()
+    of_arm = np.array([not block.nuisance for block in estimate.parameters.coordinate_blocks], dtype=bool)
+    root = np.linalg.pinv(estimate.parameters.entries_jacobian(estimate.values) * scales)
+    covariance = (root @ estimate.covariance @ root.T)[np.ix_(of_arm, of_arm)]
+    sizes, vectors = np.linalg.eigh(covariance)
+    kept = sizes > np.finfo(float).eps * sizes.max(initial=0.0)
+    if not kept.any():
+        return None
+    directions = np.zeros((int(kept.sum()), len(scales)))
+    directions[:, of_arm] = (vectors[:, kept] * np.sqrt(sizes[kept])).T
+    moved = _tip_motions(problem, estimate.values, poses, directions)
+    rms = float(np.sqrt(np.mean(np.sum(moved**2, axis=(1, 3))))) * _MM
+    return Elsewhere(rms, len(poses), "" if _position_rows(problem) else UP_TO_FRAMES)
+
+
+def _tip_motions(problem: Problem, values: Array, poses: Dataset, null: Array) -> Array:
+    """How the tips (T, or the one position that is read) move along the directions (T x 3 x N x K; m)."""
+    if rows := _position_rows(problem):
+        noise = np.concatenate([kernel.factor.noise for kernel in problem.kernels])
+        return np.asarray((whitened_rows(problem, values, poses)[rows] * noise[rows, None, None] @ null.T)[None])
+    problem = problem.of(poses)  # nothing reads a position: of the tools, up to what no contact could see
+    at, axes = tools(problem, values)
+    moves = np.array([along(problem, values, direction).ravel() for direction in null]).T
+    return apart_from(np.array(unseen_motions(at, axes)).T, moves).reshape(len(at), 3, -1, moves.shape[1])
+
+
+def _position_rows(problem: Problem) -> list[int]:
+    start = 0
+    for kernel in problem.kernels:
+        factor = kernel.factor
+        if factor.position_channels and factor.dimensions[:3] == ("length",) * 3:
+            return list(range(start, start + 3))
+        start += len(factor.noise)
+    return []
+
+
+def determined(fit: Fit) -> list[Finding]:
+    judged = fit.judged_mm[np.isfinite(fit.judged_mm)]
+    return [determined_finding(fit.estimate, fit.of(priors_alone), np.median(judged) if len(judged) else None)]
+
+
+def determined_finding(estimate: Estimate, alone: PriorsAlone | None, typical_mm: float | None) -> Finding:
+    """What the data determines, and whether what it does not matters to the tip."""
+    known = estimate.identifiability
+    test = "rank of the Jacobian in typical scales"
+    if not len(known):
+        text = "No parameter was free: the nominal model was judged, nothing was calibrated."
+        return Finding("warning", text, test, "Free parameters: parameters.free.")
+    count = len(known.undetermined)
+    if not count:
+        return Finding("good", f"The data determines all {known.rank} free parameters.", test)
+    listed = "; ".join(str(combination) for combination in known.undetermined[:MOST_TOLD])
+    more = f"; and {count - MOST_TOLD} more" if count > MOST_TOLD else ""
+    if alone is None:
+        text = f"Not determined by the data, only by priors: {listed}{more}."
+        return Finding("bad", text, test, "Free fewer parameters, or measure what armcal identify asks for.")
+    held = f"{count} {'combination is' if count == 1 else 'combinations are'} determined by priors alone"
+    held += f" ({listed})" if count <= FEW_NAMED else ""
+    test = f"{test}; the tip at {alone.poses} poses of recorded joint positions, and at as many between them"
+    test += f"; positions, not orientations, up to {alone.up_to}, which nothing measured shows" if alone.up_to else ""
+    negligible = np.inf if typical_mm is None else NEGLIGIBLE_SHARE * typical_mm
+    if alone.between_mm <= negligible:
+        most = f"{alone.between_mm:.2g}" if alone.between_mm >= 0.001 else "0.001"
+        text = f"{held}; the tip at unseen poses does not depend on them (at most {most} mm, 1 sd)."
+        return Finding("note", text, test, "Nothing for the tip; armcal identify names them.")
+    if alone.worst_mm <= negligible:
+        text = f"{held}. The tip depends on them by up to {alone.between_mm:.2g} mm (1 sd) where a joint stands "
+        text += "between its recorded positions, or is approached from another side there; elsewhere it does not."
+        advice = "Measure each joint between its recorded positions too, from both sides; armcal identify names them."
+        return Finding("warning", text, test, advice)
+    text = f"{held}, and the tip at unseen poses depends on them, by up to {alone.between_mm:.2g} mm (1 sd)."
+    return Finding(
+        "warning", text, test, "armcal identify names them, and armcal plan finds the poses that determine them."
+    )

@@ -1,46 +1,43 @@
-"""The verdict: what a person should conclude, each sentence from a test with a stated level."""
+"""The verdict: what a person should conclude, each sentence from a check; and the checks of an estimate itself."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
 import numpy as np
 from scipy.special import bdtr, chdtri, ndtri
 
-from armcal.base.arrays import Array, Indices
+from armcal.arm.joints import Limits, joint_limits
+from armcal.base.arrays import Array
+from armcal.base.domains import Semidefinite, symmetric
+from armcal.base.parameters import ParameterBlock
 from armcal.base.units import digits, readable
-from armcal.diagnose.evidence import Evidence
-from armcal.diagnose.evidence_findings import (
-    MOST_TOLD,
-    determined_finding,
-    large_error_findings,
-    neighbour_findings,
-    predicted_in_short,
-    repeat_findings,
-    shift_findings,
-    structure_findings,
-)
-from armcal.diagnose.held import contradiction_findings
-from armcal.diagnose.large_errors import (
-    Finding,
-    component_findings,
-    first_few,
-    outlier_findings,
-    suspicious_in_short,
-    suspicious_records,
-)
-from armcal.diagnose.unseen import Elsewhere, rounding_findings
-from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
+from armcal.diagnose.checks import FIT_CHECKS, Finding, first_few, plugin_checks
+from armcal.diagnose.coverage import predictions
+from armcal.diagnose.data import still_joints
+from armcal.diagnose.fit import Fit
+from armcal.diagnose.gross import by_halves
+from armcal.diagnose.held import contradictions, instruments
+from armcal.diagnose.outliers import MOST_TOLD, component_findings, large_errors, suspicious_ids, suspicious_in_short
+from armcal.diagnose.residual_structure import predicted_in_short, repeat_findings, structure
+from armcal.diagnose.unseen import Elsewhere, determined, elsewhere, hidden_payload, priors_alone, rounded, rounding
+from armcal.estimate.estimator import AT_BOUND, CHECK_THE_DATA, Estimate
 from armcal.estimate.identifiability import POOR_CONDITION, bound_together, correlated_pairs
 from armcal.estimate.prediction import NewRecording
-from armcal.estimate.robust import WeighedFit
-from armcal.estimate.validation import summarise
-from armcal.planning.suggestion import CANDIDATES, Suggestion, in_words, is_worth_measuring
+from armcal.estimate.start import certificates
+from armcal.estimate.validation import Halves, pose_size, summarise
+from armcal.measure.measurement import Placed
+from armcal.planning.candidates import deviations as deviations_of
+from armcal.planning.suggestion import CANDIDATES, Suggestion, in_words, is_worth_measuring, suggest
+from armcal.plugins import PluginRegistry
+from armcal.problem.problem import Problem
 
 LEVEL = 0.05
 SHARE = 0.95
 FEWEST_FREEDOM = 10
 DO_NOT_USE = "Do not use this calibration"
+NOTICEABLE_SD = 0.3  # A shift by less than so many standard deviations is not reported
+_NORMAL_95 = 1.96
 _ORDER = {"bad": 0, "warning": 1, "note": 2, "good": 3}
 
 
@@ -63,59 +60,76 @@ class Verdict:
         return tuple(finding for finding in self.findings if finding.grade == "bad")
 
 
-def judge(
-    estimate: Estimate,
-    errors_mm: Array,
-    train: Indices,
-    judged_mm: Array,
-    judged_on: str,
-    ids: Sequence[str],
-    suggestions: Sequence[Suggestion] = (),
-    fitted: WeighedFit | None = None,
-    predicted: Sequence[Finding] = (),
-    evidence: Evidence | None = None,
-) -> Verdict:
-    """Judge a calibration.
+def verdict_of(fit: Fit, registry: PluginRegistry) -> Verdict:
+    """What the checks say of a fit, armcal's own and those of plugins, the worst first; a headline; a paragraph.
 
-    Args:
-        estimate: what was found.
-        errors_mm: calibrated error of each record (N).
-        train: which records trained.
-        judged_mm: errors of records that did not train, or of cross-validation (``judged_on``, in words); or empty.
-        ids: of all records (N).
-        suggestions: poses that would add most information.
-        fitted: how the training records weighed; None for plain least squares.
-        predicted: whether prediction intervals cover their share.
-        evidence: what residuals depend on, which records are missed, what priors alone hold; none unless given.
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at the estimate.
     """
-    seen = evidence or Evidence()
-    determined = determined_finding(estimate, seen.priors_alone, np.median(judged_mm) if len(judged_mm) else None)
-    own, trained = [ids[i] for i in train], errors_mm[train]
-    sizes, numbers = seen.noise or (np.ones(len(errors_mm)), 3.0)
-    suspicious = suspicious_records(trained / sizes[train], numbers, own, fitted)
-    noise = component_findings(fitted.components) if fitted and fitted.components else [_size(estimate, trained, seen)]
-    findings = [_convergence(estimate), determined, *_condition(estimate), *_bounds(estimate)]
-    findings += [*shift_findings(estimate), *noise, *_freedom(estimate), *_causes(seen)]
-    findings += structure_findings(seen.structure, seen.unit) if estimate.verdict.converged else []
-    findings += neighbour_findings(seen.structure, estimate, seen.unit)
-    findings += [*_correlated(estimate), *predicted, *large_error_findings(seen.large_errors, seen.unit)]
-    findings += [*outlier_findings(suspicious, own, fitted), *_next(estimate, suggestions)]
-    ranked = tuple(sorted(findings, key=lambda finding: _ORDER[finding.grade]))
-    headline = _errors_text(judged_mm, judged_on, seen)
-    first = _good_for(judged_mm, judged_on, seen.unit, seen.new_recording, seen.elsewhere)
+    checks = (*FIT_CHECKS, *plugin_checks(registry, before_fit=False))
+    findings = [finding for check in checks for finding in check.findings(fit)]
+    return in_all(fit, sorted(findings, key=lambda finding: _ORDER[finding.grade]))
+
+
+def in_all(fit: Fit, ranked: Sequence[Finding]) -> Verdict:
+    judged_mm, held = fit.judged_mm[np.isfinite(fit.judged_mm)], len(fit.split.holdout)
+    judged_on = f"{held} held-out records" if held else "cross-validation"
+    judged_on += ", as in a new recording (its drift not known)" if fit.drifts else ""
+    headline = _errors_text(fit, judged_mm, judged_on)
+    first = _good_for(judged_mm, judged_on, fit.unit, fit.of(new_recording), fit.of(elsewhere))
     if ranked[0].grade == "bad":
         headline, first = f"{DO_NOT_USE}. {headline}", f"{DO_NOT_USE}: {ranked[0].text}"
-    short = _in_short(first, estimate, determined, seen, suspicious_in_short(suspicious, len(own)), suggestions)
-    return Verdict(headline, ranked, " ".join(short))
+    return Verdict(headline, tuple(ranked), " ".join(_in_short(fit, first)))
 
 
-def _errors_text(judged_mm: Array, judged_on: str, seen: Evidence) -> str:
+def new_recording(fit: Fit) -> NewRecording | None:
+    if not fit.converged:
+        return None
+    return fit.of(predictions).new_recording(fit.problem.records, np.flatnonzero(np.isfinite(fit.judged_mm)))
+
+
+def suggestions(fit: Fit) -> tuple[Suggestion, ...]:
+    """Poses to measure next, joints that stood still elsewhere; none after a fit that did not converge."""
+    problem, estimate, dataset = fit.problem, fit.estimate, fit.ready.trained
+    # In a contact no pose can be chosen that does not touch.
+    chosen = all(kernel.factor.output_channels for kernel in problem.kernels)
+    if not (fit.converged and estimate.names and chosen):
+        return ()
+    joints, limits = dict[str, str](), dict[str, Limits | None]()
+    stated, arms = fit.ready.limits, fit.system.arms
+    for name, arm in arms.items():
+        own = joint_limits(arm.nominal_chain)
+        for joint, kind in arm.commanded.items():
+            channel = f"{name}.{joint}"
+            joints[channel] = kind
+            limits[channel] = stated.get(joint if len(arms) == 1 else channel, own[joint])
+    still = {channel: limits[channel] for channel in still_joints(fit.system, dataset)}
+    return suggest(problem, dataset, estimate, joints, still=still)
+
+
+def evidence(fit: Fit) -> dict[str, Any]:
+    """What was looked for in the residuals and beside them, for metrics.json."""
+    alone = fit.of(priors_alone)
+    left, beyond, away = fit.of(structure), fit.of(large_errors), fit.of(elsewhere)
+    hidden, rounds = fit.of(hidden_payload), fit.of(rounding)
+    return {
+        "residual_structure": left and asdict(left),
+        "large_errors": beyond and asdict(beyond),
+        "priors_alone": alone and {"worst_mm": alone.worst_mm, "between_mm": alone.between_mm, "poses": alone.poses},
+        "elsewhere": away and asdict(away),
+        "hidden_payload": hidden and asdict(hidden),
+        "contradictions": [asdict(one) for one in fit.of(contradictions)],
+        "rounding": rounds and asdict(rounds),
+    }
+
+
+def _errors_text(fit: Fit, judged_mm: Array, judged_on: str) -> str:
     if not len(judged_mm):
         return "No record was held out: how good the model is on new poses is not known."
-    mean, p95, unit = float(np.mean(judged_mm)), summarise(judged_mm).p95, seen.unit
+    mean, p95, unit = float(np.mean(judged_mm)), summarise(judged_mm).p95, fit.unit
     most, below = ("all of them", float(np.max(judged_mm))) if p95 is None else ("95 % of poses", p95)
     return (
-        f"{seen.name} error {readable(mean)} {unit} on average, {most} below {readable(below)} {unit}, judged on "
+        f"{fit.name} error {readable(mean)} {unit} on average, {most} below {readable(below)} {unit}, judged on "
         f"{judged_on}."
     )
 
@@ -152,48 +166,39 @@ def _good_for(
     )
 
 
-def _in_short(
-    first: str,
-    estimate: Estimate,
-    determined: Finding,
-    seen: Evidence,
-    suspicious: str,
-    suggestions: Sequence[Suggestion],
-) -> list[str]:
+def _in_short(fit: Fit, first: str) -> Iterator[str]:
     """What it is good for, what is not determined, suspicious, left over, and to be measured next; a sentence each."""
-    if not estimate.verdict.converged:
-        return ["The solver did not converge: these values are no calibration."]
-    sentences = [first]
-    if estimate.identifiability.undetermined:
-        sentences.append(f"Not determined: {determined.text[:1].lower()}{determined.text[1:]}")
-    missed = seen.large_errors
+    if not fit.converged:
+        yield "The solver did not converge: these values are no calibration."
+        return
+    yield first
+    if fit.estimate.identifiability.undetermined:
+        (finding,) = determined(fit)
+        yield f"Not determined: {finding.text[:1].lower()}{finding.text[1:]}"
+    missed = fit.of(large_errors)
     if missed is not None and missed.beyond:
         ids = ", ".join(miss.record_id for miss in missed.explained[:MOST_TOLD])
         more = f" and {missed.beyond - MOST_TOLD} more" if missed.beyond > MOST_TOLD else ""
         named = "the record" if missed.beyond == 1 else f"{missed.beyond} records"
-        sentences.append(f"Error {missed.in_words(seen.unit)} in {named}, by id: {ids}{more}.")
-    sentences.append(suspicious)
-    sentences += _left(seen, estimate)
-    if is_worth_measuring(suggestions):
-        sentences.append(f"Measure these poses next: {in_words(suggestions)}.")
-    return sentences
+        yield f"Error {missed.in_words(fit.unit)} in {named}, by id: {ids}{more}."
+    yield suspicious_in_short(fit.of(suspicious_ids), len(fit.split.train))
+    yield from _left(fit)
+    if is_worth_measuring(fit.of(suggestions)):
+        yield f"Measure these poses next: {in_words(fit.of(suggestions))}."
 
 
-def _causes(seen: Evidence) -> list[Finding]:
-    return [*contradiction_findings(seen.contradictions), *rounding_findings(seen.rounding, seen.unit)]
-
-
-def _left(seen: Evidence, estimate: Estimate) -> list[str]:
+def _left(fit: Fit) -> list[str]:
     """What is left in the residuals; that nothing was found only where all that was looked at says so."""
-    left, sentences = seen.structure, [finding.text for finding in _causes(seen)]
+    left, estimate = fit.of(structure), fit.estimate
+    sentences = [finding.text for finding in (*instruments(fit), *rounded(fit))]
     if left is None:
         return sentences or ["Whether the model lacks anything is not known: the training records are too few."]
-    sentences += [finding.text for finding in repeat_findings(left, seen.unit)]
+    sentences += [finding.text for finding in repeat_findings(left, fit.unit)]
     if left.predictable is not None and left.is_predictable:
         sentences.append(predicted_in_short(left.predictable))
     if left.worthwhile:
         listed = "; ".join(
-            f"{s.words}{', or on another cause' if s.alternatives else ''} ({readable(s.falls_mm)} {seen.unit})"
+            f"{s.words}{', or on another cause' if s.alternatives else ''} ({readable(s.falls_mm)} {fit.unit})"
             for s in left.worthwhile
         )
         sentences.append(f"Residuals still depend on {listed}.")
@@ -215,18 +220,19 @@ def _is_beyond_noise(estimate: Estimate) -> bool:
     return bool(estimate.noise_scale**2 * freedom > chdtri(freedom, LEVEL / 2))
 
 
-def _convergence(estimate: Estimate) -> Finding:
-    solver = estimate.verdict
+def converged(fit: Fit) -> list[Finding]:
+    solver = fit.estimate.verdict
     if not solver.converged:
         text = f"{solver.name} did not converge ({solver.status}): these values are no calibration."
-        return Finding("bad", text, "the solver's own", CHECK_THE_DATA)
+        return [Finding("bad", text, "the solver's own", CHECK_THE_DATA)]
     text = f"{solver.name} converged in {solver.iterations} iterations"
     if solver.starts > 1:
         text += f"; {solver.agreeing_starts} of {solver.starts} starts came to the same answer"
-    return Finding("good", text + ".", "the solver's own")
+    return [Finding("good", text + ".", "the solver's own")]
 
 
-def _condition(estimate: Estimate) -> list[Finding]:
+def conditioned(fit: Fit) -> list[Finding]:
+    estimate = fit.estimate
     known = estimate.identifiability
     if known.condition <= POOR_CONDITION:
         return []
@@ -238,8 +244,9 @@ def _condition(estimate: Estimate) -> list[Finding]:
     return [Finding("note" if held else "warning", f"Hardly determined: {known.weakest}.", test, action)]
 
 
-def _bounds(estimate: Estimate) -> list[Finding]:
+def bounds(fit: Fit) -> list[Finding]:
     """Is a bound that holds compatible with the data? One-sided, at 5 %, by the step that ignores bounds."""
+    estimate = fit.estimate
     agreeing: list[str] = []
     pushing: list[str] = []
     for i, name in enumerate(estimate.names):
@@ -258,20 +265,24 @@ def _bounds(estimate: Estimate) -> list[Finding]:
     return findings
 
 
-def _size(estimate: Estimate, trained_mm: Array, seen: Evidence) -> Finding:
+def noise(fit: Fit) -> list[Finding]:
+    return component_findings(fit.fitted.components) if fit.fitted.components else [_size(fit)]
+
+
+def _size(fit: Fit) -> Finding:
     """Are the residuals as large as the declared noise? Chi-square, two-sided, at 5 %."""
+    estimate, left, contradicted = fit.estimate, fit.of(structure), fit.of(contradictions)
     freedom, ratio = max(1, estimate.degrees_of_freedom), estimate.noise_scale
     total, test = ratio**2 * freedom, "chi-square, 5 %"
     if _is_beyond_noise(estimate):
         why = "the model's error or the instrument's, which this test cannot separate"
-        if seen.rounding is not None:
+        if fit.of(rounding) is not None:
             why = "rounding of the recorded joints would leave as much, see below"
-        elif seen.structure is not None or seen.contradictions:
+        elif left is not None or contradicted:
             known = "some of it is the model's: what residuals depend on is named below"
-            left = seen.structure
-            is_seen = seen.contradictions or (left is not None and (left.structures or left.is_predictable))
+            is_seen = contradicted or (left is not None and (left.structures or left.is_predictable))
             why += f"; {known if is_seen else 'none of the causes that were tested is in it'}"
-        mean = f"{readable(float(np.nanmean(trained_mm)))} {seen.unit} on average"
+        mean = f"{readable(float(np.nanmean(fit.errors.calibrated_mm[fit.split.train])))} {fit.unit} on average"
         text = f"Residuals are {ratio:.1f} times the declared noise, {mean}: {why}. "
         text += "Intervals are widened to the residuals."
         action = (
@@ -281,13 +292,13 @@ def _size(estimate: Estimate, trained_mm: Array, seen: Evidence) -> Finding:
     if ratio < 0.5 and total < chdtri(freedom, 1 - LEVEL / 2):
         text = f"Residuals are only {readable(ratio)} times the declared noise: was it stated too large?"
         return Finding("note", text, f"ratio below 0.5, {test}", "State the noise as the instrument's data sheet does.")
-    explained = not seen.contradictions and (seen.structure is None or not seen.structure.is_predictable)
+    explained = not contradicted and (left is None or not left.is_predictable)
     text = f"Residuals are as large as the declared noise{': the model explains the data' if explained else ''}."
     return Finding("good", text, test)
 
 
-def _freedom(estimate: Estimate) -> list[Finding]:
-    freedom = estimate.degrees_of_freedom
+def freedom(fit: Fit) -> list[Finding]:
+    freedom = fit.estimate.degrees_of_freedom
     if freedom >= FEWEST_FREEDOM:
         return []
     text = (
@@ -298,7 +309,8 @@ def _freedom(estimate: Estimate) -> list[Finding]:
     return [Finding("warning", text, f"equations less parameters, at least {FEWEST_FREEDOM}", action)]
 
 
-def _correlated(estimate: Estimate) -> list[Finding]:
+def correlated(fit: Fit) -> list[Finding]:
+    estimate = fit.estimate
     pairs = correlated_pairs(estimate.covariance, estimate.names, bound=bound_together(estimate.parameters))
     if not pairs:
         return []
@@ -306,17 +318,83 @@ def _correlated(estimate: Estimate) -> list[Finding]:
     return [Finding("note", f"Strongly correlated: {listed}.", "correlation of estimates above 0.95")]
 
 
-def _next(estimate: Estimate, suggestions: Sequence[Suggestion]) -> list[Finding]:
+def next_poses(fit: Fit) -> list[Finding]:
     """The parameter whose uncertainty is largest in its own typical scale, and the poses that would add most."""
+    estimate, suggested = fit.estimate, fit.of(suggestions)
     if not estimate.names:
         return []
     scales = [b.scale for b in estimate.parameters.free for _ in range(b.size)]
     relative = np.nan_to_num(estimate.deviations / np.array(scales), nan=np.inf)
     text = f"Least certain, in its typical scale: {estimate.names[int(np.argmax(relative))]}."
-    if not suggestions:
+    if not suggested:
         return [Finding("note", text)]
-    shrink = digits(100 * (1 - suggestions[-1].shrink), 2)
-    text += f" {len(suggestions)} poses more would shrink standard deviations by {shrink} % on average."
+    shrink = digits(100 * (1 - suggested[-1].shrink), 2)
+    text += f" {len(suggested)} poses more would shrink standard deviations by {shrink} % on average."
     test = f"determinant of the information, {CANDIDATES} poses like the recorded ones; clearance was not checked"
-    action = f"Measure next: {in_words(suggestions)}." if is_worth_measuring(suggestions) else ""
+    action = f"Measure next: {in_words(suggested)}." if is_worth_measuring(suggested) else ""
     return [Finding("note", text, test, action)]
+
+
+def found_before(fit: Fit) -> list[Finding]:
+    return list(fit.ready.findings)
+
+
+def shifts(fit: Fit) -> list[Finding]:
+    return shift_findings(fit.estimate)
+
+
+def shift_findings(estimate: Estimate) -> list[Finding]:
+    """Which estimates are moved by bounds and cones that hold others, and by how many standard deviations."""
+    blocks = {block.name for block in estimate.parameters.free if _at_its_edge(estimate, block)}
+    sd = np.where(estimate.deviations > 0, estimate.deviations, np.inf)
+    moved = np.nan_to_num((estimate.free_values - estimate.unconstrained) / sd)
+    seen = [i for i, name in enumerate(estimate.names) if name.partition("[")[0] not in blocks]
+    seen = [i for i in seen if abs(moved[i]) > NOTICEABLE_SD] if blocks else []
+    if not seen:
+        return []
+    worst = sorted(seen, key=lambda i: -abs(moved[i]))
+    listed = first_few([f"{estimate.names[i]} ({moved[i]:+.1f} sd)" for i in worst], MOST_TOLD)
+    held = ", ".join(sorted(blocks)[:MOST_TOLD]) + (" and others" if len(blocks) > MOST_TOLD else "")
+    text = f"Bounds that hold {held} shift other estimates: {listed}. Their intervals do not count this shift."
+    return [Finding("note", text, f"step without bounds, more than {NOTICEABLE_SD:g} sd")]
+
+
+def _at_its_edge(estimate: Estimate, block: ParameterBlock) -> bool:
+    if isinstance(block.domain, Semidefinite):
+        sizes = np.linalg.eigvalsh(symmetric(estimate.values[estimate.parameters.entries_of(block.name)]))
+        return bool(sizes.min() <= AT_BOUND * block.scale)
+    return not set(block.entry_names).isdisjoint(estimate.at_bound)
+
+
+def places(fit: Fit) -> list[Finding]:
+    estimate, problem = fit.estimate, fit.problem
+    if not fit.converged or not estimate.names:
+        return []
+    shown = certificates(fit.ready.training, estimate.values, fit.ready.trained)
+    texts = [*known_accuracies(problem, estimate, fit.of(by_halves)), *(f"{name}: {t}" for name, t in shown.items())]
+    return [Finding("note", text) for text in texts]
+
+
+def known_accuracies(problem: Problem, estimate: Estimate, parts: Halves | None = None) -> list[str]:
+    """How well measurements' own poses are known, a sentence each."""
+    texts = []
+    for name, measurement in problem.blueprint.measurements.items():
+        if not isinstance(measurement, Placed):
+            continue
+        pose, where = measurement.place
+        mm, deg = (_NORMAL_95 * size for size in pose_size(own_deviations(estimate, name), pose))
+        if np.isnan(mm + deg):
+            continue
+        text = f"{name}: its place {where} is known to {mm:.2g} mm and {deg:.2g} deg (95 %)"
+        if parts is not None and np.isfinite(parts.apart[name]).any():
+            mm, deg = np.nanmean(parts.apart[name], axis=0)
+            text += f", and differs by {mm:.2g} mm and {deg:.2g} deg between halves of the records"
+        texts.append(f"{text}.")
+    return texts
+
+
+def own_deviations(estimate: Estimate, instance: str) -> dict[str, float]:
+    """Standard deviations of the free coordinates of one instance by local name; infinite where undetermined."""
+    names = estimate.parameters.coordinate_names
+    deviations = zip(names, deviations_of(estimate.square_root_information), strict=True)
+    return {n.removeprefix(f"{instance}."): float(sd) for n, sd in deviations if n.startswith(f"{instance}.")}

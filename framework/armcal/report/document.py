@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
 from armcal.base.arrays import Array
-from armcal.diagnose.large_errors import Finding
+from armcal.diagnose.checks import Finding
 
 Level: TypeAlias = Literal["always", "verbose", "page"]
 

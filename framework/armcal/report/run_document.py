@@ -7,7 +7,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from armcal.base.units import readable
-from armcal.diagnose.large_errors import Finding
+from armcal.diagnose.checks import Finding
+from armcal.diagnose.unseen import priors_alone
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import CORRELATED, POOR_CONDITION, bound_together, correlated_pairs, correlations
 from armcal.plugins import PluginRegistry, said
@@ -201,7 +202,7 @@ def _determined(result: RunResult) -> Section:
     parts: list[Part] = [Finding("good", f"The data determines all {plural(len(known), 'free parameter')}.")]
     if known.undetermined:
         text = f"The data determines {known.rank} of {len(known)} parameters. These combinations rest on priors alone:"
-        parts = [Finding("note" if result.evidence.priors_alone else "bad", text), *map(str, known.undetermined)]
+        parts = [Finding("note" if result.fit.of(priors_alone) else "bad", text), *map(str, known.undetermined)]
     if known.rank:
         poor = (
             f", which is poor (above {POOR_CONDITION:.0e})".replace("e+0", "e")

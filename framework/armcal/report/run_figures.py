@@ -6,6 +6,7 @@ from scipy.special import gamma, gammainc
 from armcal.arm.assembly import command_channels
 from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.units import shown_unit
+from armcal.diagnose import outliers
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.profile import Profile
 from armcal.report.document import Figure, Marks, Panel
@@ -24,7 +25,7 @@ _AXES = ("dot small", "dot small second", "dot small third")
 
 def noise_of(result: RunResult) -> tuple[Array, float] | None:
     """How far the stated noise puts each record off (root mean square, N), and of how many numbers that is."""
-    noise = result.evidence.noise
+    noise = result.fit.of(outliers.noise_of) if result.fit.converged else None
     return None if noise is None or len(noise[0]) != len(result.dataset) else (1000 * noise[0], noise[1])
 
 

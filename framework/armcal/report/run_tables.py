@@ -10,15 +10,15 @@ import numpy as np
 from armcal.base.arrays import Indices
 from armcal.base.domains import Semidefinite, symmetric
 from armcal.base.units import shown_unit
+from armcal.diagnose.coverage import IntervalResult
+from armcal.diagnose.outliers import large_errors
 from armcal.estimate.bootstrap import Bootstrap
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.prediction import LEVELS
 from armcal.estimate.validation import ErrorSummary
 from armcal.report.document import Table
 from armcal.report.numbers import MINUS, NONE, common_decimals, count, decimals_for, entry_unit, fixed, significant
-from armcal.run.errors import ErrorTable
-from armcal.run.judging import IntervalResult
-from armcal.run.result import GroupError, RunResult
+from armcal.run.result import ErrorTable, GroupError, RunResult
 
 SETS = {"train": "training", "holdout": "held out", "cross_validated": "cross-validated"}
 MOST_LISTED = 50  # of records set aside and of correlated pairs; the rest is counted
@@ -173,7 +173,7 @@ def worst_table(result: RunResult, worst: Indices) -> Table:
 
 
 def large_errors_table(result: RunResult) -> Table | None:
-    missed, unit = result.evidence.large_errors, result.errors.unit
+    missed, unit = result.fit.of(large_errors), result.errors.unit
     if missed is None or not missed.beyond:
         return None
     rows = [

@@ -16,18 +16,21 @@ from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.calibration.calibration_file import identity_of
+from armcal.calibration.recorded_range import PAYLOAD
 from armcal.config.selection import select, without_groups
 from armcal.config.system import System, build_component, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource, load_config
-from armcal.errors import ConfigError
+from armcal.errors import ConfigError, DataError, Location
 from armcal.estimate.estimator import Estimator, Progress, no_progress
 from armcal.estimate.robust import weighed
 from armcal.estimate.simulation import SimulationRequest, Simulator
+from armcal.estimate.validation import Split, folds, hold_out, split_by_id, split_by_label
 from armcal.measure.checks import records_of
 from armcal.measure.environment import noticed, require_conditions, warn_beyond_limits
 from armcal.measure.groups import grouped_instances, groups_of, pose_numbers, unmatched
-from armcal.measure.reader import Reader, ReadRequest, evidence_channels, requested_channels
+from armcal.measure.measurement import GroupedMeasurement
+from armcal.measure.reader import Reader, ReadRequest, evidence_channels, read_ids, requested_channels
 from armcal.plugins import PluginRegistry, discover
 from armcal.run.settings import ExperimentSettings
 
@@ -165,6 +168,69 @@ class Experiment:
         """Which records are of one pose, by number (N): all arms near the same joint positions, under the same load."""
         return pose_numbers(dataset, [*command_channels(self.system.arms)])
 
+    def split(self, dataset: Dataset) -> Split:
+        """Which records train, and which are held out, as configured.
+
+        Raises:
+            ConfigError: no column separates the groups that are asked for, or no record is held out.
+        """
+        validation = self.settings.validation
+        if validation.group_by is not None:
+            self.labels(dataset)
+        if validation.train_groups:
+            return split_by_label(self.labels(dataset), validation.train_groups)
+        if validation.train_ids is not None:
+            return split_by_id(dataset.ids, read_ids(validation.train_ids))
+        split = hold_out(len(dataset), validation.holdout, validation.seed, self.poses(dataset))
+        if validation.holdout > 0 and not len(split.holdout):
+            raise ConfigError(
+                f"a share of {validation.holdout:g} of {len(dataset)} records is no record: none would be held out.",
+                where=self.source.where(("validation", "holdout")),
+                hint="Hold out a quarter (0.25), or none (0) and give folds: 5.",
+            )
+        return split
+
+    def folds(self, training: Dataset) -> tuple[Split, ...]:
+        """Folds of the training records; none if none are configured."""
+        settings = self.settings.validation
+        return folds(len(training), settings.folds, settings.seed, self.poses(training)) if settings.folds else ()
+
+    @property
+    def label(self) -> str | None:
+        """The text column that separates groups; None if there is none."""
+        text = self.settings.validation.group_by
+        if text is not None:
+            return text
+        labels = [
+            measurement.group_labels
+            for measurement in self.system.measurements.values()
+            if isinstance(measurement, GroupedMeasurement)
+        ]
+        return next((label[0] for label in labels if label), None)
+
+    def labels(self, dataset: Dataset, label: str | None = None, where: Location | None = None) -> tuple[str, ...]:
+        """Which group each record belongs to, by the configured column, or by ``label`` (asked for ``where``).
+
+        Raises:
+            ConfigError: no column separates groups.
+            DataError: records are grouped by payload, and none states one.
+        """
+        label = label or self.label
+        if label == PAYLOAD and not (dataset.has(PAYLOAD) or label in dataset.extra):
+            raise DataError(
+                "no column states what hung on the tool.",
+                where=Location(dataset.source),
+                hint="Add a column payload_g to the data, or payloads_g to a simulation.",
+            )
+        if label is None or not (label in dataset.extra or label == PAYLOAD):
+            raise ConfigError(
+                f"found no column {label or 'of groups'} in the records; "
+                f"they have {', '.join(dataset.extra) or 'none'}.",
+                where=where or self.source.where(("validation",)),
+                hint=f"Name a text column of the data, or {PAYLOAD}: group_by: NAME.",
+            )
+        return group_texts(dataset, label)
+
     def request(self, *, measured: bool) -> ReadRequest:
         """What a reader should look for; with ``measured`` the measured values are required."""
         system = self.system
@@ -206,6 +272,13 @@ class Experiment:
         """What a simulator makes records of."""
         system = self.system
         return SimulationRequest(system.arms, system.measurements, self.parameters, system.environment)
+
+
+def group_texts(dataset: Dataset, label: str) -> tuple[str, ...]:
+    """A text column as groups are named by it, without spaces about it; a payload to the nearest tenth of a gram."""
+    if label in dataset.extra:
+        return tuple(text.strip() for text in dataset.extra[label])
+    return tuple(f"{tenths / 10:g} g" for tenths in np.round(dataset.column(PAYLOAD) * 10_000).tolist())
 
 
 def with_data(source: ConfigSource, data: str | Path) -> ConfigSource:

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from armcal.base.arrays import Array
+from armcal.diagnose.fit import Prepared
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.freeing import Candidate, candidates, freeing
 from armcal.estimate.robust import fit
 from armcal.estimate.validation import cross_validate, folds
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.run.prepare import Prepared, acting
+from armcal.run.pipeline import acting
 
 _FOLDS = 5
 _MOST_STEPS = 6
@@ -51,12 +52,12 @@ def fixed_parameters(experiment: Experiment, ready: Prepared, progress: Progress
     groups, evaluator = ready.problem.blueprint.groups, experiment.settings.evaluator
     built = (system.arms, system.measurements, freer, system.environment, ready.dataset, evaluator, groups)
     wide = Problem.build(*built)
-    train, narrow = ready.split.train, wide.with_parameters(parameters)
-    records = acting(wide, ready.dataset).subset(train).records
+    train = ready.split.train
+    wide = acting(wide, ready.dataset).subset(train)
     start = next(iter(ready.start.values(ready.problem)), parameters.nominal())
-    fitted = fit(narrow.with_records(records), experiment.estimator, start, progress)
+    fitted = fit(wide.with_parameters(parameters), experiment.estimator, start, progress)
     values = fitted.solution.values
-    chosen = freeing(wide.with_records(fitted.records), own, values)
+    chosen = freeing(wide.with_records(fitted.problem.records), own, values)
     others = tuple(one.name for one in chosen.others)
     if not chosen.gaining:
         return FixedParameters(float("nan"), (), (), others)
@@ -65,7 +66,7 @@ def fixed_parameters(experiment: Experiment, ready: Prepared, progress: Progress
 
     def errors_with(count: int) -> Array:
         problem = wide.with_parameters(parameters.with_free([*own, *names[:count]]))
-        return cross_validate(problem.with_records(records), splits, experiment.estimator, values, progress).errors
+        return cross_validate(problem, splits, experiment.estimator, values, progress).errors
 
     counts = sorted({*range(min(len(names), _MOST_STEPS) + 1), len(names)})
     errors, best = {count: errors_with(count) for count in counts}, 0

@@ -20,6 +20,7 @@ from armcal.calibration.calibration_file import (
     sealed,
 )
 from armcal.calibration.physics import check_poses
+from armcal.diagnose.verdict import evidence
 from armcal.errors import ArmcalError, CalibrationWarning, NotConvergedError
 from armcal.estimate.bootstrap import Bootstrap
 from armcal.estimate.validation import in_unit
@@ -140,7 +141,7 @@ def metrics(result: RunResult) -> dict[str, Any]:
         "noise": _noise(result),
         "solver": asdict(estimate.verdict),
         "verdict": {"usable": not result.verdict.bad, "grade": result.verdict.grade, **asdict(result.verdict)},
-        "structure": result.evidence.as_dict(),
+        "structure": evidence(result.fit),
         "prediction_intervals": result.intervals.as_dict(),
         "bootstrap": _bootstrap_metrics(result),
         "profile": {p.name: {k: v for k, v in p.as_dict().items() if k != "curve"} for p in result.profiles} or None,

@@ -1,33 +1,64 @@
-"""A run: load, check, fit, validate, judge."""
+"""A run: load, check, align, fit, validate, judge; each stage is a function of this file.
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+``armcal.run.outputs`` writes what it gives.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from armcal.base.dataset import SetAside
+from armcal.arm.effects import JointEffect
+from armcal.arm.statics import LOAD_CHANNELS
+from armcal.base.dataset import Dataset, SetAside
 from armcal.calibration.intervals import PredictionRecord, covariance_rows, recording_record, stretch_records
 from armcal.calibration.recorded_range import UNKNOWN, recorded_ranges
-from armcal.diagnose.coverage import fit_and_predict
+from armcal.diagnose.checks import DATA_CHECKS, first_few, plugin_checks
+from armcal.diagnose.coverage import fit_and_predict, intervals
+from armcal.diagnose.fit import Fit, Prepared
 from armcal.diagnose.score_tests import widened
-from armcal.errors import noted
+from armcal.diagnose.verdict import verdict_of
+from armcal.errors import ConfigError, DataError, Location, ProblemError, noted
 from armcal.estimate.bootstrap import Bootstrap, bootstrap
 from armcal.estimate.estimator import Progress, no_progress, spread
-from armcal.estimate.polish import hopeless, typical_off
-from armcal.estimate.profile import Profile, profiles
+from armcal.estimate.identifiability import require_solvable
+from armcal.estimate.polish import hopeless, mislabelled, restricted, started, typical_off
+from armcal.estimate.profile import Profile, profiled, profiles
 from armcal.estimate.robust import WeighedFit, fit, held_fit, plain_fit
-from armcal.estimate.start import FAR
-from armcal.estimate.validation import CrossValidation, Split, cross_validate
+from armcal.estimate.start import FAR, Start, aligned_start, with_proposals
+from armcal.estimate.validation import cross_validate, error_unit
 from armcal.io.parallel import Executor
 from armcal.plugins import PluginRegistry
 from armcal.problem.corrected import moved_by
-from armcal.problem.motion import recorded_position
-from armcal.run.errors import ErrorTable, FittedRecords, RecordErrors, errors_of
+from armcal.problem.drift import with_drift
+from armcal.problem.finite import require_numbers
+from armcal.problem.problem import Problem
+from armcal.problem.readings import with_joint_noise
 from armcal.run.experiment import Experiment
-from armcal.run.judging import IntervalResult, interval_result, verdict_of
-from armcal.run.pose_residual import ResidualOutcome, layer_of, learned_residual
-from armcal.run.prepare import Prepared, Stopwatch, acting, folds_of, prepare
+from armcal.run.pose_residual import ResidualOutcome, layer_of, learned_residual, unlearned
 from armcal.run.result import RunResult, SuspiciousRecord, noise_result, run_groups
+
+_MM = 1000.0
+_FAR_OFF = "the model's nominal values are far off: give better ones, or "
+
+
+@dataclass(frozen=True)
+class Stopwatch:
+    """Seconds of each stage."""
+
+    began: float = field(default_factory=time.perf_counter)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+    def total(self) -> float:
+        return time.perf_counter() - self.began
 
 
 @dataclass(frozen=True)
@@ -55,132 +86,262 @@ def calibrate(
     faults += _notify_rejected(registry, ready.dataset.set_aside)
     context = RunContext(experiment, progress, executor, watch)
     with noted(ready.warnings):
-        before = FittedRecords(**vars(ready), fitted=_fitted(context, ready))
-    faults += registry.notify("armcal_estimate_changed", estimate=before.fitted.estimate)
-    run, outcome = _with_pose_residual(context, before)
-    resampled, profiled = _uncertainty(context, before)
-    result = _judged(context, run, outcome, *_validated(context, before, run, outcome))
+        plain = Fit(ready, fitted(context, ready), experiment.estimator)
+    faults += registry.notify("armcal_estimate_changed", estimate=plain.estimate)
+    learned, outcome = with_pose_residual(context, plain)
+    resampled, profiled = uncertainty(context, plain)
+    result = judged(context, validated(context, learned), outcome)
     faults += _notify_rejected(registry, result.noise.set_aside)
     warnings = (*result.warnings, *dict.fromkeys(faults))
-    # What was learned tells nothing of the parameters: they are as sure as without it.
-    left = run.fitted.estimate
-    stated = replace(before.fitted.estimate, noise_scale=left.noise_scale, degrees_of_freedom=left.degrees_of_freedom)
-    result = replace(result, command=command, warnings=warnings, estimate=stated)
-    return replace(result, bootstrap=resampled, profiles=profiled)
+    return replace(result, command=command, warnings=warnings, bootstrap=resampled, profiles=profiled)
 
 
-def _judged(
-    context: RunContext,
-    run: FittedRecords,
-    outcome: ResidualOutcome | None,
-    errors: RecordErrors,
-    intervals: IntervalResult,
-) -> RunResult:
-    """What a run knows of its fit, with the verdict on it."""
-    experiment, dataset, split, fitted = context.experiment, run.dataset, run.split, run.fitted
-    system, validation = experiment.system, experiment.settings.validation
-    if outcome is not None:
-        system = outcome.system(system)
-    with context.watch.stage("judge"):
-        context.progress("judging", 0.0)
-        verdict, evidence = verdict_of(run, errors, intervals, system, experiment.settings, experiment.estimator)
-        context.progress("judging", 1.0)
-    return RunResult(
-        name=experiment.name,
-        command="",
-        system=system,
-        pose_residual=outcome,
-        dataset=dataset,
-        split=split,
-        estimate=fitted.estimate,
-        errors=errors,
-        table=ErrorTable.of(errors, split),
-        verdict=verdict,
-        evidence=evidence,
-        warnings=(*run.warnings, *fitted.warnings, *errors.fold_warnings(validation.folds)),
-        backend=run.problem.backend,
-        seconds=context.watch.seconds,
-        provenance=replace(experiment, system=system).provenance(dataset),
-        noise=noise_result(run.problem, fitted, dataset, split, errors.calibrated_mm),
-        intervals=intervals,
-        prediction=_prediction(experiment, run, outcome, intervals),
-        groups=run_groups(experiment, run, errors),
+def prepare(
+    experiment: Experiment,
+    watch: Stopwatch,
+    accept: bool = False,
+    progress: Progress = no_progress,
+    dataset: Dataset | None = None,
+) -> Prepared:
+    """Everything that can be done and refused before solving; see ``assemble``.
+
+    Raises:
+        InputError: data, units, counts or rank do not allow a calibration.
+    """
+    ready = assemble(experiment, watch, accept, progress, dataset)
+    with watch.stage("check"), noted(ready.warnings):
+        problems = require_solvable(ready.training, ready.problem.parameters.nominal())
+    return replace(ready, warnings=(*ready.warnings, *problems))
+
+
+def assemble(
+    experiment: Experiment,
+    watch: Stopwatch,
+    accept: bool = False,
+    progress: Progress = no_progress,
+    dataset: Dataset | None = None,
+) -> Prepared:
+    """Data read and checked, and the problem that it makes, whether or not it can be solved.
+
+    With ``accept``, data that look mixed up are not refused, but a bad finding. Records that are at hand
+    (``dataset``) are not read.
+
+    Raises:
+        InputError: data, units or counts do not allow a calibration; its notes are the warnings of the data.
+    """
+    with watch.stage("read"):
+        dataset = experiment.read(progress) if dataset is None else dataset
+    with noted(dataset.warnings):
+        experiment = experiment.of_records(dataset)
+        with watch.stage("build"):
+            problem, start = _aligned(experiment, dataset)
+        with watch.stage("check"):
+            return _checked(experiment, dataset, problem, start, accept)
+
+
+def _aligned(experiment: Experiment, dataset: Dataset) -> tuple[Problem, Start]:
+    """The compiled problem of these records, base and target where they have them, and where a fit starts."""
+    system, settings = experiment.system, experiment.settings
+    parts = (system.arms, system.measurements, experiment.parameters, system.environment)
+    problem = Problem.build(*parts, dataset, settings.evaluator)
+    start = with_proposals(aligned_start(problem, dataset), dataset)
+    problem = started(start.problem)
+    require_numbers(problem, dataset)
+    return acting(problem, dataset), start
+
+
+def acting(problem: Problem, dataset: Dataset) -> Problem:
+    """The problem with the noise of joints, and with what drifts."""
+    nominal = problem.parameters.nominal()
+    return with_drift(with_joint_noise(problem, nominal), dataset, nominal)
+
+
+def _checked(
+    experiment: Experiment,
+    dataset: Dataset,
+    problem: Problem,
+    start: Start,
+    accept: bool,
+) -> Prepared:
+    """Split, and checked by every check of data; what one calls bad is refused unless it is accepted."""
+    system, settings, plan = experiment.system, experiment.settings, experiment.settings.plan
+    unlearned(system)
+    require_loads(experiment, dataset)
+    ready = Prepared(system, dataset, problem, experiment.split(dataset), start)
+    for check in (*DATA_CHECKS, *plugin_checks(experiment.registry, before_fit=True)):
+        findings = check.findings(ready)
+        for finding in findings:
+            if finding.grade == "bad" and not accept:
+                why = "" if check.plugin else _FAR_OFF
+                hint = f"{finding.action} If the data are right, {why}calibrate as it stands: armcal run --accept."
+                raise DataError(finding.text, where=Location(dataset.source), hint=hint)
+        ready = replace(ready, findings=(*ready.findings, *findings))
+    if not len(ready.split.train):
+        raise ProblemError("no record is left to train on.", hint="Hold fewer out, or measure more poses.")
+    limit = settings.validation.limit
+    if limit is not None and error_unit(problem) != "mm":
+        where = experiment.source.where(("validation", "limit"))
+        hint = "Leave it out: records are explained that miss by far more than the median."
+        raise ConfigError("found a length, and nothing measured is a length.", where=where, hint=hint)
+    problem = restricted(ready.training).with_records(problem.records)
+    profiled(problem, settings.uncertainty.profile)
+    named = mislabelled(ready.problem, dataset)
+    warned = [finding.text for finding in ready.findings if finding.grade == "warning"]
+    return replace(
+        ready,
+        problem=problem,
+        folds=experiment.folds(ready.trained),
+        warnings=(*experiment.warnings, *dataset.warnings, *start.warnings, *named, *warned),
+        limit_mm=None if limit is None else limit * _MM,
+        limits={} if plan is None else {**plan.limits, **plan.travel_limits},
     )
 
 
-def _uncertainty(context: RunContext, run: FittedRecords) -> tuple[Bootstrap | None, tuple[Profile, ...]]:
+def require_loads(experiment: Experiment, dataset: Dataset) -> None:
+    """Free springs need something that loads them: a link's mass, a payload, a force or a torque.
+
+    Raises:
+        ConfigError: nothing does.
+    """
+    statics, channels = experiment.system.statics, LOAD_CHANNELS[3:]
+    stated = statics.payload or any((*statics.force, *statics.torque))
+    if stated or any(dataset.has(channel) and dataset.column(channel).any() for channel in channels):
+        return
+    free = [block.name for block in experiment.parameters.free]
+    for name, arm in experiment.system.arms.items():
+        elastic = {effect for effect, one in arm.effects.items() if type(one).springs is not JointEffect.springs}
+        springs = [own for own in free if own.startswith(f"{name}.") and own.split(".")[1] in elastic]
+        weigh = any(mass.mass for mass in arm.masses) or any(own.startswith(f"{name}.links.") for own in free)
+        if springs and arm.deflection_size and not weigh:
+            raise ConfigError(
+                f"the springs of {name} are free ({first_few(springs)}), and nothing loads them: no link has a mass, "
+                "and no payload, force or torque is stated.",
+                where=experiment.source.where(("arms", name, "effects")),
+                hint=f"State masses (arms.{name}.links: mass, com and frame of each) or statics.payload_g; or take the "
+                "springs out. Without loads what bends is taken for lengths.",
+            )
+
+
+def fitted(context: RunContext, ready: Prepared) -> WeighedFit:
+    """The fit to the training records, as sure as records that may err alike allow."""
+    training, progress = ready.training, context.progress
+    estimator = spread(context.experiment.estimator, context.executor)
+    with context.watch.stage("fit"):
+        starts = ready.start.values(training)
+        named = any(finding.grade == "bad" for finding in ready.findings)
+        given_up = [hopeless(training, ready.trained, start, named) for start in starts]
+        left = [start for start, hopeless_from in zip(starts, given_up, strict=True) if hopeless_from is None]
+        if not left:
+            return plain_fit(training, next(given for given in given_up if given is not None))
+        best = fit(training, estimator, left[0], progress)
+        for start in left[1:]:
+            solution = best.solution
+            if solution.verdict.converged and typical_off(training, ready.trained, solution.values) <= FAR:
+                break  # no other start can be much better
+            other = fit(training, estimator, start, progress)
+            costs = [training.cost(one.solution.values) for one in (best, other)]
+            better = other.solution.verdict.converged and costs[1] < costs[0]
+            best = other if better or not best.solution.verdict.converged else best
+        return _widened(Fit(ready, best, estimator))
+
+
+def _widened(own: Fit) -> WeighedFit:
+    estimate = widened(own.acting, own.estimate, own.position[own.split.train])
+    return replace(own.fitted, estimate=estimate)
+
+
+def with_pose_residual(context: RunContext, plain: Fit) -> tuple[Fit, ResidualOutcome | None]:
+    """The fit with the pose residual that is to be learned, where it is kept, and what became of it."""
+    experiment, ready = context.experiment, plain.ready
+    layer = layer_of(experiment.system, ready.trained)
+    if layer is None or not plain.converged:
+        return plain, None
+    with context.watch.stage("pose residual"):
+        outcome = learned_residual(experiment, layer, plain, context.progress, context.executor)
+        ready = replace(ready, findings=(*ready.findings, *outcome.findings()))
+        if outcome.residual is None:
+            return replace(plain, ready=ready), outcome
+        system = outcome.system(experiment.system)
+        problem = acting(ready.problem.with_arms(system.arms).of(ready.dataset), ready.dataset)
+        ready = replace(ready, system=system, problem=problem, folds=outcome.splits)
+        again = held_fit(ready.training, experiment.estimator, plain.fitted.solution)
+        moved = moved_by(problem, again.estimate.values, system.arms[outcome.arm])
+        learned = Fit(ready, again, experiment.estimator, crossed=outcome.crossed, before=plain)
+        return replace(learned, fitted=_widened(learned)), replace(outcome, moved=moved)
+
+
+def uncertainty(context: RunContext, plain: Fit) -> tuple[Bootstrap | None, tuple[Profile, ...]]:
     """What was asked for beyond the covariance, of a fit that converged."""
     experiment, parts = context.experiment, (context.executor, context.progress)
-    settings, estimate = experiment.settings.uncertainty, run.fitted.estimate
+    settings, estimate, ready = experiment.settings.uncertainty, plain.estimate, plain.ready
     resampled: Bootstrap | None = None
     profiled: tuple[Profile, ...] = ()
-    if settings.bootstrap and estimate.verdict.converged and estimate.names:
+    if settings.bootstrap and plain.converged and estimate.names:
         with context.watch.stage("bootstrap"):
-            poses = experiment.poses(run.dataset.subset(run.split.train))
-            resampled = bootstrap(
-                run.problem.with_records(run.training), experiment.estimator, estimate, settings, *parts, poses
-            )
-    if settings.profile and estimate.verdict.converged:
+            poses = experiment.poses(ready.trained)
+            own = (ready.training, experiment.estimator, estimate, settings)
+            resampled = bootstrap(*own, *parts, poses)
+    if settings.profile and plain.converged:
         with context.watch.stage("profile"):
-            profiled = profiles(run.fitted, experiment.estimator, settings.profile, *parts)
+            profiled = profiles(plain.fitted, experiment.estimator, settings.profile, *parts)
     return resampled, profiled
 
 
-def _fitted(context: RunContext, ready: Prepared) -> WeighedFit:
-    """The fit to the training records, as sure as records that may err alike allow."""
-    problem, data, progress = ready.problem, ready.dataset.subset(ready.split.train), context.progress
-    estimator = spread(context.experiment.estimator, context.executor)
-    with context.watch.stage("fit"):
-        starts = ready.start.values(problem)
-        named = any(finding.grade == "bad" for finding in ready.findings)
-        given_up = [hopeless(problem.with_records(ready.training), data, start, named) for start in starts]
-        left = [start for start, hopeless_from in zip(starts, given_up, strict=True) if hopeless_from is None]
-        if not left:
-            return plain_fit(
-                problem.with_records(ready.training), next(given for given in given_up if given is not None)
-            )
-        fitted = fit(problem.with_records(ready.training), estimator, left[0], progress)
-        for start in left[1:]:
-            solution = fitted.solution
-            if (
-                solution.verdict.converged
-                and typical_off(problem.with_records(ready.training), data, solution.values) <= FAR
-            ):
-                break  # no other start can be much better
-            other = fit(problem.with_records(ready.training), estimator, start, progress)
-            costs = [problem.cost(one.solution.values, ready.training) for one in (fitted, other)]
-            better = other.solution.verdict.converged and costs[1] < costs[0]
-            fitted = other if better or not fitted.solution.verdict.converged else fitted
-        return _widened(ready, fitted)
+def validated(context: RunContext, own: Fit) -> Fit:
+    """Cross-validated over the training records if configured, with errors of all records and prediction intervals.
+
+    Nothing is predicted, nor cross-validated, by a fit that did not converge: its folds would not either, and each
+    would take as long. A pose residual that is kept was judged by its own folds.
+    """
+    with context.watch.stage("validate"):
+        if own.converged and own.crossed is None and own.ready.folds:
+            parts = (own.ready.folds, own.estimator, own.problem.parameters.nominal())
+            more = (context.progress, context.executor, fit_and_predict)
+            own = replace(own, crossed=cross_validate(own.ready.training, *parts, *more))
+        own.of(intervals)
+        assert own.errors is not None
+    return own
 
 
-def _widened(ready: Prepared, fitted: WeighedFit) -> WeighedFit:
-    position = recorded_position(ready.dataset)[ready.split.train]
-    acting = ready.problem.weighted(fitted.records, fitted.weights)
-    return replace(fitted, estimate=widened(ready.problem, acting, fitted.estimate, position))
+def judged(context: RunContext, own: Fit, outcome: ResidualOutcome | None) -> RunResult:
+    """What a run knows of its fit, with the verdict on it."""
+    experiment, failed = context.experiment, own.errors.failed_folds
+    with context.watch.stage("judge"):
+        context.progress("judging", 0.0)
+        verdict = verdict_of(own, experiment.registry)
+        context.progress("judging", 1.0)
+    text = f"{failed} of {len(own.ready.folds)} folds did not converge; their records are not cross-validated."
+    return RunResult(
+        name=experiment.name,
+        command="",
+        fit=own,
+        verdict=verdict,
+        warnings=(*own.ready.warnings, *own.fitted.warnings, *((text,) if failed else ())),
+        seconds=context.watch.seconds,
+        provenance=replace(experiment, system=own.system).provenance(own.dataset),
+        noise=noise_result(own),
+        prediction=_prediction(experiment, own, outcome),
+        groups=run_groups(experiment, own),
+        pose_residual=outcome,
+    )
 
 
-def _with_pose_residual(context: RunContext, run: FittedRecords) -> tuple[FittedRecords, ResidualOutcome | None]:
-    """The problem and the fit with the pose residual that is to be learned, where it is kept, and what became of it."""
-    experiment, progress, executor = context.experiment, context.progress, context.executor
-    training = run.dataset.subset(run.split.train)
-    layer = layer_of(experiment.system, training)
-    if layer is None or not run.fitted.estimate.verdict.converged:
-        return run, None
-    with context.watch.stage("pose residual"):
-        splits = folds_of(experiment, run) if experiment.settings.validation.folds else ()
-        order = np.argsort(recorded_position(training), kind="stable")
-        own = (run.problem, run.training, run.fitted, splits, order)
-        outcome = learned_residual(experiment, layer, *own, progress, executor)
-        run = replace(run, findings=(*run.findings, *outcome.findings()))
-        if outcome.residual is None:
-            return run, outcome
-        arms = outcome.system(experiment.system).arms
-        problem = acting(run.problem.with_arms(arms).of(run.dataset), run.dataset)
-        run = replace(run, problem=problem, records=problem.records)
-        again = held_fit(problem.with_records(run.training), experiment.estimator, run.fitted.solution)
-        moved = moved_by(problem.with_records(run.records), again.estimate.values, arms[outcome.arm])
-        return replace(run, fitted=_widened(run, again)), replace(outcome, moved=moved)
+def _prediction(experiment: Experiment, own: Fit, outcome: ResidualOutcome | None) -> PredictionRecord | None:
+    """What predictions need of a run; None where it did not converge."""
+    if not own.converged:
+        return None
+    ranges = recorded_ranges(own.dataset, experiment.system.arms, experiment.settings.statics.payload)
+    if outcome is not None and outcome.residual is not None and np.isfinite(outcome.reach):
+        ranges[UNKNOWN] = (0.0, outcome.reach)
+    columns = (experiment.source.data.get("data") or {}).get("columns") or {}
+    return PredictionRecord(
+        entries=own.estimate.names,
+        covariance=covariance_rows(own.estimate.covariance),
+        stretches=stretch_records(own.of(intervals).stretches),
+        columns={str(name): str(local) for name, local in columns.items()},
+        recording=recording_record(own.fitted.problem, own.ready.trained),
+        ranges=ranges,
+    )
 
 
 def _notify_rejected(registry: PluginRegistry, records: Sequence[SetAside | SuspiciousRecord]) -> list[str]:
@@ -191,48 +352,3 @@ def _notify_rejected(registry: PluginRegistry, records: Sequence[SetAside | Susp
             "armcal_record_rejected", row=record.row, record_id=record.record_id, reason=record.reason
         )
     ]
-
-
-def _validated(
-    context: RunContext, before: FittedRecords, run: FittedRecords, outcome: ResidualOutcome | None
-) -> tuple[RecordErrors, IntervalResult]:
-    """Errors of all records and prediction intervals, by cross-validation over the training records if configured.
-
-    Nominal errors are those ``before`` a pose residual was learned. Nothing is predicted, nor cross-validated, by a fit
-    that did not converge: its folds would not either, and each would take as long.
-    """
-    experiment, problem, estimator = context.experiment, run.problem, context.experiment.estimator
-    crossed: tuple[CrossValidation, tuple[Split, ...]] | None = None
-    with context.watch.stage("validate"):
-        if not run.fitted.estimate.verdict.converged:
-            return errors_of(run, None, before), IntervalResult()
-        if outcome is not None and outcome.residual is not None and outcome.crossed is not None:
-            crossed = outcome.crossed, outcome.splits
-        elif experiment.settings.validation.folds:
-            splits, start = folds_of(experiment, run), problem.parameters.nominal()
-            training = problem.with_records(run.records).subset(run.split.train)
-            parts = (splits, estimator, start, context.progress, context.executor, fit_and_predict)
-            crossed = cross_validate(training, *parts), splits
-        intervals = interval_result(problem, run.fitted, run.records, run.split, estimator, crossed, run.dataset)
-        return errors_of(run, crossed, before), intervals
-
-
-def _prediction(
-    experiment: Experiment, run: FittedRecords, outcome: ResidualOutcome | None, intervals: IntervalResult
-) -> PredictionRecord | None:
-    """What predictions need of a run; None where it did not converge."""
-    fitted = run.fitted
-    if not fitted.estimate.verdict.converged:
-        return None
-    ranges = recorded_ranges(run.dataset, experiment.system.arms, experiment.settings.statics.payload)
-    if outcome is not None and outcome.residual is not None and np.isfinite(outcome.reach):
-        ranges[UNKNOWN] = (0.0, outcome.reach)
-    columns = (experiment.source.data.get("data") or {}).get("columns") or {}
-    return PredictionRecord(
-        entries=fitted.estimate.names,
-        covariance=covariance_rows(fitted.estimate.covariance),
-        stretches=stretch_records(intervals.stretches),
-        columns={str(name): str(own) for name, own in columns.items()},
-        recording=recording_record(fitted.problem, run.dataset.subset(run.split.train)),
-        ranges=ranges,
-    )

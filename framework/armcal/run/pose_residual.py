@@ -12,8 +12,9 @@ from armcal.arm.pose_residual import OF_TOOL, ModelErrors, PoseResidual, Posture
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.config.system import System
+from armcal.diagnose.checks import Finding
 from armcal.diagnose.coverage import missed, predictor, whitened_like
-from armcal.diagnose.large_errors import Finding
+from armcal.diagnose.fit import Fit
 from armcal.errors import ConfigError, NotConvergedError
 from armcal.estimate.estimator import Progress
 from armcal.estimate.robust import WeighedFit, fit, held_fit
@@ -33,7 +34,6 @@ from armcal.io.parallel import Executor
 from armcal.measure.groups import PairedMeasurement
 from armcal.measure.instrument import Contact
 from armcal.problem.corrected import Moved, corrected, sizes_of, unexplained
-from armcal.problem.problem import FactorRecords, Problem
 from armcal.run.experiment import Experiment
 
 _FOLDS = 5
@@ -152,10 +152,8 @@ class Layer:
     residual: PoseResidual
     postures: Postures
 
-    def learned(
-        self, problem: Problem, fitted: WeighedFit, records: tuple[FactorRecords, ...], places: Indices
-    ) -> PoseResidual | None:
-        errors = model_errors(problem, fitted, records, problem.blueprint.arms[self.arm], self.postures.subset(places))
+    def learned(self, fitted: WeighedFit, places: Indices) -> PoseResidual | None:
+        errors = model_errors(fitted, fitted.problem.blueprint.arms[self.arm], self.postures.subset(places))
         return None if errors is None else self.residual.learned(errors)
 
 
@@ -197,32 +195,27 @@ def layer_of(system: System, dataset: Dataset) -> Layer | None:
 def learned_residual(
     experiment: Experiment,
     layer: Layer,
-    problem: Problem,
-    training: tuple[FactorRecords, ...],
-    fitted: WeighedFit,
-    splits: tuple[Split, ...],
-    order: Indices,
+    plain: Fit,
     progress: Progress,
     executor: Executor | None,
 ) -> ResidualOutcome:
-    """Learn from the training records, and judge by folds of them, and by stretches of the ``order`` of recording.
-
-    The ``layer`` is of theirs; ``splits`` are the folds, if some are configured.
-    """
-    count, kind = training[0].count, str(experiment.system.description["arms"][layer.arm]["residual"]["type"])
-    nothing = ResidualOutcome(layer.arm, kind, error_unit(problem))
-    learned = layer.learned(problem, fitted, fitted.records, np.arange(count, dtype=np.intp))
+    """Learn from the training records, and judge by folds of them, and by stretches of the recording."""
+    training, fitted = plain.ready.training, plain.fitted
+    order = np.argsort(plain.position[plain.split.train], kind="stable")
+    count, kind = training.count, str(experiment.system.description["arms"][layer.arm]["residual"]["type"])
+    nothing = ResidualOutcome(layer.arm, kind, error_unit(training))
+    learned = layer.learned(fitted, np.arange(count, dtype=np.intp))
     if learned is None:
         return nothing
-    splits = splits or folds(count, _FOLDS, 0)
+    splits = plain.ready.folds or folds(count, _FOLDS, 0)
     pieces = [np.sort(part) for part in np.array_split(order, _STRETCHES)]
     stretches = tuple(Split(np.setdiff1d(np.arange(count), part), part) for part in pieces)
     judge = partial(judged_with, layer=replace(layer, residual=learned))
     parts = (experiment.estimator, fitted.estimate.values, progress, executor, judge)
-    crossed = cross_validate(problem.with_records(training), splits, *parts)
+    crossed = cross_validate(training, splits, *parts)
     if crossed.failed_folds:
         return replace(nothing, why=f"{crossed.failed_folds} of {len(splits)} fits without a fold did not converge")
-    along = cross_validate(problem.with_records(training), stretches, *parts)
+    along = cross_validate(training, stretches, *parts)
     at_random, gains = _compared(crossed, splits)
     in_stretches, _ = _compared(along, stretches, together=True)
     unknown = _unknown(crossed, splits)
@@ -278,7 +271,7 @@ def judged_with(task: FitTask, layer: Layer) -> JudgedFit:
         plain = judged_fit(task, fitted.solution, train, held, began)
         if not plain.converged:
             return plain
-        learned = layer.learned(task.problem, fitted, fitted.records, task.split.train)
+        learned = layer.learned(fitted, task.split.train)
         before = errors_apart(held, fitted.solution.values)
         arm = task.problem.blueprint.arms[layer.arm]
         if learned is not None:
@@ -290,8 +283,8 @@ def judged_with(task: FitTask, layer: Layer) -> JudgedFit:
         judged = judged_fit(task, fitted.solution, train, held, began)
         if not judged.converged:
             return judged
-        alike = whitened_like(task.problem, fitted, held.records, task.estimator)
-        held_residuals = missed(predictor(task.problem, fitted), alike)
+        alike = whitened_like(held, fitted, task.estimator).records
+        held_residuals = missed(predictor(fitted), alike)
         own = {} if learned is None else {layer.arm: (learned, layer.postures.subset(task.split.holdout))}
         unknown = tuple(unexplained(held, fitted.solution.values, own))
     except NotConvergedError:
@@ -301,16 +294,15 @@ def judged_with(task: FitTask, layer: Layer) -> JudgedFit:
     return replace(judged, seconds=time.perf_counter() - began, gains=gains)
 
 
-def model_errors(
-    problem: Problem, fitted: WeighedFit, records: tuple[FactorRecords, ...], arm: Arm, postures: Postures
-) -> ModelErrors | None:
+def model_errors(fitted: WeighedFit, arm: Arm, postures: Postures) -> ModelErrors | None:
     """What a fit leaves of its records, at rest where something drifts; None where no record shows the tool."""
-    values = fitted.estimate.values
-    raw = problem.whitened(problem.residuals(values, records), records)
-    by_correction = problem.with_records(records).channel_slopes(values, arm.correction_channels)
+    problem, values = fitted.problem, fitted.estimate.values
+    raw = problem.whitened(problem.residuals(values))
+    by_correction = problem.channel_slopes(values, arm.correction_channels)
     count = len(arm.correction_channels)
-    columns = [problem.whitened([slope[:, i] for slope in by_correction], records) for i in range(count)]
-    acting = [np.sqrt(np.where(own.measured, weight, 0.0)) for own, weight in zip(records, fitted.weights, strict=True)]
+    columns = [problem.whitened([slope[:, i] for slope in by_correction]) for i in range(count)]
+    weighed = zip(problem.records, fitted.weights, strict=True)
+    acting = [np.sqrt(np.where(own.measured, weight, 0.0)) for own, weight in weighed]
     left = np.vstack([own * root for own, root in zip(raw, acting, strict=True)]).T
     moved = np.stack(
         [np.vstack([own * root for own, root in zip(column, acting, strict=True)]).T for column in columns], axis=2

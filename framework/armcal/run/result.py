@@ -1,8 +1,9 @@
 """What a run knows when it ends: everything that the outputs, the report and the terminal show."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 
@@ -10,24 +11,22 @@ from armcal.base.arrays import Array
 from armcal.base.config_text import finite
 from armcal.base.dataset import Dataset
 from armcal.calibration.intervals import PredictionRecord
+from armcal.calibration.recorded_range import PAYLOAD
 from armcal.config.system import System
-from armcal.diagnose.evidence import Evidence
+from armcal.diagnose.coverage import IntervalResult, intervals
+from armcal.diagnose.fit import Fit, RecordErrors
 from armcal.diagnose.verdict import Verdict
 from armcal.estimate.bootstrap import Bootstrap
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.polish import settled, untrained
 from armcal.estimate.profile import Profile
 from armcal.estimate.residual_spread import ResidualSpread, residual_spread
-from armcal.estimate.robust import WeighedFit
-from armcal.estimate.validation import Split
+from armcal.estimate.validation import ErrorSummary, Split, summarise
 from armcal.estimate.variance import VarianceComponents
 from armcal.measure.groups import Groups
 from armcal.problem.problem import Problem
-from armcal.run.errors import ErrorTable, FittedRecords, RecordErrors
-from armcal.run.experiment import Experiment
-from armcal.run.judging import IntervalResult
+from armcal.run.experiment import Experiment, group_texts
 from armcal.run.pose_residual import ResidualOutcome
-from armcal.run.prepare import PAYLOAD, group_texts, label_of
 
 _MM = 1000.0
 
@@ -99,18 +98,18 @@ class NoiseResult:
         return content
 
 
-def noise_result(problem: Problem, fit: WeighedFit, dataset: Dataset, split: Split, errors_mm: Array) -> NoiseResult:
-    """From a fit on the training records; errors are of all records (N)."""
+def noise_result(fit: Fit) -> NoiseResult:
+    fitted, dataset, train = fit.fitted, fit.dataset, fit.split.train
     weights = np.full(len(dataset), np.nan)
-    weights[split.train] = np.min(np.array(fit.weights), axis=0)
+    weights[train] = np.min(np.array(fitted.weights), axis=0)
     suspicious = []
-    for suspect in fit.suspects:
-        i = int(split.train[suspect.record])
+    for suspect in fitted.suspects:
+        i = int(train[suspect.record])
         row = dataset.rows[i] if dataset.rows else 0
-        numbers = (suspect.distance, suspect.limit, suspect.weight, float(errors_mm[i]))
+        numbers = (suspect.distance, suspect.limit, suspect.weight, float(fit.errors.calibrated_mm[i]))
         suspicious.append(SuspiciousRecord(row, dataset.ids[i], suspect.measurement, *numbers))
-    scatter = residual_spread(problem.with_records(fit.records), fit.estimate, dataset.subset(split.train))
-    return NoiseResult(fit.loss, weights, tuple(suspicious), fit.components, len(fit.rounds), scatter)
+    scatter = residual_spread(fitted.problem, fit.estimate, fit.ready.trained)
+    return NoiseResult(fitted.loss, weights, tuple(suspicious), fitted.components, len(fitted.rounds), scatter)
 
 
 @dataclass(frozen=True)
@@ -143,21 +142,21 @@ class RunGroups:
         return {error.name: error.as_dict() for error in self.errors}
 
 
-def run_groups(experiment: Experiment, run: FittedRecords, errors: RecordErrors) -> RunGroups:
+def run_groups(experiment: Experiment, fit: Fit) -> RunGroups:
     """Errors of each group, sorted by name (none if nothing separates groups), and the keys of the problem's groups."""
-    problem, records, dataset, keys = run.problem, run.records, run.dataset, run.problem.blueprint.groups
-    label = label_of(experiment)
+    problem, dataset, keys = fit.problem, fit.dataset, fit.problem.blueprint.groups
+    label, errors = experiment.label, fit.errors
     if label is None or not (label in dataset.extra or (label == PAYLOAD and dataset.has(PAYLOAD))):
         return RunGroups((), keys)
     labels = np.array(group_texts(dataset, label))
-    before = _distances(problem, settled(untrained(problem).with_records(records), problem.parameters.nominal()))
+    before = _distances(problem, settled(untrained(problem), problem.parameters.nominal()))
     # Distances are judged by what the records of each socket say, not by what the known distance made of them.
-    after = _distances(problem, settled(untrained(problem).with_records(records), run.fitted.estimate.values))
+    after = _distances(problem, settled(untrained(problem), fit.estimate.values))
     result = []
     for name in sorted(set(labels.tolist()) - {""}):
         inside = labels == name
         nominal, calibrated = (float(np.nanmean(e[inside])) for e in (errors.nominal_mm, errors.calibrated_mm))
-        trained = int(np.sum(inside[run.split.train]))
+        trained = int(np.sum(inside[fit.split.train]))
         of_nominal, of_calibrated = _within(name, before), _within(name, after)
         result.append(GroupError(name, int(inside.sum()), trained, nominal, calibrated, of_nominal, of_calibrated))
     return RunGroups(tuple(result), keys)
@@ -173,27 +172,60 @@ def _within(name: str, distances: list[tuple[tuple[str, str], float]]) -> float 
 
 
 @dataclass(frozen=True)
+class ErrorTable:
+    """Error summaries (mm) by model and by records (train, holdout, cross_validated).
+
+    ``calibrated`` counts the drift that neighbouring records show; ``at_rest`` is without it, and empty if nothing
+    drifts. ``turns`` are those of orientations (deg): another table, without a drift; None where none are measured.
+    """
+
+    nominal: dict[str, ErrorSummary]
+    calibrated: dict[str, ErrorSummary]
+    at_rest: dict[str, ErrorSummary] = field(default_factory=dict)
+    turns: Self | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        return {
+            model: {name: summary.as_dict() for name, summary in table.items()}
+            for model, table in (("nominal", self.nominal), ("calibrated", self.calibrated), ("at_rest", self.at_rest))
+            if table
+        }
+
+    @classmethod
+    def of(cls, errors: RecordErrors, split: Split) -> Self:
+        """The summaries of every record's errors."""
+        judged = np.isfinite(errors.cross_validated_mm)
+
+        def summaries(of: Array, crossed: Array) -> dict[str, ErrorSummary]:
+            sets = {"train": of[split.train], "holdout": of[split.holdout], "cross_validated": crossed[judged]}
+            return {name: summarise(own) for name, own in sets.items()}
+
+        at_rest = {}
+        if errors.at_rest_mm is not None and errors.cross_validated_at_rest_mm is not None:
+            at_rest = summaries(errors.at_rest_mm, errors.cross_validated_at_rest_mm)
+        nominal = summaries(errors.nominal_mm, errors.nominal_crossed_mm)
+        turns = None
+        if errors.turns is not None:
+            own = errors.turns
+            before = summaries(own.nominal_deg, own.nominal_crossed_deg)
+            turns = cls(before, summaries(own.calibrated_deg, own.cross_validated_deg))
+        return cls(nominal, summaries(errors.calibrated_mm, errors.cross_validated_mm), at_rest, turns)
+
+
+@dataclass(frozen=True)
 class RunResult:
     """A finished run.
 
     Attributes:
         name: of the experiment.
         command: how to repeat it.
-        system: arms, measurements and statics, with what was learned of pose residuals.
-        dataset: the records used.
-        split: which trained and which judged.
-        estimate: what was found.
-        errors: of every record.
-        table: their summaries.
+        fit: the problem, its records and the estimate, and whatever a check or a table asks of them.
         verdict: what to conclude.
         warnings: of config, data and problem.
-        backend: what evaluated the model.
         seconds: of each stage, and ``total``.
         provenance: hashes and versions.
         noise: how the training records weighed.
         bootstrap: refits to resampled records, if they were asked for.
-        intervals: how wide prediction intervals are, and what they hold.
-        evidence: what residuals still depend on, which records are missed, what priors alone hold.
         profiles: intervals by profile likelihood, of the numbers asked for.
         prediction: what predictions need of the run beyond the values; None if it did not converge.
         groups: of records, where a column separates them.
@@ -202,25 +234,58 @@ class RunResult:
 
     name: str
     command: str
-    system: System
-    dataset: Dataset
-    split: Split
-    estimate: Estimate
-    errors: RecordErrors
-    table: ErrorTable
+    fit: Fit
     verdict: Verdict
     warnings: tuple[str, ...]
-    backend: str
     seconds: dict[str, float]
     provenance: dict[str, Any]
     noise: NoiseResult = field(default_factory=NoiseResult)
     bootstrap: Bootstrap | None = None
-    intervals: IntervalResult = field(default_factory=IntervalResult)
-    evidence: Evidence = field(default_factory=Evidence)
     profiles: tuple[Profile, ...] = ()
     prediction: PredictionRecord | None = None
     groups: RunGroups = field(default_factory=RunGroups)
     pose_residual: ResidualOutcome | None = None
+
+    @property
+    def system(self) -> System:
+        """Arms, measurements and statics, with what was learned of pose residuals."""
+        return self.fit.system
+
+    @property
+    def dataset(self) -> Dataset:
+        """The records used."""
+        return self.fit.dataset
+
+    @property
+    def split(self) -> Split:
+        """Which records trained and which judged."""
+        return self.fit.split
+
+    @cached_property
+    def estimate(self) -> Estimate:
+        """What was found; what a pose residual learned tells nothing of it: it is as sure as without."""
+        left, plain = self.fit.estimate, (self.fit.before or self.fit).estimate
+        return replace(plain, noise_scale=left.noise_scale, degrees_of_freedom=left.degrees_of_freedom)
+
+    @property
+    def errors(self) -> RecordErrors:
+        """Of every record."""
+        return self.fit.errors
+
+    @cached_property
+    def table(self) -> ErrorTable:
+        """Summaries of the errors."""
+        return ErrorTable.of(self.errors, self.split)
+
+    @property
+    def intervals(self) -> IntervalResult:
+        """How wide prediction intervals are, and what they hold."""
+        return self.fit.of(intervals)
+
+    @property
+    def backend(self) -> str:
+        """What evaluated the model."""
+        return self.fit.problem.backend
 
     @property
     def odd_records(self) -> tuple[str, ...]:

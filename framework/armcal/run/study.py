@@ -18,6 +18,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.settings import Settings
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource, load_variants
+from armcal.diagnose.fit import Prepared
 from armcal.errors import ConfigError, DataError, InputError, Location, NotConvergedError, ProblemError
 from armcal.estimate.bootstrap import BlockLength, automatic_block_length, standard_error_of_mean
 from armcal.estimate.estimator import Progress, no_progress
@@ -38,8 +39,8 @@ from armcal.io.parallel import Executor
 from armcal.plugins import PluginRegistry, discover
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
+from armcal.run.pipeline import Stopwatch, prepare
 from armcal.run.pose_residual import Layer, judged_with, layer_of
-from armcal.run.prepare import Prepared, Stopwatch, labels_of, prepare
 from armcal.run.settings import ExperimentSettings, ValidationSettings
 from armcal.run.study_result import Cell, Change, NestedResult, StudyResult, VariantResult
 
@@ -216,7 +217,7 @@ def compare(
         some, first = next(iter(ready.values())), next(iter(study.experiments.values()))
         dataset, poses = some.dataset, first.poses(some.dataset)
         where = study.source.where(("study", "group_by"))
-        labels = () if settings.group_by is None else labels_of(first, dataset, settings.group_by, where)
+        labels = () if settings.group_by is None else first.labels(dataset, settings.group_by, where)
         groups = _groups(labels, dataset, settings)
         for name, own in ready.items():
             for rows in groups.values():
@@ -274,7 +275,7 @@ def _groups(labels: Sequence[str], dataset: Dataset, settings: StudySettings) ->
 
 
 def _require_solvable(ready: Prepared, rows: Indices) -> None:
-    problem = restricted(ready.problem.with_records(ready.records).subset(rows))
+    problem = restricted(ready.problem.subset(rows))
     require_solvable(problem, problem.parameters.nominal())
 
 
@@ -317,7 +318,7 @@ def _fits(
     for name, split in plan:
         start = problems[name].parameters.nominal()
         task = FitTask(
-            problems[name].with_records(ready[name].records), study.experiments[name].estimator, start, split
+            problems[name].with_records(ready[name].problem.records), study.experiments[name].estimator, start, split
         )
         tasks.append((task, layers[name]))
     with watch.stage("fits"):
@@ -366,7 +367,7 @@ def _judged(name: str, ready: Prepared, fits: Sequence[JudgedFit], whole: _Train
 def _nominal(ready: Prepared) -> tuple[Array, Array | None]:
     """Errors (mm) and, where they are measured, turns (deg) without calibration."""
     problem = untrained(ready.problem)
-    errors, turns = errors_and_turns(problem.with_records(ready.records), problem.parameters.nominal())
+    errors, turns = errors_and_turns(problem.with_records(ready.problem.records), problem.parameters.nominal())
     return errors * _MM, None if turns is None else np.degrees(turns)
 
 

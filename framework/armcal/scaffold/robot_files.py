@@ -25,8 +25,7 @@ from armcal.report.page import page
 from armcal.report.run_document import plugin_sections, run_document
 from armcal.run import outputs
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import calibrate
-from armcal.run.prepare import Stopwatch, assemble
+from armcal.run.pipeline import Stopwatch, assemble, calibrate
 from armcal.run.result import RunResult
 from armcal.scaffold.plugin_files import number, rendered, staged, write_texts
 from armcal.scaffold.robot import Robot, RobotJoint, Unit
@@ -108,7 +107,7 @@ def _choose_free(experiment: Experiment, robot: Robot, target: Mapping[str, floa
     values = experiment.parameters.nominal()  # as drawn, not where the records place it: springs would seem loaded
     for name, place in target.items():
         values[parameters.entries_of(name)] = place
-    triangle = factor_at_zero(ready.problem.with_records(ready.training), values)
+    triangle = factor_at_zero(ready.training, values)
     free = [block.name for block in parameters.free]
     preferred = [
         [name for name in free if any(fnmatch.fnmatchcase(name, glob) for glob in globs)] for globs in robot.preferred

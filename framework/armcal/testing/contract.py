@@ -129,6 +129,8 @@ def _process() -> dict[str, Any]:
 def checks_of(kind: str) -> tuple[Check, ...]:
     if kind not in CHECKS:  # a command, or a section of the report
         return (it_imports,)
+    if kind == "check":  # a function without settings
+        return (it_imports, *CHECKS[kind], it_prints_nothing_and_leaves_the_process_alone)
     repeated = (it_is_the_same_each_time,) if kind in RESULTS else ()
     return (*CHECKS[""], *CHECKS[kind], *repeated, it_prints_nothing_and_leaves_the_process_alone)
 

@@ -15,10 +15,16 @@ from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Interval
 from armcal.calibration.exporter import Exporter, ExportRequest
+from armcal.config.system import StaticsSettings, System
+from armcal.diagnose.checks import Finding
+from armcal.diagnose.fit import Fit, Prepared
 from armcal.errors import InputError, ProblemError
-from armcal.estimate.estimator import Estimator, Solution
+from armcal.estimate.estimator import Estimator, Solution, SolverVerdict
 from armcal.estimate.online import Gaussian, Linearised, Observation, OnlineEstimator, Update
+from armcal.estimate.robust import plain_fit
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
+from armcal.estimate.start import Start
+from armcal.estimate.validation import Split
 from armcal.measure.measurement import Channel
 from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.problem.problem import Problem
@@ -201,20 +207,49 @@ def cut_short_it_reports_that_it_did_not_converge(s: Subject) -> None:
     expect(not verdict.converged, "found converged after one iteration, expected not converged")
 
 
+@check("check")
+def of_a_sound_fit_it_gives_findings_or_none_and_none_is_bad(s: Subject) -> None:
+    """Exact tips of an arm of two joints, and its true parameters; no other column is there."""
+    problem, every = _posed(Interval()), np.arange(_POSES, dtype=np.intp)
+    system = System(problem.blueprint.arms, problem.blueprint.measurements, StaticsSettings(), {})
+    ready = Prepared(system, _measured(), problem, Split(every, every[:0]), Start(problem))
+    true = Solution(np.array(list(_TRUTH.values())), SolverVerdict("exact", "", True, 1, 0.0))
+    fit = Fit(ready, plain_fit(problem, true), _Exact(true))
+    findings = s.made(ready if getattr(s.made, "before_fit", False) else fit)
+    listed = isinstance(findings, list | tuple) and all(isinstance(one, Finding) for one in findings)
+    expect(listed, f"found {findings!r}, expected a list of armcal.Finding, empty where there is nothing to say")
+    bad = [one.text for one in findings if one.grade == "bad"]
+    expect(not bad, f"found {bad} of a sound fit, expected nothing bad")
+
+
+@dataclass(frozen=True)
+class _Exact:
+    """An estimator that knows the truth."""
+
+    solution: Solution
+
+    def solve(self, problem: Problem, start: Array, progress: Any = None) -> Solution:
+        return self.solution
+
+
 RESULTS["estimator"] = lambda s, estimator: _solved(estimator, s.posed).values
 
 
 def _posed(side: Interval, prior_sd: float | None = None) -> Problem:
     """Exact tip positions; ``side`` moves y alone, so neither its bound nor its prior disturbs the rest."""
     arms, measurements = planar_arms([ARM]), {TRACKER: Tip()}
-    parameters = all_parameters(arms)
-    true = parameters.with_nominal(np.array(list(_TRUTH.values())))
-    moved = dataset(commands(arms, _POSES, np.random.default_rng(5)))
-    exact = measured_without_noise(SimulationRequest(arms, measurements, true, GRAVITY), moved)
-    records = dataset({**moved.channels, **exact})
+    parameters, records = all_parameters(arms), _measured()
     block = replace(parameters[_SIDE], domain=side, prior_sd=prior_sd)
     parameters = parameters.replaced({_SIDE: block}).with_free(parameters.names)
     return Problem.build(arms, measurements, parameters, GRAVITY, records, "interpreted")
+
+
+def _measured() -> Dataset:
+    arms = planar_arms([ARM])
+    true = all_parameters(arms).with_nominal(np.array(list(_TRUTH.values())))
+    moved = dataset(commands(arms, _POSES, np.random.default_rng(5)))
+    exact = measured_without_noise(SimulationRequest(arms, {TRACKER: Tip()}, true, GRAVITY), moved)
+    return dataset({**moved.channels, **exact})
 
 
 def _solved(estimator: Estimator, problem: Problem) -> Solution:

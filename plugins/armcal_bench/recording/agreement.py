@@ -21,6 +21,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.units import to_unit
 from armcal.devices.live import LiveCamera
 from armcal.diagnose.score_tests import widened
+from armcal.diagnose.verdict import known_accuracies, own_deviations
 from armcal.errors import ArmcalError, ConfigError, ProblemError
 from armcal.estimate.estimator import Solution, SolverVerdict, estimate
 from armcal.estimate.identifiability import (
@@ -45,8 +46,6 @@ from armcal.problem.problem import Problem
 from armcal.problem.projection import factor_at_zero
 from armcal.problem.readings import with_joint_noise
 from armcal.run.experiment import Experiment
-from armcal.run.judging import known_accuracies, own_deviations
-from armcal.run.prepare import labels_of
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.special import fdtri
@@ -296,7 +295,7 @@ def explained(experiment: Experiment, problem: Problem, dataset: Dataset) -> tup
 def _training(experiment: Experiment, dataset: Dataset) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
     settings, chosen = experiment.settings.validation, np.arange(len(dataset), dtype=np.intp)
     if settings.train_groups:
-        labels = labels_of(experiment, dataset)
+        labels = experiment.labels(dataset)
         chosen = np.flatnonzero([label in settings.train_groups for label in labels])
     elif settings.holdout and settings.train_ids is None and len(dataset) > 2:
         chosen = hold_out(len(dataset), settings.holdout, settings.seed, experiment.poses(dataset)).train
@@ -362,7 +361,7 @@ def advice(fitter: QuickFitter, fitted: Fitted, dataset: Dataset, joints: Mappin
         return Advice()
     acting = _used(problem, fitted.used)
     made = estimate(acting, Solution(fitted.values, _QUICK))
-    made = widened(problem, acting.records, made, np.arange(len(dataset)))
+    made = widened(acting, made, np.arange(len(dataset)))
     best = suggest(problem, dataset.subset(np.flatnonzero(fitted.used)), made, joints, 1)
     own = {f"{n}.{local}": sd for n in problem.blueprint.measurements for local, sd in own_deviations(made, n).items()}
     finite = {name: sd for name, sd in own.items() if np.isfinite(sd) and sd > 0}

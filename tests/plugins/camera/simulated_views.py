@@ -14,9 +14,7 @@ from armcal.base.quaternions import quaternion_of
 from armcal.estimate.estimator import Estimate
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import RunContext
-from armcal.run.pipeline import _fitted as fitted_of
-from armcal.run.prepare import Stopwatch, prepare
+from armcal.run.pipeline import RunContext, Stopwatch, fitted, prepare
 from scipy.spatial.transform import Rotation
 
 ARM = Path(__file__).resolve().parents[3] / "configs" / "camera" / "arm.yaml"
@@ -89,7 +87,7 @@ def estimated(experiment: Experiment) -> Estimate:
     """The fit from where the images have the start."""
     ready = prepare(experiment, Stopwatch())
     assert ready.start.taken
-    return fitted_of(RunContext(experiment, lambda *_: None, None, Stopwatch()), ready).estimate
+    return fitted(RunContext(experiment, lambda *_: None, None, Stopwatch()), ready).estimate
 
 
 def assert_found(estimate: Estimate, **poses: Array) -> None:

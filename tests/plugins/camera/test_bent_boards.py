@@ -10,7 +10,7 @@ import pytest
 import yaml
 from armcal.run.experiment import Experiment
 from armcal.run.fixed_parameters import fixed_parameters
-from armcal.run.prepare import Stopwatch, prepare
+from armcal.run.pipeline import Stopwatch, prepare
 from armcal_camera.camera import bent
 
 from tests.plugins.camera.simulated_views import base_T, estimated, numbers, pose, simulated

@@ -10,9 +10,7 @@ import pytest
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.problem.problem import Problem
-from armcal.run.pipeline import RunContext
-from armcal.run.pipeline import _fitted as fitted_of
-from armcal.run.prepare import Stopwatch, prepare
+from armcal.run.pipeline import RunContext, Stopwatch, fitted, prepare
 
 DEMO = Path(__file__).resolve().parents[3] / "configs" / "camera" / "demo.yaml"
 _QUIET = ("validation.folds=0", "validation.holdout=0")
@@ -26,7 +24,7 @@ def test_intervals_cover_and_the_tool_is_found(monkeypatch: pytest.MonkeyPatch) 
         dataset = experiment.simulator().simulate(experiment.simulation_request)
         monkeypatch.setattr(type(experiment), "read", lambda *_, made=dataset: made)
         ready = prepare(experiment, Stopwatch())
-        estimate = fitted_of(RunContext(experiment, lambda *_: None, None, Stopwatch()), ready).estimate
+        estimate = fitted(RunContext(experiment, lambda *_: None, None, Stopwatch()), ready).estimate
         monkeypatch.undo()
         source = load_config(DEMO.parent / "truth.yaml")
         truth = with_values(experiment.parameters, source.data, source, ())

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from armcal.errors import ConfigError, ProblemError
 from armcal.run.experiment import Experiment
-from armcal.run.prepare import Stopwatch, prepare
+from armcal.run.pipeline import Stopwatch, prepare
 from armcal_camera.export import FramesSettings, HandEyeExporter, OpenCvExporter
 
 from tests.plugins.camera.simulated_views import ARM, assert_found, base_T, estimated, numbers, pose, simulated

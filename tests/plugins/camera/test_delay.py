@@ -11,6 +11,7 @@ import yaml
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.units import to_unit
+from armcal.diagnose.residual_structure import structure
 from armcal.errors import DataError
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
@@ -76,9 +77,9 @@ def test_late_joints_are_named_without_the_effect(recorded: Path) -> None:
     content["parameters"]["free"].remove("arm.clock.delay")
     (recorded / "plain.yaml").write_text(yaml.safe_dump(content))
     experiment = Experiment.load(recorded / "plain.yaml")
-    structure = calibrate(experiment, "test").evidence.structure
-    assert structure is not None
-    first = structure.structures[0]
+    left = calibrate(experiment, "test").fit.of(structure)
+    assert left is not None
+    first = left.structures[0]
     assert first.kind == "delay" and first.odds > 0.9
     late_ms = float(first.size.removeprefix("joints late by about ").split()[0])
     assert abs(late_ms - 1000 * LATE_S) < 100 * LATE_S

@@ -8,7 +8,7 @@ import armcal
 import numpy as np
 from armcal.problem.many_points import FEW_POINTS, with_few_points
 from armcal.problem.motion import Motion
-from armcal.run.prepare import Stopwatch, assemble
+from armcal.run.pipeline import Stopwatch, assemble
 
 CONFIG = Path(__file__).parents[3] / "configs" / "so101" / "camera.yaml"
 
@@ -16,7 +16,7 @@ CONFIG = Path(__file__).parents[3] / "configs" / "so101" / "camera.yaml"
 def test_slopes_by_loads_of_few_points_are_those_of_all() -> None:
     experiment = armcal.Experiment.load(CONFIG, ["arms.arm.effects.spring.compliance_rad_per_Nm=0.05"])
     ready = assemble(experiment, Stopwatch())
-    problem = ready.problem.with_records(ready.training)
+    problem = ready.training
     few = with_few_points(problem)
     values, dataset = problem.parameters.nominal(), ready.dataset.subset(ready.split.train)
     of_all, of_few = (Motion.of(p, values, dataset) for p in (problem, few))

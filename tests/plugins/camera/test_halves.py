@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.base.arrays import Array
-from armcal.diagnose.evidence_findings import steadier_weights
+from armcal.diagnose.gross import steadier_weights
 from armcal.estimate.validation import Halves, pose_size
 from armcal.run.pipeline import calibrate
 from armcal.run.result import RunResult

@@ -12,8 +12,7 @@ from armcal.errors import ProblemError
 from armcal.measure.csv_writer import write_csv
 from armcal.planning.candidates import deviations
 from armcal.run.experiment import Experiment
-from armcal.run.pipeline import calibrate
-from armcal.run.prepare import Stopwatch, assemble
+from armcal.run.pipeline import Stopwatch, assemble, calibrate
 from scipy.spatial.transform import Rotation
 
 from tests.plugins.camera.simulated_views import ARM, MIDDLE, base_T, numbers

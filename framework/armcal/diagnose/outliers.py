@@ -1,23 +1,29 @@
-"""Records that the model misses by more than a limit, and what is unusual about each."""
+"""Records that stand out: missed by more than noise explains, far from the fit, contradicting the others, moved.
+
+Some records contradict the others: a fit to the majority leaves them far off, and the others near. And did what the arm
+touches stay where it was? A socket that moved splits its residuals in two, in recorded order.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
-from scipy.special import betainc, fdtri, gammaincinv
+from scipy.special import betainc, chdtri, fdtri, gammaincinv
 
 from armcal.arm.assembly import shown_joint
 from armcal.base.arrays import Array, Indices
-from armcal.base.dataset import Dataset
 from armcal.base.units import digits, display_unit, readable, to_unit
+from armcal.diagnose.checks import Finding, first_few
+from armcal.diagnose.fit import Fit, thinned
+from armcal.diagnose.score_tests import FitRows, sampled_rows
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.robust import WeighedFit
 from armcal.estimate.validation import error_dimension
 from armcal.estimate.variance import VarianceComponents
+from armcal.measure.groups import group_key
 from armcal.problem.factor_records import noise_roots
 from armcal.problem.motion import Motion
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 
 BY_CHANCE = 0.01  # Of recordings in which noise alone puts any record beyond the limit, where none is configured
 _EFFICIENCY = 0.37  # Of a median as a measure of spread, against all numbers
@@ -57,15 +63,6 @@ class LargeErrors:
         return f"above {stated}" if self.configured else f"beyond what noise explains ({stated} for most records)"
 
 
-@dataclass(frozen=True)
-class Judged:
-    """What is known of every record of a dataset once it was judged."""
-
-    errors_mm: Array  # by fits that did not see the record (N; nan where there is none)
-    residuals: tuple[Array, ...]  # raw, of each factor (n_r x N), in one sign convention
-    position: Indices  # how many records were recorded before each (N)
-
-
 def noise_limit(errors: Array, rows: float) -> float:
     """Beyond what equal normal noise seldom (``BY_CHANCE``) puts any of these errors, each of so many numbers.
 
@@ -76,15 +73,18 @@ def noise_limit(errors: Array, rows: float) -> float:
     return float(np.sqrt(medians) * np.median(errors))
 
 
-def noise_of(problem: Problem, records: Sequence[FactorRecords]) -> tuple[Array, float]:
+def noise_of(fit: Fit) -> tuple[Array, float]:
     """How far noise, as records state it, puts each off (N; SI), and of how many independent numbers that is.
 
     Noise of joints is larger the farther out the arm reaches, and moves it along some directions more than along
-    others. More than three numbers, as of an image, are off together.
+    others. More than three numbers, as of an image, are off together. Of a fit that did not converge all are alike.
     """
-    counted, count = error_dimension(problem), records[0].count
+    if not fit.converged:
+        return np.ones(len(fit.dataset)), 3.0
+    problem = fit.few
+    counted, count = error_dimension(problem), problem.count
     total, squares = np.zeros((2, count))
-    for kernel, record in zip(problem.kernels, records, strict=True):
+    for kernel, record in zip(problem.kernels, problem.records, strict=True):
         rows = [dimension == counted for dimension in kernel.factor.dimensions]
         roots = noise_roots(kernel.factor, record)[:, rows]
         covariance = np.where(record.measured[:, None, None], roots @ np.swapaxes(roots, 1, 2), 0.0)
@@ -95,23 +95,18 @@ def noise_of(problem: Problem, records: Sequence[FactorRecords]) -> tuple[Array,
     return np.sqrt(np.where(known, total, 1.0)), float(np.clip(np.median(rows_known), 1, 3)) if known.any() else 3.0
 
 
-def large_errors(
-    problem: Problem,
-    records: Sequence[FactorRecords],
-    estimate: Estimate,
-    dataset: Dataset,
-    motion: Motion,
-    judged: Judged,
-    limit_mm: float | None = None,
-) -> LargeErrors | None:
+def large_errors(fit: Fit) -> LargeErrors | None:
     """Which judged records lie beyond the limit, and what is unusual about them; None if none was judged."""
-    errors = judged.errors_mm
+    if not fit.converged:
+        return None
+    problem, estimate, motion = fit.few, fit.estimate, fit.motion
+    errors, limit_mm = fit.judged_mm, fit.ready.limit_mm
     known = np.isfinite(errors)
     if not known.any():
         return None
-    variance = _leverage(problem, records, estimate)
+    variance = _leverage(problem, estimate)
     if limit_mm is None:
-        noise, numbers = noise_of(problem, records)
+        noise, numbers = fit.of(noise_of)
         sizes = noise * np.sqrt(1 + variance / sum(len(kernel.factor.noise) for kernel in problem.kernels))
         limits = sizes * noise_limit(errors[known] / sizes[known], numbers)
     else:
@@ -122,28 +117,21 @@ def large_errors(
     if len(beyond):
         leverage = _above(variance)
         efforts = {name: _above(np.abs(loads.efforts)) for name, loads in motion.loads.items()}
-        explained = tuple(
-            _miss(int(i), problem, dataset, motion, judged, leverage, efforts) for i in beyond[:MOST_EXPLAINED]
-        )
+        residuals = problem.residuals(estimate.values)
+        explained = tuple(_miss(fit, int(i), residuals, leverage, efforts) for i in beyond[:MOST_EXPLAINED])
     limit = float(np.median(limits[known]))
     return LargeErrors(limit, limit_mm is not None, int(known.sum()), len(beyond), explained)
 
 
-def _miss(
-    record: int,
-    problem: Problem,
-    dataset: Dataset,
-    motion: Motion,
-    judged: Judged,
-    leverage: Array,
-    efforts: Mapping[str, Array],
-) -> Miss:
-    whole, step = np.vstack(judged.residuals), judged.position - judged.position[record]
+def _miss(fit: Fit, record: int, residuals: Sequence[Array], leverage: Array, efforts: Mapping[str, Array]) -> Miss:
+    """``residuals`` are raw, of each factor (n_r x N), in one sign convention."""
+    problem, dataset, motion = fit.problem, fit.dataset, fit.motion
+    whole, step = np.vstack(residuals), fit.position - fit.position[record]
     lengths, beside = np.linalg.norm(whole, axis=0), np.abs(step) == 1
     same = whole[:, record] @ whole > _ALIKE * lengths[record] * lengths
     alike = bool(beside.any() and np.all((same & (lengths >= np.median(lengths)))[beside]))
     far = bool(leverage[record] > UNUSUAL)
-    heavy, along = _heaviest(record, problem, motion, efforts), _along(record, problem, motion, judged)
+    heavy, along = _heaviest(record, problem, motion, efforts), _along(record, problem, motion, residuals)
     reasons = [
         "its prediction is among the 5 % that depend most on the parameters' uncertainty" if far else "",
         heavy,
@@ -157,18 +145,18 @@ def _miss(
         advice = "measure more poses like it"
     unusual = tuple(filter(None, reasons)) or ("nothing is unusual about the pose",)
     row = dataset.rows[record] if dataset.rows else 0
-    return Miss(dataset.ids[record], row, float(judged.errors_mm[record]), unusual, advice)
+    return Miss(dataset.ids[record], row, float(fit.judged_mm[record]), unusual, advice)
 
 
-def _leverage(problem: Problem, records: Sequence[FactorRecords], estimate: Estimate) -> Array:
+def _leverage(problem: Problem, estimate: Estimate) -> Array:
     """Variance of what the model predicts of each record, in units of the declared noise (N)."""
-    count = records[0].count
+    count = problem.count
     if not len(estimate.covariance):
         return np.zeros(count)
     values, vectors = np.linalg.eigh(estimate.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     total = np.zeros(count)
-    for jacobian in problem.jacobians(estimate.values, records):
+    for jacobian in problem.jacobians(estimate.values):
         total += np.sum((np.swapaxes(jacobian, 1, 2) @ root) ** 2, axis=(0, 2))
     return total
 
@@ -191,9 +179,9 @@ def _heaviest(record: int, problem: Problem, motion: Motion, efforts: Mapping[st
     return ""
 
 
-def _along(record: int, problem: Problem, motion: Motion, judged: Judged) -> str:
+def _along(record: int, problem: Problem, motion: Motion, residuals: Sequence[Array]) -> str:
     """The joint whose own motion the residual follows, and how far off it would be; only what chance rarely does."""
-    own = np.concatenate([r[:, record] for r in judged.residuals])
+    own = np.concatenate([r[:, record] for r in residuals])
     slopes = np.concatenate([s[:, :, record] for s in motion.slopes])
     lengths = np.linalg.norm(slopes, axis=0) * np.linalg.norm(own)
     if len(own) < 2 or not np.any(lengths > 0):
@@ -212,31 +200,12 @@ def _along(record: int, problem: Problem, motion: Motion, judged: Judged) -> str
     return f"its error lies along {shown}'s own motion, as if {digits(to_unit(off, unit.name), 2)} {unit.name} off"
 
 
-Grade = Literal["good", "note", "warning", "bad"]
 MOST_LISTED = 10
 MOST_SUSPICIOUS = 0.2  # Of the training records; more of them are no outliers
 _SMALLEST = 1e-3  # Of the noise, in thousandths: smaller errors are a simulation's without noise
-_MOST_NAMED = 5
+_MOST_NAMED, _FEW_NAMED, MOST_TOLD = 5, 3, 5
 _TOO_MANY = "their noise is larger than the others', or the model lacks something where they are"
 _SHOWN = {"rad": (180 / np.pi, " deg"), "m": (1000.0, " mm")}
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One row of the verdict: how much it matters, what it is, how it was tested at which level, what to do."""
-
-    grade: Grade
-    text: str
-    test: str = ""
-    action: str = ""
-
-    @property
-    def whole(self) -> str:
-        return self.text + (f" [{self.test}]" if self.test else "") + (f" {self.action}" if self.action else "")
-
-
-def first_few(texts: Sequence[str], most: int = 5) -> str:
-    return ", ".join(texts[:most]) + (f" and {len(texts) - most} more" if len(texts) > most else "")
 
 
 def suspect_findings(fitted: WeighedFit, ids: Sequence[str]) -> list[Finding]:
@@ -326,3 +295,210 @@ def component_findings(components: VarianceComponents) -> list[Finding]:
     if components.unseen:
         findings.append(Finding("note", f"No residual shows what these joints do: {', '.join(components.unseen)}."))
     return findings
+
+
+def suspicious_ids(fit: Fit) -> list[str]:
+    """Of training records beyond their limit, the farthest first."""
+    sizes, numbers = fit.of(noise_of)
+    train = fit.split.train
+    return suspicious_records(fit.errors.calibrated_mm[train] / sizes[train], numbers, fit.trained_on, fit.fitted)
+
+
+def suspicious(fit: Fit) -> list[Finding]:
+    return outlier_findings(fit.of(suspicious_ids), fit.trained_on, fit.fitted)
+
+
+def missed(fit: Fit) -> list[Finding]:
+    """Records beyond the limit, each with what is unusual about it."""
+    beyond, unit = fit.of(large_errors), fit.unit
+    if beyond is None:
+        return []
+    limit = (
+        "validation.limit_mm"
+        if beyond.configured
+        else f"what noise and uncertain parameters do, {100 * BY_CHANCE:g} % over all"
+    )
+    test = f"errors of {beyond.judged} records by fits that did not see them, limit {limit}"
+    if not beyond.beyond:
+        return [Finding("good", f"No judged record has an error {beyond.in_words(unit)}.", test)]
+    listed = "; ".join(
+        f"{miss.record_id} ({readable(miss.error_mm)} {unit}: {', '.join(miss.reasons)})"
+        for miss in beyond.explained[:MOST_TOLD]
+    )
+    more = f"; and {beyond.beyond - MOST_TOLD} more, in the report" if beyond.beyond > MOST_TOLD else ""
+    records = "1 record has" if beyond.beyond == 1 else f"{beyond.beyond} records have"
+    text = f"{records} an error {beyond.in_words(unit)}: "
+    advice = "; or ".join(dict.fromkeys(miss.advice for miss in beyond.explained[:MOST_TOLD]))
+    return [Finding("warning", f"{text}{listed}{more}.", test, f"{advice.capitalize()}.")]
+
+
+LEAST_SHARE = 0.1  # Of the records: fewer than these are outliers, which the other tests name one by one
+FAR, FAR_IN_NOISE = 7.0, 5.0
+"""In standard deviations by the lower quartile of all residuals, and by the declared noise: what is far. Of three equal
+normal coordinates one record in 10^9 is."""
+LEAST_SCALE = 1.5
+"""Residuals in units of the declared noise: a tenth of the records five standard deviations off make more."""
+_ROUNDS = 60
+_QUARTILE = 0.25
+_SMALLEST = 1e-9
+_RUN = 0.9
+"""So much of a run of records from one place on is far, and so little of those before, where something moved there."""
+
+FEWEST = 8  # Records of a group for it to be judged
+_LEAST_PART = 3
+APART = 5.0
+"""Parts whose means lie so many standard deviations of their records apart: neighbouring postures are alike, and so
+are what a model misses of them, which moves means by up to half as much."""
+_MM = 1000.0
+
+
+@dataclass(frozen=True)
+class Minority:
+    """Records that contradict the others.
+
+    Attributes:
+        since: the first of them in the recording, if it is all those from there on (or up to there); else None.
+    """
+
+    far: Indices  # which of the records looked at
+    typical_mm: float  # of those that agree, what they are off by (median)
+    far_mm: float  # of those that do not, likewise
+    since: int | None
+
+
+def minority(rows: FitRows, noise_scale: float, position: Indices) -> Minority | None:
+    """The records that a fit to the majority leaves far off, if they are many; None if there is no such split.
+
+    The fit minimises the sum of residual lengths, to first order from the estimate, by weights that are their inverse
+    [Huber1981]: up to half of the records may be off by anything. One whose residuals are as small as their noise
+    (``noise_scale``) has no such records. ``position`` is how many were recorded before each (N).
+    """
+    acting = np.flatnonzero(_lengths(rows, rows.residual) > 0)
+    if noise_scale < LEAST_SCALE or len(acting) < 1 / LEAST_SHARE:
+        return None
+    data, weights = len(rows.record_of), np.ones(len(rows.residual))
+    for _ in range(_ROUNDS):
+        step = np.linalg.lstsq(rows.slopes * weights[:, None], -rows.residual * weights, rcond=1e-9)[0]
+        residual = rows.residual + rows.slopes @ step
+        lengths = _lengths(rows, residual)
+        floor = max(_SMALLEST, 0.1 * float(np.quantile(lengths, _QUARTILE)))
+        weights[:data] = 1 / np.sqrt(np.maximum(lengths, floor))[rows.record_of]
+    numbers = min(3, max(1, round(data / len(lengths))))  # more share what the model misses of their record
+    sd = float(np.quantile(lengths[acting], _QUARTILE)) / float(np.sqrt(chdtri(numbers, 1 - _QUARTILE)))
+    limit = max(FAR * sd, FAR_IN_NOISE)
+    far, near = acting[lengths[acting] > limit], acting[lengths[acting] <= limit]
+    if len(far) < LEAST_SHARE * len(acting) or len(far) > len(near):
+        return None
+    sizes = rows.errors(residual) * 1000.0
+    return Minority(far, float(np.median(sizes[near])), float(np.median(sizes[far])), _since(far, near, position))
+
+
+def _lengths(rows: FitRows, residual: Array) -> Array:
+    return np.asarray(np.linalg.norm(residual[rows.by_record], axis=1))
+
+
+def _since(far: Indices, near: Indices, position: Indices) -> int | None:
+    order = np.sort(np.concatenate([position[far], position[near]]))
+    is_far = np.isin(order, position[far])
+    if not is_far[-1]:
+        return None
+    after = np.cumsum(is_far[::-1])[::-1]
+    count = np.arange(len(order), 0, -1)
+    best = int(np.argmax(after - (count - after)))
+    inside, outside = float(np.mean(is_far[best:])), float(np.mean(is_far[:best])) if best else 1.0
+    return int(order[best]) if inside >= _RUN and outside <= 1 - _RUN else None
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A group whose first records lie elsewhere than the others.
+
+    Attributes:
+        before, after: how many records there are of each.
+    """
+
+    measurement: str  # whose residuals show it
+    key: str  # of the group
+    before: int
+    after: int
+    distance: float  # of the two means (m)
+    scatter: float  # standard deviation of a residual's entry within the two parts (m)
+
+
+def moved_groups(problem: Problem, values: Array) -> tuple[Moved, ...]:
+    """Groups among weighted records that seem to have moved once, by the clearest split."""
+    moved, plan = [], problem.blueprint
+    residuals = problem.residuals(values)
+    for kernel, record, residual in zip(problem.kernels, problem.records, residuals, strict=True):
+        if record.group is None:
+            continue
+        lengths = np.array([dimension == "length" for dimension in kernel.factor.dimensions], dtype=bool)
+        group, weighted = record.group[: record.count], record.weight[: record.count] > 0
+        for number in np.unique(group[weighted & (group >= 0)]):
+            own = residual[lengths][:, weighted & (group == number)]
+            if own.shape[1] >= FEWEST and lengths.any():
+                before, distance, scatter = _split(own)
+                if distance > APART * scatter:
+                    key = group_key(plan.measurements, plan.groups, kernel.factor.name, number)
+                    after = own.shape[1] - before
+                    moved.append(Moved(kernel.factor.name, key, before, after, distance, scatter))
+    return tuple(moved)
+
+
+def moved(fit: Fit) -> list[Finding]:
+    if not fit.converged:
+        return []
+    return moved_findings(moved_groups(fit.acting, fit.estimate.values))
+
+
+def moved_findings(moved: Sequence[Moved]) -> list[Finding]:
+    return [
+        Finding(
+            "warning",
+            f"{group.key}: its first {group.before} records lie {digits(group.distance * _MM)} mm from the other "
+            f"{group.after}, {group.distance / group.scatter:.0f} times their spread. Did it move, or the base?",
+            f"the best split in recorded order, limit {APART:g} standard deviations",
+            "Give the records before the move a label of their own, or leave them out.",
+        )
+        for group in moved
+    ]
+
+
+def _split(residual: Array) -> tuple[int, float, float]:
+    """Records before the best split, the distance of the means (m) and the scatter within the parts (m)."""
+    rows, count = residual.shape
+    best = (0.0, 0, 0.0, 1.0)
+    for before in range(_LEAST_PART, count - _LEAST_PART + 1):
+        parts = residual[:, :before], residual[:, before:]
+        means = [part.mean(axis=1, keepdims=True) for part in parts]
+        within = sum(float(np.sum((part - mean) ** 2)) for part, mean in zip(parts, means, strict=True))
+        scatter = max(float(np.sqrt(within / (rows * (count - 2)))), 1e-12)
+        distance = float(np.linalg.norm(means[0] - means[1]))
+        evidence = distance / scatter * float(np.sqrt(before * (count - before) / count))
+        if evidence > best[0]:
+            best = (evidence, before, distance, scatter)
+    return best[1], best[2], best[3]
+
+
+def contradicting(fit: Fit) -> list[Finding]:
+    """Records that contradict the others."""
+    if not fit.converged:
+        return []
+    chosen = thinned(fit.split.train)
+    apart = minority(fit.of(sampled_rows)[1], fit.estimate.noise_scale, fit.position[chosen])
+    if apart is None:
+        return []
+    ids = [fit.dataset.ids[i] for i in chosen]
+    count, total = len(apart.far), len(ids)
+    text = (
+        f"{count} of {total} training records ({100 * count / total:.0f} %) contradict the others: a fit to the "
+        f"majority is off by {digits(apart.typical_mm, 2)} mm there, and by {digits(apart.far_mm)} mm in these"
+    )
+    listed = f"{', '.join(ids[i] for i in apart.far[:_FEW_NAMED])}{', ...' if count > _FEW_NAMED else ''}"
+    test = f"sum of residual lengths minimised; far is beyond {FAR:g} sd by the lower quartile"
+    if apart.since is None:
+        action = f"Find out what is different about them ({listed}): units, joints, the target, reflections."
+        return [Finding("bad", f"{text}.", test, action)]
+    text += f": nearly all from record {ids[apart.far[0]]} on"
+    action = "Something moved there, or slipped: the base, the tracker, the target or a joint. Measure again, or split."
+    return [Finding("bad", f"{text}.", test, action)]

@@ -1,0 +1,147 @@
+"""The list of checks: what each asks of the data or of a fit, and how often it warns of sound ones.
+
+A check is a function of a fit (``armcal.diagnose.fit.Fit``), or of the data before a fit (``Prepared`` there), that
+gives findings. It stands here by its module and name, which are imported when it runs.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pkgutil import resolve_name
+from typing import Any, Literal, Protocol
+
+from armcal.plugins import PluginRegistry, said
+
+Grade = Literal["good", "note", "warning", "bad"]
+EXACT, NO_RATE = "exact", "no rate yet"
+"""Of a check that states a fact and tests nothing; of one whose false alarms were not counted."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One row of the verdict: how much it matters, what it is, how it was tested at which level, what to do."""
+
+    grade: Grade
+    text: str
+    test: str = ""
+    action: str = ""
+
+    @property
+    def whole(self) -> str:
+        """All of it in one text."""
+        return self.text + (f" [{self.test}]" if self.test else "") + (f" {self.action}" if self.action else "")
+
+
+class CheckFunction(Protocol):
+    """A function of a fit (``armcal.diagnose.fit.Fit``) that gives findings: none where it has nothing to say.
+
+    ``rate`` says how often it warns of sound data, ``"exact"`` where it states a fact, and ``page`` where it is
+    explained; ``before_fit = True`` hands it the data before the fit (``armcal.diagnose.fit.Prepared``). All three are
+    attributes of the function and may be left out. What it raises costs nobody a calibration: a warning stands in place
+    of its findings.
+    """
+
+    def __call__(self, fit: Any) -> Sequence[Finding]:
+        """What there is to say of this fit."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """A check of the list."""
+
+    name: str
+    question: str  # that it answers
+    rate: str  # of false alarms: the level stated for sound data, ``EXACT`` or ``NO_RATE``
+    page: str  # of the documentation
+    target: str  # module:function; of armcal's own below ``armcal.diagnose``
+    plugin: str = ""  # that registered it; empty for armcal's own
+
+    def findings(self, subject: Any) -> list[Finding]:
+        """Of a fit, or of data before it; what a plugin's check raises is a warning in their place."""
+        if not self.plugin:
+            return list(resolve_name(f"armcal.diagnose.{self.target}")(subject))
+        try:
+            findings = list(resolve_name(self.target)(subject))
+            if not all(isinstance(one, Finding) for one in findings):
+                raise TypeError(f"found {findings!r}, expected a list of armcal.Finding")
+        except Exception as fault:  # a plugin may fail in any way, and must not cost anybody a calibration
+            return [Finding("warning", f"The check {self.name!r} of the plugin {self.plugin} failed: {said(fault)}.")]
+        return findings
+
+
+DATA_CHECKS = (
+    Check("axes", "Would the data fit far better with axes or joints exchanged, reversed or coupled?", NO_RATE,
+          "troubleshooting.md", "data:mixed_up"),
+    Check("reach", "Are all positions in one unit, and as far out as the arm reaches?", NO_RATE, "data.md",
+          "data:reach"),
+    Check("masses", "Does the arm weigh what an arm of its length may weigh?", NO_RATE, "models.md", "data:masses"),
+)  # fmt: skip
+"""Of data before a fit."""
+
+FIT_CHECKS = (
+    Check("converged", "Did the solver converge?", EXACT, "numbers.md", "verdict:converged"),
+    Check("determined", "Do the data determine all free parameters, and does the tip depend on the others?", EXACT,
+          "identifiability.md", "unseen:determined"),
+    Check("condition", "Is a combination of parameters hardly determined?", EXACT, "identifiability.md",
+          "verdict:conditioned"),
+    Check("bounds", "Do the data push against a bound?", "5 %", "numbers.md", "verdict:bounds"),
+    Check("shifts", "Do bounds that hold shift other estimates?", EXACT, "numbers.md", "verdict:shifts"),
+    Check("noise", "Are residuals as large as the declared noise, and whose are they?", "5 %", "noise.md",
+          "verdict:noise"),
+    Check("freedom", "Are equations left beside the free parameters?", EXACT, "numbers.md", "verdict:freedom"),
+    Check("instruments", "Do records contradict what an instrument holds: a board's size, a lens?", "0.1 %",
+          "board.md", "held:instruments"),
+    Check("rounding", "Were recorded joint angles rounded?", NO_RATE, "data.md", "unseen:rounded"),
+    Check("structure", "What do residuals still depend on?", "5 %", "mathematics.md", "residual_structure:depends"),
+    Check("neighbours", "Do records that follow one another miss alike?", "5 %", "mathematics.md",
+          "residual_structure:neighbours"),
+    Check("correlated", "Which estimates correlate strongly?", EXACT, "identifiability.md", "verdict:correlated"),
+    Check("before", "What did the checks of the data find, and what became of a pose residual?", EXACT,
+          "pose_residual.md", "verdict:found_before"),
+    Check("computed", "Do the tips come from the joints, not from an instrument?", NO_RATE, "data.md",
+          "gross:computed"),
+    Check("gross", "Is the error gross beside the arm's reach?", NO_RATE, "numbers.md", "gross:gross"),
+    Check("jump", "Do the records contradict one another from one place on?", NO_RATE, "numbers.md", "gross:jumped"),
+    Check("minority", "Do many records contradict the others?", NO_RATE, "numbers.md", "outliers:contradicting"),
+    Check("size", "Is the calibrated arm as large as the nominal one?", NO_RATE, "numbers.md", "gross:size"),
+    Check("displaced", "Is a parameter far from its prior or its nominal value?", NO_RATE, "numbers.md",
+          "gross:displaced"),
+    Check("scale", "Which error of an instrument's scale would not show?", "5 %", "trackers.md", "unseen:scale"),
+    Check("payload", "Which payload would not show?", EXACT, "effects.md", "unseen:payload"),
+    Check("elsewhere", "How well is the tool known away from the contacts?", EXACT, "ball_and_sockets.md",
+          "unseen:away"),
+    Check("worse", "Are unseen records missed by more than by the nominal arm?", "1 %", "numbers.md",
+          "gross:worse"),
+    Check("turns", "Are orientations grossly off, or worse than the nominal arm's?", NO_RATE, "numbers.md",
+          "gross:turns"),
+    Check("aligned", "Are positions far worse than those aligned before the fit?", NO_RATE, "numbers.md",
+          "gross:aligned"),
+    Check("overfitted", "Are unseen records missed by far more than those that trained?", NO_RATE, "numbers.md",
+          "gross:overfit"),
+    Check("weights", "Does the declared noise predict better than estimated variances?", "5 %", "noise.md",
+          "gross:weights"),
+    Check("intervals", "Do prediction intervals cover their share?", "5 %", "numbers.md", "coverage:covered"),
+    Check("places", "How well are base and target known?", EXACT, "numbers.md", "verdict:places"),
+    Check("moved", "Did what the arm touches move?", NO_RATE, "ball_and_sockets.md", "outliers:moved"),
+    Check("still", "Did a joint stand still?", EXACT, "data.md", "data:still"),
+    Check("same_poses", "Are held-out records at poses that trained?", EXACT, "numbers.md", "data:same_poses"),
+    Check("gravity", "Is the direction of gravity stated where springs bend?", EXACT, "effects.md", "data:gravity"),
+    Check("large_errors", "Are unseen records missed by more than noise explains?", "1 %", "numbers.md",
+          "outliers:missed"),
+    Check("outliers", "Do training records lie farther off than noise allows?", "1 %", "noise.md",
+          "outliers:suspicious"),
+    Check("next", "What is least certain, and which poses would add most?", EXACT, "plan.md", "verdict:next_poses"),
+)  # fmt: skip
+"""Of a fit, in the order of the verdict within one grade."""
+
+
+def plugin_checks(registry: PluginRegistry, before_fit: bool) -> Iterator[Check]:
+    """The checks that plugins registered, by name."""
+    for component in sorted((c for c in registry.components if c.kind == "check"), key=lambda one: one.name):
+        own = component.load()
+        if bool(getattr(own, "before_fit", False)) == before_fit:
+            rate, page = getattr(own, "rate", NO_RATE), getattr(own, "page", "")
+            yield Check(component.name, component.summary, rate, page, component.target, component.plugin)
+
+
+def first_few(texts: Sequence[str], most: int = 5) -> str:
+    return ", ".join(texts[:most]) + (f" and {len(texts) - most} more" if len(texts) > most else "")
