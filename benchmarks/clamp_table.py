@@ -19,7 +19,7 @@ from armcal.base.parameters import Parameters
 from armcal.estimate.estimator import Estimate, estimate
 from armcal.estimate.polish import started
 from armcal.problem.problem import Problem
-from armcal.problem.readings import with_joint_noise
+from armcal.problem.variants import with_joint_noise
 from armcal.run.experiment import Experiment
 from numpy.typing import NDArray
 

@@ -54,11 +54,11 @@ def run() -> Iterator[Row]:
 
 
 def _kernel_residuals(case: lrm.Case, problem: Problem) -> Callable[[Array], Array]:
-    records = problem.of(case.dataset).records
+    problem = problem.of(case.dataset)
     noise = np.array(problem.kernels[0].factor.noise)[:, None]
 
     def residuals(increment: Array) -> Array:
-        raw = problem.with_records(records).residuals(case.parameters.retract(increment))[0]
+        raw = problem.residuals(case.parameters.retract(increment))[0]
         return np.asarray((raw / noise).ravel())
 
     return residuals

@@ -38,8 +38,8 @@ class Case:
 
     def solve(self, problem: Problem) -> Solution:
         """The configured fit from nominal values, every equilibrium cold."""
-        records = problem.of(self.dataset).records
-        return self.experiment.estimator.solve(problem.with_records(records), self.parameters.nominal())
+        problem = problem.of(self.dataset)
+        return self.experiment.estimator.solve(problem, self.parameters.nominal())
 
 
 def simulated(records: int, also_free: Sequence[str] = ()) -> Case:

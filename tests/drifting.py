@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from armcal.estimate.robust import fit
-from armcal.problem.drift import with_drift
 from armcal.problem.problem import Problem
+from armcal.problem.variants import with_drift
 from armcal.run.experiment import Experiment
 
 DEMO = str(Path(__file__).resolve().parents[1] / "configs" / "lrm_arm" / "demo.yaml")

@@ -172,6 +172,18 @@ def test_modules_and_functions_can_be_held_in_mind(path: Path) -> None:
         assert length < 60, f"{path}: {name}"
 
 
+def test_a_problem_carries_its_records() -> None:
+    """Only the room of problems takes them apart: elsewhere no function takes both."""
+    for path in (*FRAMEWORK.rglob("*.py"), *PLUGINS.rglob("*.py")):
+        if path.parent == FRAMEWORK / "problem":
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                given = [a.annotation for a in (*node.args.args, *node.args.kwonlyargs) if a.annotation is not None]
+                taken = {name.id for one in given for name in ast.walk(one) if isinstance(name, ast.Name)}
+                assert not taken >= {"Problem", "FactorRecords"}, f"{path.name}: {node.name}"
+
+
 def test_only_the_command_line_prints_or_exits() -> None:
     for path in FILES:
         if "cli" not in path.parts:

@@ -20,7 +20,7 @@ from armcal.estimate.identifiability import require_solvable
 from armcal.estimate.polish import started
 from armcal.estimate.simulation import SimulationRequest
 from armcal.problem.problem import Problem
-from armcal.problem.readings import with_joint_noise
+from armcal.problem.variants import with_joint_noise
 from armcal.run.experiment import Experiment
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -15,8 +15,7 @@ from armcal.base.domains import Semidefinite, symmetric
 from armcal.base.settings import Settings
 from armcal.estimate.estimator import Progress, Solution, SolverVerdict, no_progress
 from armcal.estimate.polish import polish
-from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import NormalEquations, Problem
+from armcal.problem.problem import NormalEquations, PosedProblem, Problem
 from pydantic import Field
 
 _LEAST_DAMPING, _FIRST_DAMPING, _MOST_DAMPING = 1e-12, 1e-6, 1e8

@@ -31,8 +31,7 @@ from armcal.estimate.estimator import Progress, Solution, SolverVerdict, no_prog
 from armcal.estimate.polish import bounded_step, polish
 from armcal.io.parallel import Executor, Sequential
 from armcal.io.signals import Interrupts
-from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import NormalEquations, Problem
+from armcal.problem.problem import NormalEquations, PosedProblem, Problem
 from pydantic import Field
 from typing_extensions import override
 

@@ -16,7 +16,7 @@ from armcal.estimate.simulation import SimulationRequest
 from armcal.measure.groups import ONLY, group_blocks, owner_of
 from armcal.measure.measurement import GroupedMeasurement, Measurement
 from armcal.problem.problem import Problem
-from armcal.problem.projection import fits, joint_channels, projected
+from armcal.problem.variants import fits, joint_channels, projected
 from pydantic import Field
 
 _BATCH = 64

@@ -24,8 +24,8 @@ from armcal.estimate.simulation import (
     with_outliers,
 )
 from armcal.measure.instrument import LimitedView
-from armcal.problem.many_points import as_seen
 from armcal.problem.problem import Problem
+from armcal.problem.variants import as_seen
 from pydantic import Field
 
 _MOST_DRAWS = 100

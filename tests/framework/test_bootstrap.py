@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from armcal.cli.main import cli
 from armcal.errors import NotConvergedError, ProblemError
-from armcal.estimate.bootstrap import (
+from armcal.estimate.estimator import Solution, SolverVerdict, estimate
+from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
+from armcal.estimate.uncertainty import (
     BootstrapSettings,
     automatic_block_length,
     bootstrap,
     draw_weights,
     standard_error_of_mean,
 )
-from armcal.estimate.estimator import Solution, SolverVerdict, estimate
-from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.io.parallel import Workers
-from armcal.problem.correlation import Correlation
+from armcal.problem.records import Correlation
 from armcal.run.study import change, simplest_good
 from armcal.run.study_result import Change
 from click.testing import CliRunner
@@ -126,11 +126,9 @@ def _experiments(lrm, make_noise, number: int, settings: BootstrapSettings):
     for seed in range(number):
         random = np.random.default_rng(seed)
         noisy = {name: values + NOISE_M * make_noise(random, len(values)) for name, values in exact.items()}
-        records = problem.of(with_channels(dataset, noisy)).records
-        fitted = estimate(
-            problem.with_records(records), experiment.estimator.solve(problem.with_records(records), start)
-        )
-        resampled = bootstrap(problem.with_records(records), experiment.estimator, fitted, replace_seed(settings, seed))
+        problem = problem.of(with_channels(dataset, noisy))
+        fitted = estimate(problem, experiment.estimator.solve(problem, start))
+        resampled = bootstrap(problem, experiment.estimator, fitted, replace_seed(settings, seed))
         assert resampled.failed == 0 and resampled.names == fitted.names
         found.append(fitted.values[list(fitted.free_entries)])
         spreads.append(resampled.deviations)
@@ -177,13 +175,13 @@ def _fitted(lrm, *overrides):
     experiment = lrm.experiment("demo", FREE, "evaluator=interpreted", *overrides)
     dataset = experiment.read()
     problem = lrm.problem(experiment, dataset)
-    records = problem.of(dataset).records
+    problem = problem.of(dataset)
     start = experiment.parameters.nominal()
     return (
         experiment,
         problem,
-        records,
-        estimate(problem.with_records(records), experiment.estimator.solve(problem.with_records(records), start)),
+        problem.records,
+        estimate(problem, experiment.estimator.solve(problem, start)),
     )
 
 

@@ -33,10 +33,8 @@ def fitted(free: str, truth: dict[str, float], *settings: str, seed: int = 3) ->
     exact = measured_without_noise(request, commands)
     dataset = with_channels(commands, {n: x + random.normal(0, NOISE_M, len(x)) for n, x in exact.items()})
     problem = Problem.build(system.arms, system.measurements, parameters, system.environment, dataset, "interpreted")
-    records = problem.of(dataset).records
-    return estimate(
-        problem.with_records(records), loaded.estimator.solve(problem.with_records(records), parameters.nominal())
-    )
+    problem = problem.of(dataset)
+    return estimate(problem, loaded.estimator.solve(problem, parameters.nominal()))
 
 
 SPRINGS = '["arm.spring.k[2-4]", "arm.mdh.theta[2-4]"]'

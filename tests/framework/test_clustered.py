@@ -41,11 +41,9 @@ def estimates(order: str, seeds: range, count: int) -> list[tuple[Estimate, Esti
         problem = Problem.build(
             system.arms, system.measurements, parameters, system.environment, dataset, "interpreted"
         )
-        records = problem.of(dataset).records
-        plain = estimate(
-            problem.with_records(records), loaded.estimator.solve(problem.with_records(records), parameters.nominal())
-        )
-        wide = widened(problem.with_records(records), plain, places)
+        problem = problem.of(dataset)
+        plain = estimate(problem, loaded.estimator.solve(problem, parameters.nominal()))
+        wide = widened(problem, plain, places)
         found.append((plain, wide, (plain.values - parameters.nominal())[free]))
     return found
 

@@ -21,7 +21,7 @@ from armcal.estimate.estimator import estimate
 from armcal.estimate.prediction import KnownDrift, Predictor
 from armcal.estimate.robust import NoiseSettings, Weighing
 from armcal.estimate.validation import cross_validate, folds, record_errors
-from armcal.problem.drift import residuals, with_drift
+from armcal.problem.variants import with_drift
 from armcal_cvxpy.estimator import CvxpyEstimator
 from armcal_ipopt.estimator import IpoptEstimator
 from click.testing import CliRunner
@@ -240,7 +240,7 @@ def test_residuals_of_other_records_are_kriged_from_those_that_tell(lrm, weighte
     dense = Dense(dataset.subset(train), DRIFTS, weights)
     for part, chosen in ((others, held), (problem.with_records(records).subset(train).records, train)):
         expected = dense.told(v, dataset.subset(chosen))
-        (found,) = residuals(problem.with_records(part), values, problem.with_records(telling))
+        (found,) = problem.with_records(part).residuals_beside(problem.with_records(telling), values)
         np.testing.assert_allclose(found.T, expected, rtol=0, atol=1e-9)
         errors = record_errors(problem.with_records(part), values, problem.with_records(telling))
         np.testing.assert_allclose(errors, np.linalg.norm(expected, axis=1), rtol=0, atol=1e-9)
@@ -258,7 +258,8 @@ def test_records_without_weight_are_told_the_drift_too(lrm):
     problem = posed(lrm, dataset)[0]
     values = lrm.vector(problem.parameters, {name: v[name] for name in FREE})
     records = with_drift(problem.of(dataset, weights), dataset, problem.parameters.nominal()).records
-    (found,) = residuals(problem.with_records(records), values, problem.with_records(records))
+    problem = problem.with_records(records)
+    (found,) = problem.residuals_beside(problem, values)
     expected = Dense(dataset, DRIFTS, weights).told(v, dataset)
     np.testing.assert_allclose(found.T, expected, rtol=0, atol=1e-9)
 
@@ -544,10 +545,11 @@ def test_a_run_on_a_drifting_recording_states_both_errors(tmp_path):
 
 def new_recording(problem, records, fitted):
     """What a run gathers of a fit to all records."""
-    known = estimate(problem.with_records(records), fitted)
-    drift = KnownDrift.by(problem.with_records(records), known.values)
-    by = Predictor(problem, known.values, known.covariance, known.noise_scale, known.degrees_of_freedom, drift)
-    return by.new_recording(records, np.arange(records[0].count))
+    problem = problem.with_records(records)
+    known = estimate(problem, fitted)
+    drift = KnownDrift.by(problem, known.values)
+    by = Predictor(known.values, known.covariance, known.noise_scale, known.degrees_of_freedom, drift)
+    return by.new_recording(problem, np.arange(problem.count))
 
 
 @pytest.mark.slow
@@ -573,13 +575,11 @@ def test_angles_do_not_count_where_errors_are_lengths(lrm):
     for experiment in (lrm.experiment(), lrm.experiment("option1", *pose)):
         problem = lrm.problem(experiment, dataset, "interpreted", parameters_of(lrm, drifts, experiment=experiment))
         values = problem.parameters.nominal()
-        records = with_drift(problem.of(dataset), dataset, values).records
+        problem = with_drift(problem.of(dataset), dataset, values)
         free = len(problem.free_names)
-        by = Predictor(
-            problem, values, np.eye(free) * 1e-8, 1.0, 99.0, KnownDrift.by(problem.with_records(records), values)
-        )
-        known.append(by.new_recording(records, np.arange(40)))
-        assert by.new_recording(records, np.arange(0)) is None
+        by = Predictor(values, np.eye(free) * 1e-8, 1.0, 99.0, KnownDrift.by(problem, values))
+        known.append(by.new_recording(problem, np.arange(40)))
+        assert by.new_recording(problem, np.arange(0)) is None
     assert known[0].freedom == pytest.approx(known[1].freedom) and known[0].freedom < known[0].independent
 
 

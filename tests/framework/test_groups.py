@@ -120,7 +120,7 @@ def test_the_gradient_is_that_of_the_cost_and_the_exact_hessian_that_of_the_grad
         problem.with_records(records).normal_equations(values),
         problem.with_records(records).exact_hessian(values),
     )
-    beside = equations.hessian - plain.normal_equations(values, records).hessian
+    beside = equations.hessian - plain.with_records(records).normal_equations(values).hessian
     size = np.sqrt(np.diag(equations.hessian))
     for column, entry in enumerate(problem.parameters.free_entries):
         step = np.zeros(len(values))
@@ -128,7 +128,7 @@ def test_the_gradient_is_that_of_the_cost_and_the_exact_hessian_that_of_the_grad
         sides = [problem.with_records(records).normal_equations(values + sign * step) for sign in (1, -1)]
         slope = (sides[0].cost - sides[1].cost) / 2e-2
         assert slope == pytest.approx(equations.gradient[column] / size[column], rel=1e-5, abs=1e-3)
-        up, down = (plain.normal_equations(values + sign * step, records) for sign in (1, -1))
+        up, down = (plain.with_records(records).normal_equations(values + sign * step) for sign in (1, -1))
         bend = (up.gradient - down.gradient) / 2e-2 / size + beside[:, column] / size / size[column]
         np.testing.assert_allclose(exact[:, column] / size / size[column], bend, atol=2e-4, err_msg=str(column))
 
@@ -195,7 +195,7 @@ def test_names_of_groups_mean_nothing_but_their_order():
     values = co.by_name(problem.parameters, near(problem))
     moved = {n.replace("back", "zebra").replace("front", "ant").replace("shelf", "mouse"): x for n, x in values.items()}
     first = problem.with_records(records).normal_equations(co.vector(problem.parameters, values))
-    second = again.normal_equations(co.vector(again.parameters, moved), others)
+    second = again.with_records(others).normal_equations(co.vector(again.parameters, moved))
     assert second.cost == pytest.approx(first.cost, rel=1e-12)
     np.testing.assert_allclose(np.linalg.eigvalsh(second.hessian), np.linalg.eigvalsh(first.hessian), rtol=1e-8)
 
@@ -231,9 +231,11 @@ def test_the_unit_of_length_means_nothing():
     values = near(problem)
     lengths = np.array([b.unit == "m" for b in problem.parameters.blocks])
     grown = np.where(lengths, k, 1.0)
-    assert large.cost(values * grown, others) == pytest.approx(problem.with_records(records).cost(values), rel=1e-10)
+    assert large.with_records(others).cost(values * grown) == pytest.approx(
+        problem.with_records(records).cost(values), rel=1e-10
+    )
     free = list(problem.parameters.free_entries)
-    slope = large.normal_equations(values * grown, others).gradient * grown[free]
+    slope = large.with_records(others).normal_equations(values * grown).gradient * grown[free]
     expected = problem.with_records(records).normal_equations(values).gradient
     np.testing.assert_allclose(slope, expected, rtol=1e-8, atol=1e-9 * np.abs(expected).max())
 

@@ -62,8 +62,8 @@ def fits_under_priors(
         moved = (system.arms, system.measurements, parameters.with_nominal(truth), system.environment)
         exact = measured_without_noise(SimulationRequest(*moved), commands)
         noisy = {name: values + random.normal(0, noise, len(values)) for name, values in exact.items()}
-        records = problem.of(with_channels(commands, noisy)).records
-        found.append((fit(problem.with_records(records), estimator, parameters.nominal()), truth))
+        problem = problem.of(with_channels(commands, noisy))
+        found.append((fit(problem, estimator, parameters.nominal()), truth))
     return found
 
 
@@ -118,10 +118,8 @@ def test_intervals_hold_under_priors_when_the_noise_is_ten_times_what_was_declar
         )
         exact = measured_without_noise(request, commands)
         noisy = {name: values + random.normal(0, 5e-3, len(values)) for name, values in exact.items()}
-        records = problem.of(with_channels(commands, noisy)).records
-        found = estimate(
-            problem.with_records(records), loaded.estimator.solve(problem.with_records(records), parameters.nominal())
-        )
+        problem = problem.of(with_channels(commands, noisy))
+        found = estimate(problem, loaded.estimator.solve(problem, parameters.nominal()))
         free = list(parameters.free_entries)
         scores.append((found.values - truth)[free] / found.deviations)
     assert 0.9 < np.sqrt(np.mean(np.square(scores))) < 1.1
@@ -223,10 +221,10 @@ def test_the_information_kept_is_that_of_the_estimate() -> None:
     problem = Problem.build(
         system.arms, system.measurements, loaded.parameters, system.environment, dataset, "interpreted"
     )
-    records = problem.of(dataset).records
+    problem = problem.of(dataset)
     found = estimate(
-        problem.with_records(records),
-        loaded.estimator.solve(problem.with_records(records), loaded.parameters.nominal()),
+        problem,
+        loaded.estimator.solve(problem, loaded.parameters.nominal()),
     )
     root = found.square_root_information
     inverse = np.linalg.inv(root.T @ root)

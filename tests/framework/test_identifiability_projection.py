@@ -15,7 +15,7 @@ from armcal.estimate.estimator import Solution, SolverVerdict, estimate
 from armcal.estimate.identifiability import analyse, explain, identify, require_solvable
 from armcal.measure.measurement import Channel
 from armcal.problem.problem import Problem
-from armcal.problem.projection import projected
+from armcal.problem.variants import projected
 from armcal.testing.planar import GRAVITY, Tip, planar_arms
 
 COUNT = 30

@@ -22,9 +22,9 @@ def judged(seen: np.ndarray):
     told = {f"second.{a}": dataset.column(f"tracker.{a}") + random.normal(0, 5e-4, 60) for a in "xyz"}
     dataset = with_channels(dataset, {name: np.where(seen, values, np.nan) for name, values in told.items()})
     problem = problem_of(loaded, dataset)
-    records = problem.of(dataset).records
-    fitted = fit(problem.with_records(records).subset(np.arange(40)), loaded.estimator, loaded.parameters.nominal())
-    return predictor(fitted), problem.with_records(records).subset(np.arange(40, 60)).records
+    problem = problem.of(dataset)
+    fitted = fit(problem.subset(np.arange(40)), loaded.estimator, loaded.parameters.nominal())
+    return predictor(fitted), problem.subset(np.arange(40, 60))
 
 
 @pytest.mark.slow

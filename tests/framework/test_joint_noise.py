@@ -13,7 +13,7 @@ from armcal.base.dataset import Dataset
 from armcal.calibration.intervals import PredictionRecord, Uncertainty
 from armcal.estimate.estimator import estimate
 from armcal.estimate.polish import started
-from armcal.problem.readings import with_joint_noise
+from armcal.problem.variants import with_joint_noise
 from armcal_contact.contacts import TipDistance
 from armcal_ipopt.estimator import IpoptEstimator
 from armcal_tracker.position import TipPosition, TipPositionSettings

@@ -33,8 +33,8 @@ def without_priors():
 def test_it_is_the_posterior_without_the_record() -> None:
     """Values and drift together, each record in turn taken out of the information."""
     _, fitted, joint, known = without_priors()
-    (spread,) = predictor(fitted).left_out(fitted.records, "same")
-    (own,) = predictor(fitted).spreads(fitted.records, "same")
+    (spread,) = predictor(fitted).left_out(fitted.problem, "same")
+    (own,) = predictor(fitted).spreads(fitted.problem, "same")
     information = joint.T @ joint + known
     scale = (fitted.estimate.noise_scale * NOISE) ** 2
     for i in range(len(joint) // 3):
@@ -49,10 +49,11 @@ def test_it_is_the_posterior_without_the_record() -> None:
 def test_a_record_that_weighed_less_is_missed_less() -> None:
     _, fitted, *_ = without_priors()
     by = predictor(fitted)
-    (whole,), (own,) = by.left_out(fitted.records, "same"), by.spreads(fitted.records, "same")
-    weight = fitted.records[0].weight.copy()
+    (whole,), (own,) = by.left_out(fitted.problem, "same"), by.spreads(fitted.problem, "same")
+    (kept,) = fitted.problem.records
+    weight = kept.weight.copy()
     weight[0], weight[1] = 0.0, 0.5
-    (spread,) = by.left_out([replace(fitted.records[0], weight=weight)], "same")
+    (spread,) = by.left_out(fitted.problem.with_records([replace(kept, weight=weight)]), "same")
     assert np.allclose(spread.covariance[0], own.covariance[0], rtol=1e-10)
     assert (spread.deviations[:, 1] < whole.deviations[:, 1]).all()
     assert (spread.deviations[:, 1] > own.deviations[:, 1]).all()
@@ -65,7 +66,7 @@ def test_where_nothing_drifts_both_recordings_are_the_same() -> None:
     problem = problem_of(loaded, dataset)
     fitted = fit(problem.of(dataset), loaded.estimator, loaded.parameters.nominal())
     by = predictor(fitted)
-    (same,), (new,) = by.left_out(fitted.records, "same"), by.left_out(fitted.records, "new")
+    (same,), (new,) = by.left_out(fitted.problem, "same"), by.left_out(fitted.problem, "new")
     assert np.array_equal(same.covariance, new.covariance)
     # What records hold of what is known of themselves sums to the number of values.
     noise = (fitted.estimate.noise_scale * NOISE) ** 2
@@ -79,18 +80,18 @@ def test_a_record_alone_in_telling_something_is_not_predicted_without_it() -> No
     loaded = Experiment.load(DEMO, [FREE])
     dataset = loaded.read().subset(np.arange(2))
     problem = problem_of(loaded, dataset)
-    records = problem.of(dataset).records
-    fitted = fit(problem.with_records(records), loaded.estimator, loaded.parameters.nominal())
-    (spread,) = predictor(fitted).left_out(fitted.records, "same")
-    (own,) = predictor(fitted).spreads(fitted.records, "same")
+    problem = problem.of(dataset)
+    fitted = fit(problem, loaded.estimator, loaded.parameters.nominal())
+    (spread,) = predictor(fitted).left_out(fitted.problem, "same")
+    (own,) = predictor(fitted).spreads(fitted.problem, "same")
     assert np.isfinite(spread.covariance).all()
     assert (spread.deviations > 3 * own.deviations).any(axis=0).all()
 
 
 @pytest.mark.parametrize("recording", ["same", "new"])
 def test_the_order_of_records_does_not_matter(recording: str) -> None:
-    *_, problem, _, _, _, fitted = drifting_problem()
-    by, count = predictor(fitted), fitted.records[0].count
-    turned = problem.with_records(fitted.records).subset(np.arange(count)[::-1]).records
-    (forth,), (back,) = by.left_out(fitted.records, recording), by.left_out(turned, recording)
+    *_, fitted = drifting_problem()
+    by, count = predictor(fitted), fitted.problem.count
+    turned = fitted.problem.subset(np.arange(count)[::-1])
+    (forth,), (back,) = by.left_out(fitted.problem, recording), by.left_out(turned, recording)
     assert np.allclose(forth.covariance, back.covariance[::-1], rtol=1e-10)

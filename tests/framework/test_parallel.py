@@ -37,8 +37,8 @@ def _setup(lrm, evaluator="interpreted", *overrides):
 def _fold_errors(lrm, executor: Executor | None) -> np.ndarray:
     experiment, problem, dataset = _setup(lrm)
     start, splits = experiment.parameters.nominal(), folds(len(dataset), 4, 3)
-    records = problem.of(dataset).records
-    return cross_validate(problem.with_records(records), splits, experiment.estimator, start, executor=executor).errors
+    problem = problem.of(dataset)
+    return cross_validate(problem, splits, experiment.estimator, start, executor=executor).errors
 
 
 @pytest.mark.parametrize(

@@ -33,8 +33,8 @@ from armcal.estimate.robust import fit
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.estimate.validation import folds
 from armcal.measure.reader import ReadRequest, requested_channels
-from armcal.problem.drift import with_drift
 from armcal.problem.motion import recorded_position
+from armcal.problem.variants import with_drift
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, calibrate, prepare
 from click.testing import CliRunner, Result
@@ -81,7 +81,7 @@ def test_covariances_are_those_of_dense_gaussian_conditioning(drifting) -> None:
     h = slopes[rows["h"]] - drift[rows["h"]] @ message_of @ a.T @ j
     g = drift[rows["h"]]
     whole = h @ found.covariance @ h.T + s**2 * (g @ message_of @ g.T + noise**2 * np.eye(len(g)))
-    (spread,) = by.spreads(problem.with_records(records).subset(held).records, "same")
+    (spread,) = by.spreads(problem.with_records(records).subset(held), "same")
     for i in range(len(held)):
         block = whole[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
         assert np.allclose(spread.covariance[i], block, rtol=2e-4, atol=1e-4 * np.trace(block))
@@ -105,15 +105,15 @@ def test_without_priors_it_is_the_joint_posterior(drifting) -> None:
     posterior = scale[:, None] * np.linalg.inv(scaled.T @ scaled + known) * scale
     new = joint[rows_h]
     whole = fitted.estimate.noise_scale**2 * (new @ posterior @ new.T + 5e-4**2 * np.eye(len(new)))
-    (spread,) = predictor(fitted).spreads(problem.with_records(records).subset(held).records, "same")
+    (spread,) = predictor(fitted).spreads(problem.with_records(records).subset(held), "same")
     assert np.allclose(spread.deviations.T.ravel(), np.sqrt(np.diag(whole)), rtol=2e-2)
 
 
 def test_nothing_told_of_the_drift_counts_all_of_it(drifting) -> None:
     loaded, _, problem, records, _, held, fitted = drifting
     by, found = predictor(fitted), fitted.estimate
-    new = problem.with_records(records).subset(held).records
-    plain = [replace(each, correlation=None) for each in new]
+    new = problem.with_records(records).subset(held)
+    plain = [replace(each, correlation=None) for each in new.records]
     slopes = dense_slopes(problem, found.values, plain)
     free = [b.name for b in loaded.parameters.free]
     variance = np.zeros(len(free))
@@ -132,9 +132,7 @@ def test_the_order_of_new_records_does_not_matter(drifting) -> None:
     *_, problem, records, _, held, fitted = drifting
     by, turned = predictor(fitted), held[::-1]
     for recording in ("same", "new"):
-        (forth,), (back,) = (
-            by.spreads(problem.with_records(records).subset(own).records, recording) for own in (held, turned)
-        )
+        (forth,), (back,) = (by.spreads(problem.with_records(records).subset(own), recording) for own in (held, turned))
         assert np.allclose(forth.covariance, back.covariance[::-1], rtol=1e-10)
 
 
@@ -144,9 +142,9 @@ def test_a_record_counts_its_own_noise() -> None:
     noise = np.where(np.arange(60) % 2, 5e-4, 5e-3)
     dataset = with_channels(dataset, {"tracker.noise": noise})
     problem = problem_of(loaded, dataset)
-    records = problem.of(dataset).records
-    fitted = fit(problem.with_records(records), loaded.estimator, loaded.parameters.nominal())
-    (spread,) = predictor(fitted).spreads(records, "same")
+    problem = problem.of(dataset)
+    fitted = fit(problem, loaded.estimator, loaded.parameters.nominal())
+    (spread,) = predictor(fitted).spreads(problem, "same")
     deviations = spread.deviations / (fitted.estimate.noise_scale * noise)
     assert (deviations > 1).all() and (deviations < 1.5).all()
 
@@ -192,7 +190,7 @@ def test_intervals_hold_their_share_when_the_model_is_true() -> None:
         chosen = np.sort(random.permutation(100)[:50])
         train = problem.with_records(records).subset(chosen).records
         fitted = fit(problem.with_records(train), loaded.estimator, loaded.parameters.nominal())
-        held = problem.with_records(records).subset(np.setdiff1d(np.arange(100), chosen)).records
+        held = problem.with_records(records).subset(np.setdiff1d(np.arange(100), chosen))
         for name, each in score(predictor(fitted), held).items():
             scores[name].append(each)
     for name, tolerance in (("same", 0.03), ("new", 0.05)):
@@ -403,7 +401,7 @@ def test_what_is_kept_predicts_as_the_fit_itself(extra: tuple[str, ...], tmp_pat
     acting, position = fitted.problem.weighted(fitted.weights), recorded_position(dataset)[split.train]
     fitted = replace(fitted, estimate=widened(acting, fitted.estimate, position))
     by = predictor(fitted)
-    alike = whitened_like(problem.with_records(records), fitted, loaded.estimator).records
+    alike = whitened_like(problem.with_records(records), fitted, loaded.estimator)
     for recording, spreads in ((name, by.spreads(alike, name)) for name in ("same", "new")):
         found = kept.plus_minus(dataset, recording)
         deviations = np.array([found.deviations[f"tracker.{axis}"] for axis in "xyz"])

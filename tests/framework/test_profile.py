@@ -12,11 +12,10 @@ from armcal.cli.main import cli
 from armcal.errors import ConfigError, NotConvergedError
 from armcal.estimate.estimator import Solution, SolverVerdict
 from armcal.estimate.polish import bounded_step, polish
-from armcal.estimate.profile import profiled, profiles
 from armcal.estimate.robust import NoiseSettings, Weighing, fit
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
-from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import Problem
+from armcal.estimate.uncertainty import profiled, profiles
+from armcal.problem.problem import PosedProblem, Problem
 from armcal.run.experiment import Experiment
 from click.testing import CliRunner
 
@@ -116,7 +115,9 @@ def test_the_curve_is_that_of_fits_with_the_parameter_fixed() -> None:
         data = [type(r)(r.count, r.record, r.weight, np.zeros_like(r.state)) for r in records]
         at = GaussNewton().solve(other.with_records(data), alone.nominal()).values
         expected = (
-            2 * (other.with_records(data).cost(at) - base.cost(estimate.values, records)) / estimate.noise_scale**2
+            2
+            * (other.with_records(data).cost(at) - base.with_records(records).cost(estimate.values))
+            / estimate.noise_scale**2
         )
         assert rise == pytest.approx(expected, rel=1e-5, abs=1e-8)
 

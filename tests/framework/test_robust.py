@@ -121,8 +121,8 @@ def test_stated_deviations_hold_over_many_experiments(lrm, loss):
     off = []
     for seed in range(60):
         q, points, _ = measured(80, 100 + seed, outliers=0.05)
-        records = problem.of(lrm.dataset(q, points)).records
-        off.append(deviations_off(fitted(problem, records, truth, loss), truth))
+        problem = problem.of(lrm.dataset(q, points))
+        off.append(deviations_off(fitted(problem, problem.records, truth, loss), truth))
     off = np.array(off)
     assert np.sqrt(np.mean(off**2)) == pytest.approx(1.0, abs=0.12)
     assert np.mean(np.abs(off) < 1.96) > 0.92

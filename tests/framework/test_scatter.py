@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
-from armcal.estimate.residual_spread import ResidualSpread, residual_spread
+from armcal.estimate.prediction import ResidualSpread, residual_spread
 
 
 def told(residual: np.ndarray, places: np.ndarray | None = None, weight: np.ndarray | None = None) -> ResidualSpread:

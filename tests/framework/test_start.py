@@ -13,8 +13,8 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.cli.check import gravity_lines
 from armcal.cli.main import cli
-from armcal.diagnose.data import find_permuted_axes
 from armcal.diagnose.fit import Prepared
+from armcal.diagnose.permuted_axes import find_permuted_axes
 from armcal.estimate.start import Start, aligned_start, placings
 from armcal.problem.rigid_alignment import Alignment, Tools, alignments, hand_eye, sighting_of, tools_of, undetermined
 from armcal.run.experiment import Experiment
@@ -84,10 +84,9 @@ def test_what_upright_axes_do_not_determine_is_named() -> None:
 
 @pytest.mark.slow
 def test_parameters_that_place_the_arm_are_known_by_what_they_move(anywhere: Prepared) -> None:
-    problem, records = anywhere.problem, anywhere.records
-    sighting = sighting_of(problem.with_records(records), anywhere.dataset, 0, 300)
+    sighting = sighting_of(anywhere.problem, anywhere.dataset, 0, 300)
     assert sighting is not None
-    placing = placings(problem.with_records(records), sighting)[0]
+    placing = placings(anywhere.problem, sighting)[0]
     assert placing.base == (*(f"arm.mdh.base_{of}" for of in ("x", "y", "z", "rx", "ry")), "arm.mdh.theta1")
     assert placing.target == ("arm.mdh.tool_y", "arm.mdh.tool_z", "tracker.target_x")
     assert placing.stands_anywhere and placing.basis.shape == (3, 3)
@@ -238,7 +237,7 @@ def studied(name: str, folder: Path) -> tuple[Prepared, Experiment]:
     if name != "hobby":
         return ready, experiment
     dataset = hobby(ready.dataset, np.random.default_rng(5))
-    return replace(ready, dataset=dataset, records=ready.problem.of(dataset).records), experiment
+    return replace(ready, dataset=dataset, problem=ready.problem.of(dataset)), experiment
 
 
 @pytest.mark.slow

@@ -229,14 +229,14 @@ def test_the_exact_hessian_is_the_difference_of_the_gradient(lrm, evaluator):
     dataset = lrm.dataset(q, measured)
     problem = lrm.problem(lrm.experiment(), dataset, evaluator)
     weights = np.linspace(0.2, 2.0, 11)
-    records = problem.of(dataset, weights).records
+    problem = problem.of(dataset, weights)
     values, free = lrm.vector(problem.parameters, oracle.PUBLISHED), list(problem.parameters.free_entries)
-    hessian = problem.with_records(records).exact_hessian(values)
+    hessian = problem.exact_hessian(values)
     np.testing.assert_allclose(hessian, hessian.T, rtol=0, atol=1e-9 * np.abs(hessian).max())
     for column, place in enumerate(free):
         step = np.zeros_like(values)
         step[place] = 1e-6
-        ahead, behind = (settled_gradient(problem, values + s * step, records) for s in (1, -1))
+        ahead, behind = (settled_gradient(problem, values + s * step, problem.records) for s in (1, -1))
         numeric = (ahead - behind) / 2e-6
         np.testing.assert_allclose(hessian[:, column], numeric, rtol=0, atol=1e-6 * np.abs(numeric).max())
 
@@ -269,14 +269,14 @@ def test_the_gradient_is_the_difference_of_the_cost(lrm):
     measured = oracle.tip(oracle.published(), q) + np.random.default_rng(10).normal(0, 0.01, (11, 3))
     dataset = lrm.dataset(q, measured)
     problem = lrm.problem(lrm.experiment(), dataset)
-    records = problem.of(dataset).records
+    problem = problem.of(dataset)
     values = lrm.vector(problem.parameters, oracle.PUBLISHED)
-    equations = problem.with_records(records).normal_equations(values)
-    assert equations.cost == pytest.approx(problem.with_records(records).cost(values), rel=1e-12)
+    equations = problem.normal_equations(values)
+    assert equations.cost == pytest.approx(problem.cost(values), rel=1e-12)
     for column, place in enumerate(problem.parameters.free_entries):
         step = np.zeros_like(values)
         step[place] = 1e-6
-        ahead, behind = (problem.with_records(records).cost(values + s * step) for s in (1, -1))
+        ahead, behind = (problem.cost(values + s * step) for s in (1, -1))
         numeric = (ahead - behind) / 2e-6
         assert equations.gradient[column] == pytest.approx(numeric, abs=1e-6 * np.abs(equations.gradient).max())
 
@@ -324,9 +324,9 @@ def test_turning_and_shifting_the_root_frame_with_gravity_changes_no_deflection(
         problem = Problem.build(
             {"arm": one}, system.measurements, parameters, system.environment, dataset, "interpreted"
         )
-        records = problem.of(dataset).records
-        points.append(problem.with_records(records).predict(stiff)[0].outputs[:3].T)
-        at_rest.append(records[0].state[:, :30])
+        problem = problem.of(dataset)
+        points.append(problem.predict(stiff)[0].outputs[:3].T)
+        at_rest.append(problem.records[0].state[:, :30])
     np.testing.assert_allclose(at_rest[0], at_rest[1], rtol=0, atol=1e-12)
     np.testing.assert_allclose(turn.apply(points[0]) + shift, points[1], rtol=0, atol=1e-12)
 

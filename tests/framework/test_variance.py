@@ -12,7 +12,7 @@ from armcal.diagnose.outliers import component_findings
 from armcal.errors import ProblemError
 from armcal.estimate.robust import NoiseSettings, fit, weighed
 from armcal.estimate.variance import Term, _evaluate, apply_components, estimate_components, maximise
-from armcal.problem.factor_records import by_covariance, transformed
+from armcal.problem.records import by_covariance, transformed
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, prepare
 from armcal_ipopt.estimator import IpoptEstimator
@@ -191,9 +191,9 @@ def test_weighing_by_what_was_estimated_is_more_accurate(lrm, experiments):
     plain, better = [], []
     for seed in range(experiments):
         q, points, _ = measured(100, 600 + seed, joint_sd=joint_sd)
-        records = problem.of(lrm.dataset(q, points)).records
-        plain.append(IPOPT.solve(problem.with_records(records), truth).values[free] - truth[free])
-        better.append(weighed_fit(problem, records, truth).solution.values[free] - truth[free])
+        problem = problem.of(lrm.dataset(q, points))
+        plain.append(IPOPT.solve(problem, truth).values[free] - truth[free])
+        better.append(weighed_fit(problem, problem.records, truth).solution.values[free] - truth[free])
     gain = np.sqrt(np.mean(np.square(better), axis=0) / np.mean(np.square(plain), axis=0))
     assert np.median(gain) < 0.6
 

@@ -14,7 +14,7 @@ from armcal.estimate.polish import started
 from armcal.estimate.simulation import SimulationRequest
 from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import ReadRequest, requested_channels
-from armcal.problem.readings import with_joint_noise
+from armcal.problem.variants import with_joint_noise
 from armcal_contact.contacts import ClampedTool, PlaneContact
 from armcal_dualarm.closure import ClosedChain
 from armcal_ipopt.estimator import IpoptEstimator

@@ -11,7 +11,7 @@ from armcal.base import se3
 from armcal.errors import InputError
 from armcal.estimate.identifiability import require_solvable
 from armcal.estimate.polish import restricted, settled, started, untrained
-from armcal.problem.readings import with_joint_noise
+from armcal.problem.variants import with_joint_noise
 from armcal_contact.contacts import BallInSocket, ClampedTool, PlaneContact
 from armcal_dualarm.closure import ClosedChain
 from armcal_ipopt.estimator import IpoptEstimator
@@ -93,7 +93,7 @@ def test_the_plane_found_is_the_one_of_least_squares(stated, tilt):
     best = best * np.sign(best @ normal)
     v = co.by_name(begun.parameters, values)
     assert v["plane.table.offset"] == pytest.approx(best @ centre, abs=1e-9)
-    left = begun.residuals(values, records)[0][0]
+    left = begun.with_records(records).residuals(values)[0][0]
     np.testing.assert_allclose(left, (points - centre) @ best, atol=1e-9)
     assert np.hypot(v["plane.table.tilt_1"], v["plane.table.tilt_2"]) == pytest.approx(np.arccos(best @ mean), abs=1e-8)
 
@@ -161,7 +161,7 @@ def test_an_unknown_clamp_starts_at_the_tool_wherever_that_points(turn):
     fixture = state((0.1, 0.2, 0.0), Rotation.from_euler("z", 2.0))
     problem, records = clamp_bench(clamp(fixture=fixture)).problem(co.dataset([(co.joints(q), {"point": "bench"})]))
     begun = started(problem.with_records(records))
-    assert np.abs(begun.residuals(begun.parameters.nominal(), records)[0]).max() < 1e-7
+    assert np.abs(begun.with_records(records).residuals(begun.parameters.nominal())[0]).max() < 1e-7
     v = co.by_name(begun.parameters, begun.parameters.nominal())
     np.testing.assert_allclose(pose_in(v, "clamp.fixture") @ pose_in(v, "clamp.bench.point"), pose, atol=1e-7)
 

@@ -11,8 +11,7 @@ from armcal.base.domains import Interval
 from armcal.errors import ProblemError
 from armcal.estimate.estimator import estimate
 from armcal.estimate.identifiability import analyse, require_solvable
-from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import Problem
+from armcal.problem.problem import PosedProblem, Problem
 from armcal_cvxpy.estimator import CvxpyEstimator
 from armcal_ipopt.estimator import IpoptEstimator
 from armcal_tracker.position import TipPosition, TipPositionSettings

@@ -14,8 +14,7 @@ import pytest
 import yaml
 from armcal.base.domains import Semidefinite, symmetric
 from armcal.estimate.estimator import estimate
-from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import Problem
+from armcal.problem.problem import PosedProblem, Problem
 from armcal.run.experiment import Experiment
 from armcal_cvxpy.estimator import CvxpyEstimator
 from armcal_ipopt.estimator import IpoptEstimator, QuadraticModel
@@ -409,10 +408,8 @@ def coverage(lrm, seeds, count=150, noise=2e-4):
     for seed in seeds:
         dataset = lrm.dataset(q, noisy(exact, seed, noise))
         problem = problem or lrm.problem(experiment, dataset, "interpreted")
-        records = problem.of(dataset).records
-        fit = estimate(
-            problem.with_records(records), CONE.solve(problem.with_records(records), problem.parameters.nominal())
-        )
+        problem = problem.of(dataset)
+        fit = estimate(problem, CONE.solve(problem, problem.parameters.nominal()))
         assert fit.verdict.converged
         for name, value, sd, interval in zip(
             fit.names, fit.values[list(fit.free_entries)], fit.deviations, fit.intervals, strict=True

@@ -79,10 +79,10 @@ def test_intervals_hold_the_truth_as_often_as_they_say(
     for seed in range(seeds):
         dataset = simulated(loaded, seed)
         problem = problem or problem_for(loaded, dataset)
-        records = problem.of(dataset).records
-        solution = loaded.estimator.solve(problem.with_records(records), loaded.parameters.nominal())
+        problem = problem.of(dataset)
+        solution = loaded.estimator.solve(problem, loaded.parameters.nominal())
         assert solution.verdict.converged
-        intervals = estimate(problem.with_records(records), solution).intervals
+        intervals = estimate(problem, solution).intervals
         held.append([i.lower <= x <= i.upper for i, x in zip(intervals, expected, strict=True)])
         one_sided.append([i.bound is not None for i in intervals])
     share = np.mean(held, axis=0)

@@ -38,10 +38,8 @@ from armcal.estimate.validation import Recording
 from armcal.estimate.variance import Axes, Component, VarianceComponents, apply_components
 from armcal.io.plain_files import input_file
 from armcal.measure.reader import RequestedChannel
-from armcal.problem.corrected import sizes_of, unexplained
-from armcal.problem.drift import Chain, chain, with_drift
 from armcal.problem.problem import Problem
-from armcal.problem.readings import reading_slopes, with_joint_noise
+from armcal.problem.variants import Chain, chain, reading_slopes, sizes_of, unexplained, with_drift, with_joint_noise
 
 _AT_ONCE = 1000  # Records whose slopes are in memory together
 _FORGOTTEN = 5.0  # So many correlation distances beyond the recording nothing is known of its drift
@@ -216,9 +214,7 @@ class Uncertainty:
             axes: Axes = "together" if instruments <= set(self.system.measurements) else "apart"
             estimated = VarianceComponents(self.components, (), (), 0.0)
             whitened = apply_components(problem, self.values, estimated, axes)
-        spreads = self._from_either_side(
-            problem, self._predictor(problem, None).spreads(whitened.records, "new"), commands
-        )
+        spreads = self._from_either_side(problem, self._predictor(None).spreads(whitened, "new"), commands)
         recording: Recording = "same" if self.record.recording is None else "new"
         still = tuple(np.zeros_like(spread.deviations) for spread in spreads)
         return _Part(places, recording, still, spreads, reading_slopes(problem, self.values))
@@ -227,9 +223,7 @@ class Uncertainty:
         self, problem: Problem, commands: Dataset, places: Indices, drift: KnownDrift, along: Chain | None
     ) -> _Part:
         problem = self._drifted(problem.of(commands), commands, along, self.noise_scale)
-        spreads = self._from_either_side(
-            problem, self._predictor(problem, drift).spreads(problem.records, "same"), commands
-        )
+        spreads = self._from_either_side(problem, self._predictor(drift).spreads(problem, "same"), commands)
         shared = problem.correlation
         moved = () if shared is None else [shared.shift(i, drift.states) for i in range(len(problem.records))]
         off = tuple(m[:, : len(places), 0] for m in moved)
@@ -251,8 +245,8 @@ class Uncertainty:
                 covariance += np.einsum("rn,sn->nrs", half, half)
         return tuple(replace(s, covariance=own) for s, own in zip(spreads, covariances, strict=True))
 
-    def _predictor(self, problem: Problem, drift: KnownDrift | None) -> Predictor:
-        return Predictor(problem, self.values, self.record.symmetric_covariance, self.noise_scale, self.freedom, drift)
+    def _predictor(self, drift: KnownDrift | None) -> Predictor:
+        return Predictor(self.values, self.record.symmetric_covariance, self.noise_scale, self.freedom, drift)
 
     def _known_drift(self, recording: RecordingRecord, dataset: Dataset, along: Chain | None) -> KnownDrift:
         problem = self._drifted(self._problem(dataset), dataset, along)

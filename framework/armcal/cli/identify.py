@@ -30,7 +30,7 @@ from armcal.estimate.identifiability import (
 )
 from armcal.estimate.validation import error_unit
 from armcal.planning.criterion import observability
-from armcal.problem.projection import factor_at_zero
+from armcal.problem.variants import factor_at_zero
 from armcal.run.experiment import Experiment
 from armcal.run.fixed_parameters import FixedParameters, FreedStep, fixed_parameters
 from armcal.run.pipeline import Stopwatch, assemble

@@ -25,7 +25,6 @@ from armcal.diagnose.checks import Finding
 from armcal.diagnose.dependences import MOST_LEVELS
 from armcal.diagnose.fit import Fit
 from armcal.errors import NotConvergedError
-from armcal.estimate.bootstrap import automatic_block_length, standard_error_of_mean
 from armcal.estimate.estimator import Estimator
 from armcal.estimate.prediction import (
     LEVELS,
@@ -39,9 +38,10 @@ from armcal.estimate.prediction import (
     quantile,
 )
 from armcal.estimate.robust import WeighedFit, Weighing, fit
+from armcal.estimate.uncertainty import automatic_block_length, standard_error_of_mean
 from armcal.estimate.validation import FitTask, JudgedFit, Recording, Split, failed_fit, fit_and_judge, judged_fit
 from armcal.estimate.variance import apply_components
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import Problem
 
 Residuals = tuple[Array, ...]  # Raw residuals, one (n_r x N) a factor
 FEWEST = 40  # Judged records for a stretch to be found
@@ -59,6 +59,7 @@ class Scores:
     freedom: Array  # degrees of freedom of the fit that judged each record (N)
 
     def of_level(self, level: float) -> Array:
+        """Sizes of residuals over half the widths of their intervals (n_r x N)."""
         return np.asarray(np.abs(self.errors) / quantile(level, self.freedom))
 
     @property
@@ -101,6 +102,8 @@ class Coverage:
         return self.stretched or self.raw
 
     def as_dict(self) -> dict[str, object]:
+        """For JSON."""
+
         def named(shares: tuple[float, ...] | None, radius: float | None) -> dict[str, float | None] | None:
             if shares is None:
                 return None
@@ -122,32 +125,33 @@ def level_name(level: float) -> str:
 
 
 def predictor(fitted: WeighedFit) -> Predictor:
-    problem, estimate = fitted.problem, fitted.estimate
-    drift = KnownDrift.by(problem, estimate.values)
-    return Predictor(
-        problem, estimate.values, estimate.covariance, estimate.noise_scale, estimate.degrees_of_freedom, drift
-    )
+    estimate = fitted.estimate
+    drift = KnownDrift.by(fitted.problem, estimate.values)
+    known = (estimate.values, estimate.covariance, estimate.noise_scale, estimate.degrees_of_freedom)
+    return Predictor(*known, drift)
 
 
-def missed(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, Residuals]:
+def missed(by: Predictor, held: Problem) -> dict[Recording, Residuals]:
     """Residuals of records that a fit did not see; nan where a measurement was not made."""
     residuals: dict[Recording, Residuals] = {"same": by.residuals(held)}
-    if by.drifts:
-        residuals["new"] = by.problem.residuals(by.values, held)
+    if by.drift is not None:
+        residuals["new"] = held.residuals(by.values)
     return {
         name: tuple(
             np.where(factor_records.measured, own, np.nan)
-            for factor_records, own in zip(held, held_residuals, strict=True)
+            for factor_records, own in zip(held.records, held_residuals, strict=True)
         )
         for name, held_residuals in residuals.items()
     }
 
 
-def score(by: Predictor, held: Sequence[FactorRecords]) -> dict[Recording, Scores]:
-    return {name: scored(by.problem, own, by.spreads(held, name)) for name, own in missed(by, held).items()}
+def score(by: Predictor, held: Problem) -> dict[Recording, Scores]:
+    """Residuals of records that a fit did not see, in units of what it predicts for them."""
+    return {name: scored(held, own, by.spreads(held, name)) for name, own in missed(by, held).items()}
 
 
 def scored(problem: Problem, residuals: Residuals, spreads: Sequence[Spread]) -> Scores:
+    """Residuals in units of what is predicted for them; nan where there are none."""
     errors = [residual / spread.deviations for residual, spread in zip(residuals, spreads, strict=True)]
     reaches = [
         np.linalg.norm(residual[: len(POSITION)], axis=0) / spread.of(POSITION).radius()
@@ -160,6 +164,7 @@ def scored(problem: Problem, residuals: Residuals, spreads: Sequence[Spread]) ->
 
 
 def whitened_like(held: Problem, fitted: WeighedFit, estimator: Estimator) -> Problem:
+    """Records with the noise that the fit estimated, if it did."""
     if fitted.components is None or not isinstance(estimator, Weighing):
         return held
     return apply_components(held, fitted.solution.values, fitted.components, estimator.settings.axes)
@@ -176,7 +181,7 @@ def fit_and_predict(task: FitTask) -> JudgedFit:
         judged = judged_fit(task, fitted.solution, train, held, began)
         if not judged.converged:
             return judged
-        own = missed(predictor(fitted), whitened_like(held, fitted, task.estimator).records)
+        own = missed(predictor(fitted), whitened_like(held, fitted, task.estimator))
         return replace(judged, held_residuals=own, seconds=time.perf_counter() - began)
     except NotConvergedError:
         return failed_fit(task, began)
@@ -191,6 +196,7 @@ def besides(scores: Scores, places: Indices) -> Scores:
 def _collected(
     splits: Sequence[Split], residuals: Sequence[Mapping[Recording, Residuals]], count: int
 ) -> dict[Recording, Residuals]:
+    """The residuals of all folds in the order of the records; nan where a fold has none."""
     result: dict[Recording, Residuals] = {}
     for split, held_residuals in zip(splits, residuals, strict=True):
         for name, own in held_residuals.items():
@@ -229,6 +235,7 @@ def coverage(scores: Scores, stretches: Sequence[Stretch | None] | None = None) 
 
 
 def coverage_finding(shares: Coverage, of: str, recording: Recording = "same") -> Finding:
+    """Do intervals cover their share? Two-sided, at 5 %, against so many independent numbers as they are worth."""
     share, raw = shares.stated[LEVELS.index(STATED)], shares.raw[LEVELS.index(STATED)]
     error = np.sqrt(STATED * (1 - STATED) / shares.independent)
     off = abs(share - STATED) > ndtri(1 - LEVEL / 2) * error
@@ -327,6 +334,7 @@ class IntervalResult:
         return [*typical, *(coverage_finding(own, words, name) for name, own in coverages.items())]
 
     def _typical(self) -> str:
+        """How wide the intervals are."""
         half, radius = self.half_width_mm, self.radius_mm
         first: Recording = "new" if "new" in half else "same"
         text = "In the median pose, of poses like the recorded ones, a prediction is good to "
@@ -361,14 +369,14 @@ def intervals(fit: Fit) -> IntervalResult:
     scores, shares, stretches = _crossed(fit)
     holdout: dict[Recording, Coverage] = {}
     if len(split.holdout):
-        for name, own in score(by, alike.subset(split.holdout).records).items():
+        for name, own in score(by, alike.subset(split.holdout)).items():
             shares_held = coverage(own, [stretches.get(name)] * len(split.holdout))
             if shares_held is not None:
                 holdout[name] = shares_held
             scores = {**scores, name: _filled(scores.get(name), own, split.holdout, len(fit.dataset))}
-    spreads: dict[Recording, Sequence[Spread]] = {"same": by.spreads(alike.records, "same")}
-    if by.drifts:
-        spreads["new"] = by.spreads(alike.records, "new")
+    spreads: dict[Recording, Sequence[Spread]] = {"same": by.spreads(alike, "same")}
+    if by.drift is not None:
+        spreads["new"] = by.spreads(alike, "new")
     places = [i for i, kernel in enumerate(problem.kernels) if is_position(kernel)]
     typical = {
         name: _typical([spread[i].of(POSITION) for i in places], stretches.get(name))
@@ -416,7 +424,7 @@ def _crossed(
         for whole, block in zip(unknown, one.unknown, strict=True):
             whole[fold.holdout] = block
     scores = {
-        name: scored(by.problem, own, by.left_out(fitted.records, name, unknown))
+        name: scored(fitted.problem, own, by.left_out(fitted.problem, name, unknown))
         for name, own in held_residuals.items()
     }
     shares: dict[Recording, Coverage] = {}
@@ -445,6 +453,7 @@ def _filled(before: Scores | None, own: Scores, places: Indices, count: int) -> 
 
 
 def _typical(spreads: Sequence[Spread], widened: Stretch | None) -> tuple[float, float]:
+    """Median half width of a 90 % interval of a coordinate, and of a 95 % radius (mm)."""
     if not spreads:
         return float("nan"), float("nan")
     factor = widened.coordinates[LEVELS.index(STATED)] if widened else 1.0

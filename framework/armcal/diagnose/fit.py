@@ -32,12 +32,10 @@ from armcal.estimate.validation import (
     errors_and_turns,
     record_errors,
 )
-from armcal.problem.drift import residuals
-from armcal.problem.many_points import with_few_points
 from armcal.problem.motion import Motion, recorded_position
-from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import Problem
+from armcal.problem.problem import PosedProblem, Problem
 from armcal.problem.rigid_alignment import along, apart_from, tools, unseen_motions
+from armcal.problem.variants import with_few_points
 
 T = TypeVar("T")
 MOST_RECORDS = 300  # That are looked at where more would show no more
@@ -160,6 +158,7 @@ class Fit:
 
     @cached_property
     def name(self) -> str:
+        """What errors are errors of."""
         return error_name(self.problem)
 
     @cached_property
@@ -198,6 +197,7 @@ class Fit:
 
     @property
     def trained_on(self) -> tuple[str, ...]:
+        """Ids of the training records."""
         return self.ready.trained.ids
 
     @cached_property
@@ -291,7 +291,7 @@ def _errors(fit: Fit) -> RecordErrors:
         calibrated_mm=errors * _MM,
         cross_validated_mm=judged,
         nominal_residual_mm=_known(residual, problem) * _MM,
-        calibrated_residual_mm=_known(residuals(problem, after, fit.fitted.problem), problem) * _MM,
+        calibrated_residual_mm=_known(problem.residuals_beside(fit.fitted.problem, after), problem) * _MM,
         position_mm=problem.predict(values)[0].tools[0, 3] * _MM,
         nominal_crossed_mm=nominal_crossed * _MM,
         rival_mm=rival * _MM,
@@ -335,6 +335,7 @@ def _nominal(
 
 
 def _placing_names(problem: Problem) -> set[str]:
+    """Free parameters that only say where base and tool point are, and those of measurements."""
     some = problem.subset(thinned(np.arange(problem.count), _POSES))
     blocks, nominal = problem.parameters.coordinate_blocks, problem.parameters.nominal()
     moving = {b.name for i, b in enumerate(blocks) if not b.nuisance and not only_places(some, nominal, i)}

@@ -54,10 +54,10 @@ from armcal.diagnose.predictable import (
 )
 from armcal.diagnose.predictable import LEVEL as PREDICTED_LEVEL
 from armcal.diagnose.score_tests import FamilyTest, FitRows, LinearFit, family_test, linear_fit, own_basis
-from armcal.estimate.bootstrap import automatic_block_length
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.freeing import candidates
 from armcal.estimate.identifiability import Measure
+from armcal.estimate.uncertainty import automatic_block_length
 from armcal.measure.groups import pose_numbers
 from armcal.problem.problem import Problem
 
@@ -70,6 +70,8 @@ CHANGING = "something that changes with time and is none of these"
 
 @dataclass(frozen=True)
 class Odds:
+    """What speaks for one cause beside others."""
+
     share: float  # of the odds of all causes, of what is not among them, and of chance, the cause's own
     alternatives: tuple[str, ...]  # in words, those that it does not beat 20 to 1, the most likely first
     chance: float  # the share of nothing at all
@@ -263,6 +265,7 @@ def structure(fit: Fit) -> ResidualStructure | None:
 
 
 def _modelled(fit: Fit) -> frozenset[str]:
+    """The types of the effects that the model has."""
     arms = fit.system.description.get("arms") or {}
     effects = [effect for arm in arms.values() for effect in (arm.get("effects") or {}).values()]
     return frozenset(str(effect.get("type")) for effect in effects)
@@ -386,6 +389,7 @@ def _structure(
     p_value: float,
     odds: Odds,
 ) -> Structure:
+    """What a cause takes up beside the others."""
     one, (residual, basis) = contest.causes[cause], contest.beside(others)
     own, coefficients = own_basis(contest.columns[cause], basis)
     present = one.effect.split(" ")[0] in modelled
@@ -438,6 +442,7 @@ def neighbours(fit: Fit) -> list[Finding]:
 
 
 def structure_findings(structure: ResidualStructure | None, unit: str = "mm") -> list[Finding]:
+    """What residuals still depend on."""
     if structure is None:
         text = "The training records are too few to tell whether the model lacks anything."
         return [Finding("note", text, f"at least {FEWEST_RECORDS} records", "Measure more poses.")]
@@ -489,6 +494,7 @@ def predicted_in_short(predicted: Predictable) -> str:
 
 
 def _remedies(predicted: Predictable) -> Iterator[str]:
+    """What takes up what each kind of carrier predicts."""
     kinds = {carrier.kind for carrier in predicted.carriers}
     if predicted.is_in_order:
         yield _TELL_APART["open"]
@@ -537,6 +543,7 @@ def _share(odds: float) -> str:
 
 
 def _scatter(structure: ResidualStructure) -> list[Finding]:
+    """What the size of residuals depends on."""
     noise = structure.noise
     if noise is None or noise.high < _NO_NOISE:
         return []
@@ -552,6 +559,7 @@ def _scatter(structure: ResidualStructure) -> list[Finding]:
 
 
 def repeat_findings(structure: ResidualStructure, unit: str) -> list[Finding]:
+    """What repeats say of the rest."""
     repeats = structure.repeats
     if repeats is None or not repeats.exceeded:
         return []

@@ -26,8 +26,8 @@ from armcal.base.arrays import Array, Indices, Mask
 from armcal.diagnose.fit import Fit, thinned
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.prediction import POSITION, is_position
-from armcal.problem.many_points import with_few_points
 from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.variants import with_few_points
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,7 @@ class FitRows:
 
     @classmethod
     def of(cls, problem: Problem, estimate: Estimate) -> Self:
+        """The rows at an estimate; of records with the weights they had."""
         values, parameters = estimate.values, problem.parameters
         count, scales = problem.count, parameters.scales()
         chain = parameters.entries_jacobian(values) * scales
@@ -184,6 +185,8 @@ def own_basis(columns: Array, basis: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class FamilyTest:
+    """A family of tests at once."""
+
     adjusted: Array  # p-values of each set, counting that so many were looked at (family-wise)
     share: Array  # of the squared residual, how much each set would take up
     lag_one: float  # correlation of neighbouring residuals, less what the fit itself makes of it

@@ -85,7 +85,7 @@ def in_all(fit: Fit, ranked: Sequence[Finding]) -> Verdict:
 def new_recording(fit: Fit) -> NewRecording | None:
     if not fit.converged:
         return None
-    return fit.of(predictions).new_recording(fit.problem.records, np.flatnonzero(np.isfinite(fit.judged_mm)))
+    return fit.of(predictions).new_recording(fit.problem, np.flatnonzero(np.isfinite(fit.judged_mm)))
 
 
 def suggestions(fit: Fit) -> tuple[Suggestion, ...]:
@@ -108,6 +108,7 @@ def suggestions(fit: Fit) -> tuple[Suggestion, ...]:
 
 
 def evidence(fit: Fit) -> dict[str, Any]:
+    """What was looked for in the residuals and beside them, for metrics.json."""
     alone = fit.of(priors_alone)
     left, beyond, away = fit.of(structure), fit.of(large_errors), fit.of(elsewhere)
     hidden, rounds = fit.of(hidden_payload), fit.of(rounding)
@@ -166,6 +167,7 @@ def _good_for(
 
 
 def _in_short(fit: Fit, first: str) -> Iterator[str]:
+    """What it is good for, what is not determined, suspicious, left over, and to be measured next; a sentence each."""
     if not fit.converged:
         yield "The solver did not converge: these values are no calibration."
         return
@@ -374,6 +376,7 @@ def places(fit: Fit) -> list[Finding]:
 
 
 def known_accuracies(problem: Problem, estimate: Estimate, parts: Halves | None = None) -> list[str]:
+    """How well measurements' own poses are known, a sentence each."""
     texts = []
     for name, measurement in problem.blueprint.measurements.items():
         if not isinstance(measurement, Placed):

@@ -17,7 +17,7 @@ from armcal.errors import NotConvergedError
 from armcal.estimate.identifiability import Identifiability, InverseInformation, identify_from
 from armcal.io.parallel import Executor
 from armcal.problem.problem import Problem, triangular
-from armcal.problem.projection import factor_at_zero
+from armcal.problem.variants import factor_at_zero
 
 CONFIDENCE = 0.95
 NEAR_A_BOUND_SD = 3.0  # Within so many standard deviations of a bound an interval is one-sided

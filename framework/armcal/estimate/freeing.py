@@ -13,8 +13,7 @@ from scipy.special import fdtrc
 from armcal.base.arrays import Array
 from armcal.base.domains import Semidefinite
 from armcal.base.parameters import Parameters
-from armcal.problem.normal_equations import NormalEquations
-from armcal.problem.problem import Problem
+from armcal.problem.problem import NormalEquations, Problem
 
 LEVEL = 0.05  # Of naming any parameter though nothing is to be gained
 MOST_UNCERTAIN = 0.5  # In typical scales: what the noise leaves less certain than this is not determined

@@ -32,10 +32,10 @@ from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.parameters import Parameters
 from armcal.base.units import shown_unit
 from armcal.errors import NotConvergedError, ProblemError
-from armcal.problem.factor_records import subset
 from armcal.problem.problem import Problem
-from armcal.problem.projection import approach_channels, factor_at_zero, fits, joint_channels, projected
+from armcal.problem.records import subset
 from armcal.problem.rigid_alignment import along, apart_from, tools, unseen_motions
+from armcal.problem.variants import approach_channels, factor_at_zero, fits, joint_channels, projected
 
 MOST_NAMES = 6  # A longer combination is cut when it is shown; ``terms`` has all of it
 

@@ -18,8 +18,7 @@ from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Solution, SolverVerdict
 from armcal.measure.groups import OTHER, group_name, owner_of
 from armcal.measure.measurement import GroupedMeasurement
-from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import NormalEquations, Problem
+from armcal.problem.problem import NormalEquations, PosedProblem, Problem
 from armcal.problem.rigid_alignment import spread_of
 
 HOPELESS = 0.12

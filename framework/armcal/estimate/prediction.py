@@ -1,4 +1,4 @@
-"""How far a measurement may lie from its prediction: by noise, by parameters not known exactly, by a drift not known.
+"""How far measurements may lie from predictions, and how residuals scatter.
 
 The residual of a record that took no part in a fit has the covariance s^2 N + H C H' + s^2 D. N is the noise declared
 of it, s the noise found in units of the declared one, C the covariance of the values and H the slope of its residual
@@ -6,23 +6,33 @@ by them. D is what a drift does: in another recording than the fit's, where noth
 in the same one G K G', with the slope G of the residual by the drift's states there and their covariance K after the
 training records. The drift that those determine depends on the values as well: H has what they make of the drift taken
 off. (Gaussian processes with explicit basis functions, [Rasmussen2006].)
+
+A model that is wrong errs by more than its instrument, and alike in poses that follow one another. Whoever goes on from
+the calibration needs both: the covariance as the noise to expect, and its shared part as no new evidence each time.
+The shared part is a process whose correlation falls by e over a distance, beside an independent part: the first two
+serial correlations determine share and distance [Box2015]. A few residuals do not determine a covariance of many rows:
+it is taken together with the declared noise, scaled to the residuals, as the mean of an inverse Wishart distribution
+whose weight is the likeliest for these residuals [Chen1979].
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import fdtri, stdtrit
+from scipy.special import fdtri, multigammaln, stdtrit
 
 from armcal.base.arrays import Array, Indices
+from armcal.base.dataset import Dataset
+from armcal.estimate.estimator import SMALLEST_SPREAD, Estimate
 from armcal.estimate.validation import Recording, error_dimension
-from armcal.problem.corrected import unexplained
-from armcal.problem.factor_records import correlation_of, noise_roots
 from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.records import noise_roots
+from armcal.problem.variants import unexplained
 
 LEVELS = (0.5, 0.9, 0.95)  # Of the intervals that are stated and judged
 STATED = 0.9  # The level of a plus-minus
@@ -102,32 +112,27 @@ class NewRecording:
 class Predictor:
     """A fit as far as its predictions need it."""
 
-    problem: Problem  # of the fit, or one for other records with the same free parameters
     values: Array  # found (all canonical entries)
     covariance: Array  # of the free canonical entries
     noise_scale: float  # residuals in units of the declared noise
     freedom: float  # degrees of freedom of that
     drift: KnownDrift | None = None  # as the records of the fit determine it; None where nothing drifts
 
-    @property
-    def drifts(self) -> bool:
-        return any(block.drift is not None for block in self.problem.parameters.free)
-
-    def residuals(self, records: Sequence[FactorRecords]) -> tuple[Array, ...]:
+    def residuals(self, problem: Problem) -> tuple[Array, ...]:
         """Raw residuals less the known drift, one (n_r x N) a factor; records on the chain of those of the fit."""
-        raw, here = self.problem.with_records(records).residuals(self.values), correlation_of(records)
+        raw, here = problem.residuals(self.values), problem.correlation
         return raw if here is None or self.drift is None else here.taken_off(raw, self.drift.states)
 
-    def spreads(self, records: Sequence[FactorRecords], recording: Recording) -> tuple[Spread, ...]:
+    def spreads(self, problem: Problem, recording: Recording) -> tuple[Spread, ...]:
         """Spread about predictions, one a factor: with the drift of the ``same`` recording, without in a ``new`` one.
 
         In the same recording the records must be on the chain of those of the fit.
         """
-        parts = self._parts(records, recording)
+        parts = self._parts(problem, recording)
         return tuple(Spread(noise + values + drift, self.freedom) for noise, values, drift in parts)
 
     def left_out(
-        self, fitted: Sequence[FactorRecords], recording: Recording, unknown: Sequence[Array] | None = None
+        self, fitted: Problem, recording: Recording, unknown: Sequence[Array] | None = None
     ) -> tuple[Spread, ...]:
         """As ``spreads`` of the fit's own records, each as if the fit had done without it.
 
@@ -135,12 +140,13 @@ class Predictor:
         little too narrow. ``unknown`` is what pose residuals that did not see them do not know (see ``unexplained``).
         """
         spreads = []
-        for record, (noise, values, drift) in zip(fitted, self._parts(fitted, recording, unknown), strict=True):
+        parts = zip(fitted.records, self._parts(fitted, recording, unknown), strict=True)
+        for record, (noise, values, drift) in parts:
             own = (noise, values + drift) if recording == "same" else (noise + drift, values)
             spreads.append(Spread(_without_itself(*own, record), self.freedom))
         return tuple(spreads)
 
-    def new_recording(self, records: Sequence[FactorRecords], judged: Indices) -> NewRecording | None:
+    def new_recording(self, problem: Problem, judged: Indices) -> NewRecording | None:
         """What the errors of judged records, held out of this recording, say of a new one.
 
         None where nothing drifts, or no record is judged.
@@ -149,13 +155,13 @@ class Predictor:
         that part, and in a new recording it is an error. For residuals of slopes J and the covariance S, of which D
         is the drift's, what both have in common is J C J' S^-1 D, with C the covariance of the values.
         """
-        here, there = correlation_of(records), self.drift
+        here, there = problem.correlation, self.drift
         if here is None or there is None or not len(judged):
             return None
-        counted, whole, common = error_dimension(self.problem), 0.0, 0.0
+        counted, whole, common = error_dimension(problem), 0.0, 0.0
         noises: list[Array] = []
         roots: list[Array] = []
-        parts = zip(self.problem.kernels, self._slopes(records), self._parts(records, "new"), strict=True)
+        parts = zip(problem.kernels, self._slopes(problem), self._parts(problem, "new"), strict=True)
         for i, (kernel, slope, (noise, values, drift)) in enumerate(parts):
             rows = np.flatnonzero([dimension == counted for dimension in kernel.factor.dimensions])
             taken_up = np.moveaxis(here.shift(i, there.slopes)[:, : slope.shape[2]], 1, 2)
@@ -170,18 +176,16 @@ class Predictor:
         part = len(judged) / len(near)
         return NewRecording(ratio[judged], part * freedom, part * independent)
 
-    def _parts(
-        self, records: Sequence[FactorRecords], recording: Recording, unknown: Sequence[Array] | None = None
-    ) -> list[_Parts]:
+    def _parts(self, problem: Problem, recording: Recording, unknown: Sequence[Array] | None = None) -> list[_Parts]:
         """Covariances by noise, by values and by drift (N x n_r x n_r each), one of each a factor.
 
         What pose residuals do not know counts as noise: it is the same whether or not a record was learned from.
         """
-        here, there, parts = correlation_of(records), self.drift if recording == "same" else None, []
-        blocks, variance = self.problem.parameters.free, self.noise_scale**2
+        here, there, parts = problem.correlation, self.drift if recording == "same" else None, []
+        blocks, variance = problem.parameters.free, self.noise_scale**2
         drifting = np.array([0.0 if b.drift is None else b.drift.sd**2 for b in blocks for _ in range(b.size)])
-        unknown = unexplained(self.problem.with_records(records), self.values) if unknown is None else unknown
-        rows = zip(self.problem.kernels, records, self._slopes(records), unknown, strict=True)
+        unknown = unexplained(problem, self.values) if unknown is None else unknown
+        rows = zip(problem.kernels, problem.records, self._slopes(problem), unknown, strict=True)
         for i, (kernel, record, slope, own) in enumerate(rows):
             if here is None or there is None:
                 drift = np.einsum("rvn,v,svn->nrs", slope, variance * drifting, slope, optimize=True)
@@ -194,10 +198,10 @@ class Predictor:
             parts.append((variance * (roots @ roots.transpose(0, 2, 1)) + own, values, drift))
         return parts
 
-    def _slopes(self, records: Sequence[FactorRecords]) -> list[Array]:
+    def _slopes(self, problem: Problem) -> list[Array]:
         """Residuals by free canonical entries, raw, one (n_r x n_v x N) a factor."""
-        bare = self.problem.with_records([replace(record, whitening=None) for record in records]).unweighted()
-        pairs = zip(self.problem.kernels, bare.jacobians(self.values), strict=True)
+        bare = problem.with_records([replace(record, whitening=None) for record in problem.records]).unweighted()
+        pairs = zip(problem.kernels, bare.jacobians(self.values), strict=True)
         return [jacobian * np.array(kernel.factor.noise)[:, None, None] for kernel, jacobian in pairs]
 
 
@@ -244,3 +248,98 @@ def _degrees_of_freedom(
         for t, other in enumerate(kernels)
     )
     return trace**2 / shared, trace**2 / independent
+
+
+_FEWEST = 20
+_SIGNIFICANT_SD = 3.0
+_LONGEST = 50.0
+_WEIGHTS = np.geomspace(1.0, 1e5, 51)  # Of the declared noise, in records: those that are tried
+
+
+@dataclass(frozen=True)
+class ResidualSpread:
+    """Of one measurement.
+
+    Attributes:
+        channel: what counts it: ``sequence`` where the records say their place, else ``record``, one by one.
+    """
+
+    covariance: Array  # of the raw residual (n_r x n_r; m or rad)
+    share: float  # of it that neighbours have in common, 0 to 1
+    over: float  # distance over which the common part falls by e
+    channel: str = "record"
+    freedom: float = math.inf  # degrees of freedom with which the covariance is known
+
+
+def residual_spread(problem: Problem, estimate: Estimate, dataset: Dataset) -> dict[str, ResidualSpread]:
+    """The scatter of the residuals that an estimate leaves, by measurement.
+
+    Where parameters drift, what neighbours share is the drift: what is left is the declared noise, scaled to the
+    residuals.
+
+    Args:
+        problem: that was solved.
+        estimate: of it.
+        records: it was trained on, with their weights.
+        dataset: the same ones, in the order of recording or with their ``sequence``.
+    """
+    known = max(float(estimate.degrees_of_freedom), 1.0)
+    if problem.correlation is not None:
+        noise = {k.factor.name: np.array(k.factor.noise) * estimate.noise_scale for k in problem.kernels}
+        return {name: ResidualSpread(np.diag(sd**2), 0.0, 1.0, freedom=known) for name, sd in noise.items()}
+    # Parameters that were fitted make residuals too small.
+    freedom = known / max(problem.equations(), 1)
+    channel = "sequence" if dataset.has("sequence") else "record"
+    places = dataset.column("sequence") if dataset.has("sequence") else np.arange(len(dataset), dtype=float)
+    residual_spreads, residuals = {}, problem.residuals(estimate.values)
+    for kernel, record, residual in zip(problem.kernels, problem.records, residuals, strict=True):
+        weight = np.minimum(record.weight[: record.count], 1.0) * record.measured
+        kept = np.flatnonzero(weight > 0)
+        if len(kept) < 2:
+            continue
+        roots = residual[:, kept] * np.sqrt(weight[kept])
+        count = float(weight.sum()) * freedom
+        covariance, weighed = _shrunk(roots @ roots.T, count, np.array(kernel.factor.noise), estimate.noise_scale)
+        size, directions = np.linalg.eigh(covariance)
+        inverse = np.where(size > 1e-12 * size[-1], 1 / np.sqrt(np.maximum(size, 1e-300)), 0.0)
+        share, over = _shared((directions * inverse).T @ residual[:, kept], places[kept])
+        spread = ResidualSpread(covariance, share, over, channel, min(weighed, known))
+        residual_spreads[kernel.factor.name] = spread
+    return residual_spreads
+
+
+def _shrunk(products: Array, count: float, noise: Array, scale: float) -> tuple[Array, float]:
+    """The covariance of residuals (n_r x n_r), and the records that it is worth, those of the declared noise included.
+
+    Args:
+        products: sum of the residuals' outer products (n_r x n_r; m or rad).
+        count: how many records they are worth, less what parameters took of them.
+        noise: standard deviations that are declared (n_r; m or rad).
+        scale: of all residuals against theirs; holds where this measurement's own are too few to say.
+    """
+    rows, own = len(noise), float(np.sum(np.diag(products) / noise**2))
+    variance = own / (rows * count) if rows * count >= 1 else scale**2
+    declared = noise * np.sqrt(max(variance, SMALLEST_SPREAD**2))
+    sizes = np.maximum(np.linalg.eigvalsh(products / np.outer(declared, declared)), 0.0)
+    prior = _WEIGHTS + rows + 1
+    evidence = multigammaln(0.5 * (prior + count), rows) - multigammaln(0.5 * prior, rows)
+    evidence += 0.5 * prior * rows * np.log(_WEIGHTS)
+    evidence -= 0.5 * (prior + count) * np.log(_WEIGHTS[:, None] + sizes).sum(axis=1)
+    weight = float(_WEIGHTS[int(np.argmax(evidence))])
+    covariance = (weight * np.diag(declared**2) + products) / (weight + count)
+    return covariance, min(weight + count, max(rows * count, 1.0))
+
+
+def _shared(whitened: Array, places: Array) -> tuple[float, float]:
+    """Share and distance; none where chance may have made the correlation."""
+    order = np.argsort(places, kind="stable")
+    series, count = whitened[:, order], whitened.shape[1]
+    if count < _FEWEST:
+        return 0.0, 1.0
+    total = float(np.sum(series**2)) / count
+    first, second = (float(np.sum(series[:, lag:] * series[:, :-lag])) / (count - lag) / total for lag in (1, 2))
+    spacing = float(np.median(np.diff(places[order]))) or 1.0
+    if first < _SIGNIFICANT_SD / np.sqrt(count * len(series)):
+        return 0.0, 1.0
+    decay = float(np.clip(second / first, np.exp(-1.0), np.exp(-1.0 / _LONGEST)))
+    return float(np.clip(first / decay, 0.0, 0.95)), float(-spacing / np.log(decay))

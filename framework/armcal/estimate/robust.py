@@ -48,8 +48,7 @@ from armcal.estimate.identifiability import InverseInformation
 from armcal.estimate.polish import bounded_step
 from armcal.estimate.variance import Axes, VarianceComponents, apply_components, estimate_components
 from armcal.io.parallel import Executor
-from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import FactorRecords, Problem
+from armcal.problem.problem import PosedProblem, Problem
 
 LossName = Literal["huber", "cauchy"]
 
@@ -451,10 +450,6 @@ class WeighedFit:
     rounds: tuple[Round, ...] = ()  # of reweighting and selecting
     warnings: tuple[str, ...] = ()  # what a user should know
     as_declared: Array | None = None
-
-    @property
-    def records(self) -> tuple[FactorRecords, ...]:
-        return self.problem.records
 
     @property
     def set_aside(self) -> tuple[Suspect, ...]:

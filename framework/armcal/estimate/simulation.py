@@ -18,7 +18,7 @@ from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
 from armcal.measure.measurement import Measurement
 from armcal.problem.problem import Problem
-from armcal.problem.readings import disturbed
+from armcal.problem.variants import disturbed
 
 
 @dataclass(frozen=True)

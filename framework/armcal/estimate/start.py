@@ -29,8 +29,7 @@ from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.polish import descended
 from armcal.measure.instrument import Certifying, Proposing, Reading
 from armcal.measure.measurement import Carried, borrowed_names
-from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import Problem
+from armcal.problem.problem import PosedProblem, Problem
 from armcal.problem.rigid_alignment import (
     Alignment,
     Sighting,

@@ -17,7 +17,6 @@ from armcal.estimate.estimator import Estimator, Progress, Solution, no_progress
 from armcal.estimate.polish import restricted, settled
 from armcal.io.parallel import Executor, Sequential
 from armcal.measure.measurement import Placed
-from armcal.problem.drift import residuals
 from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem
 
@@ -81,7 +80,7 @@ def errors_and_turns(problem: Problem, values: Array, training: Problem | None =
     None where no orientation is measured beside lengths.
     """
     values = settled(problem, values)
-    raw = problem.residuals(values) if training is None else residuals(problem, values, training)
+    raw = problem.residuals(values) if training is None else problem.residuals_beside(training, values)
     own = tuple(zip(problem.kernels, problem.records, raw, strict=True))
     return _sizes(own, error_dimension(problem)), _sizes(own, "angle") if measures_turns(problem) else None
 

@@ -30,9 +30,9 @@ from armcal.errors import ProblemError
 from armcal.estimate.estimator import CONFIDENCE, degrees_of_freedom
 from armcal.estimate.identifiability import correlated_pairs
 from armcal.estimate.polish import bounded_step
-from armcal.problem.factor_records import by_covariance, noise_roots, transformed, whitening_of
-from armcal.problem.many_points import with_few_points
 from armcal.problem.problem import FactorRecords, NormalEquations, Problem
+from armcal.problem.records import by_covariance, noise_roots, transformed, whitening_of
+from armcal.problem.variants import with_few_points
 
 MOST_STEPS = 100
 AT_REST = 1e-3  # A step this many standard deviations long ends the search

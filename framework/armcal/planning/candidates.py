@@ -9,9 +9,8 @@ import numpy as np
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.errors import ProblemError
-from armcal.problem.many_points import as_seen
 from armcal.problem.problem import Problem, triangular
-from armcal.problem.projection import as_predicted
+from armcal.problem.variants import as_predicted, as_seen
 
 RIDGE = 1e-9
 """Information in typical scales that stands in for what nothing determines yet, relative to the candidates' mean:

@@ -32,7 +32,7 @@ from armcal.functions.batch_function import EvaluatorChoice, quietly
 from armcal.functions.c_source import LANES
 from armcal.functions.interpreted import InterpretedFunction
 from armcal.problem.factor import Factor
-from armcal.problem.factor_records import FactorRecords, PointRecords, declared, mean_shares, transformed
+from armcal.problem.records import FactorRecords, PointRecords, declared, mean_shares, transformed
 
 _AGREEMENT = 1e-12
 

@@ -1,22 +1,34 @@
-"""A problem: records, and the arms, measurements and parameters that are compiled once to evaluate them."""
+"""A problem: records, and the arms, measurements and parameters that are compiled once to evaluate them.
+
+Solvers see it posed: residuals and priors over scaled increments from the nominal values. A solver of smooth problems
+moves ``x`` (n), increments in their typical scales. A cone solver moves ``c`` (n), coordinates in their typical scales,
+in which priors are quadratic and a semidefinite block is a cone.
+"""
+
+from __future__ import annotations
 
 import pickle
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import Any, Self, cast, overload
+from typing import Any, Self
 
+import casadi as ca
 import numpy as np
 
-from armcal.arm.assembly import Arm
+from armcal.arm.assembly import Arm, scoped
+from armcal.arm.effects import JointCommand
 from armcal.arm.statics import Environment
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
+from armcal.base.se3 import Expression
+from armcal.errors import DataError, NotConvergedError, ProblemError
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.measure.groups import (
     NO_GROUP,
     Groups,
+    OwnedTie,
     group_name,
     group_numbers,
     groups_of,
@@ -26,12 +38,120 @@ from armcal.measure.groups import (
     with_partners,
 )
 from armcal.measure.measurement import GroupedMeasurement, Measurement
-from armcal.problem import factor_records
-from armcal.problem.correlation import Correlation
+from armcal.plugins import refuse
 from armcal.problem.factor import build_factor
-from armcal.problem.factor_records import FactorRecords, correlation_of, mean_shares, transformed
 from armcal.problem.kernel import HELD, GroupedKernel, Kernel, Shown, build_kernel
-from armcal.problem.normal_equations import ExtraRows, NormalEquations, TieFunction, stacked
+from armcal.problem.records import (
+    Correlation,
+    FactorRecords,
+    applicable,
+    correlation_of,
+    factor_records,
+    mean_shares,
+    subset,
+    transformed,
+    weighted,
+)
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Half the squared whitened residuals and their Gauss-Newton model.
+
+    ``gradient`` (n) and ``hessian`` (n x n) are with respect to the free canonical entries.
+    """
+
+    cost: float
+    gradient: Array
+    hessian: Array
+
+    def chained(self, jacobian: Array) -> NormalEquations:
+        return NormalEquations(self.cost, jacobian.T @ self.gradient, jacobian.T @ self.hessian @ jacobian)
+
+
+@dataclass(frozen=True)
+class ExtraRows:
+    """Whitened rows that belong to no single record: residual (m) and Jacobian by free entries (m x n)."""
+
+    residual: Array
+    jacobian: Array
+
+    @property
+    def cost(self) -> float:
+        return 0.5 * float(self.residual @ self.residual)
+
+    def added_to(self, equations: NormalEquations) -> NormalEquations:
+        by_residual, products = self.jacobian.T @ self.residual, self.jacobian.T @ self.jacobian
+        return NormalEquations(
+            equations.cost + self.cost, equations.gradient + by_residual, equations.hessian + products
+        )
+
+
+def stacked(rows: Sequence[ExtraRows], width: int) -> ExtraRows:
+    residual = np.concatenate([np.zeros(0), *(row.residual for row in rows)])
+    return ExtraRows(residual, np.vstack([np.zeros((0, width)), *(row.jacobian for row in rows)]))
+
+
+@dataclass(frozen=True)
+class TieFunction:
+    """One tie, ready to evaluate.
+
+    Attributes:
+        bend: of those numbers and a factor for each entry of the residual to the second derivative of their product.
+    """
+
+    groups: tuple[str, str]  # the keys
+    entries: Indices  # positions in a value vector of what it holds together (n)
+    noise: Array  # standard deviation of each entry of its residual
+    function: ca.Function  # of those numbers to the residual (m or rad) and its Jacobian
+    bend: ca.Function
+
+    @classmethod
+    def of(cls, owned: OwnedTie, parameters: Parameters) -> TieFunction:
+        """Built for the blocks of a problem."""
+        entries: list[int] = []
+        sides: tuple[dict[str, Expression], dict[str, Expression]] = ({}, {})
+        for side, names in zip(sides, owned.names, strict=True):
+            for local, full in names.items():
+                own = range(len(parameters.entry_names))[parameters.entries_of(full)]
+                side[local] = ca.SX.sym(local, len(own))
+                entries += own
+        symbols = ca.vertcat(*sides[0].values(), *sides[1].values())
+        residual = owned.tie.residual(*sides)
+        outputs = [ca.densify(residual), ca.densify(ca.jacobian(residual, symbols))]
+        function = ca.Function("tie", [symbols], outputs)
+        factors = ca.SX.sym("factors", len(owned.tie.noise))
+        second = ca.densify(ca.hessian(ca.dot(factors, residual), symbols)[0])
+        bend = ca.Function("tie_bend", [symbols, factors], [second])
+        return cls(owned.tie.groups, np.array(entries, dtype=np.intp), np.array(owned.tie.noise), function, bend)
+
+    @property
+    def sides(self) -> tuple[Indices, Indices]:
+        half = len(self.entries) // 2
+        return self.entries[:half], self.entries[half:]
+
+    def residual(self, values: Array) -> Array:
+        """What is left open at a value vector (m or rad)."""
+        return np.asarray(self.function(values[self.entries])[0]).ravel()
+
+    def rows(self, values: Array, places: Mapping[int, int], width: int) -> ExtraRows:
+        """Whitened; ``places`` are those of free entries by position in the value vector."""
+        residual, slope = (np.asarray(dm) for dm in self.function(values[self.entries]))
+        columns, free = self._free(places)
+        jacobian = np.zeros((len(self.noise), width))
+        jacobian[:, free] = slope[:, columns]
+        return ExtraRows(residual.ravel() / self.noise, jacobian / self.noise[:, None])
+
+    def curvature(self, values: Array, places: Mapping[int, int], width: int) -> Array:
+        second = np.asarray(self.bend(values[self.entries], self.residual(values) / self.noise**2))
+        columns, free = self._free(places)
+        whole = np.zeros((width, width))
+        whole[np.ix_(free, free)] = second[np.ix_(columns, columns)]
+        return whole
+
+    def _free(self, places: Mapping[int, int]) -> tuple[list[int], list[int]]:
+        columns = [column for column, entry in enumerate(self.entries.tolist()) if entry in places]
+        return columns, [places[int(self.entries[column])] for column in columns]
 
 
 @dataclass(frozen=True)
@@ -123,10 +243,6 @@ class Compiled:
         choices = {k.factor.name: k.backend.name for k in self.kernels}
         return pickle.dumps((self.blueprint.bare(), choices, self.parameters))
 
-    def evaluated_by(self, evaluator: EvaluatorChoice) -> Self:
-        choices = dict.fromkeys(self.blueprint.measurements, evaluator)
-        return replace(self, kernels=self.blueprint.kernels(0, choices))
-
     @cached_property
     def grouped(self) -> tuple[GroupedKernel, ...]:
         """Each kernel with where its values come from, and where its Jacobian goes."""
@@ -157,13 +273,13 @@ class Compiled:
         dataset = with_partners(plan.with_corrections(dataset), plan.measurements)
         factors = [kernel.factor for kernel in self.kernels]
         numbers = [group_numbers(dataset, name, m, plan.groups) for name, m in plan.measurements.items()]
-        masks = [factor_records.applicable(f, dataset, n) for f, n in zip(factors, numbers, strict=True)]
+        masks = [applicable(f, dataset, n) for f, n in zip(factors, numbers, strict=True)]
         # A record that no measurement can read stays with all whose group it names, so that an error names it.
         unread = ~np.any(masks, axis=0)
         readers = [unread if number is None else unread & (number != NO_GROUP) for number in numbers]
         refuse_lost(dataset, plan.measurements, unread & ~np.any(readers, axis=0))
         return tuple(
-            factor_records.factor_records(factor, dataset, number, mask | reader, weights)
+            factor_records(factor, dataset, number, mask | reader, weights)
             for factor, number, mask, reader in zip(factors, numbers, masks, readers, strict=True)
         )
 
@@ -227,7 +343,7 @@ class Problem:
 
     def with_parameters(self, parameters: Parameters, tied: bool = True) -> Self:
         """The same blocks, other ones of them free, or with other nominal values or priors; groups not ``tied``."""
-        ties = self.known_ties if tied else ()
+        ties = self.compiled.known_ties if tied else ()
         return replace(self, compiled=replace(self.compiled, parameters=parameters, known_ties=ties))
 
     def with_arms(self, arms: Mapping[str, Arm]) -> Self:
@@ -236,36 +352,20 @@ class Problem:
 
     def evaluated_by(self, evaluator: EvaluatorChoice) -> Self:
         """The same problem by another evaluator; ``compiled`` waits for the compiler."""
-        return replace(self, compiled=self.compiled.evaluated_by(evaluator))
+        kernels = self.blueprint.kernels(0, dict.fromkeys(self.blueprint.measurements, evaluator))
+        return replace(self, compiled=replace(self.compiled, kernels=kernels))
 
-    @overload
-    def subset(self, records: Indices) -> Self: ...
-    @overload
-    def subset(self, records: Sequence[FactorRecords], chosen: Indices) -> tuple[FactorRecords, ...]: ...
-    def subset(
-        self, records: Sequence[FactorRecords] | Indices, chosen: Indices | None = None
-    ) -> Self | tuple[FactorRecords, ...]:
-        """Of some records alone, in that order."""
-        if chosen is None:
-            return replace(self, records=factor_records.subset(self.records, np.asarray(records)))
-        return factor_records.subset(cast(Sequence[FactorRecords], records), chosen)
+    def subset(self, chosen: Indices) -> Self:
+        return replace(self, records=subset(self.records, chosen))
 
     def unweighted(self) -> Self:
         """With the weights of all records one, and none correlated."""
         alike = [replace(record, weight=np.ones_like(record.weight), correlation=None) for record in self.records]
         return self.with_records(alike)
 
-    @overload
-    def weighted(self, records: Sequence[Array]) -> Self: ...
-    @overload
-    def weighted(self, records: Sequence[FactorRecords], weights: Sequence[Array]) -> tuple[FactorRecords, ...]: ...
-    def weighted(
-        self, records: Sequence[FactorRecords] | Sequence[Array], weights: Sequence[Array] | None = None
-    ) -> Self | tuple[FactorRecords, ...]:
+    def weighted(self, weights: Sequence[Array]) -> Self:
         """With the weights of records multiplied, factor by factor (N each)."""
-        if weights is None:
-            return replace(self, records=factor_records.weighted(self.records, cast(Sequence[Array], records)))
-        return factor_records.weighted(cast(Sequence[FactorRecords], records), weights)
+        return replace(self, records=weighted(self.records, weights))
 
     @property
     def parameters(self) -> Parameters:
@@ -282,10 +382,6 @@ class Problem:
     @property
     def grouped(self) -> tuple[GroupedKernel, ...]:
         return self.compiled.grouped
-
-    @property
-    def known_ties(self) -> tuple[TieFunction, ...]:
-        return self.compiled.known_ties
 
     @property
     def ties(self) -> tuple[TieFunction, ...]:
@@ -305,7 +401,6 @@ class Problem:
 
     @property
     def count(self) -> int:
-        """How many records there are."""
         return self.records[0].count if self.records else 0
 
     @property
@@ -317,31 +412,34 @@ class Problem:
         """Each measurement's kernel with its records."""
         return zip(self.grouped, self.records, strict=True)
 
-    def equations(self, records: Sequence[FactorRecords] | None = None) -> int:
-        self = self._of(records)
+    def equations(self) -> int:
         own = sum(record.equations(len(grouped.kernel.factor.noise)) for grouped, record in self.pairs)
         return own + sum(len(tie.noise) for tie in self.ties)
 
-    def residuals(self, values: Array, records: Sequence[FactorRecords] | None = None) -> tuple[Array, ...]:
+    def residuals(self, values: Array) -> tuple[Array, ...]:
         """Raw residuals in equilibrium, one (n_r x N) matrix a factor."""
-        self = self._of(records)
         self.compiled.check_fixed(values)
         return tuple(grouped.residuals(values, record)[:, : record.count] for grouped, record in self.pairs)
 
-    def require_held(self, values: Array, records: Sequence[FactorRecords] | None = None) -> None:
+    def residuals_beside(self, training: Self, values: Array) -> tuple[Array, ...]:
+        """Raw residuals less the drift that training records of the recording determine, one (n_r x N) a factor."""
+        raw, here, there = self.residuals(values), self.correlation, training.correlation
+        if here is None or there is None:
+            return raw
+        return here.taken_off(raw, there.states([r[:, :, None] for r in training.weighted_residuals(values)]))
+
+    def require_held(self, values: Array) -> None:
         """Refuse values at which springs do not hold the arm in every record.
 
         Raises:
             NotConvergedError: a record has no elastic equilibrium, or one that is not stable.
         """
-        self = self._of(records)
         self.residuals(values)
         for grouped, record in self.pairs:
             grouped.require_held(values, record)
 
-    def cost(self, values: Array, records: Sequence[FactorRecords] | None = None) -> float:
+    def cost(self, values: Array) -> float:
         """Half the weighted squared whitened residuals."""
-        self = self._of(records)
         raw, shared = self.residuals(values), self.correlation
         weighted = self._weighted(self.whitened(raw))
         if shared is not None:
@@ -353,23 +451,20 @@ class Problem:
                 total += 0.5 * float(np.sum((declared_ones @ share[: record.count]) ** 2))
         return total + sum(0.5 * float(np.sum((tie.residual(values) / tie.noise) ** 2)) for tie in self.ties)
 
-    def weighted_residuals(self, values: Array, records: Sequence[FactorRecords] | None = None) -> tuple[Array, ...]:
+    def weighted_residuals(self, values: Array) -> tuple[Array, ...]:
         """Residuals in units of their noise, times the roots of their weights, one (n_r x N) matrix a factor."""
-        self = self._of(records)
         return self._weighted(self.whitened_residuals(values))
 
     def _weighted(self, whitened: Sequence[Array]) -> tuple[Array, ...]:
         pairs = zip(self.records, whitened, strict=True)
         return tuple(residual * np.sqrt(record.weight[: record.count]) for record, residual in pairs)
 
-    def whitened_residuals(self, values: Array, records: Sequence[FactorRecords] | None = None) -> tuple[Array, ...]:
+    def whitened_residuals(self, values: Array) -> tuple[Array, ...]:
         """Residuals in units of their noise, weights left out, one (n_r x N) matrix a factor."""
-        self = self._of(records)
         return self.whitened(self.residuals(values))
 
-    def whitened(self, residuals: Sequence[Array], records: Sequence[FactorRecords] | None = None) -> tuple[Array, ...]:
+    def whitened(self, residuals: Sequence[Array]) -> tuple[Array, ...]:
         """Raw residuals in units of their noise, one (n_r x N) matrix a factor."""
-        self = self._of(records)
         return tuple(
             transformed(record.whitening[:, :, : record.count], residual)
             if record.whitening is not None
@@ -377,12 +472,11 @@ class Problem:
             for kernel, record, residual in zip(self.kernels, self.records, residuals, strict=True)
         )
 
-    def normal_equations(self, values: Array, records: Sequence[FactorRecords] | None = None) -> NormalEquations:
+    def normal_equations(self, values: Array) -> NormalEquations:
         """Cost, gradient and Gauss-Newton Hessian, accumulated in blocks: memory does not grow with the records.
 
         Correlated records are made independent all at once.
         """
-        self = self._of(records)
         entries = len(self.parameters.free_entries)
         cost, gradient, hessian = 0.0, np.zeros(entries), np.zeros((entries, entries))
         for jacobian, residual in self._independent_blocks(values):
@@ -391,9 +485,8 @@ class Problem:
             hessian = hessian + sum((part @ part.T for part in jacobian), np.zeros((entries, entries)))
         return self._extra(values).added_to(NormalEquations(cost, gradient, hessian))
 
-    def triangular_factor(self, values: Array, records: Sequence[FactorRecords] | None = None) -> Array:
+    def triangular_factor(self, values: Array) -> Array:
         """R with R'R = J'J of the whitened residuals by coordinates: singular values keep their condition."""
-        self = self._of(records)
         chain = self.parameters.entries_jacobian(values)
         triangle = np.zeros((0, self.increments))
         for jacobian, _ in self._independent_blocks(values):
@@ -401,21 +494,19 @@ class Problem:
             triangle = triangular(np.vstack([triangle, rows]))
         return triangular(np.vstack([triangle, self._extra(values).jacobian @ chain]))
 
-    def jacobians(self, values: Array, records: Sequence[FactorRecords] | None = None) -> tuple[Array, ...]:
+    def jacobians(self, values: Array) -> tuple[Array, ...]:
         """Whitened, weighted Jacobians by free canonical entries, one (n_r x n_v x N) array a factor."""
-        self = self._of(records)
         self.compiled.check_fixed(values)
         blocks = (grouped.linearised(values, record) for grouped, record in self.pairs)
         whole = (np.concatenate([jacobian for jacobian, _ in of_factor], axis=2) for of_factor in blocks)
         return tuple(jacobian[:, :, : record.count] for jacobian, record in zip(whole, self.records, strict=True))
 
-    def exact_hessian(self, values: Array, records: Sequence[FactorRecords] | None = None) -> Array:
+    def exact_hessian(self, values: Array) -> Array:
         """The Hessian of ``cost`` by free canonical entries with the curvature of the residuals (n x n).
 
         Of correlated records the Gauss-Newton one: their curvature would couple all of them. Nor has it the
         curvature of groups' means, where these weigh more than their records say.
         """
-        self = self._of(records)
         if self.correlation is not None:
             return self.normal_equations(values).hessian
         self.residuals(values)
@@ -432,8 +523,7 @@ class Problem:
             grouped.channel_slopes(values, record, channels)[:, :, : record.count] for grouped, record in self.pairs
         )
 
-    def predict(self, values: Array, records: Sequence[FactorRecords] | None = None) -> tuple[Shown, ...]:
-        self = self._of(records)
+    def predict(self, values: Array) -> tuple[Shown, ...]:
         self.compiled.check_fixed(values)
         return tuple(grouped.predict(values, record) for grouped, record in self.pairs)
 
@@ -471,9 +561,6 @@ class Problem:
         for made in shared.independent([np.moveaxis(row, 1, 2) for row in rows]):
             yield np.moveaxis(made[:, :, :-1], 1, 2), made[:, :, -1]
 
-    def _of(self, records: Sequence[FactorRecords] | None) -> Self:
-        return self if records is None else self.with_records(records)
-
 
 @lru_cache(maxsize=64)
 def _from_bytes(written: bytes) -> Compiled:
@@ -483,3 +570,144 @@ def _from_bytes(written: bytes) -> Compiled:
 
 def triangular(rows: Array) -> Array:
     return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
+class PosedProblem:
+    """Half the squared whitened residuals of a problem plus priors."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.scales = problem.parameters.increment_scales()
+        self.coordinate_scales = problem.parameters.scales()
+        self._prior = problem.parameters.prior_information() * self.coordinate_scales**2
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of ``x``, and of ``c``: only numbers have them, and theirs are the same."""
+        lower, upper = self.problem.parameters.increment_bounds()
+        return lower / self.scales, upper / self.scales
+
+    def x(self, values: Array) -> Array:
+        return self.problem.parameters.local(values) / self.scales
+
+    def values(self, x: Array) -> Array:
+        return self.problem.parameters.retract(x * self.scales)
+
+    def coordinates(self, x: Array) -> Array:
+        return self.problem.parameters.coordinates(x * self.scales) / self.coordinate_scales
+
+    def from_coordinates(self, c: Array) -> Array:
+        return self.problem.parameters.from_coordinates(c * self.coordinate_scales) / self.scales
+
+    def cost(self, x: Array) -> float:
+        """Residuals and priors; infinite where a record has no elastic equilibrium."""
+        try:
+            return self.problem.cost(self.values(x)) + self._prior_cost(x)
+        except NotConvergedError:
+            return float("inf")
+
+    def model(self, x: Array) -> NormalEquations:
+        """Cost, gradient and Gauss-Newton Hessian by ``x``."""
+        data = self.problem.normal_equations(self.values(x))
+        gradient, hessian = self._chained(x, data)
+        curvature = self.problem.parameters.curvature(self._entry_gradient(x, data.gradient))
+        hessian = hessian + curvature * np.outer(self.scales, self.scales)
+        return NormalEquations(data.cost + self._prior_cost(x), gradient, hessian)
+
+    def convex_model(self, x: Array) -> NormalEquations:
+        """Cost, gradient and Gauss-Newton Hessian by ``c``."""
+        chain = self.problem.parameters.entries_jacobian(self.values(x)) * self.coordinate_scales
+        data = self.problem.normal_equations(self.values(x)).chained(chain)
+        gradient = data.gradient + self._prior * self.coordinates(x)
+        return NormalEquations(data.cost + self._prior_cost(x), gradient, data.hessian + np.diag(self._prior))
+
+    def by_increments(self, x: Array, model: NormalEquations) -> NormalEquations:
+        """A model by ``c`` at the place of ``x`` as one by ``x``, with all of the curvature of ``c``."""
+        chain = self._coordinates_jacobian(x)
+        by_entries = self.problem.parameters.entries_jacobian(self.values(x)) @ (
+            model.gradient / self.coordinate_scales
+        )
+        curvature = self.problem.parameters.curvature(by_entries, convex=False) * np.outer(self.scales, self.scales)
+        moved = model.chained(chain)
+        return NormalEquations(moved.cost, moved.gradient, moved.hessian + curvature)
+
+    def exact_hessian(self, x: Array) -> Array:
+        """The Hessian by ``x`` with the curvature of the residuals."""
+        data = self.problem.normal_equations(self.values(x))
+        exact = NormalEquations(0.0, data.gradient, self.problem.exact_hessian(self.values(x)))
+        curvature = self.problem.parameters.curvature(self._entry_gradient(x, data.gradient))
+        return self._chained(x, exact)[1] + curvature * np.outer(self.scales, self.scales)
+
+    def _chained(self, x: Array, data: NormalEquations) -> tuple[Array, Array]:
+        """Gradient and Hessian by ``x`` of data, by canonical entries, and priors, by coordinates."""
+        parameters, delta = self.problem.parameters, x * self.scales
+        by_data = data.chained(parameters.retract_jacobian(delta) * self.scales)
+        by_prior = self._coordinates_jacobian(x)
+        weighted = by_prior.T * self._prior
+        return by_data.gradient + weighted @ self.coordinates(x), by_data.hessian + weighted @ by_prior
+
+    def _coordinates_jacobian(self, x: Array) -> Array:
+        """d ``c`` / d ``x``."""
+        jacobian = self.problem.parameters.coordinates_jacobian(x * self.scales)
+        return jacobian * self.scales / self.coordinate_scales[:, None]
+
+    def _entry_gradient(self, x: Array, data: Array) -> Array:
+        """The gradient by canonical entries, with that of the priors where entries are coordinates."""
+        by_prior = self._prior * self.coordinates(x) / self.coordinate_scales
+        return data + self.problem.parameters.entries_jacobian(self.values(x)) @ by_prior
+
+    def _prior_cost(self, x: Array) -> float:
+        return 0.5 * float(self._prior @ self.coordinates(x) ** 2) if self._prior.any() else 0.0
+
+
+def require_numbers(problem: Problem, dataset: Dataset) -> None:
+    """Refuse a problem whose residuals or derivatives are no numbers (NaN, infinite) at the nominal values.
+
+    Raises:
+        DataError: a record has no number where the measurement needs one.
+        PluginError: the displacement of an effect is none; with its method.
+        ProblemError: another residual or a derivative is none; with measurement and record, or parameters.
+    """
+    nominal = problem.parameters.nominal()
+    for kernel, own, residual in zip(problem.kernels, problem.records, problem.residuals(nominal), strict=True):
+        lost = np.flatnonzero(own.measured & ~np.isfinite(residual).all(axis=0))
+        if len(lost):
+            record = dataset.ids[lost[0]]
+            numbers = zip(kernel.factor.channels, own.record[:, lost[0]], strict=True)
+            if empty := [channel for channel, number in numbers if not np.isfinite(number)]:
+                text = f"found no number for {', '.join(empty)} in the record {record}."
+                hint = "A reader refuses or sets aside such records: armcal.measure.checks.check_dataset does."
+                raise DataError(text, where=dataset.where(int(lost[0])), hint=hint)
+            _check_displacements(problem, dataset)
+            raise ProblemError(
+                f"the measurement {kernel.factor.name} predicts no number (NaN) for the record {record} at the nominal "
+                "values.",
+                hint="Correct its outputs or residual, the arm model, or a spring's law there.",
+            )
+    slopes = np.diag(problem.normal_equations(nominal).hessian)
+    if names := [name for name, slope in zip(problem.free_names, slopes, strict=True) if not np.isfinite(slope)]:
+        raise ProblemError(
+            f"the derivative of the residuals by {', '.join(names)} is no number (NaN or infinite) at the nominal "
+            "values.",
+            hint="Start from other values, or correct the component that has these parameters.",
+        )
+
+
+def _check_displacements(problem: Problem, dataset: Dataset) -> None:
+    """Refuse an effect that displaces a joint by no number in a record."""
+    plan, nominal = problem.blueprint, problem.parameters.nominal()
+    for arm in plan.arms.values():
+        postures = arm.postures(dataset, plan.environment)
+        values = {block.name: ca.SX.sym(block.name, block.size) for block in arm.parameters()}
+        entries = np.concatenate([nominal[problem.parameters.entries_of(name)] for name in values])
+        for name, effect in arm.effects.items():
+            for index, joint in enumerate(arm.joint_names):
+                command, approach = ca.SX.sym("command"), ca.SX.sym("approach")
+                local = scoped(values, f"{arm.name}.{name}.")
+                moved = ca.SX(effect.displacement(JointCommand(index, command, approach), local))
+                inputs = [ca.vertcat(*values.values()), command, approach]
+                function = ca.Function("displacement", inputs, [ca.densify(moved)])
+                shown = np.asarray(function(entries, postures.commands[[index]], postures.approaches[[index]])).ravel()
+                if len(lost := np.flatnonzero(~np.isfinite(shown))):
+                    at = f"{postures.commands[index, lost[0]]:.4g}"
+                    given = f"{shown[lost[0]]} for {joint} commanded to {at} (record {dataset.ids[lost[0]]})"
+                    refuse(effect.displacement, given, "a number (rad or m)")

@@ -8,7 +8,7 @@ from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.units import shown_unit
 from armcal.diagnose import outliers
 from armcal.estimate.estimator import Estimate
-from armcal.estimate.profile import Profile
+from armcal.estimate.uncertainty import Profile
 from armcal.report.document import Figure, Marks, Panel
 from armcal.report.numbers import count, entry_unit, plural, significant
 from armcal.run.result import RunResult

@@ -12,9 +12,9 @@ from armcal.base.domains import Semidefinite, symmetric
 from armcal.base.units import shown_unit
 from armcal.diagnose.coverage import IntervalResult
 from armcal.diagnose.outliers import large_errors
-from armcal.estimate.bootstrap import Bootstrap
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.prediction import LEVELS
+from armcal.estimate.uncertainty import Bootstrap
 from armcal.estimate.validation import ErrorSummary
 from armcal.report.document import Table
 from armcal.report.numbers import MINUS, NONE, common_decimals, count, decimals_for, entry_unit, fixed, significant

@@ -22,7 +22,7 @@ from armcal.calibration.calibration_file import (
 from armcal.calibration.physics import check_poses
 from armcal.diagnose.verdict import evidence
 from armcal.errors import ArmcalError, CalibrationWarning, NotConvergedError
-from armcal.estimate.bootstrap import Bootstrap
+from armcal.estimate.uncertainty import Bootstrap
 from armcal.estimate.validation import in_unit
 from armcal.io import folder as folders
 from armcal.io.cells import csv_text

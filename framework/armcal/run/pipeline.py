@@ -21,21 +21,17 @@ from armcal.diagnose.fit import Fit, Prepared
 from armcal.diagnose.score_tests import widened
 from armcal.diagnose.verdict import verdict_of
 from armcal.errors import ConfigError, DataError, Location, ProblemError, noted
-from armcal.estimate.bootstrap import Bootstrap, bootstrap
 from armcal.estimate.estimator import Progress, no_progress, spread
 from armcal.estimate.identifiability import require_solvable
 from armcal.estimate.polish import hopeless, mislabelled, restricted, started, typical_off
-from armcal.estimate.profile import Profile, profiled, profiles
 from armcal.estimate.robust import WeighedFit, fit, held_fit, plain_fit
 from armcal.estimate.start import FAR, Start, aligned_start, with_proposals
+from armcal.estimate.uncertainty import Bootstrap, Profile, bootstrap, profiled, profiles
 from armcal.estimate.validation import cross_validate, error_unit
 from armcal.io.parallel import Executor
 from armcal.plugins import PluginRegistry
-from armcal.problem.corrected import moved_by
-from armcal.problem.drift import with_drift
-from armcal.problem.finite import require_numbers
-from armcal.problem.problem import Problem
-from armcal.problem.readings import with_joint_noise
+from armcal.problem.problem import Problem, require_numbers
+from armcal.problem.variants import moved_by, with_drift, with_joint_noise
 from armcal.run.experiment import Experiment
 from armcal.run.pose_residual import ResidualOutcome, layer_of, learned_residual, unlearned
 from armcal.run.result import RunResult, SuspiciousRecord, noise_result, run_groups
@@ -46,6 +42,8 @@ _FAR_OFF = "the model's nominal values are far off: give better ones, or "
 
 @dataclass(frozen=True)
 class Stopwatch:
+    """Seconds of each stage."""
+
     began: float = field(default_factory=time.perf_counter)
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -325,6 +323,7 @@ def judged(context: RunContext, own: Fit, outcome: ResidualOutcome | None) -> Ru
 
 
 def _prediction(experiment: Experiment, own: Fit, outcome: ResidualOutcome | None) -> PredictionRecord | None:
+    """What predictions need of a run; None where it did not converge."""
     if not own.converged:
         return None
     ranges = recorded_ranges(own.dataset, experiment.system.arms, experiment.settings.statics.payload)

@@ -33,7 +33,7 @@ from armcal.estimate.validation import (
 from armcal.io.parallel import Executor
 from armcal.measure.groups import PairedMeasurement
 from armcal.measure.instrument import Contact
-from armcal.problem.corrected import Moved, corrected, sizes_of, unexplained
+from armcal.problem.variants import Moved, corrected, sizes_of, unexplained
 from armcal.run.experiment import Experiment
 
 _FOLDS = 5
@@ -62,6 +62,7 @@ class Comparison:
 
     @classmethod
     def of(cls, without: Array, with_it: Array, gains: Array) -> Self:
+        """Of records (N), and of gains by measurement (measurements x chances)."""
         return cls(float(np.nanmean(without)), float(np.nanmean(with_it)), min(map(_sure, gains)))
 
     @property
@@ -77,6 +78,8 @@ def _sure(gains: Array) -> float:
 
 @dataclass(frozen=True)
 class ResidualOutcome:
+    """What became of a pose residual."""
+
     arm: str  # whose
     kind: str  # its type
     unit: str  # of errors
@@ -102,6 +105,7 @@ class ResidualOutcome:
         return replace(system, arms=arms, description={**system.description, "arms": described})
 
     def findings(self) -> list[Finding]:
+        """What it does, and for which poses."""
         if self.folds is None:
             return [Finding("note", f"The pose residual of {self.arm} is not kept: {self.why}.")]
         test = f"{len(self.splits)} folds, and {_STRETCHES} stretches of the recording, held out of fit and learning"
@@ -125,6 +129,7 @@ class ResidualOutcome:
         return findings
 
     def as_dict(self) -> dict[str, Any]:
+        """For metrics.json."""
         compared = {"folds": self.folds, "stretches": self.stretches}
         named: dict[str, Any] = {
             name: {f"without_{self.unit}": p.without, f"with_{self.unit}": p.with_it, "standard_errors": p.sure}
@@ -258,6 +263,7 @@ def _harm(gains: Array, unknown: Array) -> str:
 
 
 def judged_with(task: FitTask, layer: Layer) -> JudgedFit:
+    """Fit, learn from what the fit leaves, and judge with that."""
     began, task = time.perf_counter(), task.trained()
     try:
         train, held = task.parts()
@@ -277,8 +283,7 @@ def judged_with(task: FitTask, layer: Layer) -> JudgedFit:
         judged = judged_fit(task, fitted.solution, train, held, began)
         if not judged.converged:
             return judged
-        alike = whitened_like(held, fitted, task.estimator).records
-        held_residuals = missed(predictor(fitted), alike)
+        held_residuals = missed(predictor(fitted), whitened_like(held, fitted, task.estimator))
         own = {} if learned is None else {layer.arm: (learned, layer.postures.subset(task.split.holdout))}
         unknown = tuple(unexplained(held, fitted.solution.values, own))
     except NotConvergedError:

@@ -16,11 +16,10 @@ from armcal.config.system import System
 from armcal.diagnose.coverage import IntervalResult, intervals
 from armcal.diagnose.fit import Fit, RecordErrors
 from armcal.diagnose.verdict import Verdict
-from armcal.estimate.bootstrap import Bootstrap
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.polish import settled, untrained
-from armcal.estimate.profile import Profile
-from armcal.estimate.residual_spread import ResidualSpread, residual_spread
+from armcal.estimate.prediction import ResidualSpread, residual_spread
+from armcal.estimate.uncertainty import Bootstrap, Profile
 from armcal.estimate.validation import ErrorSummary, Split, summarise
 from armcal.estimate.variance import VarianceComponents
 from armcal.measure.groups import Groups
@@ -163,7 +162,7 @@ def run_groups(experiment: Experiment, fit: Fit) -> RunGroups:
 
 
 def _distances(problem: Problem, values: Array) -> list[tuple[tuple[str, str], float]]:
-    return [(tie.groups, float(np.linalg.norm(tie.residual(values))) * _MM) for tie in problem.known_ties]
+    return [(tie.groups, float(np.linalg.norm(tie.residual(values))) * _MM) for tie in problem.compiled.known_ties]
 
 
 def _within(name: str, distances: list[tuple[tuple[str, str], float]]) -> float | None:

@@ -7,8 +7,8 @@ from pydantic import Field, field_validator, model_validator
 from armcal.base.settings import Angle, InputPath, Length, Settings
 from armcal.config.selection import ParameterSettings
 from armcal.config.system import StaticsSettings
-from armcal.estimate.bootstrap import BootstrapSettings
 from armcal.estimate.robust import NoiseSettings
+from armcal.estimate.uncertainty import BootstrapSettings
 from armcal.planning.criterion import Goal
 from armcal.run.plan_clearance import ClearanceSettings
 

@@ -20,10 +20,10 @@ from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource, load_variants
 from armcal.diagnose.fit import Prepared
 from armcal.errors import ConfigError, DataError, InputError, Location, NotConvergedError, ProblemError
-from armcal.estimate.bootstrap import BlockLength, automatic_block_length, standard_error_of_mean
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.identifiability import require_solvable
 from armcal.estimate.polish import restricted, untrained
+from armcal.estimate.uncertainty import BlockLength, automatic_block_length, standard_error_of_mean
 from armcal.estimate.validation import (
     ErrorSummary,
     FitTask,

@@ -20,7 +20,7 @@ from armcal.estimate.identifiability import MinimalSet, minimal_set
 from armcal.estimate.simulation import measured_without_noise
 from armcal.measure.csv_writer import write_csv
 from armcal.plugins import PluginRegistry
-from armcal.problem.projection import factor_at_zero
+from armcal.problem.variants import factor_at_zero
 from armcal.report.page import page
 from armcal.report.run_document import plugin_sections, run_document
 from armcal.run import outputs

@@ -21,7 +21,7 @@ from armcal.base.units import ERROR_UNITS, display_unit, si_unit
 from armcal.measure.measurement import Channel, GroupedMeasurement, Measurement
 from armcal.measure.reader import surroundings
 from armcal.problem.factor import Factor, build_factor
-from armcal.problem.readings import readings_by_residual
+from armcal.problem.variants import readings_by_residual
 from armcal.testing.checking import JOINTS, RESULTS, Subject, check, expect
 from armcal.testing.planar import ARM, GRAVITY, SkewedArm, all_parameters, planar_arms
 

@@ -39,12 +39,9 @@ from armcal.estimate.validation import hold_out
 from armcal.measure.instrument import Proposing
 from armcal.measure.measurement import Measurement
 from armcal.planning.suggestion import suggest
-from armcal.problem.factor_records import declared
-from armcal.problem.many_points import as_seen
-from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import Problem
-from armcal.problem.projection import factor_at_zero
-from armcal.problem.readings import with_joint_noise
+from armcal.problem.problem import PosedProblem, Problem
+from armcal.problem.records import declared
+from armcal.problem.variants import as_seen, factor_at_zero, with_joint_noise
 from armcal.run.experiment import Experiment
 from numpy.typing import NDArray
 from scipy.linalg import block_diag

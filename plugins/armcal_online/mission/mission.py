@@ -25,8 +25,7 @@ from armcal.estimate.robust import reweighted
 from armcal.io.lines import StandardOutput
 from armcal.measure.csv_writer import write_csv
 from armcal.plugins import PluginRegistry, discover
-from armcal.problem.posed import PosedProblem
-from armcal.problem.problem import Problem
+from armcal.problem.problem import PosedProblem, Problem
 from armcal.run.experiment import Experiment
 from armcal.run.outputs import calibration_content
 from armcal.run.pipeline import calibrate

@@ -32,7 +32,7 @@ from armcal.base.units import amount_in_time
 from armcal.config.selection import quantity
 from armcal.errors import ConfigError, Location
 from armcal.estimate.online import Gaussian, checked
-from armcal.problem.correlation import kept, passed_on
+from armcal.problem.records import kept, passed_on
 from scipy.optimize import lsq_linear
 
 _ENTRIES = np.triu_indices(3)

@@ -16,7 +16,7 @@ from armcal.calibration.exporter import Exported
 from armcal.errors import ConfigError, DataError, Location
 from armcal.estimate.estimator import Solution, SolverVerdict, no_progress
 from armcal.estimate.online import Gaussian, Update, checked, kalman_update
-from armcal.problem.posed import PosedProblem
+from armcal.problem.problem import PosedProblem
 
 COUNTER = itertools.count()
 

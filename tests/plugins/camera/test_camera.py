@@ -17,8 +17,8 @@ from armcal.errors import ConfigError, ProblemError
 from armcal.estimate.start import Start, with_proposals
 from armcal.estimate.validation import record_errors
 from armcal.problem.factor import build_factor
-from armcal.problem.many_points import as_seen, with_few_points
 from armcal.problem.problem import Problem
+from armcal.problem.variants import as_seen, with_few_points
 from armcal.run.experiment import Experiment
 from armcal_camera.intrinsics import normalised, pinhole, projected
 from scipy.spatial.transform import Rotation
