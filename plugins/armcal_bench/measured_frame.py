@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.units import length_mistake
-from armcal.diagnose.permuted_axes import FITS, MISSES, MUCH_BETTER
+from armcal.diagnose.data import FITS, MISSES, MUCH_BETTER
 from armcal.problem.rigid_alignment import rigid_fit, spread_of
 
 FEWEST = 3  # Poses: fewer show neither a gain nor a reflection

@@ -25,7 +25,7 @@ from armcal.calibration.intervals import PredictionRecord
 from armcal.cli.common import FILE, Console, accept, overrides, speaking
 from armcal.config.system import System, build_component
 from armcal.config.yaml_source import ConfigSource, load_config
-from armcal.diagnose.readings import check_reach
+from armcal.diagnose.data import check_reach
 from armcal.errors import ConfigError, DataError, Location, noted
 from armcal.estimate.prediction import RADIUS_LEVEL, Spread, quantile
 from armcal.estimate.start import BETTER, FAR, pose_words

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from armcal.cli.main import cli
 from armcal.diagnose.fit import Prepared
-from armcal.diagnose.gross import Figure, computed_findings, figure_of, size_findings
+from armcal.diagnose.gross import Figure, computed_findings, figure, size_findings
 from armcal.estimate.estimator import Estimate
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, assemble, calibrate
 from click.testing import CliRunner
+from fits import fit_that_found
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 CONFIG = CONFIGS / "so101" / "ruler.yaml"
@@ -35,9 +36,9 @@ def size(ready: Prepared, zero_rad: float, factor: float) -> float:
         own = parameters.entries_of(block.name)
         values[own] = values[own] * factor if block.unit == "m" else zero_rad
     known = SimpleNamespace(values=values, covariance=np.zeros((len(parameters.free_entries),) * 2))
-    figure = figure_of(ready.training, cast(Estimate, known))
-    assert bool(size_findings(figure)) == (factor != 1.0)
-    return figure.size
+    own = figure(fit_that_found(cast(Estimate, known), {}, ready))
+    assert bool(size_findings(own)) == (factor != 1.0)
+    return own.size
 
 
 def test_lengths_make_a_size_and_the_zero_of_a_joint_does_not(ready: Prepared) -> None:

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.cli.main import cli
+from armcal.diagnose.data import find_permuted_axes, within
 from armcal.diagnose.fit import Prepared
-from armcal.diagnose.permuted_axes import find_permuted_axes
-from armcal.diagnose.readings import within
 from armcal.errors import DataError, NotConvergedError
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, assemble, calibrate

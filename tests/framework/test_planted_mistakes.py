@@ -12,7 +12,7 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
-from armcal.diagnose.readings import check_reach
+from armcal.diagnose.data import check_reach
 from armcal.errors import ConfigError
 from armcal.estimate.validation import folds, hold_out
 from armcal.run.experiment import Experiment

@@ -13,8 +13,8 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.cli.check import gravity_lines
 from armcal.cli.main import cli
+from armcal.diagnose.data import find_permuted_axes
 from armcal.diagnose.fit import Prepared
-from armcal.diagnose.permuted_axes import find_permuted_axes
 from armcal.estimate.start import Start, aligned_start, placings
 from armcal.problem.rigid_alignment import Alignment, Tools, alignments, hand_eye, sighting_of, tools_of, undetermined
 from armcal.run.experiment import Experiment

@@ -46,8 +46,6 @@ class CheckFunction(Protocol):
 
 @dataclass(frozen=True)
 class Check:
-    """A check of the list."""
-
     name: str
     question: str  # that it answers
     rate: str  # of false alarms: the level stated for sound data, ``EXACT`` or ``NO_RATE``
@@ -135,7 +133,6 @@ FIT_CHECKS = (
 
 
 def plugin_checks(registry: PluginRegistry, before_fit: bool) -> Iterator[Check]:
-    """The checks that plugins registered, by name."""
     for component in sorted((c for c in registry.components if c.kind == "check"), key=lambda one: one.name):
         own = component.load()
         if bool(getattr(own, "before_fit", False)) == before_fit:

@@ -59,7 +59,6 @@ class Scores:
     freedom: Array  # degrees of freedom of the fit that judged each record (N)
 
     def of_level(self, level: float) -> Array:
-        """Sizes of residuals over half the widths of their intervals (n_r x N)."""
         return np.asarray(np.abs(self.errors) / quantile(level, self.freedom))
 
     @property
@@ -102,8 +101,6 @@ class Coverage:
         return self.stretched or self.raw
 
     def as_dict(self) -> dict[str, object]:
-        """For JSON."""
-
         def named(shares: tuple[float, ...] | None, radius: float | None) -> dict[str, float | None] | None:
             if shares is None:
                 return None
@@ -146,12 +143,10 @@ def missed(by: Predictor, held: Problem) -> dict[Recording, Residuals]:
 
 
 def score(by: Predictor, held: Problem) -> dict[Recording, Scores]:
-    """Residuals of records that a fit did not see, in units of what it predicts for them."""
     return {name: scored(held, own, by.spreads(held, name)) for name, own in missed(by, held).items()}
 
 
 def scored(problem: Problem, residuals: Residuals, spreads: Sequence[Spread]) -> Scores:
-    """Residuals in units of what is predicted for them; nan where there are none."""
     errors = [residual / spread.deviations for residual, spread in zip(residuals, spreads, strict=True)]
     reaches = [
         np.linalg.norm(residual[: len(POSITION)], axis=0) / spread.of(POSITION).radius()
@@ -164,7 +159,6 @@ def scored(problem: Problem, residuals: Residuals, spreads: Sequence[Spread]) ->
 
 
 def whitened_like(held: Problem, fitted: WeighedFit, estimator: Estimator) -> Problem:
-    """Records with the noise that the fit estimated, if it did."""
     if fitted.components is None or not isinstance(estimator, Weighing):
         return held
     return apply_components(held, fitted.solution.values, fitted.components, estimator.settings.axes)
@@ -196,7 +190,6 @@ def besides(scores: Scores, places: Indices) -> Scores:
 def _collected(
     splits: Sequence[Split], residuals: Sequence[Mapping[Recording, Residuals]], count: int
 ) -> dict[Recording, Residuals]:
-    """The residuals of all folds in the order of the records; nan where a fold has none."""
     result: dict[Recording, Residuals] = {}
     for split, held_residuals in zip(splits, residuals, strict=True):
         for name, own in held_residuals.items():
@@ -235,7 +228,6 @@ def coverage(scores: Scores, stretches: Sequence[Stretch | None] | None = None) 
 
 
 def coverage_finding(shares: Coverage, of: str, recording: Recording = "same") -> Finding:
-    """Do intervals cover their share? Two-sided, at 5 %, against so many independent numbers as they are worth."""
     share, raw = shares.stated[LEVELS.index(STATED)], shares.raw[LEVELS.index(STATED)]
     error = np.sqrt(STATED * (1 - STATED) / shares.independent)
     off = abs(share - STATED) > ndtri(1 - LEVEL / 2) * error
@@ -334,7 +326,6 @@ class IntervalResult:
         return [*typical, *(coverage_finding(own, words, name) for name, own in coverages.items())]
 
     def _typical(self) -> str:
-        """How wide the intervals are."""
         half, radius = self.half_width_mm, self.radius_mm
         first: Recording = "new" if "new" in half else "same"
         text = "In the median pose, of poses like the recorded ones, a prediction is good to "
@@ -453,7 +444,6 @@ def _filled(before: Scores | None, own: Scores, places: Indices, count: int) -> 
 
 
 def _typical(spreads: Sequence[Spread], widened: Stretch | None) -> tuple[float, float]:
-    """Median half width of a 90 % interval of a coordinate, and of a 95 % radius (mm)."""
     if not spreads:
         return float("nan"), float("nan")
     factor = widened.coordinates[LEVELS.index(STATED)] if widened else 1.0

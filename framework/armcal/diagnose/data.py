@@ -1,16 +1,658 @@
-"""Checks of data, before a fit and beside one: what is mixed up, in another unit, too heavy, or stood still."""
+"""Checks of data: what is mixed up, in another unit, too heavy, or stood still.
+
+Do measured positions fit the model far better with axes or joints exchanged or reversed, or in other units? Single
+changes are tried first; where none explains the data, the base elsewhere, then several at once. Each reading of the
+data is given the same chance: where the base may stand anywhere, it and the target are found anew, and what counts is
+what is left of its residuals once all free parameters have adapted to first order. The likeliest are then fitted: a
+right reading leaves little, a wrong one cannot be mended by any parameters.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations, permutations, product
+from typing import Self
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from armcal.arm.assembly import command_channels, shown_joint
+from armcal.arm.assembly import Arm, command_channels, shown_joint
+from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.units import digits, to_unit
 from armcal.config.system import System
 from armcal.diagnose.checks import Finding, first_few
 from armcal.diagnose.fit import Fit, Prepared
-from armcal.diagnose.permuted_axes import MUCH_BETTER, find_permuted_axes
-from armcal.diagnose.readings import check_reach
+from armcal.errors import DataError, Location, NotConvergedError
+from armcal.estimate.polish import descended
+from armcal.estimate.start import Placing, placings
 from armcal.measure.groups import first_of_pose
+from armcal.problem.problem import FactorRecords, PosedProblem, Problem
+from armcal.problem.records import subset
+from armcal.problem.rigid_alignment import (
+    Sighting,
+    Tools,
+    nearest,
+    rigid_fit,
+    shown_instead,
+    sighting_of,
+    spread_of,
+    tools,
+    tools_of,
+)
+
+Wires = Mapping[str, tuple[Mapping[str, float], float]]
+"""Channels, each read as a sum of channels times factors, and a summand."""
+_DEGREES, _TURN, _MRAD = 180 / np.pi, 360.0, 1000 * np.pi / 180
+_ZEROS_DEG = (180, 90, -90)
+"""What the zero of a joint is off by: half the counts of a servo, or where another convention has it."""
+_MOST_SIGNS = 8
+_AXES = "xyz"
+_INCH = 25.4
+_ROUNDED = 1e-6
+_REACH_RATIO = 10.0
+_ALIKE = 0.35  # In powers of ten: so alike are two distances of one unit
+_FEWEST_ROWS, _NEARLY_ALL, _NEAREST = 3, 0.95, 1e-6
+_NEAR = 0.2  # Of their distance from the base: so near are positions to where the nominal arm has them
+_TURNED = 0.05
+_FAR, _HALVINGS = 3.0, 60
+FEWEST_IN_PART = 8  # Records in a part: an alignment has nine numbers
+_PARTS, _ROUNDS = (0.25, 0.5, 0.75), 3
+_UNITS = {"millimetres": 0.001, "centimetres": 0.01, "metres": 1.0, "inches": _INCH / 1000}
+LENGTHS = (10.0, 0.1, 1000.0, 0.001, _INCH, 1 / _INCH, 1000 / _INCH, _INCH / 1000)
+"""What lengths are off by that were read in mm, cm, m or inches and taken for another of these."""
+_AXIS_LENGTHS = (10.0, 0.1, 1000.0, 0.001)
+LEFT_HANDED = "a left-handed frame made right-handed (one axis reversed, or two exchanged)"
+
+
+def single_joints(arm: Arm) -> list[tuple[str, Wires]]:
+    """Each joint's sign, each two joints of a kind exchanged, and all angles, one, or one travel in another unit."""
+    joints = tuple(arm.commanded)
+    angles = {joint: joint for joint, dimension in arm.commanded.items() if dimension == "angle"}
+    readings: list[tuple[str, Wires]] = [
+        (f"the sign of {joint} reversed", _wires(arm, {joint: joint}, -1.0)) for joint in joints
+    ]
+    for one, other in combinations(joints, 2):
+        if arm.commanded[one] == arm.commanded[other]:
+            readings.append((f"{one} and {other} exchanged", _wires(arm, {one: other, other: one}, 1.0)))
+    for factor in (_DEGREES, 1 / _DEGREES, _TURN, _MRAD, 1 / _MRAD):
+        readings.append((f"joint angles {factor:.4g} times as large", _wires(arm, angles, factor)))
+    for joint in joints:
+        units = LENGTHS if joint not in angles else (_DEGREES,) if len(angles) > 1 else ()
+        readings += [(f"{joint} {factor:.4g} times as large", _wires(arm, {joint: joint}, factor)) for factor in units]
+    for joint, turn in product(angles, _ZEROS_DEG):
+        readings.append((f"{turn} deg added to {joint}", _wires(arm, {joint: joint}, 1.0, np.radians(turn))))
+    return readings
+
+
+def coupled_joints(arm: Arm) -> Iterator[tuple[str, Wires]]:
+    for joint, other in permutations(arm.commanded, 2):
+        for sign in (1.0, -1.0) if arm.commanded[joint] == arm.commanded[other] else ():
+            factor = arm.couplings.get(joint, {}).get(other, 0.0) + sign
+            stated = f"state couplings: {{{joint}: {{{other}: {factor:g}}}}}" if factor else f"do not couple {joint}"
+            words = f"{joint} {'+' if sign > 0 else '-'} {other} taken for {joint}"
+            why = "(coupled joints, as the pendant of a Fanuc and the links of a palletiser have them: "
+            channels = {f"{arm.name}.{joint}": 1.0, f"{arm.name}.{other}": sign}
+            yield f"{words} {why}{stated})", {f"{arm.name}.{joint}": (channels, 0.0)}
+
+
+def several_joints(arm: Arm) -> Iterator[tuple[str, Wires]]:
+    """The signs of several joints, and joints in reverse order or shifted."""
+    joints = tuple(arm.commanded)
+    for size in range(2, len(joints) + 1) if len(joints) <= _MOST_SIGNS else ():
+        for chosen in combinations(joints, size):
+            words = f"the signs of {', '.join(chosen[:-1])} and {chosen[-1]} reversed"
+            yield words, _wires(arm, {joint: joint for joint in chosen}, -1.0)
+    if len(set(arm.commanded.values())) == 1:
+        orders = [joints[::-1], *(joints[step:] + joints[:step] for step in range(1, len(joints)))]
+        for order in orders if len(joints) > 2 else ():
+            yield (
+                f"({', '.join(order)}) taken for ({', '.join(joints)})",
+                _wires(arm, dict(zip(joints, order, strict=True)), 1.0),
+            )
+
+
+def axes_words(order: Sequence[int], signs: Sequence[float]) -> str:
+    moved = [i for i in range(3) if order[i] != i]
+    negative = [_AXES[order[i]] for i in range(3) if signs[i] < 0]
+    if len(moved) == 2 and not negative:
+        return f"{_AXES[moved[0]]} and {_AXES[moved[1]]} exchanged"
+    if not moved:
+        return f"the sign{'s' * (len(negative) > 1)} of {' and '.join(negative)} reversed"
+    taken = (f"{'-' if sign < 0 else ''}{_AXES[axis]}" for axis, sign in zip(order, signs, strict=True))
+    return f"({', '.join(taken)}) taken for (x, y, z)"
+
+
+def _wires(arm: Arm, joints: Mapping[str, str], factor: float, added: float = 0.0) -> Wires:
+    return {
+        f"{arm.name}.{part}{joint}": ({f"{arm.name}.{part}{other}": scale}, summand)
+        for joint, other in joints.items()
+        for part, scale, summand in (("", factor, added), ("approach.", float(np.sign(factor)), 0.0))
+    }
+
+
+def turned_axes() -> Iterator[tuple[str, Array]]:
+    """All exchanges and signs of axes but none (3 x 3), in words."""
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            turn = np.zeros((3, 3))
+            turn[range(3), order] = signs
+            if not np.array_equal(turn, np.eye(3)):
+                yield axes_words(order, signs), turn
+
+
+def scaled_positions() -> Iterator[tuple[str, Array]]:
+    """Positions, or one axis of them, in another unit (3 x 3), in words."""
+    for factor in LENGTHS:
+        yield f"positions {factor:.4g} times as large", factor * np.eye(3)
+    for axis, factor in product(range(3), _AXIS_LENGTHS):
+        scale = np.diag([factor if i == axis else 1.0 for i in range(3)])
+        yield f"{_AXES[axis]} {factor:.4g} times as large", scale
+
+
+def unit_mistaken(factor: float) -> str:
+    pairs = product(_UNITS.items(), repeat=2)
+    return next(f"{own} among {other}" for (own, size), (other, taken) in pairs if np.isclose(taken / size, factor))
+
+
+def check_reach(problem: Problem, dataset: Dataset) -> None:
+    """Positions ten times farther out, or nearer, than the model's: a unit is wrong, of all records or of some.
+
+    Raises:
+        DataError: which, and as which unit they are read.
+    """
+    shown = problem.predict(problem.parameters.nominal())
+    for kernel, own in zip(problem.kernels, shown, strict=True):
+        channels = kernel.factor.output_channels
+        if [channel.rpartition(".")[2] for channel in channels] != ["x", "y", "z"]:
+            continue
+        name, measured = kernel.factor.name, dataset.stacked(channels)
+        factor, wrong = _in_another_unit(measured, own.outputs[:3])
+        if wrong.any():
+            first, count = int(np.argmax(wrong)), int(wrong.sum())
+            which, more = f"the position of record {dataset.ids[first]} is", ""
+            if count > 1:
+                which, more = f"{count} of {len(dataset)} positions are", f" (the first: record {dataset.ids[first]})"
+            raise DataError(
+                f"{name}: {which} about {digits(factor)} times as far from the base frame "
+                f"as the model's tip, the others as far{more}: {unit_mistaken(factor)}?",
+                where=Location(dataset.source, row=dataset.rows[first] if dataset.rows else None),
+                hint="Write all rows in the unit of the column names.",
+            )
+        far, distances = (float(np.median(np.linalg.norm(x, axis=0))) for x in (own.outputs[:3], measured))
+        if distances > _REACH_RATIO * far or far > _REACH_RATIO * distances:
+            raise DataError(
+                f"{name}: positions are typically {distances:.4g} m from the base frame, the model's tip {far:.4g} m.",
+                where=Location(dataset.source),
+                hint="Check the unit in the column names (x_mm or x_m) and the frame of the measurements.",
+            )
+
+
+def _in_another_unit(measured: Array, shown: Array) -> tuple[float, Mask]:
+    """Positions so many times as far out as the model's (3 x N each, m), where the others are as far; or none.
+
+    Many are known by their distances alone, as where half of them spoil the place of the base. Few are where the model
+    has them once they are divided by that, and the others are typically where it has them.
+    """
+    far, distances, missed = (np.linalg.norm(x, axis=0) for x in (shown, measured, measured - shown))
+    far = np.maximum(far, _NEAREST)
+    orders = np.log10(np.where(distances > 0, distances, np.nan) / far)
+    right = np.abs(orders) < _ALIKE
+    # Near the origin any factor comes about by a little that the nominal arm is off.
+    far_off = (missed > _NEAR * np.median(far)) & (np.nanmedian(missed / far) < _NEAR)
+    best = np.inf, 1.0, np.zeros(len(far), dtype=bool)
+    for factor in LENGTHS:
+        off = np.abs(orders - np.log10(factor))
+        wrong = off < _ALIKE
+        if min(right.sum(), wrong.sum()) < _FEWEST_ROWS or np.mean(right | wrong) < _NEARLY_ALL:
+            wrong = (np.linalg.norm(measured / factor - shown, axis=0) < _NEAR * far) & far_off
+        if wrong.any():
+            best = min(best, (float(np.median(off[wrong])), factor, wrong), key=lambda one: one[0])
+    return best[1:]
+
+
+@dataclass(frozen=True)
+class TwoFrames:
+    """Where the second frame begins (a place among the records), and what both leave (root mean square, m)."""
+
+    begins: int
+    left: float
+
+
+def two_frames(tools: Tools, measured: Array, basis: Array) -> TwoFrames | None:
+    """Records (3 x n, m) in recorded order, each part aligned by itself; None where they are too few.
+
+    From a few divisions on, each part is aligned and the division put where both alignments leave least, in turn.
+    """
+    every = np.arange(measured.shape[1])
+    if len(every) < 2 * FEWEST_IN_PART:
+        return None
+    divisions = []
+    for part in _PARTS:
+        begins = round(part * len(every))
+        for _ in range(_ROUNDS):
+            begins = min(max(begins, FEWEST_IN_PART), len(every) - FEWEST_IN_PART)
+            halves = [nearest(tools.subset(own), measured[:, own], basis) for own in (every[:begins], every[begins:])]
+            squares = [np.sum((measured - alignment.moved(tools)) ** 2, axis=0) for alignment in halves]
+            before, after = (np.concatenate([[0.0], np.cumsum(square)]) for square in squares)
+            left = before + after[-1] - after
+            begins = int(np.argmin(left[FEWEST_IN_PART:-FEWEST_IN_PART])) + FEWEST_IN_PART
+            divisions.append(TwoFrames(begins, float(np.sqrt(left[begins] / len(every)))))
+    return min(divisions, key=lambda one: one.left)
+
+
+def rewired(channels: Sequence[str], own: FactorRecords, read_as: Wires) -> FactorRecords:
+    read = own.record.copy()
+    for channel, (others, added) in read_as.items():
+        if channel in channels and all(other in channels for other in others):
+            parts = (factor * own.record[channels.index(other)] for other, factor in others.items())
+            read[channels.index(channel)] = sum(parts, np.asarray(added))
+    return replace(own, record=read, state=np.zeros_like(own.state))
+
+
+def kept_spread(read: Array, measured: Array) -> float:
+    """How far positions are spread as they are read (3 x N, m); as in their thinnest direction where that grew thinner.
+
+    A reading that flattens what was measured hides anything in the direction in which it does.
+    """
+    own, given = (np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(p, bias=True)), 0.0)) for p in (read, measured))
+    flattened = own[0] * np.linalg.norm(given) < (1 - _ROUNDED) * given[0] * np.linalg.norm(own)
+    return float(np.sqrt(len(own)) * own[0] if flattened else np.linalg.norm(own))
+
+
+@dataclass(frozen=True)
+class Adapting:
+    """Predicted positions (3 x N, m), and how the free parameters, in typical scales, move them: U S V' (3N x n)."""
+
+    predicted: Array
+    ways: Array
+    sizes: Array
+
+    def left(self, measured: Array, enough: float = np.inf) -> float:
+        """Root mean square distance once the free parameters have adapted to first order, not too far (m).
+
+        Where more than ``enough`` is left however far they adapt, that is given.
+        """
+        return float(self.left_of_each(measured[None], enough)[0])
+
+    def left_of_each(self, measured: Array, enough: float) -> Array:
+        """The same of several readings (k x 3 x N) of what was measured (k)."""
+        off = (measured - self.predicted).transpose(0, 2, 1).reshape(len(measured), -1)
+        along, unit = off @ self.ways, 3 / max(1, off.shape[1] - len(self.sizes))
+        left = np.sum(off**2, axis=1) - np.sum(along**2, axis=1)
+        for i in np.flatnonzero(unit * left <= enough**2):
+            fitted = self.sizes * within(along[i], self.sizes, _FAR * np.sqrt(len(self.sizes)))
+            left[i] += np.sum((along[i] - fitted) ** 2)
+        return np.asarray(np.sqrt(unit * np.maximum(left, 0.0)))
+
+    def can_move(self, turn: Array, shift: Array) -> bool:
+        moved = (np.cross(Rotation.from_matrix(turn).as_rotvec(), self.predicted.T) + shift).ravel()
+        along = self.ways.T @ moved
+        return float(moved @ moved - along @ along) <= _TURNED**2 * float(moved @ moved)
+
+
+def within(along: Array, sizes: Array, radius: float) -> Array:
+    """The steps (n) that come nearest to ``along`` times ``sizes``, no longer than a radius. [Nocedal2006]"""
+    steps = along / sizes
+    if np.linalg.norm(steps) <= radius:
+        return np.asarray(steps)
+    low, high = 0.0, float(np.linalg.norm(along * sizes)) / radius
+    for _ in range(_HALVINGS):
+        damping = (low + high) / 2
+        steps = along * sizes / (sizes**2 + damping)
+        low, high = (damping, high) if np.linalg.norm(steps) > radius else (low, damping)
+    return np.asarray(steps)
+
+
+def is_place(names: Sequence[str]) -> bool:
+    return tuple(name[-1:] for name in names[:3]) == tuple(_AXES)
+
+
+def apart_in_groups(problem: Problem, number: int, values: Array) -> float:
+    """How far single records of a group typically put its place from their middle (m): all are of one without groups.
+
+    Raises:
+        NotConvergedError: a record has no elastic equilibrium at these values.
+    """
+    own = problem.records[number]
+    groups = np.zeros(own.count) if own.group is None else own.group[: own.count]
+    places = problem.grouped[number].nuisance_starts(values, own)[:3, : own.count]
+    members = [np.flatnonzero(groups == group) for group in np.unique(groups[groups >= 0])]
+    middles = [np.median(places[:, chosen], axis=1, keepdims=True) for chosen in members]
+    away = [places[:, chosen] - middle for chosen, middle in zip(members, middles, strict=True)]
+    return float(np.median(np.linalg.norm(np.hstack(away), axis=0))) if away else np.inf
+
+
+MUCH_BETTER = 3.0  # A permutation leaves so many times less than the data as they stand
+FITS, MISSES = 0.15, 0.01
+"""Of the spread of the positions: what a right reading leaves at most to first order, what is worth a look."""
+_NOISE, _EXPLAINS = 3.0, (0.05, MUCH_BETTER)
+"""What it leaves at most once fitted: times the noise; of the spread, and so many times less than the data as given."""
+_HOPELESS, _EXPLAINS_HOPELESS = 0.1, (0.08, 1.8)
+"""The same where no parameters mend what is given, of the spread: a model that lacks much may leave half of that."""
+_FITTED, _FIT_STEPS, _FIT_DAMPING, _FARTHEST, _DETERMINED = 5, 25, 1e-3, 8.0, 1e-3
+_MOST_RECORDS = 300
+_EQUATIONS = 2.0  # So many numbers a parameter are needed to separate readings
+_AS_GOOD = 1.5
+_SMALLEST = 1e-9
+_ROUGHLY = 2.0
+_SEVERAL_RECORDS, _MOST_NAMED = 100, 3
+_MM = 1000.0
+
+
+@dataclass(frozen=True)
+class PermutedAxes:
+    """A reading of the data that fits much better than the data as they stand."""
+
+    measurement: str  # whose positions
+    readings: tuple[str, ...]  # those that fit about as well as the best one, in words
+    as_given_mm: float  # what the data leave as they stand (root mean square, free parameters adapted)
+    left_mm: float  # what the best reading leaves
+    of_joints: bool  # whether it is joints that it reads otherwise; else axes
+    adapted: bool = True  # whether free parameters were; else the arm is the nominal one
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """What is left of one reading (m), how channels and positions (3 x n) are read; None where nothing is fitted."""
+
+    left: float
+    words: str
+    of_joints: bool
+    read_as: Wires = field(default_factory=dict)
+    measured: Array | None = None
+
+
+@dataclass(frozen=True)
+class _Seen:
+    sighting: Sighting  # what was measured
+    records: FactorRecords  # of its kernel alone, their noise as declared
+    rows: tuple[tuple[str, Array], ...]  # what was measured a row before and a row after, in words (3 x n each, m)
+    placing: Placing | None  # what places the arm; None where its base may not stand anywhere
+    noise: Array  # declared, of each axis (3, m)
+    ids: tuple[str, ...] = ()  # of the records (n)
+
+    @property
+    def measured(self) -> Array:
+        return self.sighting.measured
+
+    def thinned(self, most: int) -> Self:
+        every = np.arange(0, self.records.count, max(1, -(-self.records.count // most)))
+        rows = tuple((words, positions[:, every]) for words, positions in self.rows)
+        (records,) = subset([self.records], every)
+        return replace(self, sighting=self.sighting.subset(every), records=records, rows=rows)
+
+
+def find_permuted_axes(problem: Problem, dataset: Dataset) -> PermutedAxes | None:
+    """The first measurement whose positions, as they stand, do not fit, but do with one exchange undone.
+
+    The problem is of the dataset, its noise as declared.
+    """
+    for number, kernel in enumerate(problem.kernels):
+        try:
+            seen = _seen(problem, dataset, number)
+            arms = [problem.blueprint.arms[name] for name in problem.blueprint.measurements[kernel.factor.name].arms]
+            permuted = _of_contact(problem, number, arms) if seen is None else _of(problem, seen, arms[0])
+        except NotConvergedError:
+            continue
+        if permuted is not None:
+            return permuted
+    return None
+
+
+def _of_contact(problem: Problem, number: int, arms: Sequence[Arm]) -> PermutedAxes | None:
+    """Of a contact: how far apart single records put what they touch together, by the nominal arm, however read."""
+    kernel, own, nominal = problem.kernels[number], problem.records[number], problem.blueprint.parameters.nominal()
+    if kernel.factor.output_channels or not is_place(kernel.factor.nuisance_names):
+        return None
+
+    def left(read_as: Wires) -> float:
+        try:
+            wired = rewired(kernel.factor.channels, own, read_as)
+            return apart_in_groups(problem.with_record(number, wired), number, nominal)
+        except NotConvergedError:
+            return np.inf
+
+    reach = spread_of(tools(problem, nominal)[0][0])
+    if not MISSES * reach < (as_given := left({})) < np.inf:
+        return None
+    # Another unit of angles would put all tools near one place, whatever they touch.
+    readings = [
+        _Reading(left(wires), words if len(arms) == 1 else f"{words} ({arm.name})", True)
+        for arm in arms
+        for words, wires in [*single_joints(arm), *coupled_joints(arm)]
+        if all(abs(factor) == 1 for channels, _ in wires.values() for factor in channels.values())
+    ]
+    best, *others = sorted(readings, key=lambda reading: reading.left)
+    if best.left > min(FITS * reach, as_given / MUCH_BETTER):
+        return None
+    words = (best.words, *(other.words for other in others[: _MOST_NAMED - 1] if other.left <= _AS_GOOD * best.left))
+    return PermutedAxes(kernel.factor.name, words, as_given * _MM, best.left * _MM, True, adapted=False)
+
+
+def _seen(problem: Problem, dataset: Dataset, number: int) -> _Seen | None:
+    """A measurement that gives positions in the base frame, at most so many records of it; None of another.
+
+    Records without both neighbours are left out, unless these are most.
+    """
+    sighting = sighting_of(problem, dataset, number, _MOST_RECORDS)
+    if sighting is None:
+        return None
+    every, rows = _neighbours(problem, dataset, sighting)
+    sighting = sighting.subset(every)
+    if 3 * len(sighting.chosen) < _EQUATIONS * max(problem.increments, 6):
+        return None
+    own = replace(problem.subset(sighting.chosen).records[number], whitening=None, correlation=None)
+    noise = np.array(problem.kernels[number].factor.noise[:3])
+    return _Seen(sighting, own, rows, None, noise, tuple(dataset.ids[i] for i in sighting.chosen))
+
+
+def _neighbours(
+    problem: Problem, dataset: Dataset, sighting: Sighting
+) -> tuple[Indices, tuple[tuple[str, Array], ...]]:
+    """Which of the records to look at, and what was measured one row before and after each of these (3 x n each)."""
+    channels = problem.kernels[sighting.kernel].factor.position_channels
+    lines = np.array(dataset.rows or range(len(dataset)))
+    whole = np.flatnonzero(problem.records[sighting.kernel].measured)
+    place, positions = {line: i for i, line in zip(whole, lines[whole], strict=True)}, dataset.stacked(channels)
+    beside = np.array([[place.get(lines[i] + step, -1) for i in sighting.chosen] for step in (-1, 1)])
+    both = np.flatnonzero((beside >= 0).all(axis=0))
+    if 2 * len(both) < len(sighting.chosen):
+        return np.arange(len(sighting.chosen)), ()
+    words = ("positions of the row before", "positions of the row after")
+    rows = ((w, positions[:, of[both]]) for w, of in zip(words, beside, strict=True))
+    return both, tuple((f"the {w} taken for each row's", moved) for w, moved in rows)
+
+
+def _of(problem: Problem, seen: _Seen, arm: Arm) -> PermutedAxes | None:
+    straight = _positions(problem, seen, {}, problem.parameters.nominal())
+    if straight is None:
+        return None
+    spread = max(spread_of(seen.measured), spread_of(straight.predicted))
+    as_given = straight.left(seen.measured)
+    if as_given > MISSES * spread:
+        placing = placings(problem, seen.sighting)[0]
+        seen = replace(seen, placing=placing if placing.stands_anywhere else None)
+        as_given = min(as_given, _left(problem, seen, {}, seen.measured, np.inf))
+    if as_given <= MISSES * spread:
+        return None
+    enough = min(FITS * spread, as_given / MUCH_BETTER)
+    readings = [*_single(problem, seen, arm, straight, enough), *_in_two_frames(problem, seen)]
+    explained = _explained(problem, seen, readings, enough)
+    if not explained:
+        if seen.placing is None:
+            turn, shift = rigid_fit(straight.predicted, seen.measured)
+            angle = float(np.rad2deg(np.linalg.norm(Rotation.from_matrix(turn).as_rotvec())))
+            apart = f"{digits(float(np.linalg.norm(shift)) * _MM)} mm and {digits(angle, 2)} deg"
+            words = f"the arm's base elsewhere by {apart}"
+            left = straight.left(turn.T @ (seen.measured - shift[:, None]))
+            read = _Reading(left, words, False, {}, turn.T @ (seen.measured - shift[:, None]))
+            explained = _explained(problem, seen, [read], enough)
+            if explained and straight.can_move(turn, shift):
+                return None  # the fit moves the base there by itself
+        if not explained:
+            few = seen.thinned(_SEVERAL_RECORDS)
+            if _left(problem, few, {}, few.measured, np.inf) <= MISSES * spread:
+                return None  # as they stand, the records that are looked at fit: a few others are off
+            explained = _explained(problem, few, list(_several(problem, few, arm, enough)), enough)
+    if not explained:
+        return None
+    (best, left), name = explained[0], problem.kernels[seen.sighting.kernel].factor.name
+    alike = [r.words for r, _ in explained if r.left <= _AS_GOOD * best.left and r.of_joints == best.of_joints]
+    return PermutedAxes(name, tuple(alike[:_MOST_NAMED]), as_given * _MM, left * _MM, best.of_joints)
+
+
+def _explained(
+    problem: Problem, seen: _Seen, readings: Sequence[_Reading], enough: float
+) -> list[tuple[_Reading, float]]:
+    """Readings that explain the records once they are fitted, the likeliest first, and what each then leaves (m).
+
+    Where a fit of the data as given comes nearly as near, none is needed.
+    """
+    likely = sorted((r for r in readings if r.left <= enough), key=lambda reading: reading.left)[:_FITTED]
+    if not likely:
+        return []
+    noise, explained = float(np.linalg.norm(seen.noise)), []
+    worse = _fitted(problem, seen, {}, seen.measured) / spread_of(seen.measured)
+    for reading in likely:
+        measured = reading.measured
+        left = reading.left if measured is None else _fitted(problem, seen, reading.read_as, measured)
+        spread = kept_spread(seen.measured if measured is None else measured, seen.measured)
+        share, better = _EXPLAINS if worse <= _HOPELESS else _EXPLAINS_HOPELESS
+        if left <= min(max(_NOISE * noise, share * spread), spread * worse / better):
+            explained.append((reading, left))
+    return explained
+
+
+def _fitted(problem: Problem, seen: _Seen, read_as: Wires, measured: Array) -> float:
+    """What a short fit of a reading typically leaves (median, m); infinite where it leads far from the nominal arm."""
+    number = seen.sighting.kernel
+    values, measured, _ = _placed(problem, seen, read_as, measured)
+    some = [*problem.subset(seen.sighting.chosen).records]
+    some = [replace(one, weight=0 * one.weight, whitening=None, correlation=None) for one in some]
+    own = rewired(problem.kernels[number].factor.channels, seen.records, read_as)
+    rows, unturned = np.zeros(len(problem.kernels[number].factor.noise)), np.tile(np.eye(3), (own.count, 1, 1))
+    rows[:3] = 1 / seen.noise
+    whitening = np.tile(np.diag(rows)[:, :, None], len(own.weight))
+    some[number] = replace(own, whitening=whitening)
+    problem = shown_instead(problem.with_records(some), number, Tools(measured, unturned))
+    posed = PosedProblem(problem)
+    try:
+        if problem.increments:
+            matters = np.diag(posed.model(posed.x(values)).hessian)
+            x = descended(posed, posed.x(values), _FIT_STEPS, _FIT_DAMPING, 1e-3)
+            if np.abs(x - posed.x(values))[matters > _DETERMINED * matters.max()].max(initial=0.0) > _FARTHEST:
+                return np.inf
+            values = posed.values(x)
+        return float(np.median(np.linalg.norm(problem.residuals(values)[number][:3], axis=0)))
+    except NotConvergedError:
+        return np.inf
+
+
+def _positions(problem: Problem, seen: _Seen, read_as: Wires, values: Array) -> Adapting | None:
+    """At these values, channels read as others, times a factor; None where a record has no equilibrium."""
+    number, parameters = seen.sighting.kernel, problem.parameters
+    records = rewired(problem.kernels[number].factor.channels, seen.records, read_as)
+    try:
+        blocks = list(problem.grouped[number].linearised(values, records))
+    except NotConvergedError:
+        return None
+    noise, count = seen.noise[:, None], records.count
+    slopes, residual = (np.concatenate(parts, axis=-1)[:3, ..., :count] for parts in zip(*blocks, strict=True))
+    rows = (slopes * noise[:, :, None]).transpose(2, 0, 1).reshape(3 * count, -1)
+    rows = rows @ parameters.entries_jacobian(values) * parameters.scales()
+    basis, triangle = np.linalg.qr(rows)
+    ways, sizes, _ = np.linalg.svd(triangle, full_matrices=False)
+    kept = sizes > _SMALLEST * sizes.max(initial=0.0)
+    return Adapting(seen.measured - residual * noise, basis @ ways[:, kept], sizes[kept])
+
+
+def _placed(problem: Problem, seen: _Seen, read_as: Wires, measured: Array) -> tuple[Array, Array, float]:
+    """Values and positions in the base frame (3 x n) of a reading, base and target found anew, and what is left (m)."""
+    # As configured: where records that are mixed up put base and target says nothing of another reading of them.
+    placing, number, nominal = seen.placing, seen.sighting.kernel, problem.blueprint.parameters.nominal()
+    if placing is None:
+        return nominal, measured, 0.0
+    as_read = rewired(problem.kernels[number].factor.channels, seen.records, read_as)
+    alignment = nearest(tools_of(problem.with_record(number, as_read), nominal, number), measured, placing.basis)
+    values = placing.with_target(problem.parameters, nominal, alignment.offset)
+    return values, alignment.back(measured), alignment.left
+
+
+def _left(problem: Problem, seen: _Seen, read_as: Wires, measured: Array, enough: float) -> float:
+    """What a reading leaves where base and target are found anew: roughly, if that is far more than enough (m)."""
+    values, measured, left = _placed(problem, seen, read_as, measured)
+    if left > _ROUGHLY * enough:
+        return left
+    positions = _positions(problem, seen, read_as, values)
+    return np.inf if positions is None else positions.left(measured, enough)
+
+
+def _of_axes(seen: _Seen, straight: Adapting) -> Iterator[tuple[str, Array]]:
+    if seen.placing is not None:
+        yield LEFT_HANDED, np.diag([1.0, 1.0, -1.0]) @ seen.measured
+    else:
+        for words, turn in turned_axes():
+            if np.linalg.det(turn) < 0 or not straight.can_move(turn, np.zeros(3)):
+                yield words, turn @ seen.measured
+    for words, scale in scaled_positions():
+        yield words, scale @ seen.measured
+    yield from seen.rows
+
+
+def _single(problem: Problem, seen: _Seen, arm: Arm, straight: Adapting, enough: float = np.inf) -> Iterator[_Reading]:
+    smaller = _Smaller(spread_of(straight.predicted))
+    for words, measured in _of_axes(seen, straight):
+        left = straight.left(measured) if seen.placing is None else _left(problem, seen, {}, measured, enough)
+        yield _Reading(smaller.left(left, kept_spread(measured, seen.measured)), words, False, {}, measured)
+    spread = spread_of(seen.measured)
+    for words, read_as in [*single_joints(arm), *coupled_joints(arm)]:
+        left = _left(problem, seen, read_as, seen.measured, enough)
+        yield _Reading(smaller.left(left, spread), words, True, read_as, seen.measured)
+
+
+def _in_two_frames(problem: Problem, seen: _Seen) -> Iterator[_Reading]:
+    """The records from one on in another frame, where base and target are found for each part by itself."""
+    if seen.placing is None:
+        return
+    nominal = problem.blueprint.parameters.nominal()
+    number = seen.sighting.kernel
+    tools = tools_of(problem.with_record(number, seen.records), nominal, number)
+    apart = two_frames(tools, seen.measured, seen.placing.basis)
+    if apart is not None:
+        words = f"the positions from record {seen.ids[apart.begins]} on taken for those in another frame"
+        yield _Reading(apart.left, f"{words} (something moved there: calibrate both parts by themselves)", False)
+
+
+def _several(problem: Problem, seen: _Seen, arm: Arm, enough: float) -> Iterator[_Reading]:
+    """Signs of several joints, joints in another order, and either or one joint's permutation beside one of axes."""
+    straight = _positions(problem, seen, {}, problem.parameters.nominal())
+    if straight is None:
+        return
+    axes = [("", seen.measured), *((f" and {own}", moved) for own, moved in _of_axes(seen, straight))]
+    axes = axes if seen.placing is None else axes[:2]
+    smaller, measured = _Smaller(spread_of(straight.predicted)), np.array([moved for _, moved in axes])
+    spreads = [kept_spread(moved, seen.measured) for moved in measured]
+    for words, read_as in [*single_joints(arm), *several_joints(arm)]:
+        if seen.placing is not None:
+            lefts = [_left(problem, seen, read_as, moved, enough) for moved in measured]
+        else:
+            positions = _positions(problem, seen, read_as, problem.parameters.nominal())
+            lefts = [] if positions is None else positions.left_of_each(measured, enough).tolist()
+        for left, spread, (own, moved) in zip(lefts, spreads, axes, strict=False):
+            yield _Reading(smaller.left(left, spread), f"{words}{own}", True, read_as, moved)
+
+
+@dataclass(frozen=True)
+class _Smaller:
+    """How far the arm's positions are spread (m): measured ones near one point are near those of any arm."""
+
+    size: float
+
+    def left(self, left: float, spread: float) -> float:
+        """What a reading leaves, as many times more as its positions are spread less; infinite where it is no fit."""
+        spread = max(spread, _SMALLEST)
+        return np.inf if left > FITS * spread else left * max(1.0, self.size / spread)
+
 
 _MEND = {
     True: "the order, the directions or the zeros of the joints in the model",
@@ -23,7 +665,6 @@ _DENSEST, _SHORTEST = 200.0, 0.4
 
 
 def mixed_up(ready: Prepared) -> list[Finding]:
-    """Positions that do not fit the model, but do once one exchange is undone."""
     reading = find_permuted_axes(ready.problem, ready.dataset)
     if reading is None:
         return []
@@ -78,7 +719,6 @@ def still_joints(system: System, dataset: Dataset) -> dict[str, str]:
 
 
 def still(fit: Fit) -> list[Finding]:
-    """Joints that stood still in all records that trained."""
     stood = still_joints(fit.system, fit.ready.trained)
     if not stood:
         return []

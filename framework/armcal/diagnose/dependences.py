@@ -71,8 +71,6 @@ class Dependence:
 
 @dataclass(frozen=True)
 class Records:
-    """Records that dependences are made from."""
-
     dataset: Dataset
     motion: Motion
 
@@ -81,11 +79,9 @@ class Records:
         return tuple(slope.shape[0] for slope in self.motion.slopes)
 
     def along(self, joint: str, features: Array) -> tuple[Array, ...]:
-        """Features (N x k) along the motion of a joint."""
         return tuple(slope[:, :, None] * features[None] for slope in self.motion.along(joint))
 
     def axes(self, features: Array) -> tuple[Array, ...]:
-        """Features (N x k) along each entry of each factor's residual."""
         whole, place, parts = sum(self.sizes) * features.shape[1], 0, []
         for size in self.sizes:
             part = np.zeros((size, len(features), whole))
@@ -97,7 +93,6 @@ class Records:
 
 
 def dependences(problem: Problem, motion: Motion, dataset: Dataset, moves: Moves) -> Iterator[Dependence]:
-    """Everything that these records could show; what does not vary is left out."""
     arms, here = problem.blueprint.arms, Records(dataset, motion)
     yield from _of_held(problem, moves)
     yield from _of_order(here)
@@ -122,7 +117,6 @@ def dependences(problem: Problem, motion: Motion, dataset: Dataset, moves: Moves
 
 
 def _of_held(problem: Problem, moves: Moves) -> Iterator[Dependence]:
-    """Parameters that the fit held, as ``armcal identify --fixed`` judges them."""
     for name in filter(moves.__contains__, candidates(problem.parameters)):
         block, columns = problem.parameters[name], moves[name]
         words, measure = f"{name}, which is held", "armcal identify --fixed, which judges it on records held out"
@@ -440,7 +434,6 @@ def outside(
     positions: Sequence[Array],
     moves: Moves,
 ) -> Iterator[Dependence]:
-    """Everything that these records could show; ``positions`` are what instruments should read."""
     here = Records(dataset, motion)
     yield from _of_mistakes(here, problem, moves)
     if motion.by_load:
@@ -460,7 +453,6 @@ def outside(
 
 
 def _of_instrument(here: Records, read: Sequence[Array]) -> Iterator[Dependence]:
-    """Scale and axes of instruments that measure positions; all of them alike."""
     if not any(np.any(position) for position in read):
         return
     zeros = [np.zeros((size, len(here.dataset), 1)) for size in here.sizes]
@@ -501,7 +493,6 @@ def predicted_positions(problem: Problem, values: Array, dataset: Dataset) -> tu
 
 
 def _of_steps(here: Records, problem: Problem, read: Sequence[Array]) -> Iterator[Dependence]:
-    """Something that moved once, between two records."""
     order = recorded_order(here.dataset)
     if np.ptp(order) <= 0:
         return
@@ -529,7 +520,6 @@ def _of_steps(here: Records, problem: Problem, read: Sequence[Array]) -> Iterato
 
 
 def _of_mistakes(here: Records, problem: Problem, moves: Moves) -> Iterator[Dependence]:
-    """What instruments say may have gone wrong with them meanwhile."""
     order, many = recorded_order(here.dataset), len(problem.blueprint.measurements) > 1
     ranked = np.argsort(order, kind="stable")
     rank = np.argsort(ranked, kind="stable")

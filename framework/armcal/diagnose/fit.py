@@ -158,7 +158,6 @@ class Fit:
 
     @cached_property
     def name(self) -> str:
-        """What errors are errors of."""
         return error_name(self.problem)
 
     @cached_property
@@ -197,7 +196,6 @@ class Fit:
 
     @property
     def trained_on(self) -> tuple[str, ...]:
-        """Ids of the training records."""
         return self.ready.trained.ids
 
     @cached_property
@@ -335,7 +333,6 @@ def _nominal(
 
 
 def _placing_names(problem: Problem) -> set[str]:
-    """Free parameters that only say where base and tool point are, and those of measurements."""
     some = problem.subset(thinned(np.arange(problem.count), _POSES))
     blocks, nominal = problem.parameters.coordinate_blocks, problem.parameters.nominal()
     moving = {b.name for i, b in enumerate(blocks) if not b.nuisance and not only_places(some, nominal, i)}

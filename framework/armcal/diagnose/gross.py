@@ -34,8 +34,6 @@ AS_MUCH, BY_SHARES = 0.01, 0.05
 
 @dataclass(frozen=True)
 class Displaced:
-    """A parameter far from its nominal value."""
-
     name: str  # of its coordinate
     amount: float  # how far, in ``unit``
     unit: str  # that people are shown
@@ -94,11 +92,8 @@ class Figure:
 
 
 def figure(fit: Fit) -> Figure:
-    return figure_of(fit.problem.subset(thinned(fit.split.train)), fit.estimate)
-
-
-def figure_of(problem: Problem, estimate: Estimate) -> Figure:
     """Of the first tool of all, at random poses about the recorded ones: what touches a socket hardly moves in them."""
+    problem, estimate = fit.problem.subset(thinned(fit.split.train)), fit.estimate
     poses = at_random_poses(problem).subset(np.arange(_POSES, dtype=np.intp))
     try:
         nominal, calibrated, bent = _places(poses, estimate)
@@ -255,19 +250,25 @@ def _share(structure: Structure, left: ResidualStructure) -> float:
     return structure.falls_mm / max(left.mean_mm, 1e-12)
 
 
-def turn_findings(judged_deg: Array, fitted_deg: Array, held: str) -> list[Finding]:
-    """Errors of orientations (N; nan where not judged) beside a radian, as those of lengths stand beside the reach.
+def turns(fit: Fit) -> list[Finding]:
+    """Errors of orientations beside a radian, as those of lengths stand beside the reach; and the nominal arm's.
 
-    Where no record judges, those that trained do (``fitted_deg``). ``held`` says what should have been free.
+    Where no record judges, those that trained do.
     """
-    seen = judged_deg[np.isfinite(judged_deg)]
-    which, seen = ("that did not train", seen) if len(seen) else ("that trained", fitted_deg)
+    own, held = fit.errors.turns, fit.split.holdout
+    if own is None:
+        return []
+    unseen = own.cross_validated_deg.copy()
+    unseen[held] = own.calibrated_deg[held]
+    worse = worse_than_nominal(unseen, own.rival_deg, fit.spent, "deg")
+    seen = unseen[np.isfinite(unseen)]
+    which, seen = ("that did not train", seen) if len(seen) else ("that trained", own.calibrated_deg[fit.split.train])
     mean = float(np.mean(seen))
     if not np.radians(mean) > OF_REACH:
-        return []
+        return worse
     text = f"The mean orientation error of records {which} is {digits(mean)} deg: the values do not describe this arm."
     test = f"mean, limit {100 * OF_REACH:g} % of a radian, {np.degrees(OF_REACH):.1f} deg"
-    return [Finding("bad", text, test, held or _LOOK)]
+    return [Finding("bad", text, test, fit.of(held_turn) or _LOOK), *worse]
 
 
 def held_turn(fit: Fit) -> str:
@@ -296,14 +297,17 @@ def held_turn(fit: Fit) -> str:
     return ""
 
 
-def worse_than_aligned(judged_mm: Array, left_mm: float, spent: float, held: str) -> list[Finding]:
-    """Errors of records that did not train (N; nan where not judged) beside what was left before the fit (median).
+def aligned(fit: Fit) -> list[Finding]:
+    """Errors of records that did not train beside what was left before the fit (medians).
 
     Alignment has nine numbers, and parameters that spend p of m equations make errors 1 / sqrt(1 - p / (m - 1)) times
     as large (``spent`` is the quotient).
     """
-    seen = judged_mm[np.isfinite(judged_mm)]
-    spent += 3 / max(len(seen), 1)
+    alignment = fit.ready.start.alignment
+    if alignment is None or fit.unit != "mm":
+        return []
+    seen, left_mm = fit.judged_mm[np.isfinite(fit.judged_mm)], alignment.left * _MM
+    spent = fit.spent + 3 / max(len(seen), 1)
     after = float(np.median(seen)) if len(seen) else 0.0
     if spent >= 1 or after <= BETTER * left_mm / np.sqrt(1 - spent):
         return []
@@ -313,7 +317,8 @@ def worse_than_aligned(judged_mm: Array, left_mm: float, spent: float, held: str
     )
     test = f"medians, limit {BETTER / np.sqrt(1 - spent):.2g} times"
     action = "Something that places the arm or its target is held, or has a prior, elsewhere: free it, or correct it."
-    return [Finding("bad", text, test, held or action)]
+    free = "" if fit.errors.turns is None else fit.of(held_turn)
+    return [Finding("bad", text, test, free or action)]
 
 
 def overfitted(
@@ -346,7 +351,6 @@ def overfitted(
 
 
 def size_findings(figure: Figure) -> list[Finding]:
-    """Is the calibrated arm as large as the nominal one?"""
     off, lengths = abs(figure.size - 1), figure.proportion
     action = "Check the units and values of known distances and positions, and the tracker's scale."
     if off > SIZE:
@@ -436,26 +440,7 @@ def size(fit: Fit) -> list[Finding]:
 
 
 def worse(fit: Fit) -> list[Finding]:
-    """Of a pose residual it is not known how much freedom it takes up."""
     return worse_than_nominal(fit.unseen_mm, fit.errors.rival_mm, fit.spent, fit.unit)
-
-
-def turns(fit: Fit) -> list[Finding]:
-    own, held = fit.errors.turns, fit.split.holdout
-    if own is None:
-        return []
-    unseen = own.cross_validated_deg.copy()
-    unseen[held] = own.calibrated_deg[held]
-    findings = turn_findings(unseen, own.calibrated_deg[fit.split.train], fit.of(held_turn))
-    return findings + worse_than_nominal(unseen, own.rival_deg, fit.spent, "deg")
-
-
-def aligned(fit: Fit) -> list[Finding]:
-    start = fit.ready.start
-    if start.alignment is None or fit.unit != "mm":
-        return []
-    free = "" if fit.errors.turns is None else fit.of(held_turn)
-    return worse_than_aligned(fit.judged_mm, start.alignment.left * _MM, fit.spent, free)
 
 
 def overfit(fit: Fit) -> list[Finding]:
@@ -469,7 +454,6 @@ def overfit(fit: Fit) -> list[Finding]:
 
 
 def by_halves(fit: Fit) -> Halves | None:
-    """Fits to halves of the training records as these weighed."""
     return halves(fit.acting, fit.inner, fit.estimate.values) if fit.converged else None
 
 

@@ -30,8 +30,6 @@ _RANK = 1e-9
 
 @dataclass(frozen=True)
 class HeldParameter:
-    """A parameter that was not free."""
-
     name: str  # in full
     unit: str  # SI
     value: float  # at which it is held
@@ -85,7 +83,6 @@ def contradictions(fit: Fit) -> tuple[Contradiction, ...]:
 
 
 def with_contradicted(fit: Fit, problem: Problem) -> Problem:
-    """The problem with what records contradict free."""
     return freed(problem, [parameter.name for one in fit.of(contradictions) for parameter in one.parameters])
 
 

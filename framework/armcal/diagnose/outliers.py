@@ -209,7 +209,6 @@ _SHOWN = {"rad": (180 / np.pi, " deg"), "m": (1000.0, " mm")}
 
 
 def suspect_findings(fitted: WeighedFit, ids: Sequence[str]) -> list[Finding]:
-    """Which training records lie beyond what noise does, at 1 % over all of them; ``ids`` are theirs."""
     if not fitted.suspects:
         return [Finding("good", "No training record lies farther from the fit than noise allows (1 % over all).")]
     left = "Left in the fit" if fitted.loss == "reject" else f"Weighed less by the loss {fitted.loss}"
@@ -241,7 +240,6 @@ def suspicious_records(errors: Array, rows: float, ids: Sequence[str], fitted: W
 
 
 def outlier_findings(suspicious: Sequence[str], ids: Sequence[str], fitted: WeighedFit | None) -> list[Finding]:
-    """Records beyond their limits if the loss sought them, else beyond what noise does to their errors."""
     if fitted is not None and fitted.loss != "none":
         action = "Look at them in residuals.csv, and measure them again."
         return [replace(f, action=action) if f.grade == "warning" else f for f in suspect_findings(fitted, ids)]
@@ -268,7 +266,6 @@ def suspicious_in_short(ids: Sequence[str], records: int) -> str:
 
 
 def component_findings(components: VarianceComponents) -> list[Finding]:
-    """Is it the tracker or the model?"""
     joints = components.share("joint")
     parts = sorted(components.components, key=lambda c: -c.share)
     texts = []
@@ -309,7 +306,6 @@ def suspicious(fit: Fit) -> list[Finding]:
 
 
 def missed(fit: Fit) -> list[Finding]:
-    """Records beyond the limit, each with what is unusual about it."""
     beyond, unit = fit.of(large_errors), fit.unit
     if beyond is None:
         return []
@@ -481,7 +477,6 @@ def _split(residual: Array) -> tuple[int, float, float]:
 
 
 def contradicting(fit: Fit) -> list[Finding]:
-    """Records that contradict the others."""
     if not fit.converged:
         return []
     chosen = thinned(fit.split.train)

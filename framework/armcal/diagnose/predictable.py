@@ -46,8 +46,6 @@ _RIDGE = 0.05
 
 @dataclass(frozen=True)
 class Smooth:
-    """The best process of one kind."""
-
     evidence: float  # logarithm of its odds against noise alone, two hyperparameters paid for
     function: Array  # what it takes up (rows)
     hat: Array  # a root of the matrix that gives it from the residual (rows x n)
@@ -180,8 +178,6 @@ _NEXT_CARRIER = 0.1  # Of the whole share: what predicts less beside the ones be
 
 @dataclass(frozen=True)
 class Carrier:
-    """What predicts residuals."""
-
     kind: str  # ``joint``, ``time``, ``payload``, ``approach`` or ``temperature``
     name: str  # of the joint, with its arm where there are several; empty where it is none
     share: float  # of the residual variance, beside the carriers before it
@@ -283,8 +279,6 @@ def predictable(problem: Problem, rows: FitRows, basis: Array, motion: Motion, d
 
 
 def _inputs(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[_Input]:
-    """Everything recorded that varies."""
-
     def on_circle(values: Array, closed: bool = False) -> Array:
         low, high = np.nanmin(values), np.nanmax(values)
         return np.nan_to_num(values if closed else np.pi * (values - low) / (high - low))
@@ -305,7 +299,6 @@ def _inputs(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[_Inp
 
 
 def _blocks(rows: FitRows, motion: Motion, inputs: Sequence[_Input]) -> Iterator[_Block]:
-    """Functions of each input and of each pair of joints of an arm."""
     typical = np.sqrt(np.mean([np.mean(_along(rows, motion, c) ** 2) for c in motion.channels])) or 1.0
     finest = min(_FINE, max(_COARSE, len(inputs[0].angle) // _RECORDS_PER_HARMONIC))
     acting = np.abs(rows.columns([np.ones((len(w), w.shape[2], 1)) for w in rows.whitening])[:, 0]) > 0

@@ -70,8 +70,6 @@ CHANGING = "something that changes with time and is none of these"
 
 @dataclass(frozen=True)
 class Odds:
-    """What speaks for one cause beside others."""
-
     share: float  # of the odds of all causes, of what is not among them, and of chance, the cause's own
     alternatives: tuple[str, ...]  # in words, those that it does not beat 20 to 1, the most likely first
     chance: float  # the share of nothing at all
@@ -265,7 +263,6 @@ def structure(fit: Fit) -> ResidualStructure | None:
 
 
 def _modelled(fit: Fit) -> frozenset[str]:
-    """The types of the effects that the model has."""
     arms = fit.system.description.get("arms") or {}
     effects = [effect for arm in arms.values() for effect in (arm.get("effects") or {}).values()]
     return frozenset(str(effect.get("type")) for effect in effects)
@@ -389,7 +386,6 @@ def _structure(
     p_value: float,
     odds: Odds,
 ) -> Structure:
-    """What a cause takes up beside the others."""
     one, (residual, basis) = contest.causes[cause], contest.beside(others)
     own, coefficients = own_basis(contest.columns[cause], basis)
     present = one.effect.split(" ")[0] in modelled
@@ -442,7 +438,6 @@ def neighbours(fit: Fit) -> list[Finding]:
 
 
 def structure_findings(structure: ResidualStructure | None, unit: str = "mm") -> list[Finding]:
-    """What residuals still depend on."""
     if structure is None:
         text = "The training records are too few to tell whether the model lacks anything."
         return [Finding("note", text, f"at least {FEWEST_RECORDS} records", "Measure more poses.")]
@@ -494,7 +489,6 @@ def predicted_in_short(predicted: Predictable) -> str:
 
 
 def _remedies(predicted: Predictable) -> Iterator[str]:
-    """What takes up what each kind of carrier predicts."""
     kinds = {carrier.kind for carrier in predicted.carriers}
     if predicted.is_in_order:
         yield _TELL_APART["open"]
@@ -543,7 +537,6 @@ def _share(odds: float) -> str:
 
 
 def _scatter(structure: ResidualStructure) -> list[Finding]:
-    """What the size of residuals depends on."""
     noise = structure.noise
     if noise is None or noise.high < _NO_NOISE:
         return []
@@ -559,7 +552,6 @@ def _scatter(structure: ResidualStructure) -> list[Finding]:
 
 
 def repeat_findings(structure: ResidualStructure, unit: str) -> list[Finding]:
-    """What repeats say of the rest."""
     repeats = structure.repeats
     if repeats is None or not repeats.exceeded:
         return []

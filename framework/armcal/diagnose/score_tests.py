@@ -48,7 +48,6 @@ class FitRows:
 
     @classmethod
     def of(cls, problem: Problem, estimate: Estimate) -> Self:
-        """The rows at an estimate; of records with the weights they had."""
         values, parameters = estimate.values, problem.parameters
         count, scales = problem.count, parameters.scales()
         chain = parameters.entries_jacobian(values) * scales
@@ -185,8 +184,6 @@ def own_basis(columns: Array, basis: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class FamilyTest:
-    """A family of tests at once."""
-
     adjusted: Array  # p-values of each set, counting that so many were looked at (family-wise)
     share: Array  # of the squared residual, how much each set would take up
     lag_one: float  # correlation of neighbouring residuals, less what the fit itself makes of it

@@ -26,7 +26,7 @@ from armcal.diagnose.checks import Finding, first_few
 from armcal.diagnose.dependences import predicted_positions
 from armcal.diagnose.fit import Fit, thinned
 from armcal.diagnose.gross import Figure, figure
-from armcal.diagnose.held import OFF, HeldParameter, held_scales
+from armcal.diagnose.held import OFF, held_scales
 from armcal.diagnose.predictable import CLEAR
 from armcal.diagnose.residual_structure import structure
 from armcal.diagnose.score_tests import FitRows, sampled_rows
@@ -180,16 +180,6 @@ class Elsewhere:
         return f"Away from the contacts the tool is known to {readable(self.rms_mm)} mm (root mean square)"
 
 
-def scale(fit: Fit) -> list[Finding]:
-    if not fit.converged:
-        return []
-    problem, rows = fit.of(sampled_rows)
-    estimate, dataset = fit.estimate, fit.dataset.subset(thinned(fit.split.train))
-    read = predicted_positions(problem, estimate.values, dataset)
-    sd = scale_deviation(problem, rows, read, estimate.noise_scale, estimate.values)
-    return scale_findings(fit.of(figure), sd, fit.of(held_scales), by_distances=not any(map(len, read)))
-
-
 def scale_deviation(
     problem: Problem, rows: FitRows, positions: Sequence[Array], noise_scale: float, values: Array
 ) -> float | None:
@@ -221,38 +211,39 @@ def scale_deviation(
     return noise_scale / left if left > 0 else float("inf")
 
 
-def scale_findings(
-    figure: Figure, instrument_sd: float | None, held: Sequence[tuple[HeldParameter, str]], by_distances: bool = False
-) -> list[Finding]:
-    """In which frame the answer is, which error of a scale would not show, and which held scale the data contradict.
-
-    ``by_distances``: no instrument has a scale, but known distances have.
-    """
+def scale(fit: Fit) -> list[Finding]:
+    """In which frame the answer is, which error of a scale would not show, and which held scale the data contradict."""
+    if not fit.converged:
+        return []
+    (problem, rows), estimate, own = fit.of(sampled_rows), fit.estimate, fit.of(figure)
+    read = predicted_positions(problem, estimate.values, fit.dataset.subset(thinned(fit.split.train)))
+    instrument_sd = scale_deviation(problem, rows, read, estimate.noise_scale, estimate.values)
+    by_distances = not any(map(len, read))  # no instrument has a scale, but known distances have
     findings = []
     if instrument_sd is not None and by_distances:
         text = (
             "The arm's size rests on the known distances alone: 1 % of them is 1 % of all its lengths "
-            f"({digits(0.01 * figure.reach_mm, 2)} mm at the arm's reach), and an error of them "
-            f"{_unseen(instrument_sd, figure)}."
+            f"({digits(0.01 * own.reach_mm, 2)} mm at the arm's reach), and an error of them "
+            f"{_unseen(instrument_sd, own)}."
         )
         action = "Measure these distances again, by other means; or train on a longer one."
         findings.append(Finding("note", text, "two standard deviations of a scale beside the parameters", action))
     elif instrument_sd is not None:
         text = (
-            f"The answer is in the instrument's frame: in it the arm stands {digits(figure.moved_mm)} mm and "
-            f"{digits(figure.turned_deg, 2)} deg from where the configuration has it. An error of the instrument's "
-            f"scale {_unseen(instrument_sd, figure)}."
+            f"The answer is in the instrument's frame: in it the arm stands {digits(own.moved_mm)} mm and "
+            f"{digits(own.turned_deg, 2)} deg from where the configuration has it. An error of the instrument's "
+            f"scale {_unseen(instrument_sd, own)}."
         )
         action = "Measure a known length with the instrument, if the scale matters."
         findings.append(Finding("note", text, "two standard deviations of a scale beside the parameters", action))
-    for one, check in held:
+    for one, check in fit.of(held_scales):
         contradicts = one.p_value < OFF
         put = f"records and priors put it {100 * one.off:+.2g} +- {100 * one.sd:.2g} % from there"
         text = f"{one.name} is held, {'although' if contradicts else 'and'} {put}."
         if 2 * one.sd > UNSEEN:
-            text = f"{one.name} is held: an error of it {_unseen(one.sd, figure)}."
+            text = f"{one.name} is held: an error of it {_unseen(one.sd, own)}."
         elif not contradicts:
-            text += f" An error {_unseen(one.sd, figure)}."
+            text += f" An error {_unseen(one.sd, own)}."
         test = f"the scale beside the free parameters, records as clusters, t, {100 * OFF:g} %"
         findings.append(
             Finding("warning" if contradicts else "note", text, test, f"{check}; or free the scale with a prior.")
@@ -260,11 +251,10 @@ def scale_findings(
     return findings
 
 
-def _unseen(sd: float, figure: Figure) -> str:
-    """Which errors of a scale would not show: two standard deviations of it."""
+def _unseen(sd: float, own: Figure) -> str:
     if 2 * sd > UNSEEN:
         return "would not show in these data at all"
-    return f"of up to {200 * sd:.2g} % would not show ({digits(2 * sd * figure.reach_mm, 2)} mm at the arm's reach)"
+    return f"of up to {200 * sd:.2g} % would not show ({digits(2 * sd * own.reach_mm, 2)} mm at the arm's reach)"
 
 
 def hidden_payload(fit: Fit) -> HiddenPayload | None:
@@ -436,7 +426,6 @@ def determined(fit: Fit) -> list[Finding]:
 
 
 def determined_finding(estimate: Estimate, alone: PriorsAlone | None, typical_mm: float | None) -> Finding:
-    """What the data determines, and whether what it does not matters to the tip."""
     known = estimate.identifiability
     test = "rank of the Jacobian in typical scales"
     if not len(known):

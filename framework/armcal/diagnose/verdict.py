@@ -108,7 +108,6 @@ def suggestions(fit: Fit) -> tuple[Suggestion, ...]:
 
 
 def evidence(fit: Fit) -> dict[str, Any]:
-    """What was looked for in the residuals and beside them, for metrics.json."""
     alone = fit.of(priors_alone)
     left, beyond, away = fit.of(structure), fit.of(large_errors), fit.of(elsewhere)
     hidden, rounds = fit.of(hidden_payload), fit.of(rounding)
@@ -167,7 +166,6 @@ def _good_for(
 
 
 def _in_short(fit: Fit, first: str) -> Iterator[str]:
-    """What it is good for, what is not determined, suspicious, left over, and to be measured next; a sentence each."""
     if not fit.converged:
         yield "The solver did not converge: these values are no calibration."
         return
@@ -376,7 +374,6 @@ def places(fit: Fit) -> list[Finding]:
 
 
 def known_accuracies(problem: Problem, estimate: Estimate, parts: Halves | None = None) -> list[str]:
-    """How well measurements' own poses are known, a sentence each."""
     texts = []
     for name, measurement in problem.blueprint.measurements.items():
         if not isinstance(measurement, Placed):

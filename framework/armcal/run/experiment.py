@@ -269,7 +269,6 @@ class Experiment:
 
     @property
     def simulation_request(self) -> SimulationRequest:
-        """What a simulator makes records of."""
         system = self.system
         return SimulationRequest(system.arms, system.measurements, self.parameters, system.environment)
 

@@ -42,8 +42,6 @@ _FAR_OFF = "the model's nominal values are far off: give better ones, or "
 
 @dataclass(frozen=True)
 class Stopwatch:
-    """Seconds of each stage."""
-
     began: float = field(default_factory=time.perf_counter)
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -323,7 +321,6 @@ def judged(context: RunContext, own: Fit, outcome: ResidualOutcome | None) -> Ru
 
 
 def _prediction(experiment: Experiment, own: Fit, outcome: ResidualOutcome | None) -> PredictionRecord | None:
-    """What predictions need of a run; None where it did not converge."""
     if not own.converged:
         return None
     ranges = recorded_ranges(own.dataset, experiment.system.arms, experiment.settings.statics.payload)

@@ -50,8 +50,6 @@ _SPEEDS = {"angle": np.deg2rad(60.0), "length": 0.05}
 
 @dataclass(frozen=True)
 class PlanContext:
-    """What all steps of one plan stand on."""
-
     experiment: Experiment
     settings: PlanSettings
     space: JointSpace
@@ -68,7 +66,6 @@ class PlanContext:
         return triangular(np.vstack([self.priors, rows.reshape(-1, rows.shape[-1])]))
 
     def rows(self, dataset: Dataset) -> Array:
-        """Whitened Jacobians (n_r x N x n)."""
         records = as_if_measured(self.experiment, dataset)
         problem = problem_of(self.experiment, self.parameters, records)
         return whitened_rows(problem, self.parameters.nominal(), records)
@@ -127,7 +124,6 @@ def as_if_measured(experiment: Experiment, dataset: Dataset) -> Dataset:
 def plan_context(
     experiment: Experiment, settings: PlanSettings, space: JointSpace, parameters: Parameters, given: Dataset | None
 ) -> PlanContext:
-    """Priors and given records as information, at the nominal values."""
     scales, prior = parameters.scales(), parameters.prior_information()
     priors = np.diag(scales * np.sqrt(prior))[prior > 0]
     return PlanContext(experiment, settings, space, parameters, given, priors)

@@ -88,14 +88,11 @@ def stated_beyond(experiment: Experiment, stated: Mapping[str, Limits]) -> tuple
 
 @dataclass(frozen=True)
 class Pool:
-    """Candidates for a plan."""
-
     kind: str  # where they come from
     dataset: Dataset  # joint commands, approach, load and gravity
     left_out: Mapping[str, int]  # how many were left out, by reason
 
     def without(self, faulty: Mask, reason: str) -> Self:
-        """Those that are not faulty (N, bool)."""
         if not faulty.any():
             return self
         left_out = {**self.left_out, reason: self.left_out.get(reason, 0) + int(faulty.sum())}

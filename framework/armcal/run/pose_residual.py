@@ -62,7 +62,6 @@ class Comparison:
 
     @classmethod
     def of(cls, without: Array, with_it: Array, gains: Array) -> Self:
-        """Of records (N), and of gains by measurement (measurements x chances)."""
         return cls(float(np.nanmean(without)), float(np.nanmean(with_it)), min(map(_sure, gains)))
 
     @property
@@ -78,8 +77,6 @@ def _sure(gains: Array) -> float:
 
 @dataclass(frozen=True)
 class ResidualOutcome:
-    """What became of a pose residual."""
-
     arm: str  # whose
     kind: str  # its type
     unit: str  # of errors
@@ -105,7 +102,6 @@ class ResidualOutcome:
         return replace(system, arms=arms, description={**system.description, "arms": described})
 
     def findings(self) -> list[Finding]:
-        """What it does, and for which poses."""
         if self.folds is None:
             return [Finding("note", f"The pose residual of {self.arm} is not kept: {self.why}.")]
         test = f"{len(self.splits)} folds, and {_STRETCHES} stretches of the recording, held out of fit and learning"
@@ -129,7 +125,6 @@ class ResidualOutcome:
         return findings
 
     def as_dict(self) -> dict[str, Any]:
-        """For metrics.json."""
         compared = {"folds": self.folds, "stretches": self.stretches}
         named: dict[str, Any] = {
             name: {f"without_{self.unit}": p.without, f"with_{self.unit}": p.with_it, "standard_errors": p.sure}
@@ -263,7 +258,6 @@ def _harm(gains: Array, unknown: Array) -> str:
 
 
 def judged_with(task: FitTask, layer: Layer) -> JudgedFit:
-    """Fit, learn from what the fit leaves, and judge with that."""
     began, task = time.perf_counter(), task.trained()
     try:
         train, held = task.parts()
