@@ -38,6 +38,7 @@ from armcal.measure.reader import CYCLE, Reader, ReadRequest, RequestedChannel, 
 from armcal.plugins import PluginRegistry
 from armcal.problem.problem import Problem
 from armcal.problem.rigid_alignment import FEWEST, Sighting, Tools, alignments, sighting_of, tools_of, undetermined
+from armcal.report.document import Document, Section, Table
 from armcal.report.numbers import decimals_for, plural
 from armcal.run.experiment import Experiment, with_data
 from scipy.spatial.transform import Rotation
@@ -183,13 +184,13 @@ def acceptance(console: Console, source: Path, records: Path, out: Path, frame: 
     origin = {"source": str(source), "records_sha256": visits.dataset.sha256}
     whole = as_json({**origin, **content, "figures": figures}) + "\n"
     kept.place({"acceptance.csv": csv_text([_HEADINGS, *rows], ".6g"), "acceptance.json": whole})
-    console.result({**content, "folder": str(out)})
-    for caption, headings, cells in _tables(rows):
-        console.table(caption, headings, cells, left=("To", "Direction"))
     for text in warnings:
         console.warn(text)
-    for text in _sentences(content, source.name):
-        console.line(text)
+    headline, *others = _sentences(content, source.name)
+    sections = [Section("Figures", parts=list(_tables(rows)), level="always")]
+    console.show(
+        Document(f"Acceptance of {source.name}", headline, sections, summary=others, data=content), folder=str(out)
+    )
     console.line(f"figures: {out / 'acceptance.csv'}")
 
 
@@ -237,7 +238,7 @@ def _sentences(content: Mapping[str, Any], name: str) -> list[str]:
     return texts
 
 
-def _tables(rows: Sequence[Row]) -> Iterator[tuple[str, list[str], list[tuple[str, ...]]]]:
+def _tables(rows: Sequence[Row]) -> Iterator[Table]:
     """A table a section, with its caption and headings: a row a pose or pair, a column a figure."""
 
     def shown(row: Row) -> str:
@@ -258,7 +259,7 @@ def _tables(rows: Sequence[Row]) -> Iterator[tuple[str, list[str], list[tuple[st
             words, _, unit = row.name.rpartition("_")
             headings.append(f"{words.replace('_', ' ')} {row.model}".removesuffix(" measured") + f", {unit}")
         cells = [(*(own[i] for i in used), str(f[0].cycles), *map(shown, f)) for own, f in members.items()]
-        yield f"{caption}, 95 % intervals", headings, cells
+        yield Table(f"{caption}, 95 % intervals", headings, cells, left=("To", "Direction"))
 
 
 def read_visits(subject: ArmToJudge, registry: PluginRegistry, path: Path) -> Visits:

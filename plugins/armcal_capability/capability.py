@@ -11,6 +11,7 @@ from armcal.base.config_text import as_json
 from armcal.cli.common import Console, command_line, overrides, speaking
 from armcal.io.cells import csv_text
 from armcal.io.folder import reserved
+from armcal.report.document import Document, Section, Table
 from armcal.report.numbers import count
 
 from armcal_capability.survey import ORIENTATIONS, Survey, load_task, survey
@@ -52,13 +53,12 @@ def capability(console: Console, source: Path, out: Path, settings: Path | None,
             "capability.json": as_json({"command": command_line(), **content}) + "\n",
         }
     )
-    console.result({**content, "folder": str(out)})
-    headings, rows = _table(designs)
-    console.table(_CAPTION, headings, rows, left=("Area",))
     best = max(designs, key=lambda name: designs[name]["score"])
     has = f"{best} has the most, " if len(designs) > 1 else ""
     score = f"{count(designs[best]['score'])} of {count(designs[best]['most'])}"
-    console.line(f"Score, points times tool orientations reached: {has}{score}.")
+    headline = f"Score, points times tool orientations reached: {has}{score}."
+    areas = Section("Areas", parts=[_table(designs)], level="always")
+    console.show(Document(f"Capability of {source.name}", headline, [areas], data=content), folder=str(out))
     console.line(f"results: {out}  ({time.perf_counter() - began:.1f} s)")
 
 
@@ -91,7 +91,7 @@ def summaries(surveys: Mapping[str, Survey]) -> dict[str, dict[str, Any]]:
     return content
 
 
-def _table(designs: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], list[list[str]]]:
+def _table(designs: Mapping[str, Mapping[str, Any]]) -> Table:
     """A row an area, and one for the score of several areas; the name of a design stands in its first row."""
     areas = list(next(iter(designs.values()))["areas"].values())
     is_held, shown = areas[0]["held"] is not None, [name for name in _SHORT if name in areas[0]["quantities"]]
@@ -105,7 +105,7 @@ def _table(designs: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], list[li
             rows.append(["", "total", "", "", count(own["score"]), *([""] * len(shown))])
     headings = ["Design", "Area", "Reached", "Held", "Score", *(_SHORT[name] for name in shown)]
     kept = [i for i in range(len(headings)) if (i or len(designs) > 1) and (is_held or i != 3)]
-    return [headings[i] for i in kept], [[row[i] for i in kept] for row in rows]
+    return Table(_CAPTION, [headings[i] for i in kept], [[row[i] for i in kept] for row in rows], left=("Area",))
 
 
 def _areas_text(surveys: Mapping[str, Survey]) -> str:

@@ -326,7 +326,7 @@ def test_the_shell_completes_commands_without_importing_them() -> None:
     )
     ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     *offered, heavy = ran.stdout.splitlines()
-    commands = ("check", "compensate", "calibration", "convert", "capability", "control")
+    commands = ("check", "checks", "compensate", "calibration", "convert", "capability", "control")
     assert offered == [f"plain,{command}" for command in commands], ran.stderr
     assert heavy == "heavy: []"
 

@@ -16,6 +16,7 @@ from armcal.calibration.compensation.request import Redundancy
 from armcal.calibration.recorded_range import beyond_records
 from armcal.cli.common import FILE, Console, accept, arm, point, spare_inputs, speaking, within
 from armcal.errors import InputError, Location
+from armcal.report.document import Document
 from armcal.run.compensate import Assessed, Bench, TargetFile, assess, check_units, commanded, summary, write_commands
 
 _SHOWN = 5
@@ -118,16 +119,7 @@ def _show(console: Console, file: TargetFile, assessed: Assessed, bench: Bench, 
     ]
     set_aside = [{"row": target.row, "reason": target.reason} for target in file.dataset.set_aside]
     offset = None if bench.target is None else [1000 * float(x) for x in bench.target.tool_T_target[:3, 3]]
-    console.result(
-        {
-            **figures,
-            "point": bench.point,
-            "target_mm": offset,
-            "missed": missed,
-            "set_aside": set_aside,
-            "out": str(out),
-        }
-    )
+    data = {**figures, "point": bench.point, "target_mm": offset, "missed": missed, "set_aside": set_aside}
     for target in missed[:_SHOWN]:
         away = target["nearest_mm"]
         console.warn(
@@ -138,7 +130,8 @@ def _show(console: Console, file: TargetFile, assessed: Assessed, bench: Bench, 
         console.warn(f"{len(missed) - _SHOWN} more targets cannot be reached; the file says why")
     for cell in set_aside[:_SHOWN]:
         console.warn(f"row {cell['row']} is set aside: {cell['reason']}")
-    console.line(f"{figures['reached']} of {figures['targets']} targets are reached, {_ARRIVES[bench.point]}: {out}")
+    headline = f"{figures['reached']} of {figures['targets']} targets are reached, {_ARRIVES[bench.point]}."
+    summary_texts = list[str]()
     if figures["reached"]:
         text = f"error {figures['error_mm']:.3g} mm by the calibration's model "
         text += f"(at most {figures['largest_error_mm']:.3g} mm)"
@@ -149,4 +142,6 @@ def _show(console: Console, file: TargetFile, assessed: Assessed, bench: Bench, 
         elif not bench.is_judged:
             text += "; how far the tool frame's origin is off is not known: only the target was measured, and where it "
             text += "sits on the tool was fitted (--point target)"
-        console.line(text)
+        summary_texts.append(text)
+    console.show(Document("Commands", headline, [], summary=summary_texts, data=data), out=str(out))
+    console.line(f"commands: {out}")

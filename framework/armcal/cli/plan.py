@@ -15,6 +15,7 @@ from armcal.errors import ConfigError, InputError, Location
 from armcal.estimate.identifiability import Measure
 from armcal.measure.csv_writer import write_csv
 from armcal.planning.criterion import GOALS
+from armcal.report.document import Document, Section, Table
 from armcal.run.experiment import Experiment
 from armcal.run.iso_plan import NAMES, POINTS, make_iso_plan
 from armcal.run.plan import PlanResult, make_plan
@@ -74,10 +75,10 @@ def plan(
         result = make_plan(experiment, count, given["candidates"], given["given"], given["calibration"], progress)
     write_csv(out, result.dataset, experiment.request(measured=False).channels)
     content = {**_content(experiment, result), "out": str(out), "seconds": time.perf_counter() - began}
-    console.result(content)
     for text in experiment.warnings:
         console.warn(text)
-    _show(console, content)
+    console.show(_document(content))
+    console.line(f"plan: {out}  ({content['seconds']:.1f} s)")
 
 
 def _edge(given: Mapping[str, Any], count: int | None) -> float | None:
@@ -149,49 +150,44 @@ def _content(experiment: Experiment, result: PlanResult) -> dict[str, Any]:
     }
 
 
-def _show(console: Console, content: dict[str, Any]) -> None:
-    pool = content["candidates"]
-    left = f" ({counts_text(pool['left_out'])} left out)" if pool["left_out"] else ""
+def _document(content: dict[str, Any]) -> Document:
+    pool, visit, parameters = content["candidates"], content["visit"], content["parameters"]
+    omitted = f" ({counts_text(pool['left_out'])} left out)" if pool["left_out"] else ""
     given = f" after {content['given_records']} given records" if content["given_records"] else ""
     moved = f"; {pool['refined']} of the plan moved on from there" if pool["refined"] else ""
     kinds = {"continuous": "spread through joint space", "grid": "of a grid", "listed": "listed"}
-    console.line(
+    headline = (
         f"{content['experiment']}: {content['poses']} of {pool['count']} candidates "
-        f"{kinds.get(pool['kind'], pool['kind'])}{left}{moved}{given}, goal {content['goal']}, for "
-        f"{len(content['parameters'])} parameters; {content['starts']} starts."
+        f"{kinds.get(pool['kind'], pool['kind'])}{omitted}{moved}{given}, goal {content['goal']}, for "
+        f"{len(parameters)} parameters; {content['starts']} starts."
     )
     goal_value = "" if content["goal"] in ("D", "O1") else f", goal's value {content['value']:.6g}"
-    console.line(f"log determinant {content['log_det']:.4f}" + goal_value)
-    console.line(_bound_text(content))
     indices = "  ".join(f"{name.upper()} {value:.4g}" for name, value in content["observability"].items())
-    console.line(f"observability: {indices}")
-    parameters = content["parameters"]
     rows: list[tuple[str, ...]] = []
     worst = np.argsort([-p["sd_in_ordinary_sizes"] for p in parameters], kind="stable")[:_SHOWN]
     for p in (parameters[i] for i in worst):
-        shown, measure = ("sd_before", "sd_after"), Measure(p["unit"], 1.0)
-        texts = ["-" if p[key] is None else f"{measure.shown(p[key])[0]:.3g}" for key in shown]
+        measure = Measure(p["unit"], 1.0)
+        texts = ["-" if p[key] is None else f"{measure.shown(p[key])[0]:.3g}" for key in ("sd_before", "sd_after")]
         rows.append((p["name"], *texts, measure.shown(0.0)[1] or p["unit"]))
-    columns = ("parameter", "before", "after", "unit")
-    console.table("Predicted standard deviations, the largest first", columns, rows, left=("unit",))
-    console.line(f"least determined: {content['weakest']}.")
-    visit = content["visit"]
+    caption = "Predicted standard deviations, the largest first"
+    table = Table(caption, ("parameter", "before", "after", "unit"), rows, left=("unit",))
     hot = visit["peak_squared_torque"]
     heat_text = f"; squared torque, averaged over 5 poses, at most {hot:.2f} of the largest" if hot is not None else ""
-    console.line(f"order of visit: {visit['order']}, {visit['travel_s']:.0f} s between poses{heat_text}.")
-    console.line(f"plan: {content['out']}  ({content['seconds']:.1f} s)")
-
-
-def _bound_text(content: dict[str, Any]) -> str:
-    bound = content["bound"]
-    if bound is None:
-        return "upper bound: none is known for this goal"
-    whole = " (over the candidates listed here, not all of joint space)"
-    return (
-        f"upper bound {bound['upper']:.4f}, gap {bound['gap']:.4f}, {content['goal']}-efficiency at least "
-        f"{100 * bound['efficiency']:.2f} % (certified by the equivalence theorem)"
-        + (whole if content["candidates"]["kind"] == "continuous" else "")
-    )
+    criterion = [f"log determinant {content['log_det']:.4f}{goal_value}", f"observability: {indices}"]
+    certified = "how good another choice could be is not known for this goal."
+    if (bound := content["bound"]) is not None:
+        criterion.append(f"upper bound {bound['upper']:.4f}, gap {bound['gap']:.4f}")
+        certified = (
+            f"{content['goal']}-efficiency at least {100 * bound['efficiency']:.2f} %, certified by the equivalence "
+        )
+        certified += "theorem"
+        certified += " over the candidates listed here, not all of joint space" * (pool["kind"] == "continuous") + "."
+    sections = [
+        Section("Precision", parts=[table, f"least determined: {content['weakest']}."], level="always"),
+        Section("Criterion", parts=criterion, level="verbose"),
+    ]
+    order = f"order of visit: {visit['order']}, {visit['travel_s']:.0f} s between poses{heat_text}."
+    return Document("Plan", headline, sections, summary=[certified, order], data=content)
 
 
 def _show_iso_plan(

@@ -1,7 +1,6 @@
 """Numbers as people read them: few digits, a true minus sign, the units of the workshop."""
 
 import math
-import re
 from collections.abc import Iterable
 
 from armcal.base.domains import Pose, Rotation, ScrewAxis
@@ -9,7 +8,6 @@ from armcal.base.parameters import ParameterBlock
 
 NONE = "\u2013"
 MINUS = "\u2212"
-_TIMES = "\u00d7"
 _MOST_DECIMALS = 9
 _ASCII = {MINUS: "-", NONE: "-", "≤": "up to", "≥": "from", "\u202f": " ", "\u2007": " ", "\u2008": " "}
 
@@ -61,27 +59,11 @@ def plural(number: int, noun: str) -> str:
     return f"{count(number)} {noun}{'' if number == 1 else 's'}"
 
 
-def unbroken(words: str) -> str:
-    return re.sub(r"(\d) (mm|%|times)", "\\1\u00a0\\2", words)
-
-
 def in_ascii(text: str) -> str:
     """The same for terminals that have no more than letters."""
     for sign, word in _ASCII.items():
         text = text.replace(sign, word)
     return text.strip()
-
-
-def duration(seconds: float) -> str:
-    """Seconds, or milliseconds below a tenth of one."""
-    return f"{seconds * 1000:.0f} ms" if abs(seconds) < 0.0995 else f"{seconds:.2f} s"
-
-
-def ratio(before: float | None, after: float | None) -> str:
-    """How many times smaller ``after`` is."""
-    if before is None or after is None or not (math.isfinite(before) and math.isfinite(after)) or after <= 0:
-        return NONE
-    return f"{significant(before / after, 3 if before >= after else 2)} {_TIMES}"
 
 
 def entry_unit(block: ParameterBlock, suffix: str) -> str:

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from armcal.report.document import Document
-from armcal.report.numbers import unbroken
 from armcal.report.plot import drawn
 from armcal.version import __version__
 
@@ -25,7 +24,6 @@ def _template() -> Any:
     loader = FileSystemLoader(Path(__file__).parent)
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.lstrip_blocks = True
-    environment.filters["unbroken"] = unbroken
     environment.tests["a"] = lambda part, kind: type(part).__name__ == kind
     environment.globals["drawn"] = drawn
     return environment.get_template("page.html.j2")

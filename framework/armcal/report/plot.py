@@ -94,10 +94,10 @@ def _axes(panel: Panel) -> tuple[Axis, Axis, float]:
     of_x = np.concatenate([np.zeros(0), *(m.xy[0] for m in panel.marks)])
     of_y = np.concatenate([np.zeros(0), *(m.xy[1] for m in panel.marks)])
     low, high = _ends(of_x, panel.log)
-    left = 2.0 if panel.bare else 52.0
+    left = 45.0 if panel.bare else 52.0
     if panel.rows:
         left = min(max(map(len, panel.rows)), 24) * _LETTER + 14
-    top, right = 6.0, WIDTH - (2.0 if panel.bare else 12.0)
+    top, right = 6.0, WIDTH - (45.0 if panel.bare else 12.0)
     height = _ROW * len(panel.rows) if panel.rows else HEIGHT - 46
     start, end = (-0.7, len(panel.rows) - 0.3) if panel.rows else _ends(of_y, False)
     if panel.equal:

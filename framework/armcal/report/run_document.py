@@ -8,14 +8,13 @@ import numpy as np
 
 from armcal.base.units import readable
 from armcal.diagnose.checks import Finding
-from armcal.diagnose.unseen import priors_alone
 from armcal.estimate.estimator import Estimate
-from armcal.estimate.identifiability import CORRELATED, POOR_CONDITION, bound_together, correlated_pairs, correlations
+from armcal.estimate.identifiability import CORRELATED, bound_together, correlated_pairs, correlations
 from armcal.plugins import PluginRegistry, said
 from armcal.report import run_figures as figures
 from armcal.report import run_tables as tables
 from armcal.report.document import Code, Document, Part, Section, Table
-from armcal.report.numbers import NONE, count, duration, fixed, plural, significant
+from armcal.report.numbers import NONE, count, fixed, plural, significant
 from armcal.run.outputs import metrics
 from armcal.run.result import RunResult
 
@@ -57,7 +56,7 @@ def run_document(result: RunResult, sections: Sequence[Section] = ()) -> Documen
     notes = [finding for finding in findings if finding.grade == "note"]
     passed = [finding for finding in findings if finding.grade == "good"]
     grade = next((g for g in ("bad", "warning") if g in {f.grade for f in findings}), "good" if findings else "note")
-    do = [] if urgent or not findings else ["Nothing needs to be done before it is used."]
+    do = [] if urgent or not findings else ["No warning: the calibration can be used."]
     summary: list[Part] = [text for text in (result.verdict.paragraph, *do) if text]
     own = [
         *_accuracy(result),
@@ -65,9 +64,7 @@ def run_document(result: RunResult, sections: Sequence[Section] = ()) -> Documen
         *_records(result),
         Section("Notes", parts=notes, name="notes", level="verbose"),
         Section(f"{plural(len(passed), 'check')} passed", parts=passed, name="passed", folded=True, level="verbose"),
-        *_intervals(result),
-        *_correlated(result.estimate),
-        _determined(result),
+        *_determined(result.estimate),
         *_data(result, warnings),
         *sections,
         _origin(result),
@@ -125,28 +122,16 @@ def _accuracy(result: RunResult) -> list[Section]:
 
 
 def _parameters(result: RunResult) -> list[Section]:
-    estimate, rows = result.estimate, tables.parameter_rows(result.estimate)
-    if not rows:
-        return [
-            Section("Parameters", parts=["No parameter was free: the model stands as it was given."], name="parameters")
-        ]
-    listed: list[Part] = [tables.parameters_table(rows)]
-    listed += [table for table in (tables.principal_table(estimate),) if table]
-    own = [figure for figure in (figures.corrections(estimate),) if figure]
-    resampled = [tables.bootstrap_table(estimate, result.bootstrap)] if result.bootstrap else []
-    profiled: list[Part] = [tables.profiles_table(result), figures.profile_figure(result)] if result.profiles else []
+    estimate, count_free = result.estimate, len(result.estimate.names)
+    if not count_free:
+        text = "No parameter was free: the model stands as it was given."
+        return [Section("Parameters", parts=[text], name="parameters")]
+    table = tables.parameters_table(estimate, result.bootstrap, result.profiles)
+    requested = result.bootstrap is not None or bool(result.profiles)
+    listed, title = _some(table, tables.principal_table(estimate)), f"Table of {plural(count_free, 'free parameter')}"
     return [
-        Section("What was corrected", parts=own, name="corrections"),
-        Section(
-            f"Table of {plural(len(rows), 'free parameter')}",
-            parts=listed,
-            name="parameters",
-            folded=True,
-            level="verbose",
-        ),
-        Section("Intervals by bootstrap", parts=resampled, name="bootstrap", level="verbose"),
-        Section("Intervals by profile likelihood", parts=profiled, name="profiles"),
-        Section("Fixed parameters", parts=_some(tables.fixed_table(estimate)), name="fixed", folded=True),
+        Section("What was corrected", parts=_some(figures.corrections(estimate)), name="corrections"),
+        Section(title, parts=listed, name="parameters", folded=True, level="always" if requested else "verbose"),
     ]
 
 
@@ -157,61 +142,39 @@ def _some(*parts: Part | None) -> list[Part]:
 def _records(result: RunResult) -> list[Section]:
     worst = tables.worst_records(result)
     listed = _some(tables.worst_table(result, worst)) if len(worst) else []
-    moved = _some(tables.moved_table(result), figures.moved_in_space(result))
+    moved = _some(tables.moved_table(result))
     return [
         Section("What was learned beside the model", parts=moved, name="pose-residual"),
         Section("Where residuals come from", parts=_some(figures.against_joints(result)), name="joints"),
         Section(
             "Record by record",
-            parts=_some(figures.in_order(result, worst), tables.large_errors_table(result)),
+            parts=_some(figures.in_order(result, worst)),
             name="records",
         ),
         Section("Largest errors", parts=listed, name="worst", folded=True),
     ]
 
 
-def _intervals(result: RunResult) -> list[Section]:
-    parts = _some(tables.coverage_table(result.intervals), figures.inside_radii(result))
-    return [Section("What a +- is worth", parts=parts, name="intervals", folded=True)]
-
-
-def _correlated(estimate: Estimate) -> list[Section]:
-    names = estimate.names
-    if len(names) < 2:
-        return []
-    with np.errstate(invalid="ignore"):
-        matrix = correlations(estimate.covariance)
-    matrix = np.where(np.outer(estimate.determined, estimate.determined), matrix, 0.0)
-    pairs = correlated_pairs(matrix, names, CORRELATED, bound_together(estimate.parameters))
-    # The strongest pairs whatever their size, zeros left out.
-    rows, columns = np.triu_indices(len(names), 1)
-    sizes = np.abs(matrix[rows, columns])
-    order = [k for k in np.argsort(-sizes, kind="stable")[:_STRONGEST] if sizes[k] > 0]
-    ends = [(names[i], names[j], float(matrix[i, j])) for i, j in zip(rows[order], columns[order], strict=True)]
-    others = [(a, b, r) for a, b, r in ends if (a, b) not in {(c, d) for c, d, _ in pairs}]
-    shown = [(a, b, fixed(r, 3, signed=True)) for a, b, r in (*pairs[: tables.MOST_LISTED], *others)]
-    caption = f"Pairs that correlate by more than {CORRELATED:g} ({count(len(pairs))}), then the strongest others"
-    table = Table(caption, ("Parameter", "Parameter", "Correlation"), shown, left=("Parameter",))
-    return [Section("Which parameters are correlated", parts=[table], name="correlations", folded=True)]
-
-
-def _determined(result: RunResult) -> Section:
-    known = result.estimate.identifiability
-    if not len(known):
-        return Section("What the data did not determine", name="determined")
-    parts: list[Part] = [Finding("good", f"The data determines all {plural(len(known), 'free parameter')}.")]
-    if known.undetermined:
-        text = f"The data determines {known.rank} of {len(known)} parameters. These combinations rest on priors alone:"
-        parts = [Finding("note" if result.fit.of(priors_alone) else "bad", text), *map(str, known.undetermined)]
+def _determined(estimate: Estimate) -> list[Section]:
+    """What the data hardly determine, or not: combinations of parameters, and pairs that are correlated."""
+    known, names = estimate.identifiability, estimate.names
+    parts: list[Part] = [f"Rests on priors alone: {combination}." for combination in known.undetermined]
     if known.rank:
-        poor = (
-            f", which is poor (above {POOR_CONDITION:.0e})".replace("e+0", "e")
-            if known.condition > POOR_CONDITION
-            else ""
-        )
-        parts.append(f"Least determined: {known.weakest}. Scaled condition {significant(known.condition)}{poor}.")
-    folded = not known.undetermined
-    return Section("What the data did not determine", parts=parts, name="determined", folded=folded)
+        parts.append(f"Least determined: {known.weakest}. Scaled condition {significant(known.condition)}.")
+    if len(names) > 1:
+        with np.errstate(invalid="ignore"):
+            matrix = correlations(estimate.covariance)
+        matrix = np.where(np.outer(estimate.determined, estimate.determined), matrix, 0.0)
+        pairs = correlated_pairs(matrix, names, CORRELATED, bound_together(estimate.parameters))
+        # The strongest pairs whatever their size, zeros left out.
+        rows, columns = np.triu_indices(len(names), 1)
+        order = np.argsort(-np.abs(matrix[rows, columns]), kind="stable")[:_STRONGEST]
+        ends = [(names[rows[k]], names[columns[k]], float(matrix[rows[k], columns[k]])) for k in order]
+        others = [(a, b, r) for a, b, r in ends if r and (a, b) not in {(c, d) for c, d, _ in pairs}]
+        shown = [(a, b, fixed(r, 3, signed=True)) for a, b, r in (*pairs[: tables.MOST_LISTED], *others)]
+        caption = f"Pairs that correlate by more than {CORRELATED:g} ({count(len(pairs))}), then the strongest others"
+        parts.append(Table(caption, ("Parameter", "Parameter", "Correlation"), shown, left=("Parameter",)))
+    return [Section("What the data do not tell apart", parts=parts, name="determined", folded=not known.undetermined)]
 
 
 def _data(result: RunResult, warnings: Sequence[str]) -> list[Section]:
@@ -229,7 +192,7 @@ def _data(result: RunResult, warnings: Sequence[str]) -> list[Section]:
 def _origin(result: RunResult) -> Section:
     solver, data, estimate = result.estimate.verdict, result.dataset, result.estimate
     answer = "converged" if solver.converged else "did not converge"
-    effort = f"{plural(solver.iterations, 'iteration')}, {duration(solver.seconds)}"
+    effort = f"{plural(solver.iterations, 'iteration')}, {solver.seconds:.2f} s"
     starts = f"{solver.agreeing_starts} of {solver.starts} came to the same answer" if solver.starts > 1 else "one"
     facts: list[tuple[str, Any]] = [
         ("data", data.source or NONE),
@@ -245,5 +208,5 @@ def _origin(result: RunResult) -> Section:
     facts += [fact for fact in tables.provenance_facts(result.provenance) if fact[0] not in names]
     seconds = sorted(result.seconds.items(), key=lambda stage: stage[0] == "total")
     parts: list[Part] = [Code(result.command), Table("Provenance", ("What", "Value"), facts, left=("Value",))]
-    parts.append(Table("Time taken", ("Stage", "Time"), [(name, duration(took)) for name, took in seconds]))
+    parts.append(Table("Time taken", ("Stage", "Time"), [(name, f"{took:.2f} s") for name, took in seconds]))
     return Section("How to reproduce this", parts=parts, name="reproduce", folded=True)

@@ -8,7 +8,6 @@ from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.units import shown_unit
 from armcal.diagnose import outliers
 from armcal.estimate.estimator import Estimate
-from armcal.estimate.uncertainty import Profile
 from armcal.report.document import Figure, Marks, Panel
 from armcal.report.numbers import count, entry_unit, plural, significant
 from armcal.run.result import RunResult
@@ -24,9 +23,13 @@ _AXES = ("dot small", "dot small second", "dot small third")
 
 
 def noise_of(result: RunResult) -> tuple[Array, float] | None:
-    """How far the stated noise puts each record off (root mean square, N), and of how many numbers that is."""
-    noise = result.fit.of(outliers.noise_of) if result.fit.converged else None
-    return None if noise is None or len(noise[0]) != len(result.dataset) else (1000 * noise[0], noise[1])
+    """How far the stated noise puts each record off (root mean square, N), and of how many numbers that is.
+
+    None of images and of several measurements, whose errors are means over more numbers than a position has.
+    """
+    noise, errors = result.fit.of(outliers.noise_of) if result.fit.converged else None, result.errors
+    rows = sum(name.endswith(f"_{errors.unit}") for name in errors.residual_columns)
+    return (1000 * noise[0], noise[1]) if noise is not None and rows <= 3 else None
 
 
 def mean_noise(sizes: Array, numbers: float) -> float:
@@ -48,14 +51,6 @@ def in_space(result: RunResult) -> Figure | None:
     panels = {"nominal": errors.nominal_mm, "calibrated": errors.calibrated_mm}
     caption = f"Places of the tip, mm, and the error of each record, {errors.unit}, by one scale."
     return _space(result, panels, errors.unit, ("Error by place", caption))
-
-
-def moved_in_space(result: RunResult) -> Figure | None:
-    moved = result.pose_residual and result.pose_residual.moved
-    if not moved:
-        return None
-    words = ("How far the pose residual moves the tip", "Places of the tip, mm; shift by the pose residual, mm.")
-    return _space(result, {"": 1000 * moved.altogether}, "mm", words)
 
 
 def _space(result: RunResult, numbers: dict[str, Array], unit: str, words: tuple[str, str]) -> Figure | None:
@@ -210,7 +205,8 @@ def against_joints(result: RunResult) -> Figure | None:
             continue
         factor, unit = shown_unit("rad" if dimension == "angle" else "m")
         x, name = factor * joint, channel.partition(".")[2] if len(result.system.arms) == 1 else channel
-        marks = [Marks(_AXES[i], (x, row[some]), name=names[i]) for i, row in enumerate(values)]
+        aside = 0.02 * float(np.nanmax(x) - np.nanmin(x))  # axes stand beside one another where a joint had few angles
+        marks = [Marks(_AXES[i], (x + aside * (i - 1), row[some]), name=names[i]) for i, row in enumerate(values)]
         if noise is not None:
             reach = 2 * float(np.median(noise[0])) / np.sqrt(noise[1])
             ends = np.array([np.nanmin(x), np.nanmax(x)])
@@ -261,64 +257,6 @@ def in_order(result: RunResult, worst: Indices) -> Figure | None:
     labels = ("record, in recorded order", f"calibrated error, {result.errors.unit}")
     panel = Panel("", marks, *labels, low=0.0, high=high)
     return Figure("Error of each record in recorded order", said, caption, [panel], columns=1)
-
-
-def inside_radii(result: RunResult) -> Figure | None:
-    """Error of each judged record over its 95 % radius; None where no position was judged."""
-    scores, errors = result.intervals.scores.get("same"), result.errors
-    if scores is None or len(scores.reaches) != 1:
-        return None
-    _, holdout = roles(result)
-    judged = np.where(holdout, errors.calibrated_mm, errors.cross_validated_mm)
-    reach = scores.reaches[0]
-    known = np.isfinite(reach) & np.isfinite(judged) & (reach > 0)
-    if not known.any():
-        return None
-    stretch = result.intervals.stretches.get("same")
-    widened = stretch.radius if stretch and stretch.radius is not None else 1.0
-    radius = np.where(known, widened * judged / np.where(known, reach, 1.0), np.nan)
-    inside = float(np.mean(judged[known] <= radius[known]))
-    said = f"{plural(int(known.sum()), 'record')} judged by a fit that did not see them; {100 * inside:.1f} % inside."
-    marks = [
-        Marks(style, (radius[own], judged[own]), name=name)
-        for style, name, own in (
-            ("dot", "cross-validated", known & ~holdout),
-            ("dot holdout", "held out", known & holdout),
-        )
-        if own.any()
-    ]
-    high = float(np.nanmax(radius[known]))
-    marks.append(Marks("guide", np.array([[np.nanmin(radius[known]), high]] * 2)))
-    caption = "Below the line the error is inside its 95 % radius. Spread along the line: the +- follows the pose."
-    panel = Panel("", marks, "predicted 95 % radius, mm", "measured error, mm", low=0.0)
-    return Figure("Predicted and measured errors", said, caption, [panel], columns=1)
-
-
-def profile_figure(result: RunResult) -> Figure:
-    panels = [
-        _profile(profile, *shown_unit(result.estimate.parameters[profile.name].unit)) for profile in result.profiles
-    ]
-    caption = "The interval ends where the curve passes the level. Grey: the parabola of the standard deviation."
-    return Figure("Profiles", f"{plural(len(panels), 'profile')}; the table has the intervals.", caption, panels)
-
-
-def _profile(profile: Profile, factor: float, unit: str) -> Panel:
-    places, rises = factor * profile.curve[0], profile.curve[1]
-    low, high = float(places.min()), float(places.max())
-    top, ends = 1.6 * profile.quantile, np.array([low, high])
-    marks = [Marks("guide", (ends, np.full(2, profile.quantile)), name="level")]
-    if np.isfinite(profile.deviation) and profile.deviation > 0:
-        wide = np.linspace(low, high, 80)
-        curvature = ((wide / factor - profile.value) / profile.deviation) ** 2
-        marks.append(
-            Marks("curve before", (wide, np.where(curvature <= top, curvature, np.nan)), name="by the curvature")
-        )
-    fine = np.linspace(low, high, 120)
-    # Between fits the root of the rise is nearly straight.
-    root = np.interp(fine, places, np.sign(places - factor * profile.value) * np.sqrt(np.maximum(rises, 0.0)))
-    marks += [Marks("curve", (fine, root**2), name="profile"), Marks("dot", (places, rises))]
-    label = f"{profile.name}, {unit}" if unit else profile.name
-    return Panel("", marks, label, "twice the rise of the cost", low=0.0, high=top)
 
 
 def _thinned(numbers: Array, known: Indices, most: int = MOST_POINTS) -> Indices:

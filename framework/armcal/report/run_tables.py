@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,21 +9,17 @@ import numpy as np
 from armcal.base.arrays import Indices
 from armcal.base.domains import Semidefinite, symmetric
 from armcal.base.units import shown_unit
-from armcal.diagnose.coverage import IntervalResult
 from armcal.diagnose.outliers import large_errors
 from armcal.estimate.estimator import Estimate
-from armcal.estimate.prediction import LEVELS
-from armcal.estimate.uncertainty import Bootstrap
+from armcal.estimate.uncertainty import Bootstrap, Profile
 from armcal.estimate.validation import ErrorSummary
 from armcal.report.document import Table
-from armcal.report.numbers import MINUS, NONE, common_decimals, count, decimals_for, entry_unit, fixed, significant
+from armcal.report.numbers import NONE, common_decimals, count, decimals_for, entry_unit, fixed, significant
 from armcal.run.result import ErrorTable, GroupError, RunResult
 
 SETS = {"train": "training", "holdout": "held out", "cross_validated": "cross-validated"}
 MOST_LISTED = 50  # of records set aside and of correlated pairs; the rest is counted
 _WORST = 10
-_FIGURE_SPACE, _POINT_SPACE = "\u2007", "\u2008"
-_RECORDINGS = {"same": "calibrated recording", "new": "new recording"}
 _ENDS = {"crossed": "", "bound": "at its bound", "open": "does not end as far as was looked"}
 
 
@@ -69,60 +64,55 @@ def groups_table(groups: Sequence[GroupError], unit: str) -> Table:
     return Table(caption, headings, rows, left=("Part",))
 
 
-@dataclass(frozen=True)
-class ParameterRow:
-    """One free parameter, in words; ``held`` where only a prior holds it, or nothing."""
-
-    name: str
-    unit: str
-    nominal: str
-    value: str
-    correction: str
-    sd: str
-    interval: str
-    at_bound: bool
-    determined: bool
-    held: bool
-
-    @property
-    def remark(self) -> str:
-        words = ["at its bound"] if self.at_bound else []
-        words += ["not determined"] if not self.determined else ["held by its prior"] if self.held else []
-        return ", ".join(words)
-
-
-def parameter_rows(estimate: Estimate) -> tuple[ParameterRow, ...]:
-    """One row a free canonical entry, numbers aligned at their points."""
-    nominal, numbers, decimals = estimate.parameters.nominal(), [], []
+def parameters_table(estimate: Estimate, bootstrap: Bootstrap | None = None, profiles: Sequence[Profile] = ()) -> Table:
+    """A row a free canonical entry in customary units, with its intervals by curvature, by refits and by profile."""
+    nominal, profiled, rows = estimate.parameters.nominal(), {profile.name: profile for profile in profiles}, []
     units = [entry_unit(b, suffix) for b in estimate.parameters.free for suffix in b.domain.entries]
-    for i, entry in enumerate(estimate.free_entries):
+    for i, (name, entry, interval) in enumerate(
+        zip(estimate.names, estimate.free_entries, estimate.intervals, strict=True)
+    ):
+        factor, unit = shown_unit(units[i])
         own = (estimate.values[entry], nominal[entry], estimate.deviations[i])
-        value, before, sd = (float(number) * shown_unit(units[i])[0] for number in own)
+        value, before, sd = (factor * float(number) for number in own)
         # Two digits of the standard deviation; five of the value where there is none, three decimals of a zero.
         size = sd if math.isfinite(sd) and sd > 0 else max(abs(value), abs(before)) / 1000
-        numbers.append((value, before, sd))
-        decimals.append(decimals_for(size) if size else 3)
-    rows, widest = [], max(decimals, default=0)
-    for i, (name, (value, before, sd), digits) in enumerate(zip(estimate.names, numbers, decimals, strict=True)):
-        factor, unit = shown_unit(units[i])
-        padding = _FIGURE_SPACE * (widest - digits) + (_POINT_SPACE if digits == 0 < widest else "")
-        written = [fixed(value, digits), fixed(before, digits), fixed(value - before, digits, True), fixed(sd, digits)]
-        interval = estimate.intervals[i]
-        lower, upper = (fixed(float(end) * factor, digits) for end in (interval.lower, interval.upper))
+        digits = decimals_for(size) if size else 3
+        lower, upper = (fixed(factor * float(end), digits) for end in (interval.lower, interval.upper))
         words = f"{lower} to {upper}" if math.isfinite(sd) else NONE
         if math.isfinite(sd) and interval.bound:
             words = f"≤ {upper}" if interval.bound == "lower" else f"≥ {lower}"
-        shown, was, moved, deviation = (text if text == NONE else text + padding for text in written)
-        flags = (name in estimate.at_bound, math.isfinite(sd), not estimate.identified_by_data[i])
-        rows.append(ParameterRow(name, unit, was, shown, moved, deviation, words, *flags))
-    return tuple(rows)
-
-
-def parameters_table(rows: Sequence[ParameterRow]) -> Table:
-    cells = [(r.name, r.nominal, r.value, r.correction, r.sd, r.interval, r.unit, r.remark) for r in rows]
-    headings = ("Parameter", "Nominal", "Calibrated", "Correction", "sd", "95 % interval", "Unit", "Remark")
-    caption = "Free parameters, with standard deviation (sd) and 95 % interval; one-sided next to a bound"
-    return Table(caption, headings, cells, left=("Unit", "Remark"), page_only=("Nominal", "Correction"))
+        remarks = ["at its bound"] if name in estimate.at_bound else []
+        if not estimate.identified_by_data[i]:
+            remarks.append("held by its prior" if math.isfinite(sd) else "not determined")
+        row = [
+            name,
+            fixed(before, digits),
+            fixed(value, digits),
+            fixed(value - before, digits, True),
+            fixed(sd, digits),
+        ]
+        row.append(words)
+        if bootstrap is not None:
+            low, high = (fixed(factor * float(end), digits) for end in bootstrap.intervals[i])
+            row += [fixed(factor * float(bootstrap.deviations[i]), digits), f"{low} to {high}"]
+        if profiled:
+            profile = profiled.get(name)
+            ends = [fixed(factor * end, digits) for end in (profile.lower, profile.upper)] if profile else []
+            row.append(" to ".join(ends))
+            sides = [("lower", profile.lower_end), ("upper", profile.upper_end)] if profile else []
+            remarks += [f"{side} end {_ENDS[end]}" for side, end in sides if _ENDS[end]]
+            remarks += ["a better fit was found on the way: try more starts"] if profile and profile.better else []
+        rows.append((*row, unit, ", ".join(remarks)))
+    headings = ["Parameter", "Nominal", "Calibrated", "Correction", "sd", "95 % interval"]
+    headings += ["Bootstrap sd", "By bootstrap"] if bootstrap else []
+    headings += ["By profile"] if profiled else []
+    caption = "Free parameters, with standard deviation (sd) and 95 % intervals; one-sided next to a bound"
+    if bootstrap is not None:
+        how = f"blocks of {bootstrap.block}" if bootstrap.method == "blocks" else "parametric"
+        failed = f", {bootstrap.failed} more did not converge" if bootstrap.failed else ""
+        caption += f". Bootstrap: {len(bootstrap.values)} refits{failed}; {how}"
+    caption += ". By profile: everything else was fitted again, within bounds, for each value" if profiled else ""
+    return Table(caption, (*headings, "Unit", "Remark"), rows, ("Unit", "Remark"), ("Nominal", "Correction"))
 
 
 def principal_table(estimate: Estimate) -> Table | None:
@@ -134,17 +124,6 @@ def principal_table(estimate: Estimate) -> Table | None:
             sizes = np.linalg.eigvalsh(symmetric(estimate.values[estimate.parameters.entries_of(block.name)]))
             rows.append((block.name, *(significant(factor * max(size, 0.0)) for size in sizes)))
     return Table(f"Principal compliances, {unit}", ("Parameter", "Stiffest", "", "Softest"), rows) if rows else None
-
-
-def fixed_table(estimate: Estimate) -> Table | None:
-    rows = []
-    for block in estimate.parameters.blocks:
-        if not block.free:
-            values = estimate.values[estimate.parameters.entries_of(block.name)]
-            for name, suffix, value in zip(block.entry_names, block.domain.entries, values, strict=True):
-                factor, unit = shown_unit(entry_unit(block, suffix))
-                rows.append((name, f"{float(value) * factor:.7g}".replace("-", MINUS), unit))
-    return Table("Fixed parameters", ("Parameter", "Value", "Unit"), rows, left=("Unit",)) if rows else None
 
 
 def worst_records(result: RunResult) -> Indices:
@@ -163,27 +142,18 @@ def worst_table(result: RunResult, worst: Indices) -> Table:
         columns |= {"Nominal, deg": turns.nominal_deg, "Calibrated, deg": turns.calibrated_deg}
         columns |= {"Cross-validated, deg": turns.cross_validated_deg} if crossed else {}
     decimals = {name: common_decimals(numbers[worst].tolist()) for name, numbers in columns.items()}
+    missed = result.fit.of(large_errors)
+    unusual = {miss.record_id: "; ".join(miss.reasons) for miss in missed.explained} if missed else {}
     rows = []
     for i in worst.tolist():
         role = "train" if i in train else "holdout" if i in holdout else "not used"
         numbers = (fixed(float(own[i]), decimals[name]) for name, own in columns.items())
-        rows.append((data.ids[i], str(data.rows[i]) if data.rows else NONE, role, *numbers))
-    caption = f"The records with the largest calibrated error, {errors.unit}"
-    return Table(caption, ("Record", "Source row", "Role", *columns), rows, left=("Role",))
-
-
-def large_errors_table(result: RunResult) -> Table | None:
-    missed, unit = result.fit.of(large_errors), result.errors.unit
-    if missed is None or not missed.beyond:
-        return None
-    rows = [
-        (m.record_id, str(m.row or NONE), fixed(m.error_mm, 2), "; ".join(m.reasons), m.advice)
-        for m in missed.explained
-    ]
-    caption = f"{count(missed.beyond)} of {count(missed.judged)} records that judge, with an error "
-    caption += f"{missed.in_words(unit)} by fits that did not see them"
-    headings = ("Record", "Source row", f"Error, {unit}", "What is unusual", "What to do")
-    return Table(caption, headings, rows, left=headings[3:])
+        row = str(data.rows[i]) if data.rows else NONE
+        rows.append((data.ids[i], row, role, *numbers, unusual.get(data.ids[i], "")))
+    caption = f"The records with the largest calibrated error, {errors.unit}, and what is unusual where noise does not "
+    caption += "explain it"
+    headings = ("Record", "Source row", "Role", *columns, "What is unusual")
+    return Table(caption, headings, rows, left=("Role", "What is unusual"))
 
 
 def moved_table(result: RunResult) -> Table | None:
@@ -197,59 +167,6 @@ def moved_table(result: RunResult) -> Table | None:
     rows = [(name, *(fixed(x, decimals) for x in pair)) for name, pair in numbers.items()]
     caption = "How far the pose residual moves the tool, mm: altogether, and by what it adds to the tool and each joint"
     return Table(caption, ("Part", "Mean", "Max"), rows, strong=(0,))
-
-
-def coverage_table(intervals: IntervalResult) -> Table | None:
-    """Shares covered by the intervals of cross-validated and held-out records, in this and in a new recording."""
-    rows: list[tuple[str, ...]] = []
-    for words, shares in (("Cross-validated", intervals.crossed), ("Held out", intervals.holdout)):
-        for name, share in shares.items():
-            label = f"{words}, {_RECORDINGS[name]}" if len(shares) > 1 else words
-            radius = share.stretched_radius if share.stretched else share.raw_radius
-            rows.append((label, count(share.records), *_percent([*share.stated, radius])))
-            rows.append(("before", "", *_percent([*share.raw, share.raw_radius])))
-    caption = (
-        "Share of numbers (of positions in the last column) inside their prediction intervals, by fits that did not "
-        "see them; below, before the intervals were stretched"
-    )
-    levels = (*(f"{100 * level:g} %" for level in LEVELS), "95 % radius")
-    strong = range(0, len(rows), 2)
-    return Table(caption, ("Records", "Count", *levels), rows, strong=strong) if rows else None
-
-
-def _percent(shares: Sequence[float | None]) -> tuple[str, ...]:
-    return tuple(NONE if share is None else f"{100 * share:.1f} %" for share in shares)
-
-
-def profiles_table(result: RunResult) -> Table:
-    rows = []
-    for profile in result.profiles:
-        factor, unit = shown_unit(result.estimate.parameters[profile.name].unit)
-        width = max(factor * max(profile.upper - profile.lower, 1e-12), 1e-12)
-        digits = max(2, 1 - int(np.floor(np.log10(width))))
-        ends = f"{fixed(factor * profile.lower, digits)} to {fixed(factor * profile.upper, digits)}"
-        sides = (("lower", profile.lower_end), ("upper", profile.upper_end))
-        remarks = [f"{side} end {_ENDS[end]}" for side, end in sides if _ENDS[end]]
-        if profile.better:
-            remarks.append("a better fit was found on the way: try more starts")
-        rows.append((profile.name, fixed(factor * profile.value, digits), ends, unit, "; ".join(remarks)))
-    caption = "95 % intervals; everything else was fitted again, within bounds, for each value"
-    headings = ("Parameter", "Calibrated", "95 % interval", "Unit", "Remark")
-    return Table(caption, headings, rows, left=("Unit", "Remark"))
-
-
-def bootstrap_table(estimate: Estimate, bootstrap: Bootstrap) -> Table:
-    """How sure each parameter is, in SI, by curvature and by refits."""
-    how = f"blocks of {bootstrap.block}" if bootstrap.method == "blocks" else "parametric"
-    failed = f", {bootstrap.failed} more did not converge" if bootstrap.failed else ""
-    rows = []
-    for i, name in enumerate(bootstrap.names):
-        sd, low, high = (float(x) for x in (bootstrap.deviations[i], *bootstrap.intervals[i]))
-        digits = decimals_for(sd) or 5
-        numbers = [float(estimate.values[estimate.free_entries[i]]), float(estimate.deviations[i]), sd]
-        rows.append((name, *(fixed(x, digits) for x in numbers), f"{fixed(low, digits)} to {fixed(high, digits)}"))
-    caption = f"Bootstrap, {len(bootstrap.values)} refits{failed}; {how}"
-    return Table(caption, ("Parameter", "Value", "sd", "Bootstrap sd", "Bootstrap 95 % interval"), rows)
 
 
 def suspicious_table(result: RunResult) -> Table | None:

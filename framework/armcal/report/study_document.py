@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from armcal.report.document import Code, Document, Figure, Marks, Panel, Part, Section, Table
-from armcal.report.numbers import NONE, common_decimals, count, duration, fixed, plural, significant
+from armcal.report.numbers import NONE, common_decimals, count, fixed, plural, significant
 from armcal.report.run_tables import provenance_facts
 from armcal.run.study_result import Cell, StudyResult, VariantResult
 
@@ -27,7 +27,7 @@ def study_document(result: StudyResult) -> Document:
             for gain, pairs in (("Gain most", change.most_helped), ("Lose most", change.most_hurt)):
                 words += f" {gain}: {', '.join(f'{i} ({fixed(x, 3, signed=True)})' for i, x in pairs) or 'none'}."
             changes.append(words)
-    facts = [*provenance_facts(result.provenance), *((name, duration(took)) for name, took in result.seconds.items())]
+    facts = [*provenance_facts(result.provenance), *((name, f"{took:.2f} s") for name, took in result.seconds.items())]
     origin: list[Part] = [
         Code(result.command),
         Table("Provenance, and time taken", ("What", "Value"), facts, left=("Value",)),
@@ -121,7 +121,7 @@ def _variants(result: StudyResult) -> Table:
         if v.failed_folds:  # over fewer records than the others
             judged = [f"({text})" for text in judged]
         turned = v.turns and [fixed(x, 3) for x in (v.turns["cross_validated"].mean, v.turns["cross_validated"].p95)]
-        rows.append((v.name, count(v.free), *train, *judged, *moved, *(turned or []), duration(v.fit_seconds)))
+        rows.append((v.name, count(v.free), *train, *judged, *moved, *(turned or []), f"{v.fit_seconds:.2f} s"))
     words = f"Distance between measured and predicted, {result.unit}; cross-validated but for training: "
     words += f"{plural(len(result.dataset), 'record')}, {result.folds} folds"
     words += f" drawn {result.repeats} times" if result.repeats > 1 else ""

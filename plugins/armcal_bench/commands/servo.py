@@ -17,6 +17,7 @@ from armcal.devices.wiring import WiringRecord, servo_file_of
 from armcal.errors import EXIT_FAULT, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
 from armcal.io.journal import JOURNAL
 from armcal.io.signals import Signals
+from armcal.report.document import Document, Section, Table
 
 from armcal_bench.acquisition.preparation import Prepared
 from armcal_bench.acquisition.tracker_monitor import StopRequested
@@ -24,7 +25,6 @@ from armcal_bench.commands.acquire import driven
 from armcal_bench.commands.common import FILE, Question, energise_option, load, on_bench, waits, warned
 from armcal_bench.joint_check import check_joints
 from armcal_bench.keys import wishes_from
-from armcal_bench.servo.outcome import Outcome
 from armcal_bench.servo.outputs import improved, results, write_results, write_servo_file
 from armcal_bench.servo.session import Conversation, adapter_of, evaluated, measure, park, tried
 from armcal_bench.servo.setup import Setup
@@ -95,8 +95,9 @@ def _evaluate(console: Console, setup: Setup, out: Path, keep: bool) -> None:
     if earlier is not None:
         before, after = (WiringRecord.of_servo_file(setup.path, file) for file in (setup.file, changed))
         before.carry_over(after)
-    console.result({**content, "servo_file": str(setup.path), "before": None if earlier is None else str(earlier)})
-    _show(console, outcome, content)
+    names = {"servo_file": str(setup.path), "before": None if earlier is None else str(earlier)}
+    console.show(_document(content, setup.joints), **names)
+    console.detail(f"{len(outcome.task.observations)} angles, in {JOURNAL}.")
     if earlier is not None:
         console.line(f"{setup.path}: written; the one before is {earlier.name}")
     left = [joint for joint in setup.joints if not content["servos"].get(joint, {"written": False})["written"]]
@@ -155,7 +156,7 @@ def _stoppable(console: Console) -> Iterator[None]:
         raise type(fault)(fault.message, where=fault.where, hint=hint) from fault
 
 
-def _show(console: Console, outcome: Outcome, content: Mapping[str, Any]) -> None:
+def _document(content: Mapping[str, Any], joints: Sequence[str]) -> Document:
     rows: list[tuple[str, ...]] = []
     for joint, servo in content["servos"].items():
         half_width = servo["backlash_deg"]
@@ -166,11 +167,13 @@ def _show(console: Console, outcome: Outcome, content: Mapping[str, Any]) -> Non
             changes = f"{knot['change_us']:+.1f}", f"{knot['change_deg']:+.2f}"
             rows.append(("" if i else joint, *pulses, *changes, "" if i else backlash))
     columns = ("servo", "deg", "us", "sd", "before", "change, us", "change, deg", "backlash, deg")
-    console.table("Pulses at angles, and what changed", columns, rows)
-    for name, board in content["boards"].items():
-        if board["oscillator_sd_hz"] is not None:
-            text = f"{name}: oscillator {board['oscillator_hz'] / 1e6:.4f} +- {board['oscillator_sd_hz'] / 1e6:.4f} MHz"
-            console.line(text)
-    for sentence in content["findings"]:
-        console.line(sentence)
-    console.detail(f"{len(outcome.task.observations)} angles, in {JOURNAL}.")
+    table = Table("Pulses at angles, and what changed", columns, rows)
+    oscillators = [
+        f"{name}: oscillator {board['oscillator_hz'] / 1e6:.4f} +- {board['oscillator_sd_hz'] / 1e6:.4f} MHz"
+        for name, board in content["boards"].items()
+        if board["oscillator_sd_hz"] is not None
+    ]
+    written = sum(servo["written"] for servo in content["servos"].values())
+    headline = f"{written} of {len(joints)} servo tables were found."
+    sections = [Section("Pulses", parts=[table], level="always")]
+    return Document("Servos", headline, sections, summary=[*oscillators, *content["findings"]], data=content)
