@@ -112,7 +112,7 @@ def parameters_table(estimate: Estimate, bootstrap: Bootstrap | None = None, pro
         failed = f", {bootstrap.failed} more did not converge" if bootstrap.failed else ""
         caption += f". Bootstrap: {len(bootstrap.values)} refits{failed}; {how}"
     caption += ". By profile: everything else was fitted again, within bounds, for each value" if profiled else ""
-    return Table(caption, (*headings, "Unit", "Remark"), rows, ("Unit", "Remark"), ("Nominal", "Correction"))
+    return Table(caption, (*headings, "Unit", "Remark"), rows, ("Unit", "Remark"), ("Nominal", "Correction", "sd"))
 
 
 def principal_table(estimate: Estimate) -> Table | None:
