@@ -80,6 +80,17 @@ def _no_compiling_for_later() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _surroundings_as_before() -> Iterator[None]:
+    """What a module's tests set in the environment and on the path does not reach those of the next."""
+    environment, path = dict(os.environ), [*sys.path]
+    yield
+    for name in os.environ.keys() - environment.keys() - {"PYTEST_CURRENT_TEST"}:
+        del os.environ[name]
+    os.environ.update(environment)
+    sys.path[:] = path
+
+
 @pytest.fixture(scope="session")
 def repository() -> Path:
     """The root of the checkout."""

@@ -300,7 +300,7 @@ def _registered(chosen: tuple[tuple[PluginInfo, EntryPoint | ModuleType], ...]) 
     for plugin, origin in chosen:
         module = None
         try:
-            module = origin.load() if isinstance(origin, EntryPoint) else origin
+            module = origin if isinstance(origin, ModuleType) else origin.load()
             components += _announced(manager, plugin, module)
         except (Exception, SystemExit) as fault:  # whatever a third party's module does, the others must work
             if plugin.is_file:

@@ -222,6 +222,14 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
+def test_plugins_are_found_where_another_library_took_the_finder_over() -> None:
+    """dask's cluster loads importlib_metadata, whose entry points are of a class of its own."""
+    pytest.importorskip("importlib_metadata", reason="needs importlib_metadata, as dask's cluster brings it")
+    code = "import importlib_metadata; from armcal.plugins import discover; print(len(discover().components))"
+    ran = python("-c", code)
+    assert ran.returncode == 0 and int(ran.stdout) > 20, ran.stdout + ran.stderr
+
+
 @pytest.mark.slow
 def test_an_installed_plugin_is_listed_and_checked(installed: Path) -> None:
     assert "scara" not in armcal("plugins", "list").stdout
