@@ -9,7 +9,6 @@ stretch is never judged by the records it comes from: each fold of a cross-valid
 scores of the other folds give (cross-conformal [Vovk2015]).
 """
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -24,7 +23,6 @@ from armcal.base.units import readable
 from armcal.diagnose.checks import Finding
 from armcal.diagnose.dependences import MOST_LEVELS
 from armcal.diagnose.fit import Fit
-from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Estimator
 from armcal.estimate.prediction import (
     LEVELS,
@@ -39,7 +37,7 @@ from armcal.estimate.prediction import (
 )
 from armcal.estimate.robust import WeighedFit, Weighing, fit
 from armcal.estimate.uncertainty import automatic_block_length, standard_error_of_mean
-from armcal.estimate.validation import FitTask, JudgedFit, Recording, Split, failed_fit, fit_and_judge, judged_fit
+from armcal.estimate.validation import FitTask, JudgedFit, Recording, Split, fit_and_judge, judged_fit, judging
 from armcal.estimate.variance import apply_components
 from armcal.problem.problem import Problem
 
@@ -164,21 +162,15 @@ def whitened_like(held: Problem, fitted: WeighedFit, estimator: Estimator) -> Pr
     return apply_components(held, fitted.solution.values, fitted.components, estimator.settings.axes)
 
 
+@judging
 def fit_and_predict(task: FitTask) -> JudgedFit:
     """Fit, judge, and how it missed; see ``fit_and_judge``."""
     if task.problem.blueprint.groups:
         return fit_and_judge(task)  # a socket that is found anew from the records that judge it has no interval
-    began = time.perf_counter()
-    try:
-        train, held = task.parts()
-        fitted = fit(train, task.estimator, task.start)
-        judged = judged_fit(task, fitted.solution, train, held, began)
-        if not judged.converged:
-            return judged
-        own = missed(predictor(fitted), whitened_like(held, fitted, task.estimator))
-        return replace(judged, held_residuals=own, seconds=time.perf_counter() - began)
-    except NotConvergedError:
-        return failed_fit(task, began)
+    train, held = task.parts()
+    fitted = fit(train, task.estimator, task.start)
+    own = missed(predictor(fitted), whitened_like(held, fitted, task.estimator))
+    return replace(judged_fit(train, held, fitted.solution), held_residuals=own)
 
 
 def besides(scores: Scores, places: Indices) -> Scores:

@@ -6,20 +6,22 @@ import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from functools import wraps
+from typing import Any, Concatenate, Literal, ParamSpec
 
 import numpy as np
 
 from armcal.base.arrays import Array, Indices
 from armcal.base.units import ERROR_NAMES, ERROR_UNITS
 from armcal.errors import NotConvergedError, ProblemError
-from armcal.estimate.estimator import Estimator, Progress, Solution, no_progress
+from armcal.estimate.estimator import Estimator, Progress, Solution, gave_up, no_progress
 from armcal.estimate.polish import restricted, settled
 from armcal.io.parallel import Executor, Sequential
 from armcal.measure.measurement import Placed
 from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem
 
+P = ParamSpec("P")
 Recording = Literal["same", "new"]
 """Whether what is predicted lies within the recording of the fit, whose drift is known, or in another one."""
 
@@ -210,13 +212,9 @@ class FitTask:
     split: Split
 
     def parts(self) -> tuple[Problem, Problem]:
-        """Of the records that train, and of those that judge."""
-        return self.problem.subset(self.split.train), self.problem.subset(self.split.holdout)
-
-    def trained(self) -> FitTask:
-        """The task without the groups that no training record belongs to."""
-        held = restricted(self.problem.subset(self.split.train))
-        return replace(self, problem=held.with_records(self.problem.records))
+        """Of the records that train, and of those that judge, without the groups that no training record belongs to."""
+        train = restricted(self.problem.subset(self.split.train))
+        return train, train.with_records(self.problem.subset(self.split.holdout).records)
 
 
 @dataclass(frozen=True)
@@ -233,8 +231,8 @@ class JudgedFit:
     errors: Array  # m
     at_rest: Array  # the errors if nothing is known of a drift
     turns: Array | None  # errors of orientations (rad), where measured
-    converged: bool  # whether the fit did
-    seconds: float  # that it took
+    converged: bool = True  # whether the fit did
+    seconds: float = 0.0  # that it took
     held_residuals: Mapping[Recording, tuple[Array, ...]] = field(default_factory=dict)
     unknown: tuple[Array, ...] | None = None
     without: Array | None = None
@@ -257,35 +255,33 @@ class CrossValidation:
     fits: tuple[JudgedFit, ...] = ()
 
 
+def judging(judge: Callable[Concatenate[FitTask, P], JudgedFit]) -> Callable[Concatenate[FitTask, P], JudgedFit]:
+    """What fits and judges, timed; a fit that does not converge, which raises, has errors that are not known."""
+
+    @wraps(judge)
+    def timed(task: FitTask, /, *rest: P.args, **others: P.kwargs) -> JudgedFit:
+        began = time.perf_counter()
+        try:
+            fit = judge(task, *rest, **others)
+        except NotConvergedError:
+            nothing = np.full(len(task.split.holdout), np.nan)
+            fit = JudgedFit(nothing, nothing, nothing if measures_turns(task.problem) else None, converged=False)
+        return replace(fit, seconds=time.perf_counter() - began)
+
+    return timed
+
+
+@judging
 def fit_and_judge(task: FitTask) -> JudgedFit:
-    began, task = time.perf_counter(), task.trained()
-    try:
-        train, held = task.parts()
-        solution = task.estimator.solve(train, task.start)
-        return judged_fit(task, solution, train, held, began)
-    except NotConvergedError:
-        return failed_fit(task, began)
+    train, held = task.parts()
+    return judged_fit(train, held, task.estimator.solve(train, task.start))
 
 
-def judged_fit(
-    task: FitTask,
-    solution: Solution,
-    train: Problem,
-    held: Problem,
-    began: float,
-) -> JudgedFit:
-    judged, turns = errors_and_turns(held, solution.values, train)
-    at_rest = record_errors(held, solution.values)
+def judged_fit(train: Problem, held: Problem, solution: Solution) -> JudgedFit:
     if not solution.verdict.converged:
-        return failed_fit(task, began)
-    return JudgedFit(judged, at_rest, turns, True, time.perf_counter() - began, values=solution.values)
-
-
-def failed_fit(task: FitTask, began: float) -> JudgedFit:
-    """Errors that are not known: nan."""
-    nothing = np.full(len(task.split.holdout), np.nan)
-    turns = nothing if measures_turns(task.problem) else None
-    return JudgedFit(nothing, nothing, turns, False, time.perf_counter() - began)
+        raise gave_up(solution.verdict)
+    errors, turns = errors_and_turns(held, solution.values, train)
+    return JudgedFit(errors, record_errors(held, solution.values), turns, values=solution.values)
 
 
 def cross_validate(

@@ -1,6 +1,5 @@
 """The pose residual of a run: learned from what the physical fit leaves, kept only if records held out say so."""
 
-import time
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Self
@@ -15,7 +14,7 @@ from armcal.config.system import System
 from armcal.diagnose.checks import Finding
 from armcal.diagnose.coverage import missed, predictor, whitened_like
 from armcal.diagnose.fit import Fit
-from armcal.errors import ConfigError, NotConvergedError
+from armcal.errors import ConfigError
 from armcal.estimate.estimator import Progress
 from armcal.estimate.robust import WeighedFit, fit, held_fit
 from armcal.estimate.validation import (
@@ -26,9 +25,9 @@ from armcal.estimate.validation import (
     cross_validate,
     error_unit,
     errors_apart,
-    failed_fit,
     folds,
     judged_fit,
+    judging,
 )
 from armcal.io.parallel import Executor
 from armcal.measure.groups import PairedMeasurement
@@ -257,34 +256,26 @@ def _harm(gains: Array, unknown: Array) -> str:
     return ""
 
 
+@judging
 def judged_with(task: FitTask, layer: Layer) -> JudgedFit:
-    began, task = time.perf_counter(), task.trained()
-    try:
-        train, held = task.parts()
-        fitted = fit(train, task.estimator, task.start)
-        plain = judged_fit(task, fitted.solution, train, held, began)
-        if not plain.converged:
-            return plain
-        learned = layer.learned(fitted, task.split.train)
-        before = errors_apart(held, fitted.solution.values)
-        arm = task.problem.blueprint.arms[layer.arm]
-        if learned is not None:
-            train, held = (
-                corrected(own, arm, learned.corrections(layer.postures.subset(places)))
-                for own, places in ((train, task.split.train), (held, task.split.holdout))
-            )
-            fitted = held_fit(train, task.estimator, fitted.solution)
-        judged = judged_fit(task, fitted.solution, train, held, began)
-        if not judged.converged:
-            return judged
-        held_residuals = missed(predictor(fitted), whitened_like(held, fitted, task.estimator))
-        own = {} if learned is None else {layer.arm: (learned, layer.postures.subset(task.split.holdout))}
-        unknown = tuple(unexplained(held, fitted.solution.values, own))
-    except NotConvergedError:
-        return failed_fit(task, began)
-    judged = replace(judged, held_residuals=held_residuals, unknown=unknown, without=plain.at_rest)
-    gains = before - errors_apart(held, fitted.solution.values)
-    return replace(judged, seconds=time.perf_counter() - began, gains=gains)
+    train, held = task.parts()
+    fitted = fit(train, task.estimator, task.start)
+    plain, before = judged_fit(train, held, fitted.solution), errors_apart(held, fitted.solution.values)
+    learned, arm = layer.learned(fitted, task.split.train), task.problem.blueprint.arms[layer.arm]
+    if learned is not None:
+        train, held = (
+            corrected(own, arm, learned.corrections(layer.postures.subset(places)))
+            for own, places in ((train, task.split.train), (held, task.split.holdout))
+        )
+        fitted = held_fit(train, task.estimator, fitted.solution)
+    own = {} if learned is None else {layer.arm: (learned, layer.postures.subset(task.split.holdout))}
+    return replace(
+        judged_fit(train, held, fitted.solution),
+        held_residuals=missed(predictor(fitted), whitened_like(held, fitted, task.estimator)),
+        unknown=tuple(unexplained(held, fitted.solution.values, own)),
+        without=plain.at_rest,
+        gains=before - errors_apart(held, fitted.solution.values),
+    )
 
 
 def model_errors(fitted: WeighedFit, arm: Arm, postures: Postures) -> ModelErrors | None:

@@ -317,9 +317,7 @@ def _fits(
     tasks = []
     for name, split in plan:
         start = problems[name].parameters.nominal()
-        task = FitTask(
-            problems[name].with_records(ready[name].problem.records), study.experiments[name].estimator, start, split
-        )
+        task = FitTask(problems[name], study.experiments[name].estimator, start, split)
         tasks.append((task, layers[name]))
     with watch.stage("fits"):
         return executor.map(_fit, tasks, lambda done: progress("fits", done))
