@@ -162,7 +162,7 @@ def test_check_shows_the_excitation_before_it_refuses() -> None:
     result = armcal("check", ALL, "--data", DATA)
     assert result.exit_code == 2
     assert "Excitation of the joints" in result.stdout and "rank 34 of 45" in result.stdout
-    assert re.search(r"arm\.q1 +│ +-100 +│ +100 +│ +deg +│ +3 ", result.stdout)
+    assert re.search(r"arm\.q1 +-100 +100 +deg +3 ", result.stdout)
     assert "Ready to run" not in result.stdout
     assert "does not determine 11 combinations" in result.stderr and "armcal identify" in result.stderr
     told = json.loads(armcal("check", ALL, "--data", DATA, "--json").stdout)

@@ -117,7 +117,7 @@ def _accuracy(result: RunResult) -> list[Section]:
     curve = [figure for figure in (figures.distribution(result),) if figure]
     return [
         Section("Errors before and after", parts=[*shown, words, *curve], name="accuracy", level="always"),
-        Section("By group", parts=groups, name="groups", level="verbose"),
+        Section("By group", parts=groups, name="groups", level="always"),
     ]
 
 
