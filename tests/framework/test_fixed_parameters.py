@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.cli.main import cli
-from armcal.estimate.freeing import candidates, freeing
+from armcal.estimate.identifiability import candidates, freeing
 from armcal.measure.csv_writer import write_csv
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment

@@ -25,7 +25,7 @@ from armcal.base.units import display_unit, to_unit
 from armcal.diagnose.held import Moves
 from armcal.diagnose.predictable import CLEAR, Kernels, smooth
 from armcal.diagnose.score_tests import FitRows
-from armcal.estimate.freeing import candidates
+from armcal.estimate.identifiability import candidates
 from armcal.measure.measurement import NamesMistakes
 from armcal.problem.motion import Motion, recorded_order
 from armcal.problem.problem import Problem

@@ -55,8 +55,7 @@ from armcal.diagnose.predictable import (
 from armcal.diagnose.predictable import LEVEL as PREDICTED_LEVEL
 from armcal.diagnose.score_tests import FamilyTest, FitRows, LinearFit, family_test, linear_fit, own_basis
 from armcal.estimate.estimator import Estimate
-from armcal.estimate.freeing import candidates
-from armcal.estimate.identifiability import Measure
+from armcal.estimate.identifiability import Measure, candidates
 from armcal.estimate.uncertainty import automatic_block_length
 from armcal.measure.groups import pose_numbers
 from armcal.problem.problem import Problem

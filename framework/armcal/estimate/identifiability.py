@@ -13,6 +13,10 @@ Why a combination is undetermined: no poses determine it, these poses do not, or
 
 A model is analytic, so its rank is the same almost everywhere; random poses at a point near the values at hand show
 it with probability one, and what is undetermined there is a gauge.
+
+Of fixed parameters: those that the records would determine and that explain residuals. One after another, the one whose
+score is largest for its spread [Rao1948] is freed, to first order. What chance would find among so many is no gain:
+levels are divided by their number.
 """
 
 from __future__ import annotations
@@ -27,12 +31,14 @@ from typing import Literal
 
 import numpy as np
 from scipy.linalg import qr
+from scipy.special import fdtrc
 
 from armcal.base.arrays import Array, Indices, Mask
+from armcal.base.domains import Semidefinite
 from armcal.base.parameters import Parameters
 from armcal.base.units import shown_unit
 from armcal.errors import NotConvergedError, ProblemError
-from armcal.problem.problem import Problem
+from armcal.problem.problem import NormalEquations, Problem
 from armcal.problem.records import subset
 from armcal.problem.rigid_alignment import along, apart_from, tools, unseen_motions
 from armcal.problem.variants import approach_channels, factor_at_zero, fits, joint_channels, projected
@@ -709,3 +715,96 @@ def _mend(undetermined: Sequence[Undetermined]) -> str:
     if causes & {"poses", "unknown"}:
         advice.append("measure poses that separate them")
     return _sentence(f"{', '.join(advice[:-1])}, or {advice[-1]}.")
+
+
+_FREED_BY_CHANCE = 0.05  # Of naming any parameter though nothing is to be gained
+MOST_UNCERTAIN = 0.5  # In typical scales: what the noise leaves less certain than this is not determined
+MOST_FREED = 12
+_OWN_SHARE = 1e-6  # Of what a parameter does: less than this beside the free ones is theirs
+_SINGULAR = 1e-11
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A fixed parameter that the records would determine."""
+
+    name: str  # of its block
+    sd: Array  # of its coordinates if it were free, by the residuals found (SI)
+    change: Array  # by how much it would move, to first order (SI)
+    p_value: float  # that it gains nothing, counting that so many were looked at
+
+
+@dataclass(frozen=True)
+class Freeing:
+    """What is worth freeing, in that order, and what else the records would determine beside it."""
+
+    gaining: tuple[Candidate, ...]
+    others: tuple[Candidate, ...]
+
+
+def candidates(parameters: Parameters) -> tuple[str, ...]:
+    return tuple(
+        block.name
+        for block in parameters.blocks
+        if not (block.free or block.nuisance or isinstance(block.domain, Semidefinite))
+        and ".links." not in block.name
+        and not block.name.startswith("statics.")
+    )
+
+
+def freeing(wide: Problem, own: Sequence[str], values: Array) -> Freeing:
+    """Judge all that is free in ``wide`` and not among the ``own`` parameters, at a fit of these alone."""
+    parameters = wide.parameters
+    chain = parameters.entries_jacobian(values) * parameters.scales()
+    model = wide.normal_equations(values).chained(chain)
+    priors = parameters.prior_information() * parameters.scales() ** 2
+    off = parameters.coordinates(parameters.local(values)) / parameters.scales()
+    model = NormalEquations(model.cost, model.gradient + priors * off, model.hessian + np.diag(priors))
+    places = {name: np.arange(own.start, own.stop) for name, own in parameters.coordinates_of.items()}
+    search = _FreeingSearch(model, priors, wide.equations(), parameters.scales())
+    taken, left = [i for name in own for i in places[name]], [name for name in places if name not in set(own)]
+    gaining, count = list[Candidate](), len(left)
+    while left and len(gaining) < MOST_FREED:
+        judged = [search.judged(name, places[name], taken, count) for name in left]
+        best = min((one for one in judged if one is not None), key=lambda one: one.p_value, default=None)
+        if best is None or best.p_value > _FREED_BY_CHANCE:
+            break
+        gaining.append(best)
+        taken.extend(places[best.name])
+        left.remove(best.name)
+    others = [search.judged(name, places[name], taken, count) for name in left]
+    return Freeing(tuple(gaining), tuple(one for one in others if one is not None))
+
+
+@dataclass(frozen=True)
+class _FreeingSearch:
+    """A quadratic model of the cost by coordinates in typical scales, of so many equations; priors are part of it."""
+
+    model: NormalEquations
+    priors: Array
+    equations: int
+    scales: Array
+
+    def judged(self, name: str, own: Array, taken: Sequence[int], count: int) -> Candidate | None:
+        """A parameter beside those taken, one of ``count``; None if the records do not determine it."""
+        beside = np.array(taken, dtype=np.intp)
+        slopes, bends = self.model.gradient, self.model.hessian
+        size = np.sqrt(np.maximum(np.diag(bends)[beside], 1e-300))
+        units, inside = np.outer(size, size), bends[np.ix_(beside, beside)]
+        inverse = np.linalg.pinv(inside / units, rcond=_SINGULAR, hermitian=True) / units  # where they are determined
+        across = bends[np.ix_(own, beside)] @ inverse
+        spread = bends[np.ix_(own, own)] - across @ bends[np.ix_(beside, own)]
+        score = slopes[own] - across @ slopes[beside]
+        by_data = spread - np.diag(self.priors[own])
+        if np.linalg.eigvalsh(by_data)[0] <= _OWN_SHARE * np.diag(bends)[own].max():
+            return None
+        cost = self.model.cost - float(slopes[beside] @ inverse @ slopes[beside]) / 2
+        spare = max(1, self.equations - len(beside) - len(own))
+        gain = float(score @ np.linalg.solve(spread, score))
+        variance = max(2 * cost - gain, 0.0) / spare
+        sd = np.sqrt(variance * np.diag(np.linalg.inv(by_data)))
+        if sd.max() > MOST_UNCERTAIN:
+            return None
+        p_value = float(fdtrc(len(own), spare, gain / max(variance, 1e-300) / len(own)))
+        change = -np.linalg.solve(spread, score)
+        return Candidate(name, sd * self.scales[own], change * self.scales[own], min(1.0, count * p_value))

@@ -7,7 +7,7 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.diagnose.fit import Prepared
 from armcal.estimate.estimator import Progress, no_progress
-from armcal.estimate.freeing import Candidate, candidates, freeing
+from armcal.estimate.identifiability import Candidate, candidates, freeing
 from armcal.estimate.robust import fit
 from armcal.estimate.validation import cross_validate, folds
 from armcal.problem.problem import Problem
