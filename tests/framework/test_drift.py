@@ -274,7 +274,8 @@ def test_without_drift_nothing_changes(lrm):
 def test_a_drift_far_smaller_than_the_noise_is_none(lrm):
     dataset = recorded(lrm, 40, 17)
     still, drifting = (posed(lrm, dataset, drifts) for drifts in ({}, {"base_x": (1e-12, 5.0)}))
-    one, other = (SOLVER.solve(p, r, p.parameters.nominal()).values for p, r in (still, drifting))
+    problems = (problem.with_records(records) for problem, records in (still, drifting))
+    one, other = (SOLVER.solve(p, p.parameters.nominal()).values for p in problems)
     np.testing.assert_allclose(one, other, rtol=0, atol=1e-10)
 
 
