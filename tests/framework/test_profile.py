@@ -233,7 +233,7 @@ def test_a_run_leaves_profiles_behind(tmp_path: Path) -> None:
     told = json.loads((out / "metrics.json").read_text())["profile"]
     assert told["arm.spring.k1"]["upper"] == kept["arm.spring.k1"]["upper"] and "curve" not in told["arm.spring.k1"]
     page = (out / "report.html").read_text()
-    assert "Profile of arm.spring.k1" in page and "lower end at its bound" in page
+    assert "By profile" in page and "lower end at its bound" in page
 
 
 @pytest.mark.parametrize(("globs", "words"), [("[arm.mdh.a1]", "not free"), ("[nope]", "no parameter is called")])
