@@ -126,7 +126,7 @@ def calibrated(world: World, count: int, folder: Path) -> Calibration:
     lines = [",".join([i, *(repr(float(x)) for x in row)]) for i, row in zip(dataset.ids, table, strict=True)]
     (folder / "data.csv").write_text("\n".join([",".join(head), *lines]) + "\n", encoding="utf-8")
     experiment = Experiment.load(configuration(world.rows, folder / "data.csv"), registry=registry())
-    write(calibrate(experiment), experiment, folder / "run", lambda result: "")
+    write(calibrate(experiment), experiment, folder / "run", "")
     return Calibration.load(folder / "run" / "calibration.yaml", registry())
 
 

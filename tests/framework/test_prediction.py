@@ -468,7 +468,7 @@ def test_a_run_tells_what_its_intervals_hold(recording: Path) -> None:
     assert same["holdout"]["coordinates"] == same["cross_validated"]["records"] == 3 * RECORDED // 4
     assert same["radius_95_mm"] < 0.8 * message_of["new_recording"]["radius_95_mm"]
     page = (recording / "run" / "report.html").read_text()
-    assert "What a +- is worth" in page and "Predicted and measured errors" in page
+    assert "a prediction is good to +-" in page
     assert "90 % prediction intervals" in (recording / "run" / "log.txt").read_text()
 
 
