@@ -87,7 +87,7 @@ def test_the_wheel_holds_every_file_of_the_sources_and_nothing_else(tree: Path, 
     needed = {
         "armcal/functions/kernel_support.h",
         "armcal/report/page.html.j2",
-            "armcal/report/style.css",
+        "armcal/report/style.css",
     }
     assert needed <= names
     assert not any(name.startswith(("test", "framework", "plugins", "configs")) for name in names)
