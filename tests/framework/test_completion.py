@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 
 def completed(words: str, number: int) -> list[str]:
     code = "from armcal.cli.main import main\ntry:\n    main()\nexcept SystemExit:\n    pass\n"
@@ -21,6 +23,7 @@ def completed(words: str, number: int) -> list[str]:
     return done.stdout.split()
 
 
+@pytest.mark.slow
 def test_values_of_options_are_completed() -> None:
     answer = completed("armcal export x.yaml --format ", 4)
     assert "plain,urdf" in answer and "plain,c" in answer

@@ -188,6 +188,7 @@ def test_fifty_megabytes_without_a_line_end_take_no_memory_and_delay_nobody(hous
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 16 * 1024  # KiB
 
 
+@pytest.mark.slow
 def test_where_all_are_waited_for_one_more_is_told_so(house: House, tmp_path: Path) -> None:
     house.answering = False
     crowd = []

@@ -207,9 +207,9 @@ def test_days_need_no_more_memory_and_come_out_the_same_twice(count: int) -> Non
 RUNS = {"extended": {"type": "extended"}, "window": {"type": "window", "records": 6}}
 
 
-@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.slow), 3])
+@pytest.mark.slow
+@pytest.mark.parametrize("every", [1, 3])
 @pytest.mark.parametrize("estimator", RUNS)
-@pytest.mark.quick("window-3")
 def test_a_restored_state_goes_on_as_if_nothing_had_been(estimator: str, every: int) -> None:
     """At such records of a run in which a joint slips: a snapshot as a journal keeps it, taken up by another."""
     given = settings(estimator=RUNS[estimator])

@@ -28,7 +28,7 @@ NAMED = re.compile(
     r"|expected_sd|minimal\.sd_ordinary_sizes|designs(\.\*\.areas(\.\*\.quantities)?)?|holding_Nm|candidates\.left_out"
     r"|half_width_90|summary(\.\*)?|frames"
 )
-SLOW = ("run, poses of a camera", "study")
+SLOW = ("run, poses of a camera", "study", "study, grouped", "capability", "acquire, dry")
 DEMO = "configs/lrm_arm/demo.yaml"
 FAST = "--set evaluator=interpreted"
 RUNS: dict[str, tuple[str, ...]] = {

@@ -71,10 +71,8 @@ def judge(way: Way, run: armcal.Run) -> None:
     assert errors[0] < way.gripper_mm < 20 < errors[1], (way, errors)
 
 
-@pytest.mark.quick("sockets")
-@pytest.mark.parametrize(
-    "way", [pytest.param(way, id=way.name, marks=[pytest.mark.slow] * (way.name == "camera")) for way in WAYS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("way", [pytest.param(way, id=way.name) for way in WAYS])
 def test_the_shipped_records_find_the_zeros(way: Way, tmp_path: Path) -> None:
     run = run_of(way.name, None, tmp_path)
     assert run.converged and not any(finding.grade == "bad" for finding in run.verdict.findings)

@@ -260,7 +260,8 @@ def test_cone_and_root_agree_on_random_training_sets(lrm, seed):
     agree(lrm, seed, 40 + 20 * (seed % 4))
 
 
-@pytest.mark.parametrize("tight", ["0.01 rad/Nm", pytest.param("0.001 rad/Nm", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("tight", ["0.01 rad/Nm", "0.001 rad/Nm"])
 def test_cone_and_root_agree_under_priors_on_everything(lrm, tight):
     """So few records that priors hold much of it."""
     every = f'"arm.flex.*": {tight}, "arm.mdh.theta?": 0.5 deg, "arm.mdh.[bdt]*_?": 1 mm, "arm.mdh.d?": 1 mm'
