@@ -101,7 +101,7 @@ def rewritten(folder: Path, chance: random.Random) -> None:
     database.close()
 
 
-@pytest.mark.quick("seeds0-recalibrate")
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["recalibrate", "rollback"])
 @pytest.mark.parametrize("seeds", [range(8), *shares(8, 300, 3)])
 def test_what_says_something_else_ends_with_a_sentence(kept: Path, tmp_path: Path, command: str, seeds: range) -> None:

@@ -74,6 +74,7 @@ def test_its_headline_is_not_that_of_the_run_any_more(texts: dict[str, str], los
     assert found.level == "suspect" and found.verdict == calibration().record.verdict
 
 
+@pytest.mark.slow
 def test_a_server_answers_with_the_level_and_with_an_error_once_it_is_lost(
     texts: dict[str, str],
 ) -> None:

@@ -380,6 +380,7 @@ def test_python_gives_what_the_command_gives(recording: Path) -> None:
         pytest.param((*DRIFTING, "noise.loss=huber"), marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.slow
 def test_what_is_kept_predicts_as_the_fit_itself(extra: tuple[str, ...], tmp_path: Path) -> None:
     """Through the file: drift, estimated components, robust weights."""
     poses = tmp_path / "numbered.csv"
