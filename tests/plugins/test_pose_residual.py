@@ -143,7 +143,7 @@ def test_gains_by_chance_alone_are_seldom_harm():
 
 
 @pytest.mark.slow
-def test_metrics_say_where_it_acts_and_how_much():
+def test_the_report_says_where_it_acts_and_how_much():
     run = learned_run()
     calibration, commands = run.calibration, Experiment.load(run.folder / "run.yaml").read()
     arm = calibration.system.arms["arm"]
@@ -153,6 +153,8 @@ def test_metrics_say_where_it_acts_and_how_much():
     said = run.metrics["pose_residual"]["moves_tool_mm"]
     assert said["altogether"] == pytest.approx({"mean": moved.mean(), "max": moved.max()}, rel=1e-6)
     assert {"tool", "q1", "q2", "q3"} <= set(said)
+    page = (run.folder / "run/report.html").read_text()
+    assert "What was learned beside the model" in page and "How far the pose residual moves the tool" in page
 
 
 def test_a_calibration_predicts_what_the_run_found_and_compensates_to_the_same_arm():

@@ -53,6 +53,8 @@ from armcal.problem.records import (
     weighted,
 )
 
+__all__ = ["Compiled", "FactorRecords", "NormalEquations", "Problem", "triangular"]
+
 
 @dataclass(frozen=True)
 class NormalEquations:
@@ -218,9 +220,6 @@ class Blueprint:
     def bare(self) -> Self:
         """The same, its arms without what they keep of their expressions, which cannot be pickled."""
         return replace(self, arms={name: replace(arm) for name, arm in self.arms.items()})
-
-
-__all__ = ["Compiled", "FactorRecords", "NormalEquations", "Problem", "triangular"]
 
 
 @dataclass(frozen=True)
