@@ -63,6 +63,7 @@ class Compensator:
         self._allowed = (lambda q: allowed(q) & coupled(q)) if allowed and coupled else allowed or coupled
         self.limits = command_limits(expression, self.options.limits)
         self.reach: Reach = reach_of(expression.arm, parameters, self.limits, expression.tool_T_point)
+        self._point_T_tool = np.linalg.inv(evaluated(expression.tool_T_point.matrix()))
         self._equilibrium = Equilibrium(expression, choice)
         self._counts = ServoCounts(expression.joints, expression.servos) if expression.servos else None
         self._seeds = Seeds(expression, self._equilibrium, self.limits, SEEDS, self.options.seed)
@@ -213,10 +214,6 @@ class Compensator:
         record[: len(self.joints)] = self._set(joint_angles.T)
         return self._equilibrium(record)
 
-    def of_tool(self, poses: Array) -> Array:
-        """base_T_tool (N x 4 x 4) for poses of the point that is brought to targets (N x 4 x 4)."""
-        return np.asarray(poses @ np.linalg.inv(evaluated(self.expression.tool_T_point.matrix())))
-
     def _commanded(self, given: Array, count: int) -> Array:
         """One row for all, or a row for each, as the searches take it (n x N)."""
         numbers = np.asarray(given, dtype=float)
@@ -274,7 +271,7 @@ class Compensator:
             joints=self.joints,
             joint_angles=commands.T.copy(),
             counts=None if counts is None else counts.T.copy(),
-            base_T_tool=self.of_tool(poses),
+            base_T_tool=poses @ self._point_T_tool,
             base_T_point=poses,
             distances=np.linalg.norm(poses[:, :3, 3] - targets.positions, axis=1),
             turns=turns,
