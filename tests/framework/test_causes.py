@@ -11,11 +11,11 @@ import numpy as np
 import oracle
 import pytest
 from armcal.cli.main import cli
-from armcal.diagnose.dependences import predicted_positions
+from armcal.diagnose.causes import predicted_positions
+from armcal.diagnose.fit_rows import FitRows
 from armcal.diagnose.held import contradictions
 from armcal.diagnose.outliers import large_errors, suspicious_ids
 from armcal.diagnose.residual_structure import LEVEL, UNLISTED, neighbour_findings, structure, structure_findings
-from armcal.diagnose.score_tests import FitRows
 from armcal.diagnose.unseen import rounding, scale_deviation
 from armcal.diagnose.verdict import _in_short, suggestions
 from armcal.estimate.robust import fit
@@ -135,7 +135,7 @@ def smooth(lrm):
 @pytest.mark.slow
 def test_what_is_not_among_the_causes_is_not_given_the_name_of_one(smooth):
     found = smooth
-    assert graded(found, "smooth") != "wrong" and found.is_predictable
+    assert graded(found, "smooth") != "wrong" and found.predictable is not None
     assert "is not noise: other records predict it" in said(found)
 
 
@@ -144,19 +144,17 @@ def test_in_short_nothing_is_left_only_where_no_function_of_the_pose_is(smooth):
     found = smooth
     solved = {"verdict": SimpleNamespace(converged=True), "identifiability": SimpleNamespace(undetermined=())}
 
-    def short(predicted, times=1.0):
+    def short(rest, times=1.0):
         sure = SimpleNamespace(**solved, noise_scale=times, degrees_of_freedom=100)
-        left = replace(found, structures=(), lag_after_p=1.0, predictable=predicted)
+        left = replace(found, structures=(), predictable=rest)
         nothing = {contradictions: (), rounding: None, large_errors: None, suspicious_ids: [], suggestions: ()}
         return " ".join(_in_short(fit_that_found(sure, {structure: left, **nothing}, unit="mm"), ""))
 
-    assert "is not noise: other records predict it" in short(found.predictable)
-    assert "nothing" not in short(found.predictable) and "nothing" not in short(None)
-    chance = replace(found.predictable, p_value=0.5)
-    assert "nothing that was recorded predicts them" in short(chance)
-    assert "look like noise" not in short(chance, 37.0) and "yet they are 37.0 times the declared" in short(
-        chance, 37.0
+    assert "is not noise: other records predict it" in short(found.predictable) and "nothing" not in short(
+        found.predictable
     )
+    assert "nothing that was recorded predicts them" in short(None)
+    assert "look like noise" not in short(None, 37.0) and "yet they are 37.0 times the declared" in short(None, 37.0)
 
 
 @pytest.mark.slow
@@ -250,11 +248,12 @@ def test_late_joints_are_named_by_the_command_from_columns_of_their_rates(tmp_pa
 def test_time_is_blamed_only_where_poses_do_not_follow_it(lrm, name, in_order, cause):
     found = found_in(lrm, name, 0, in_order)
     assert found.lag_p <= LEVEL
-    assert found.alike is not None and found.alike.cause == cause
-    finding = neighbour_findings(found, SimpleNamespace(widened=()))[0]
+    assert found.predictable is not None and found.predictable.cause == cause
+    finding = next(f for f in structure_findings(found) if "time" in f.text and "pose predicts" in f.text)
     assert ("It goes with time" in finding.text) == (cause == "time")
     assert ("Let the base drift" in finding.action) == (cause == "time")
-    assert ("is the cause is not known" in finding.text) == (cause == "open")
+    assert ("do not show whether the pose or time is the cause" in finding.text) == (cause == "open")
+    assert neighbour_findings(found, SimpleNamespace(widened=()))[0].grade == "note"
 
 
 @pytest.mark.slow
@@ -270,9 +269,9 @@ def test_causes_are_named_wrong_at_most_once_in_twenty(lrm, name):
 @pytest.mark.parametrize("name", ["smooth", "slow joints"])
 def test_a_function_of_the_pose_in_nested_order_is_not_called_time(lrm, name):
     found = [found_in(lrm, name, seed, in_order=True) for seed in range(20)]
-    print(name, [one.alike.cause if one.alike else "-" for one in found])
+    print(name, [one.predictable.cause if one.predictable else "-" for one in found])
     blamed = [
-        (one.alike is not None and one.alike.cause == "time")
+        (one.predictable is not None and one.predictable.cause == "time")
         or any(s.kind in ("order", "step", "slip") and not s.alternatives for s in one.worthwhile)
         for one in found
     ]

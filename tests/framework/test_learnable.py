@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from armcal.diagnose.predictable import Carrier, Predictable
-from armcal.diagnose.residual_structure import _remedies
+from armcal.diagnose.residual_structure import Carrier, Predicted, _remedies
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
@@ -19,8 +18,8 @@ CANNOT = "A pose residual cannot learn it from these records"
 
 @pytest.mark.parametrize(("learnable", "said"), [(True, "Learn it: "), (False, CANNOT), (None, "Free what ")])
 def test_what_is_advised_is_possible(learnable: bool | None, said: str) -> None:
-    predicted = Predictable(0.71, 0.05, 0.01, (Carrier("joint", "q2", 0.7),), 100, 100, 0.1, learnable)
-    advice = list(_remedies(predicted))
+    rest = Predicted(0.71, 0.05, 40.0, 0.0, 0.0, 0.0, (Carrier("joint", "the angle of q2", 0.7),))
+    advice = list(_remedies(rest, learnable))
     assert advice[0].startswith(said) and any(text.startswith("Learn it") for text in advice) == (learnable is True)
 
 

@@ -14,14 +14,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import betainc
 
 from armcal.arm.assembly import command_channels
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.units import readable
+from armcal.diagnose.causes import MOST_LEVELS
 from armcal.diagnose.checks import Finding
-from armcal.diagnose.dependences import MOST_LEVELS
 from armcal.diagnose.fit import Fit
 from armcal.estimate.estimator import Estimator
 from armcal.estimate.prediction import (
@@ -43,7 +43,7 @@ from armcal.problem.problem import Problem
 
 Residuals = tuple[Array, ...]  # Raw residuals, one (n_r x N) a factor
 FEWEST = 40  # Judged records for a stretch to be found
-LEVEL = 0.05
+LEVEL = 0.005
 _MM = 1000.0
 _MEANT = {"same": "", "new": " without the known drift, as in a new recording,"}
 
@@ -221,14 +221,15 @@ def coverage(scores: Scores, stretches: Sequence[Stretch | None] | None = None) 
 
 def coverage_finding(shares: Coverage, of: str, recording: Recording = "same") -> Finding:
     share, raw = shares.stated[LEVELS.index(STATED)], shares.raw[LEVELS.index(STATED)]
-    error = np.sqrt(STATED * (1 - STATED) / shares.independent)
-    off = abs(share - STATED) > ndtri(1 - LEVEL / 2) * error
+    within, beyond = share * shares.independent, (1 - share) * shares.independent
+    few, many = betainc(max(beyond, 1e-9), within + 1, 1 - STATED), betainc(max(within, 1e-9), beyond + 1, STATED)
+    off = min(few, many) < LEVEL / 2
     before = f"; {100 * raw:.1f} % before they were stretched" if shares.stretched else ""
     text = (
         f"90 % prediction intervals{_MEANT[recording]} cover {100 * share:.1f} % of {shares.coordinates} coordinates "
         f"of {of}{before}"
     )
-    test = f"two-sided, 5 %, as of {shares.independent:.0f} independent numbers"
+    test = f"binomial, two-sided, {100 * LEVEL:g} %, as of {shares.independent:.0f} independent numbers"
     if not off:
         return Finding("good", f"{text}.", test)
     if share > STATED:

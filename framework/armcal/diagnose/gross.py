@@ -212,18 +212,17 @@ def gross(fit: Fit) -> list[Finding]:
     if share > OF_REACH:
         test = f"mean, limit {100 * OF_REACH:g} % of {whole:.0f} {unit}"
         return [Finding("bad", f"{error}: the values do not describe this arm.", test, _LOOK)]
-    predicted = left.predictable if left is not None and left.is_predictable else None
-    if left is None or predicted is None or predicted.share < EXPLAINED:
+    if left is None or left.share < EXPLAINED:
         return []
     explained = max((_share(s, left) for s in left.worthwhile if s.kind not in _NO_EXCUSE), default=0.0)
     limit = EXPLAINED_OF_REACH if explained >= EXPLAINED else PREDICTED_OF_REACH
     if share <= limit:
         return []
-    text = f"{error}, and other records predict {100 * predicted.share:.0f} % of its variance: the model misses it."
+    text = f"{error}, and {100 * left.share:.0f} % of its variance is not noise: the model misses it."
     test = (
         f"limits {100 * limit:g} % and {100 * EXPLAINED:.0f} %; one cause explains {100 * explained:.0f} % of the error"
     )
-    by_time = not predicted.is_in_order and [carrier.kind for carrier in predicted.carriers[:1]] == ["time"]
+    by_time = left.predictable is not None and left.predictable.cause == "time"
     return [Finding("bad", text, test, _MOVED if by_time else _LOOK)]
 
 
@@ -233,8 +232,7 @@ def jumped(fit: Fit) -> list[Finding]:
     Of what depends on time the jump is the largest: a drift has a remedy of its own.
     """
     left = fit.of(structure)
-    predicted = None if left is None or not left.is_predictable else left.predictable
-    if left is None or predicted is None or predicted.is_in_order:
+    if left is None or left.in_order:
         return []
     over_time = [s for s in left.worthwhile if s.kind in _OVER_TIME]
     most = max(over_time, key=lambda s: s.falls_mm, default=None)

@@ -14,7 +14,7 @@ from scipy.special import stdtr
 from armcal.base.arrays import Array
 from armcal.diagnose.checks import Finding
 from armcal.diagnose.fit import Fit, thinned
-from armcal.diagnose.score_tests import FitRows, unbiased_roots
+from armcal.diagnose.fit_rows import FitRows, unbiased_roots
 from armcal.estimate.identifiability import Measure
 from armcal.measure.measurement import HasScale, Mistake, NamesMistakes
 from armcal.problem.problem import Problem

@@ -15,7 +15,7 @@ from armcal.base.arrays import Array, Indices
 from armcal.base.units import digits, display_unit, readable, to_unit
 from armcal.diagnose.checks import Finding, first_few
 from armcal.diagnose.fit import Fit, thinned
-from armcal.diagnose.score_tests import FitRows, sampled_rows
+from armcal.diagnose.fit_rows import FitRows, sampled_rows
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.robust import WeighedFit
 from armcal.estimate.validation import error_dimension

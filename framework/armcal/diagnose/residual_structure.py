@@ -1,17 +1,15 @@
-"""What structure is left in the residuals of a calibration, how much of the error it is, and what would show it.
+"""What is left in the residuals of a calibration: one procedure, with one level for all that is tried.
 
-Dependences are tested all at once (family-wise 5 %). The one that explains most for its size [Schwarz1978] is taken
-into the model, to first order, and the others are tested again on what is left: so each is named for what the ones
-before it do not explain. Residuals are those of training, less the drift that was found; what the parameters can take
-up, each dependence is freed of first. Of those that were found, each is then set against all the others and against
-what is not among them: it is named alone only where it is clearly the likeliest.
+Residuals of a fit are noise less what the fit took up. Everything that may be in them is tried at once: causes, sets of
+columns, by score tests [Rao1948] with a covariance from blocks of neighbouring records [Liang1986]; smooth functions of
+the pose, and of time, by their odds [Rasmussen2006]; likeness of neighbours; what the scatter may depend on, by
+regression of squares [Koenker1981]. The residuals themselves with random signs, one a pose, and squares in random order
+say what chance does [Liu1988], and the smallest of all p-values keeps the level [Westfall1993]: neither uneven noise
+nor wild records pass for structure.
 
-Which of several causes residuals speak for: odds among all that were tried, and something that was not.
-
-A cause is a set of columns; the logarithm of its odds against noise is that of the Schwarz criterion [Schwarz1978]. A
-smooth function of the pose, or of time, stands for what is not among the causes, with the odds of its marginal
-likelihood, and is as likely as a cause that leaves more than the declared noise. Several causes at once are judged one
-by one, each in the presence of the others.
+The cause that explains most for its size [Schwarz1978] is taken into the model, and everything is tried again on what
+is left. Each that was found is then set against all others, against a smooth function of pose or time, which stands for
+what is not among them, and against chance, by the odds: it is named alone only where it is clearly the likeliest.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,52 +17,49 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtrc, chdtri, fdtrc
 
 from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.units import SMALLEST_SHOWN, digits, readable
-from armcal.diagnose.checks import Finding, Grade
-from armcal.diagnose.dependences import (
-    TIMES_REPEATS,
-    Dependence,
-    NoiseTrend,
-    Records,
-    Repeats,
-    dependences,
-    noise_trend,
-    outside,
-    predicted_positions,
-    repeats_of,
-)
+from armcal.diagnose.causes import Cause, Records, causes_of, predicted_positions, scatter_features
+from armcal.diagnose.checks import Finding
 from armcal.diagnose.fit import Fit
+from armcal.diagnose.fit_rows import SMALLEST, FitRows, basis_of, lag_one, own_basis
 from armcal.diagnose.held import moves_of, with_contradicted
-from armcal.diagnose.predictable import (
-    CLEAR,
-    FEWEST_POSES,
-    IMITATED,
-    MOST_OF_MEDIAN,
-    Kernels,
-    Predictable,
-    TimeOrPose,
-    left_out,
-    pose_kernels,
-    predictable,
-    smooth,
-    time_kernels,
-)
-from armcal.diagnose.predictable import LEVEL as PREDICTED_LEVEL
-from armcal.diagnose.score_tests import FamilyTest, FitRows, LinearFit, family_test, linear_fit, own_basis
+from armcal.diagnose.smooth import WILD, Functions, Recorded, Smooth
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import Measure, candidates
 from armcal.estimate.uncertainty import automatic_block_length
-from armcal.measure.groups import pose_numbers
+from armcal.measure.groups import PairedMeasurement, pose_numbers
 from armcal.problem.problem import Problem
 
+LEVEL = 0.01
+"""Of everything that is tried together: so often something is said of sound data."""
+CLEAR = 3.0  # Logarithm of the odds, 20 to 1, from which on one explanation is preferred
+FEWEST_RECORDS = 30
+FEWEST_POSES = 40  # Distinct poses below which nothing is said of functions of the pose
+MOST_RECORDS = 1000
+WORTHWHILE = 0.01
+DRAWS, FEWER_DRAWS = 999, 299
+"""Of chance: for the test that decides whether anything is named; in those after it, and where they show enough."""
 UNLISTED = "something that is none of these"
-CHANCE = "nothing: it may be chance"
-NOISE_LEVEL = 0.05
-NEGLIGIBLE = 0.1  # Of what causes take up: less than this may be what is not linear in them
 CHANGING = "something that changes with time and is none of these"
+CHANCE = "nothing: it may be chance"
+_OUT_OF_QUESTION = 0.1  # A p-value by the fewer draws that all of them would hardly bring to the level
+_MOST_CAUSES, _MOST_CARRIERS = 5, 3
+_MOST_BLOCKS, _FEWEST_BLOCKS, _FEWEST_SPARE_BLOCKS = 60, 30, 8
+_COLUMNS_AT_ONCE = 12  # Their products with the draws, block by block, stay in a processor's cache
+_FOLDS = 5
+_SAME = 0.999  # Cosine from which on two causes are one
+_IMITATED = 0.1  # An explanation of which another predicts this share cannot be distinguished from it
+_IN_ORDER = 0.5  # Share of the order of records from which on poses tell the time
+_NEGLIGIBLE = 0.1  # Of what causes take up: less than this may be what is not linear in them
+_NEXT_CARRIER = 0.1  # Of the whole share: what predicts less beside the ones before it is not named
+_BEYOND = 0.05  # Level at which what a cause leaves is more than noise
+_LIKELIER = 0.5  # Where chance has more of the odds, a cause is none
+_LACK, _TIMES_REPEATS, _FEWEST_REPEATS = 0.01, 3.0, 5
+_LEAST_LEFT = 0.05  # Of a row, of what a fit takes up most
+_MM = 1000.0
 
 
 @dataclass(frozen=True)
@@ -75,111 +70,15 @@ class Odds:
 
 
 @dataclass(frozen=True)
-class Contest:
-    """All causes for the residuals of a fit.
-
-    Attributes:
-        pose, time: correlations of the records.
-    """
-
-    causes: Sequence[Dependence]  # that were tried
-    columns: Sequence[Array]  # of each (rows x k)
-    residual: Array  # of the fit (rows)
-    basis: Array  # of what the fit takes up (rows x n), orthonormal
-    by_record: Indices  # the data's rows as (records x rows a record), in recorded order
-    fold: Indices  # of each row, which part of the recording judges it
-    pose: Kernels
-    time: Kernels
-
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """What stands for one cause: a jump is one wherever it is, a drift of the whole any function of time."""
-        names = []
-        for cause in self.causes:
-            once = f"{cause.kind} {cause.subject}" if cause.jumps else cause.words
-            names.append(CHANGING if cause.kind == "order" and not cause.subject else once)
-        return tuple(names)
-
-    def beside(self, others: Sequence[int]) -> tuple[Array, Array]:
-        basis = self.basis
-        for other in others:
-            basis = np.hstack([basis, own_basis(self.columns[other], basis)[0]])
-        added = basis[:, self.basis.shape[1] :]
-        return self.residual - added @ (added.T @ self.residual), basis
-
-    def time_imitated(self) -> float:
-        over_time = smooth(self.residual, self.basis, self.by_record, self.time).function
-        return self.pose.imitate(over_time[self.by_record])
-
-    def likeliest(self, others: Sequence[int], independence: float) -> int:
-        return int(np.argmax(self._gains(*self.beside(others), others, independence)))
-
-    def odds(self, cause: int, others: Sequence[int], independence: float) -> Odds:
-        """Of a cause beside others in the model; ``independence`` is how much of a record each record is worth."""
-        residual, basis = self.beside(others)
-        gains = self._gains(residual, basis, others, independence)
-        shown = dict.fromkeys(self.names, -np.inf)
-        for name, gain in zip(self.names, gains, strict=True):
-            shown[name] = float(np.logaddexp(shown[name], gain - np.log(self.names.count(name))))
-        mine = self.names[cause]
-        for words, kernels in ((UNLISTED, self.pose), (CHANGING, self.time)):
-            evidence = independence * smooth(residual, basis, self.by_record, kernels).evidence
-            shown[words] = max(shown.get(words, -np.inf), evidence)
-        # What is none of the causes cannot be excluded where what is left is far from noise or follows the pose, or
-        # poses were in order.
-        after, whole = self.beside([*others, cause])
-        beyond = float(after @ after) - chdtri(len(after) - whole.shape[1], NOISE_LEVEL)
-        left = beyond > NEGLIGIBLE * float(residual @ residual - after @ after)
-        left = left or smooth(after, whole, self.by_record, self.pose).evidence * independence > CLEAR
-        timely = self.causes[cause].jumps or self.causes[cause].kind == "order"
-        if left or (timely and self.pose.imitate((residual - after)[self.by_record]) > IMITATED):
-            shown[UNLISTED] = max(shown[UNLISTED], shown[mine])
-        shown[CHANCE] = float(np.log(len(self.causes)))  # nothing is as likely beforehand as all causes together
-        total = float(np.logaddexp.reduce(list(shown.values())))
-        close = [name for name, gain in shown.items() if gain > shown[mine] - CLEAR and name != mine]
-        of_name = dict(zip(reversed(self.names), [c.words for c in reversed(self.causes)], strict=True))
-        alternatives = tuple(of_name.get(name, name) for name in sorted(close, key=lambda name: -shown[name]))
-        return Odds(float(np.exp(shown[mine] - total)), alternatives, float(np.exp(shown[CHANCE] - total)))
-
-    def _gains(self, residual: Array, basis: Array, others: Sequence[int], independence: float) -> Array:
-        total, freedom = max(float(residual @ residual), 1e-300), len(residual) - basis.shape[1]
-        gains = np.full(len(self.causes), -np.inf)
-        for i in set(range(len(self.causes))) - set(others):
-            own = own_basis(self.columns[i], basis)[0]
-            if own.shape[1]:
-                left = max(1 - float(np.sum((own.T @ residual) ** 2)) / total, 1e-12)
-                gains[i] = -0.5 * independence * freedom * np.log(left)
-                gains[i] -= 0.5 * own.shape[1] * np.log(max(freedom * independence, 2.0))
-        return gains
-
-
-LEVEL = 0.05
-MOST_FOUND = 5
-WORTHWHILE = 0.01
-MOST_RECORDS = 1000
-FEWEST_RECORDS = 30
-_MOST_BLOCKS, _FEWEST_BLOCKS = 60, 30
-_FOLDS = 5
-_MM = 1000.0
-_SAME = 0.999  # Cosine from which on two causes are one
-_IN_ORDER = 0.5  # share of the order of records from which on poses tell the time
-_LIKELIER = 0.5  # Where chance has more of the odds, a cause is none
-
-
-@dataclass(frozen=True)
 class Structure:
-    """A dependence that was found.
-
-    Attributes:
-        kind, subject, words, effect, measure: as in ``Dependence``.
-    """
+    """A cause that was found; kind, subject, words, effect and measure as in ``Cause``."""
 
     kind: str
     subject: str
     words: str
     effect: str
     measure: str
-    p_value: float  # that the residuals do not depend on it, family-wise
+    p_value: float  # that the residuals do not depend on it, over everything that was tried
     share: float  # of the squared residuals left by the ones before it
     falls_mm: float  # by how much the mean error would fall if it were modelled, judged on records left out
     size: str  # how large it is, in words; empty if its coefficients have no unit
@@ -188,42 +87,121 @@ class Structure:
 
 
 @dataclass(frozen=True)
+class Carrier:
+    kind: str  # ``joint``, ``time``, ``payload``, ``approach`` or ``temperature``
+    words: str
+    share: float  # of the squared residuals, beside the carriers before it
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """What records predict of the residuals of other poses, by smooth functions of the pose and of time.
+
+    Attributes:
+        pose, time: logarithms of their odds against noise alone.
+        time_imitated, pose_imitated: which share of the one's function the other predicts, or of the records' order.
+    """
+
+    by_pose: float  # share of the squared residuals, of records left out
+    by_time: float
+    pose: float
+    time: float
+    time_imitated: float
+    pose_imitated: float
+    carriers: tuple[Carrier, ...] = ()  # the most important first
+
+    @property
+    def share(self) -> float:
+        return max(self.by_pose, self.by_time, 0.0)
+
+    @property
+    def cause(self) -> str:
+        """``time`` or ``pose`` where that wins by odds, by records left out, and is not imitated; else ``open``."""
+        if self.time - max(self.pose, 0.0) > CLEAR and self.by_time > self.by_pose and self.time_imitated < _IMITATED:
+            return "time"
+        if self.pose - max(self.time, 0.0) > CLEAR and self.by_pose > self.by_time and self.pose_imitated < _IMITATED:
+            return "pose"
+        return "open"
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """What the scatter of residuals depends on.
+
+    Attributes:
+        low, high: scatter in units of the declared noise, in the third of the records with the least and most of it.
+    """
+
+    words: str  # as the end of a sentence
+    p_value: float  # that it does not, over everything that was tried
+    low: float
+    high: float
+    alternatives: tuple[str, ...]  # what else may be meant, the most likely first
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """What records of one pose say of noise."""
+
+    scatter_mm: float  # of a record about the mean of its pose (root mean square)
+    left_mm: float  # of all residuals (root mean square)
+    records: int  # that are repeats
+    poses: int  # that were repeated
+    p_value: float  # that residuals are as repeats have them
+
+    @property
+    def exceeded(self) -> bool:
+        """At 1 %; and three times, as no model is perfect."""
+        return self.p_value < _LACK and self.left_mm > _TIMES_REPEATS * self.scatter_mm
+
+
+@dataclass(frozen=True)
 class ResidualStructure:
     """What the residuals of a fit still depend on.
 
     Attributes:
-        lag_after, lag_after_p: the same once the structures found are modelled.
-        predictable: what other records predict of them, whatever the cause; None where poses are too few.
+        share: of the squared residuals, what is not noise: causes take it up, or other records predict it.
+        predictable: what other records predict beside the causes; None where that is no more than chance does.
+        in_order: whether a function of time could be one of the pose, as poses were visited in an order.
     """
 
     structures: tuple[Structure, ...]  # in the order in which they were taken into the model
     more: bool  # whether something was significant still when the search ended
+    share: float
+    predictable: Predicted | None
+    in_order: bool
     lag_one: float  # correlation of neighbouring residuals, less what the fit itself makes of it
-    lag_p: float  # its p-value, in the same family
-    lag_after: float
+    lag_p: float  # its p-value, over everything that was tried
+    lag_after: float  # the same once the causes are in the model
     lag_after_p: float
-    alike: TimeOrPose | None  # why neighbours resemble each other even then; None if they do not
-    predictable: Predictable | None
-    noise: NoiseTrend | None  # what their scatter depends on; None if on nothing
+    learnable: bool | None  # whether a pose residual can learn from what is measured; None where the model has one
+    noise: Scatter | None  # what it depends on; None if on nothing
     repeats: Repeats | None  # what records of one pose say of noise; None where too few are
     mean_mm: float  # mean residual of the training records
-    tested: int  # how many dependences were tested
-    records: int  # how many records were looked at
+    tested: int  # how much was tried
+    records: int  # how many were looked at
+    poses: int  # how many of them are distinct
     block: int  # how many neighbours count as one observation
-    level: float = LEVEL  # family-wise
-
-    @property
-    def is_predictable(self) -> bool:
-        return self.predictable is not None and self.predictable.above_chance
+    level: float = LEVEL
 
     @property
     def worthwhile(self) -> tuple[Structure, ...]:
         least = max(WORTHWHILE * self.mean_mm, SMALLEST_SHOWN)
         return tuple(s for s in self.structures if s.falls_mm >= least)
 
+    @property
+    def shows(self) -> bool:
+        """Whether residuals are more than noise."""
+        return bool(self.structures) or self.predictable is not None
+
+    @property
+    def falls(self) -> float:
+        """By which share the root mean square residual would fall without what is not noise."""
+        return 1 - float(np.sqrt(max(0.0, 1 - self.share)))
+
 
 def structure(fit: Fit) -> ResidualStructure | None:
-    """Test the residuals of a fit to records, with the weights they had; None where there are too few to judge."""
+    """Try the residuals of a fit to records, with the weights they had; None where there are too few to judge."""
     if not fit.converged:
         return None
     problem, estimate = with_contradicted(fit, fit.few_acting), fit.estimate
@@ -234,31 +212,21 @@ def structure(fit: Fit) -> ResidualStructure | None:
         return None
     problem, dataset, position = problem.subset(chosen), dataset.subset(chosen), position[chosen]
     rows, read = FitRows.of(problem, estimate), predicted_positions(problem, estimate.values, dataset)
-    linear, basis, block = _fit_of(rows, len(dataset), np.diff(position) == 1)
-    motion = fit.motion.subset(fit.split.train[chosen])
-    place = next((own for own in read if len(own)), np.zeros((0, len(dataset))))
+    here = Records(dataset, fit.motion.subset(fit.split.train[chosen]))
     moves = moves_of(problem, estimate.values, candidates(problem.parameters))
-    causes = [*dependences(problem, motion, dataset, moves), *outside(problem, motion, dataset, read, moves)]
+    causes = list(causes_of(problem, here, read, moves))
     causes, columns = _named_once(problem, causes, [rows.columns(one.columns) for one in causes])
-    kernels = pose_kernels(problem, dataset), time_kernels(len(dataset))
+    place = next((own for own in read if len(own)), np.zeros((0, len(dataset))))
     contest = Contest(
-        causes, columns, linear.residual, basis, rows.by_record, linear.block * _FOLDS // linear.blocks, *kernels
+        rows,
+        Recorded.of(problem, rows, here.motion, dataset),
+        causes,
+        columns,
+        [(words, f) for words, f in scatter_features(here, place) if np.ptp(f) > 1e-9 * max(1.0, np.abs(f).max())],
+        pose_numbers(dataset, here.motion.channels),
+        np.diff(position) == 1,
     )
-    structures, first, last = _search(rows, linear, contest, _modelled(fit))
-    residual, whole = contest.beside(tuple(structures))
-    predicted = predictable(problem, rows, basis, motion, dataset)
-    lags = first.lag_one, first.lag_adjusted, last.lag_one, last.lag_adjusted
-    return ResidualStructure(
-        tuple(structures.values()),
-        bool(np.any(last.adjusted <= LEVEL)),
-        *lags,
-        _alike(residual, whole, rows, contest) if last.lag_adjusted <= LEVEL else None,
-        predicted and replace(predicted, imitated=contest.time_imitated()),
-        noise_trend(residual, whole, rows.by_record, Records(dataset, motion), place),
-        repeats_of(linear.residual, basis, rows, pose_numbers(dataset, motion.channels), contest.pose),
-        rows.mean_error(linear.residual) * _MM,
-        *(len(first.adjusted), len(dataset), block),
-    )
+    return contest.outcome(_modelled(fit), _is_learnable(problem))
 
 
 def _modelled(fit: Fit) -> frozenset[str]:
@@ -267,9 +235,15 @@ def _modelled(fit: Fit) -> frozenset[str]:
     return frozenset(str(effect.get("type")) for effect in effects)
 
 
-def _named_once(
-    problem: Problem, causes: Sequence[Dependence], columns: Sequence[Array]
-) -> tuple[list[Dependence], list[Array]]:
+def _is_learnable(problem: Problem) -> bool | None:
+    plan = problem.blueprint
+    if any(arm.residual for arm in plan.arms.values()):
+        return None
+    paired = any(isinstance(measurement, PairedMeasurement) for measurement in plan.measurements.values())
+    return not paired and all(kernel.factor.output_channels for kernel in problem.kernels)
+
+
+def _named_once(problem: Problem, causes: Sequence[Cause], columns: Sequence[Array]) -> tuple[list[Cause], list[Array]]:
     """Without what a held parameter of a joint's effect does as well, a spring's or a gear's: that one is named."""
     effects = {f"{name}.{effect}" for name, arm in problem.blueprint.arms.items() for effect in arm.effects}
     unit = [column / max(float(np.linalg.norm(column)), 1e-300) for column in columns]
@@ -282,17 +256,6 @@ def _named_once(
     return [causes[i] for i in kept], [columns[i] for i in kept]
 
 
-def _alike(residual: Array, basis: Array, rows: FitRows, contest: Contest) -> TimeOrPose:
-    time, pose = (smooth(residual, basis, rows.by_record, k) for k in (contest.time, contest.pose))
-    left = (left_out(one, residual, basis, rows.by_record) for one in (time, pose))
-    time_mm, pose_mm = (rows.mean_error(one) * _MM for one in left)
-    by_time, by_pose = (one.function[rows.by_record] for one in (time, pose))
-    imitated, order = contest.pose.imitate(by_time), np.arange(len(by_time), dtype=float)[:, None]
-    if imitated < IMITATED and (of_order := contest.pose.imitate(order)) > _IN_ORDER:
-        imitated = of_order
-    return TimeOrPose(time.evidence, pose.evidence, time_mm, pose_mm, imitated, contest.time.imitate(by_pose))
-
-
 def _looked_at(candidates: Indices, position: Indices) -> Indices:
     order = candidates[np.argsort(position[candidates], kind="stable")]
     if len(order) <= MOST_RECORDS:
@@ -302,108 +265,389 @@ def _looked_at(candidates: Indices, position: Indices) -> Indices:
     return np.concatenate([run[:most] for run in runs])
 
 
-def _fit_of(rows: FitRows, count: int, consecutive: Mask) -> tuple[LinearFit, Array, int]:
-    """The linear fit, an orthonormal basis of its slopes, and how many records a block has.
+@dataclass(frozen=True)
+class Tried:
+    """Everything that was tried on a residual, with p-values over all of it."""
 
-    Blocks are as long as errors resemble their neighbours', and neither too many nor too few. The rows of priors and
-    drifts are dealt out to them in turn.
-    """
-    length = min(automatic_block_length(rows.residual[rows.by_record].T), max(1, count // _FEWEST_BLOCKS))
-    length = max(length, -(-count // _MOST_BLOCKS))
-    block = np.arange(count) // length
-    extra = np.arange(len(rows.residual) - len(rows.record_of)) % (block.max() + 1)
-    row_block = np.concatenate([block[rows.record_of], extra]).astype(np.intp)
-    fit, basis = linear_fit(rows.slopes, rows.residual, row_block, rows.by_record, consecutive)
-    return fit, basis, int(np.bincount(block).max())
+    left: Sequence[tuple[int, Array]]  # causes that are not in the model, each with its basis
+    shares: Array  # of the squared residual, how much each of them would take up
+    p_values: Array  # of each of them
+    lag: float  # correlation of neighbours, less what the fit makes of it
+    lag_p: float
+    smooth_p: float  # the smaller one of the functions of pose and of time
+    scatter_p: Array  # of each thing on which the scatter may depend
 
-
-def _search(
-    rows: FitRows, fit: LinearFit, contest: Contest, modelled: frozenset[str]
-) -> tuple[dict[int, Structure], FamilyTest, FamilyTest]:
-    """Causes one after another as long as one is significant, then each set against all others and chance.
-
-    Also the test of the family before any cause was in the model, and that of what is left.
-    """
-    left = [
-        (i, own) for i, column in enumerate(contest.columns) if (own := own_basis(column, contest.basis)[0]).shape[1]
-    ]
-    first = test = family_test(fit, [own for _, own in left])
-    chosen, p_values, whole = list[int](), list[float](), float(fit.residual @ fit.residual)
-    while len(chosen) < MOST_FOUND:
-        now, significant = float(fit.residual @ fit.residual), np.flatnonzero(test.adjusted <= LEVEL)
-        if not len(significant):
-            break
-        # The least Bayesian information criterion, blocks counting as one.
-        sizes = np.array([own.shape[1] for _, own in left])[significant]
-        count = fit.blocks * fit.records.shape[1]
-        unexplained = np.maximum(1 - test.share[significant], 1e-12)
-        best = int(significant[np.argmin(count * np.log(unexplained) + sizes * np.log(count))])
-        if test.share[best] * now < NEGLIGIBLE * (whole - now):
-            break
-        chosen.append(left[best][0])
-        p_values.append(float(test.adjusted[best]))
-        fit = fit.with_fewer_draws().without(left[best][1])
-        basis = contest.beside(chosen)[1]
-        left = [(i, own) for i, _ in left if (own := own_basis(contest.columns[i], basis)[0]).shape[1]]
-        test = family_test(fit, [own for _, own in left])
-    worth = (1 - max(test.lag_one, 0.0)) / (1 + max(test.lag_one, 0.0))
-    settled = _settled(contest, dict(zip(chosen, p_values, strict=True)), worth)
-    structures = {
-        i: _structure(rows, contest, i, [j for j in settled if j != i], modelled, p, odds)
-        for i, (p, odds) in settled.items()
-    }
-    return structures, first, test
+    @property
+    def least(self) -> float:
+        p_values = np.concatenate([self.p_values, self.scatter_p, [self.lag_p, self.smooth_p]])
+        return float(p_values.min())
 
 
-def _settled(contest: Contest, falls: Mapping[int, float], worth: float) -> dict[int, tuple[float, Odds]]:
-    """Causes with p-values and odds, each beside the others: the likeliest in its place, none that chance beats.
+@dataclass(frozen=True)
+class Contest:
+    """Everything that may explain the residuals of a fit."""
 
-    Something is significant in one of twenty recordings of nothing but noise; odds say which of them are chance.
-    """
-    settled, p_values = list(falls), list(falls.values())
-    for _ in range(len(settled)):
-        before = list(settled)
-        for place in range(len(settled)):
-            others = settled[:place] + settled[place + 1 :]
-            settled[place] = contest.likeliest(others, worth)
-        if settled == before:
-            break
-    odds = [contest.odds(cause, [o for o in settled if o != cause], worth) for cause in settled]
-    whole = {i: (p, odd) for i, p, odd in zip(settled, p_values, odds, strict=True)}
-    least = max(whole, key=lambda i: whole[i][1].chance, default=None)
-    if least is None or whole[least][1].chance <= _LIKELIER:
-        return whole
-    return _settled(contest, {i: p for i, (p, _) in whole.items() if i != least}, worth)
+    rows: FitRows
+    recorded: Recorded
+    causes: Sequence[Cause]
+    columns: Sequence[Array]  # of each (rows x k)
+    scatters: Sequence[tuple[str, Array]]  # on which the scatter may depend (N each)
+    pose: Indices  # of each record the number of its pose (N)
+    neighbours: Mask  # whether each record but the last is followed by its neighbour in the recording (N - 1)
+
+    @cached_property
+    def basis(self) -> Array:
+        """Of what the fit takes up (rows x n), orthonormal."""
+        return basis_of(self.rows.slopes)
+
+    @cached_property
+    def residual(self) -> Array:
+        """At the last linear step of the fit (rows)."""
+        return self.rows.residual - self.basis @ (self.basis.T @ self.rows.residual)
+
+    @cached_property
+    def block(self) -> Indices:
+        """The block of each row: as long as errors resemble their neighbours', and neither too many nor too few.
+
+        The rows of priors and drifts are dealt out to them in turn.
+        """
+        count, data = len(self.rows.by_record), len(self.rows.record_of)
+        length = automatic_block_length(self.rows.residual[self.rows.by_record].T)
+        length = max(min(length, max(1, count // _FEWEST_BLOCKS)), -(-count // _MOST_BLOCKS))
+        block = np.arange(count) // length
+        extra = np.arange(len(self.residual) - data) % (block.max() + 1)
+        return np.concatenate([block[self.rows.record_of], extra]).astype(np.intp)
+
+    @property
+    def blocks(self) -> int:
+        return int(self.block.max()) + 1
+
+    @cached_property
+    def groups(self) -> list[Indices]:
+        """The data's rows of each pose."""
+        return [self.rows.by_record[self.pose == number].ravel() for number in range(int(self.pose.max()) + 1)]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """What stands for one cause: a jump is one wherever it is, a drift of the whole any function of time."""
+        names = []
+        for cause in self.causes:
+            once = f"{cause.kind} {cause.subject}" if cause.jumps else cause.words
+            names.append(CHANGING if cause.kind == "order" and not cause.subject else once)
+        return tuple(names)
+
+    def outcome(self, modelled: frozenset[str], learnable: bool | None) -> ResidualStructure:
+        chosen, first, last = self._search()
+        worth = (1 - max(last.lag, 0.0)) / (1 + max(last.lag, 0.0))
+        settled = self._settled(chosen, worth)
+        structures = {i: self._structure(i, [j for j in settled if j != i], modelled, *of) for i, of in settled.items()}
+        residual, basis = self.beside(list(structures))
+        rest = self._predicted(residual, basis) if min(last.lag_p, last.smooth_p) <= LEVEL else None
+        share, in_order = 1 - float(residual @ residual) / max(float(self.residual @ self.residual), SMALLEST), False
+        if rest is not None:
+            rest = replace(rest, carriers=tuple(self._carriers(residual, basis, rest)))
+            share = 1 - (1 - share) * (1 - rest.share)
+        if structures or rest is not None:
+            whole = self._predicted(self.residual, self.basis)
+            in_order = whole.by_time > share / 2 and whole.time_imitated > _IMITATED
+        if rest is not None and learnable and self.rows.by_record.shape[1] < 3:  # what does not place the tool
+            learnable = self._share_of(self.recorded.of_joints, residual, basis) > rest.share / 2
+        return ResidualStructure(
+            structures=tuple(structures.values()),
+            more=bool(np.any(last.p_values <= LEVEL)),
+            share=share,
+            predictable=rest,
+            in_order=in_order,
+            lag_one=first.lag,
+            lag_p=first.lag_p,
+            lag_after=last.lag,
+            lag_after_p=last.lag_p,
+            learnable=learnable,
+            noise=self._scatter(last, residual, basis),
+            repeats=self._repeats(),
+            mean_mm=self.rows.mean_error(self.residual) * _MM,
+            tested=len(first.p_values) + len(first.scatter_p) + 3,
+            records=len(self.pose),
+            poses=len(self.groups),
+            block=int(np.bincount(self.block[self.rows.by_record[:, 0]]).max()),
+        )
+
+    def beside(self, others: Sequence[int]) -> tuple[Array, Array]:
+        """The residual with other causes in the model, and what the fit takes up then."""
+        basis = self.basis
+        for other in others:
+            basis = np.hstack([basis, own_basis(self.columns[other], basis)[0]])
+        added = basis[:, self.basis.shape[1] :]
+        return self.residual - added @ (added.T @ self.residual), basis
+
+    def _search(self) -> tuple[dict[int, float], Tried, Tried]:
+        """Causes one after another as long as one is significant, with p-values; the first trial and the last."""
+        first = tried = self._tried([], FEWER_DRAWS)
+        if 1 / (1 + FEWER_DRAWS) < tried.least <= _OUT_OF_QUESTION:
+            first = tried = self._tried([], DRAWS)
+        chosen, whole = dict[int, float](), float(self.residual @ self.residual)
+        now = whole
+        while len(chosen) < _MOST_CAUSES and len(significant := np.flatnonzero(tried.p_values <= LEVEL)):
+            # The least Bayesian information criterion, blocks counting as one.
+            sizes = np.array([own.shape[1] for _, own in tried.left])[significant]
+            count = self.blocks * self.rows.by_record.shape[1]
+            unexplained = np.maximum(1 - tried.shares[significant], 1e-12)
+            best = int(significant[np.argmin(count * np.log(unexplained) + sizes * np.log(count))])
+            if tried.shares[best] * now < _NEGLIGIBLE * (whole - now):
+                break
+            now *= 1 - float(tried.shares[best])
+            chosen[tried.left[best][0]] = float(tried.p_values[best])
+            tried = self._tried(list(chosen), FEWER_DRAWS)
+        return chosen, first, tried
+
+    def _tried(self, others: Sequence[int], draws: int) -> Tried:
+        residual, basis = self.beside(others)
+        both = self._with_chance(residual, basis, draws)
+        remaining = [i for i in range(len(self.causes)) if i not in others]
+        own = [(i, of) for i in remaining if (of := own_basis(self.columns[i], basis)[0]).shape[1]]
+        lag, lag_p = lag_one(both, self.rows.by_record, self.neighbours & (np.diff(self.pose) != 0))
+        functions = (self.recorded.of_pose, self.recorded.of_time) if len(self.groups) >= FEWEST_POSES else ()
+        smooth_p = [_p_of_gains(Smooth.of(f, basis).gains(both)) for f in functions]
+        smooth_p.append(np.ones(1 + draws))
+        p_values = self._score_tests([of for _, of in own], both)
+        of_scatter = self._of_scatter(residual, basis, draws)
+        least = np.min([p_values.min(axis=0, initial=1.0), lag_p, *smooth_p, of_scatter.min(axis=0, initial=1.0)], 0)
+        chance = np.sort(least[1:])
+
+        def over_all(p: Array) -> Array:
+            return np.asarray((1 + np.searchsorted(chance, p, side="right")) / (1 + draws))
+
+        total = max(float(residual @ residual), SMALLEST)
+        shares = np.array([np.sum((of.T @ residual) ** 2) for _, of in own]) / total
+        adjusted = over_all(p_values[:, 0]), over_all(of_scatter[:, 0])
+        by_lag, by_smooth = float(over_all(lag_p[0])), float(over_all(min(p[0] for p in smooth_p)))
+        return Tried(own, shares, adjusted[0], lag, by_lag, by_smooth, adjusted[1])
+
+    def _with_chance(self, residual: Array, basis: Array, draws: int) -> Array:
+        """The residual, wild records bounded, and the same with random signs, through the fit (rows x 1 + draws)."""
+        data, random = len(self.rows.record_of), np.random.default_rng(0)
+        own = residual / np.sqrt(np.maximum(1 - np.sum(basis**2, axis=1), _LEAST_LEFT))
+        lengths = np.linalg.norm(own[self.rows.by_record], axis=1)
+        limit = WILD * float(np.median(lengths[lengths > 0])) if np.any(lengths) else 1.0
+        bounded = np.ones(len(own))
+        bounded[:data] = np.minimum(1.0, limit / np.maximum(lengths, SMALLEST))[self.rows.record_of]
+        signs = random.choice((-1.0, 1.0), (len(self.groups), draws))[self.pose][self.rows.record_of]
+        below = random.choice((-1.0, 1.0), (len(own) - data, draws))
+        both = np.column_stack([residual * bounded, (own * bounded)[:, None] * np.vstack([signs, below])])
+        return np.asarray(both - basis @ (basis.T @ both))
+
+    def _score_tests(self, bases: Sequence[Array], both: Array) -> Array:
+        """P-values of sums of block products by their own spread (bases x m); 1 where blocks are too few.
+
+        T = s' (sum of s_b s_b')^-1 s lies between 0 and the number of blocks B, and (B - k)/k T/(B - T) follows
+        F(k, B - k) for independent normal blocks.
+        """
+        p_values, by_size = np.ones((len(bases), both.shape[1])), dict[int, list[int]]()
+        for i, basis in enumerate(bases):
+            by_size.setdefault(basis.shape[1], []).append(i)
+        rows = self._by_block(both)
+        for size, members in by_size.items():
+            spare, most = self.blocks - size, max(1, _COLUMNS_AT_ONCE // size)
+            for some in (members[i : i + most] for i in range(0, len(members), most) if spare >= _FEWEST_SPARE_BLOCKS):
+                columns = self._by_block(np.hstack([bases[i] for i in some]))
+                products = (columns.transpose(0, 2, 1) @ rows).reshape(self.blocks, -1, size, both.shape[1])
+                statistic = _by_spread(products)
+                ratio = spare / size * statistic / np.maximum(self.blocks - statistic, 1e-9)
+                p_values[some] = np.maximum(fdtrc(size, spare, ratio), SMALLEST)
+        return p_values
+
+    def _by_block(self, columns: Array) -> Array:
+        order, sizes = np.argsort(self.block, kind="stable"), np.bincount(self.block)
+        place = np.arange(len(order)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+        blocks = np.zeros((len(sizes), int(sizes.max()), columns.shape[1]))
+        blocks[self.block[order], place] = columns[order]
+        return blocks
+
+    def _squares(self, residual: Array, basis: Array) -> Array:
+        """Of each record (N), what the fit takes up counted."""
+        leverage = np.sum(basis[self.rows.by_record] ** 2, axis=2)
+        return np.asarray(np.mean(residual[self.rows.by_record] ** 2 / np.maximum(1 - leverage, _LEAST_LEFT), axis=1))
+
+    def _of_scatter(self, residual: Array, basis: Array, draws: int) -> Array:
+        """P-values of what squares of residuals may depend on, and of the same in random order (things x 1 + draws)."""
+        squares, random = self._squares(residual, basis), np.random.default_rng(1)
+        spread = float(squares.std())
+        if not self.scatters or not spread:
+            return np.ones((len(self.scatters), 1 + draws))
+        orders = np.array([np.arange(len(squares)), *(random.permutation(len(squares)) for _ in range(draws))])
+        centred = ((squares - squares.mean()) / spread)[orders]
+        things = np.array([(f - f.mean()) / f.std() for _, f in self.scatters])
+        return np.asarray(np.maximum(chdtrc(1, (things @ centred.T) ** 2 / len(squares)), SMALLEST))
+
+    def _scatter(self, last: Tried, residual: Array, basis: Array) -> Scatter | None:
+        if last.scatter_p.min(initial=1.0) > LEVEL:
+            return None
+        squares = self._squares(residual, basis)
+        explained = np.array([np.corrcoef(squares, f)[0, 1] ** 2 for _, f in self.scatters])
+        best, gains = int(np.argmax(explained)), -0.5 * len(squares) * np.log1p(-np.minimum(explained, 1 - 1e-12))
+        close = [i for i in np.argsort(-gains) if i != best and gains[i] > gains[best] - CLEAR]
+        thirds = np.array_split(np.argsort(self.scatters[best][1], kind="stable"), 3)
+        low, high = (float(np.sqrt(np.mean(squares[part]))) for part in (thirds[0], thirds[-1]))
+        words = tuple(self.scatters[i][0] for i in (best, *close))
+        return Scatter(words[0], float(last.scatter_p[best]), low, high, words[1:])
+
+    def _predicted(self, residual: Array, basis: Array) -> Predicted:
+        order = np.arange(len(self.pose), dtype=float)[:, None]
+        shares, odds, functions = dict[str, float](), dict[str, float](), dict[str, Array]()
+        for name, of in (("pose", self.recorded.of_pose), ("time", self.recorded.of_time)):
+            smooth = Smooth.of(of, basis)
+            function, shares[name] = smooth.predicted(residual, self.groups)
+            odds[name] = smooth.evidence(residual)
+            functions[name] = function[self.rows.by_record]
+        of_pose, of_time = self.recorded.of_pose[0], self.recorded.of_time[0]
+        imitated = of_pose.imitate(functions["time"])
+        if imitated < _IMITATED and (of_order := of_pose.imitate(order)) > _IN_ORDER:
+            imitated = of_order
+        by_pose = of_time.imitate(functions["pose"])
+        return Predicted(shares["pose"], shares["time"], odds["pose"], odds["time"], imitated, by_pose)
+
+    def _share_of(self, functions: Functions, residual: Array, basis: Array) -> float:
+        return Smooth.of([functions], basis).predicted(residual, self.groups)[1]
+
+    def _carriers(self, residual: Array, basis: Array, whole: Predicted) -> Iterator[Carrier]:
+        """What predicts it, one after another, each that which predicts most beside the ones before it.
+
+        Time is one of them only where it predicts more than all others: of poses in an order it predicts much.
+        """
+        inputs, taken, so_far = self.recorded.inputs, list[int](), 0.0
+        possible = {i for i, own in enumerate(inputs) if own.kind != "time" or whole.by_time > whole.by_pose}
+        while possible and len(taken) < _MOST_CARRIERS:
+            reached = {i: self._share_of(self.recorded.functions([*taken, i]), residual, basis) for i in possible}
+            best = max(reached, key=lambda i: reached[i])
+            if taken and reached[best] - so_far < _NEXT_CARRIER * whole.share:
+                break
+            yield Carrier(inputs[best].kind, inputs[best].words, reached[best] - so_far)
+            possible.discard(best)
+            taken, so_far = [*taken, best], reached[best]
+
+    def _repeats(self) -> Repeats | None:
+        """What records of one pose say of noise; None where hardly a pose was repeated."""
+        by_record, size = self.rows.by_record, np.bincount(self.pose)
+        again = int(np.sum(size - 1))
+        if again < _FEWEST_REPEATS:
+            return None
+        own = np.array([self.residual[by_record[self.pose == number]].mean(axis=0) for number in range(len(size))])
+        off = np.zeros_like(self.residual)
+        off[by_record] = self.residual[by_record] - own[self.pose]
+        acting = int(np.sum(np.any(self.residual[by_record] != 0, axis=0)))
+        spare, pure = again * acting, float(off @ off)
+        lacking = len(self.pose) * acting - self.basis.shape[1] - spare
+        lack = max(float(np.sum(self.residual[by_record] ** 2)) - pure, 0.0)
+        ratio = lack / max(lacking, 1) / max(pure / spare, SMALLEST)
+        return Repeats(
+            float(np.sqrt(np.sum(self.rows.errors(off) ** 2) / again)) * _MM,
+            float(np.sqrt(np.mean(self.rows.errors(self.residual) ** 2))) * _MM,
+            again + int(np.sum(size > 1)),
+            int(np.sum(size > 1)),
+            float(fdtrc(lacking, spare, ratio)) if lacking > 0 else 1.0,
+        )
+
+    def _settled(self, chosen: Mapping[int, float], worth: float) -> dict[int, tuple[float, Odds]]:
+        """Causes with p-values and odds, each beside the others: the likeliest in its place, none that chance beats.
+
+        ``worth`` is how much of a record each record is, where neighbours err alike. The best of many causes is
+        significant in some recordings of nothing but noise; odds say which of them are chance.
+        """
+        settled = list(chosen)
+        for _ in range(len(settled)):
+            before = list(settled)
+            for place in range(len(settled)):
+                others = settled[:place] + settled[place + 1 :]
+                settled[place] = int(np.argmax(self._gains(*self.beside(others), others, worth)))
+            if settled == before:
+                break
+        odds = [self._odds(cause, [o for o in settled if o != cause], worth) for cause in settled]
+        whole = {i: (p, odd) for i, p, odd in zip(settled, chosen.values(), odds, strict=True)}
+        least = max(whole, key=lambda i: whole[i][1].chance, default=None)
+        if least is None or whole[least][1].chance <= _LIKELIER:
+            return whole
+        return self._settled({i: p for i, (p, _) in whole.items() if i != least}, worth)
+
+    def _odds(self, cause: int, others: Sequence[int], worth: float) -> Odds:
+        """Of a cause beside others in the model."""
+        residual, basis = self.beside(others)
+        gains = self._gains(residual, basis, others, worth)
+        shown = dict.fromkeys(self.names, -np.inf)
+        for name, gain in zip(self.names, gains, strict=True):
+            shown[name] = float(np.logaddexp(shown[name], gain - np.log(self.names.count(name))))
+        mine, of_pose = self.names[cause], self.recorded.of_pose
+        for words, functions in ((UNLISTED, of_pose), (CHANGING, self.recorded.of_time)):
+            shown[words] = max(shown.get(words, -np.inf), worth * Smooth.of(functions, basis).evidence(residual))
+        # What is none of the causes cannot be excluded where what is left is far from noise or follows the pose, or
+        # poses were in order.
+        after, whole = self.beside([*others, cause])
+        beyond = float(after @ after) - chdtri(len(after) - whole.shape[1], _BEYOND)
+        left = beyond > _NEGLIGIBLE * float(residual @ residual - after @ after)
+        left = left or Smooth.of(of_pose, whole).evidence(after) * worth > CLEAR
+        timely = self.causes[cause].jumps or self.causes[cause].kind == "order"
+        if left or (timely and of_pose[0].imitate((residual - after)[self.rows.by_record]) > _IMITATED):
+            shown[UNLISTED] = max(shown[UNLISTED], shown[mine])
+        shown[CHANCE] = float(np.log(len(self.causes)))  # nothing is as likely beforehand as all causes together
+        total = float(np.logaddexp.reduce(list(shown.values())))
+        close = [name for name, gain in shown.items() if gain > shown[mine] - CLEAR and name != mine]
+        of_name = dict(zip(reversed(self.names), [c.words for c in reversed(self.causes)], strict=True))
+        alternatives = tuple(of_name.get(name, name) for name in sorted(close, key=lambda name: -shown[name]))
+        return Odds(float(np.exp(shown[mine] - total)), alternatives, float(np.exp(shown[CHANCE] - total)))
+
+    def _gains(self, residual: Array, basis: Array, others: Sequence[int], worth: float) -> Array:
+        total, freedom = max(float(residual @ residual), SMALLEST), len(residual) - basis.shape[1]
+        gains = np.full(len(self.causes), -np.inf)
+        for i in set(range(len(self.causes))) - set(others):
+            own = own_basis(self.columns[i], basis)[0]
+            if own.shape[1]:
+                left = max(1 - float(np.sum((own.T @ residual) ** 2)) / total, 1e-12)
+                gains[i] = -0.5 * worth * freedom * np.log(left)
+                gains[i] -= 0.5 * own.shape[1] * np.log(max(freedom * worth, 2.0))
+        return gains
+
+    def _structure(
+        self, cause: int, others: Sequence[int], modelled: frozenset[str], p_value: float, odds: Odds
+    ) -> Structure:
+        one, (residual, basis) = self.causes[cause], self.beside(others)
+        own, coefficients = own_basis(self.columns[cause], basis)
+        effect = one.effect
+        if effect.split(" ")[0] in modelled:
+            effect += " (it is in the model: free it, or loosen its prior)"
+        share = float(np.sum((own.T @ residual) ** 2) / max(float(residual @ residual), SMALLEST))
+        left, fold = residual.copy(), self.block * _FOLDS // self.blocks
+        for number in range(_FOLDS):  # coefficients without the part of the recording that is judged
+            judged = fold == number
+            gram = own[~judged].T @ own[~judged]
+            ridge = 1e-9 * max(float(np.trace(gram)), SMALLEST) * np.eye(len(gram))
+            left[judged] -= own[judged] @ np.linalg.solve(gram + ridge, own[~judged].T @ residual[~judged])
+        falls = self.rows.mean_error(residual) - self.rows.mean_error(left)
+        size = _size(one, -coefficients @ (own.T @ residual))
+        named = (one.kind, one.subject, one.words, effect, one.measure)
+        return Structure(*named, p_value, share, max(0.0, falls) * _MM, size, odds.share, odds.alternatives)
 
 
-def _structure(
-    rows: FitRows,
-    contest: Contest,
-    cause: int,
-    others: Sequence[int],
-    modelled: frozenset[str],
-    p_value: float,
-    odds: Odds,
-) -> Structure:
-    one, (residual, basis) = contest.causes[cause], contest.beside(others)
-    own, coefficients = own_basis(contest.columns[cause], basis)
-    present = one.effect.split(" ")[0] in modelled
-    effect = f"{one.effect} (it is in the model: free it, or loosen its prior)" if present else one.effect
-    share = float(np.sum((own.T @ residual) ** 2) / max(float(residual @ residual), 1e-300))
-    left = residual.copy()  # less what it takes up, coefficients found without the records that are judged
-    for number in range(_FOLDS):
-        judged = contest.fold == number
-        gram = own[~judged].T @ own[~judged]
-        ridge = 1e-9 * max(float(np.trace(gram)), 1e-300) * np.eye(len(gram))
-        taken = np.linalg.solve(gram + ridge, own[~judged].T @ residual[~judged])
-        left[judged] -= own[judged] @ taken
-    falls = rows.mean_error(residual) - rows.mean_error(left)
-    size = _size(one, -coefficients @ (own.T @ residual))
-    named = (one.kind, one.subject, one.words, effect, one.measure)
-    return Structure(*named, p_value, share, max(0.0, falls) * _MM, size, odds.share, odds.alternatives)
+def _p_of_gains(gains: Array) -> Array:
+    """By the tail of those of chance (all but the first), which is exponential."""
+    middle = float(np.median(gains[1:]))
+    tail = float(np.mean(gains[1:][gains[1:] >= middle])) - middle
+    return np.asarray(np.maximum(0.5 * np.exp(-np.maximum(gains - middle, 0.0) / max(tail, 1e-12)), SMALLEST))
 
 
-def _size(one: Dependence, coefficients: Array) -> str:
+def _by_spread(products: Array) -> Array:
+    """Sums over blocks by their own spread (blocks x bases x k x m; bases x m)."""
+    total, size = products.sum(axis=0), products.shape[2]  # bases x k x m
+    spread = np.empty((*total[:, 0].shape, size, size))
+    for i, j in zip(*np.tril_indices(size), strict=True):
+        spread[..., i, j] = spread[..., j, i] = np.einsum("bmd,bmd->md", products[:, :, i], products[:, :, j])
+    floor = 1e-12 * np.trace(spread, axis1=2, axis2=3) + SMALLEST
+    if size == 1:
+        return np.asarray(total[:, 0] ** 2 / (spread[..., 0, 0] + floor))
+    sums = total.transpose(0, 2, 1)
+    solved = np.linalg.solve(spread + floor[..., None, None] * np.eye(size), sums[..., None])[..., 0]
+    return np.asarray(np.sum(sums * solved, axis=2))
+
+
+def _size(one: Cause, coefficients: Array) -> str:
     """Its coefficients in a customary unit, of levels the largest."""
     if not one.labels or not one.unit:
         return ""
@@ -432,90 +676,36 @@ def depends(fit: Fit) -> list[Finding]:
     return structure_findings(fit.of(structure), fit.unit) if fit.converged else []
 
 
-def neighbours(fit: Fit) -> list[Finding]:
-    return neighbour_findings(fit.of(structure), fit.estimate, fit.unit)
-
-
-def structure_findings(structure: ResidualStructure | None, unit: str = "mm") -> list[Finding]:
-    if structure is None:
+def structure_findings(outcome: ResidualStructure | None, unit: str = "mm") -> list[Finding]:
+    if outcome is None:
         text = "The training records are too few to tell whether the model lacks anything."
         return [Finding("note", text, f"at least {FEWEST_RECORDS} records", "Measure more poses.")]
-    blocks = f", blocks of {structure.block} records" if structure.block > 1 else ""
-    level = f"{100 * structure.level:g} % over all {structure.tested} dependences{blocks}"
-    test, kept = f"score test, {level}, and likelier than chance", structure.worthwhile
-    findings = [_structure_finding(s, structure, unit, test) for s in kept]
-    if not findings and not structure.is_predictable:
-        text = f"None of the {structure.tested} causes that were tested explains the remaining error."
-        if structure.structures:
-            few = len(structure.structures)
+    blocks = f", blocks of {outcome.block} records" if outcome.block > 1 else ""
+    test = f"residuals with random signs, {100 * outcome.level:g} % over all {outcome.tested} causes{blocks}"
+    kept = outcome.worthwhile
+    findings = [_cause_finding(s, outcome, unit, f"score test, {test}") for s in kept]
+    if outcome.predictable is not None:
+        findings.append(_rest_finding(outcome.predictable, outcome, test))
+    elif not kept:
+        text = f"None of the {outcome.tested} causes that were tested explains the remaining error."
+        if outcome.structures:
+            few = len(outcome.structures)
             text += f" {few} {'would' if few == 1 else 'would each'} lower it by less than 1 %."
         findings.append(Finding("good", text, test))
-    if kept and structure.more:
+    if kept and outcome.more:
         text = "Residuals depend on more than these; model them first, then look again."
         findings.append(Finding("note", text, test))
-    return [_predictable_finding(structure), *findings, *_scatter(structure), *repeat_findings(structure, unit)]
-
-
-def _predictable_finding(structure: ResidualStructure) -> Finding:
-    """What other records predict of the residuals, whatever its cause is."""
-    predicted = structure.predictable
-    if predicted is None:
+    if outcome.poses < FEWEST_POSES:
         text = "There are too few distinct poses to test whether the pose still predicts the residuals."
-        return Finding("note", text, f"at least {FEWEST_POSES} distinct poses", "Measure more poses.")
-    test = (
-        f"{predicted.records} records of {predicted.poses} poses, each predicted by the poses of other folds; "
-        f"residuals with random signs, {100 * PREDICTED_LEVEL:g} %; errors beyond {MOST_OF_MEDIAN:g} times the median "
-        "are cut"
-    )
-    if not predicted.above_chance:
-        return Finding("good", "Other poses predict no more of the residuals than chance does.", test)
-    grade: Grade = "warning" if predicted.falls >= WORTHWHILE else "note"
-    listed = ", ".join(f"{carrier.words} ({percent(carrier.share)})" for carrier in predicted.carriers)
-    text = f"{predicted_in_short(predicted)} Of it: {listed}."
-    if predicted.is_in_order:
-        text += f" The poses were visited in an order, and time alone predicts {percent(predicted.by_time)}: these data"
-        text += " do not show which of them is the cause."
-    named = sum(s.falls_mm for s in structure.worthwhile) / max(structure.mean_mm, 1e-12)
-    first = "Model what is named beside this, then look again. " if named > predicted.falls / 2 else ""
-    return Finding(grade, text, test, first + " ".join(_remedies(predicted)))
+        findings.append(Finding("note", text, f"at least {FEWEST_POSES} distinct poses", "Measure more poses."))
+    return [*findings, *_scatter_findings(outcome, test)]
 
 
-def predicted_in_short(predicted: Predictable) -> str:
-    share = f"{percent(predicted.share)} of the variance of the residuals is not noise"
-    names = [carrier.words for carrier in predicted.carriers]
-    listed = " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
-    return f"{share}: other records predict it, mostly from {listed} (chance: below {percent(predicted.chance)})."
-
-
-def _remedies(predicted: Predictable) -> Iterator[str]:
-    kinds = {carrier.kind for carrier in predicted.carriers}
-    if predicted.is_in_order:
-        yield _TELL_APART["open"]
-        return
-    if "joint" in kinds and predicted.learnable:
-        yield "Learn it: arms.NAME.residual: {type: gaussian_process}; or free what armcal identify --fixed recommends."
-    elif "joint" in kinds:
-        if predicted.learnable is False:
-            yield "A pose residual cannot learn it from these records: that takes positions or poses of the tool."
-        yield "Free what armcal identify --fixed recommends, or add effects to these joints; more poses show more."
-    if "time" in kinds:
-        yield "Let the base drift (parameters.drift); record the temperature, and repeat one pose from time to time."
-    if "temperature" in kinds:
-        yield "Add thermal_length, or measure at one temperature."
-    if "payload" in kinds:
-        yield "Weigh the payload; add or free compliance."
-    if "approach" in kinds:
-        yield "Add or free approach_backlash on these joints."
-
-
-def percent(share: float) -> str:
-    return f"{100 * share:.0f} %" if share >= 0.095 else f"{100 * share:.1g} %" if share > 0.0005 else "0.1 %"
-
-
-def _structure_finding(s: Structure, structure: ResidualStructure, unit: str, test: str) -> Finding:
+def _cause_finding(s: Structure, outcome: ResidualStructure, unit: str, test: str) -> Finding:
     """One cause if it is clearly the likeliest, else all that it does not beat."""
-    falls = f"would fall by {readable(s.falls_mm)} {unit}"
-    falls = f"the mean training residual of {readable(structure.mean_mm)} {unit} {falls}"
+    falls = (
+        f"the mean training residual of {readable(outcome.mean_mm)} {unit} would fall by {readable(s.falls_mm)} {unit}"
+    )
     what = s.words + (f" ({s.size})" if s.size else "")
     test = f"p {_p(s.p_value)}, {test}; odds among all of them and what is none of them"
     if not s.alternatives:
@@ -531,18 +721,85 @@ def _structure_finding(s: Structure, structure: ResidualStructure, unit: str, te
     return Finding("warning", text, test, f"To find out: {s.measure}.{model}")
 
 
+def _rest_finding(rest: Predicted, outcome: ResidualStructure, test: str) -> Finding:
+    """What neither noise nor a cause explains: whether the pose predicts it, or time, or either."""
+    test = f"smooth functions of {outcome.poses} poses, each predicted by the others; {test}"
+    test += f"; log odds against noise: pose {rest.pose:.0f}, time {rest.time:.0f}"
+    text = f"{predicted_in_short(outcome)} {_WHY[rest.cause]} the pose predicts {percent(rest.by_pose)} of "
+    text += f"them, time {percent(rest.by_time)}."
+    if outcome.in_order:
+        text += " The poses were visited in an order."
+    action = "Model what is named above, then look again. " if outcome.worthwhile else ""
+    slight = outcome.falls < WORTHWHILE
+    return Finding("note" if slight else "warning", text, test, action + " ".join(_remedies(rest, outcome.learnable)))
+
+
+def predicted_in_short(outcome: ResidualStructure) -> str:
+    rest = outcome.predictable
+    if rest is None or rest.share <= 0:
+        return f"Residuals of neighbouring records correlate by {outcome.lag_after:.2f}: they are not noise."
+    names = [carrier.words for carrier in rest.carriers]
+    listed = " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+    if outcome.worthwhile:
+        return (
+            f"Beside what is named, other records predict {percent(rest.share)} of the residuals, mostly from {listed}."
+        )
+    text = f"{percent(outcome.share)} of the variance of the residuals is not noise"
+    return f"{text}: other records predict it, mostly from {listed}."
+
+
+def _remedies(rest: Predicted, learnable: bool | None) -> Iterator[str]:
+    kinds = {carrier.kind for carrier in rest.carriers}
+    if rest.cause == "open":
+        yield "Repeat some of the first poses at the end: only time changes them. Visit others in random order."
+    elif rest.cause == "time":
+        yield "Let the base drift (parameters.drift); record the temperature, and repeat one pose from time to time."
+    elif "joint" in kinds and learnable:
+        yield "Learn it: arms.NAME.residual: {type: gaussian_process}; or free what armcal identify --fixed recommends."
+    elif "joint" in kinds:
+        if learnable is False:
+            yield "A pose residual cannot learn it from these records: that takes positions or poses of the tool."
+        yield "Free what armcal identify --fixed recommends, or add effects to these joints; more poses show more."
+    if "temperature" in kinds:
+        yield "Add thermal_length, or measure at one temperature."
+    if "payload" in kinds:
+        yield "Weigh the payload; add or free compliance."
+    if "approach" in kinds:
+        yield "Add or free approach_backlash on these joints."
+
+
+_WHY = {
+    "time": "It goes with time, not with the pose:",
+    "pose": "It goes with the pose, not with time:",
+    "open": "These data do not show whether the pose or time is the cause:",
+}
+
+
+def percent(share: float) -> str:
+    if share <= 0:
+        return "0 %"
+    return f"{100 * share:.0f} %" if share >= 0.095 else f"{100 * share:.1g} %" if share > 0.0005 else "0.1 %"
+
+
 def _share(odds: float) -> str:
     return "over 99 %" if odds > 0.99 else "less than 1 %" if odds < 0.01 else f"{100 * odds:.0f} %"
 
 
-def _scatter(structure: ResidualStructure) -> list[Finding]:
-    noise = structure.noise
-    if noise is None or noise.high < _NO_NOISE:
+def _p(p: float) -> str:
+    return f"{p:.3f}" if p >= 0.01 else f"below {0.005 if p < 0.005 else 0.01:g}"
+
+
+def _scatter_findings(outcome: ResidualStructure, test: str) -> list[Finding]:
+    scatter = outcome.noise
+    if scatter is None or scatter.high < _NO_NOISE:
         return []
-    text = f"The spread of the residuals depends on {'; or on '.join([noise.words, *noise.alternatives[:_MOST_TOLD]])}:"
-    text += f" from {digits(noise.low, 2)} to {digits(noise.high, 2)} times the declared noise, in the thirds of the"
+    on = "; or on ".join([scatter.words, *scatter.alternatives[:_MOST_TOLD]])
+    text = f"The spread of the residuals depends on {on}:"
+    text += (
+        f" from {digits(scatter.low, 2)} to {digits(scatter.high, 2)} times the declared noise, in the thirds of the"
+    )
     text += " records with the least and the most of it. Either the noise varies, or the model errs more there."
-    test = f"regression of squared residuals, p {_p(noise.p_value)} over everything looked at"
+    test = f"regression of squared residuals, p {_p(scatter.p_value)}; {test}"
     action = (
         "Repeat a pose at both ends of it: if repeats spread equally, the model is the cause; else state noise by "
         "record."
@@ -550,8 +807,12 @@ def _scatter(structure: ResidualStructure) -> list[Finding]:
     return [Finding("warning", text, test, action)]
 
 
-def repeat_findings(structure: ResidualStructure, unit: str) -> list[Finding]:
-    repeats = structure.repeats
+def repeated(fit: Fit) -> list[Finding]:
+    return [] if (outcome := fit.of(structure)) is None else repeat_findings(outcome, fit.unit)
+
+
+def repeat_findings(outcome: ResidualStructure, unit: str) -> list[Finding]:
+    repeats = outcome.repeats
     if repeats is None or not repeats.exceeded:
         return []
     text = (
@@ -559,8 +820,8 @@ def repeat_findings(structure: ResidualStructure, unit: str) -> list[Finding]:
         f"{readable(repeats.left_mm)} {unit} (root mean squares): "
     )
     test = f"lack of fit, F over {repeats.records} records of {repeats.poses} poses, p {_p(repeats.p_value)}, and "
-    test += f"{TIMES_REPEATS:g} times"
-    if repeats.shared or structure.is_predictable or structure.worthwhile:
+    test += f"{_TIMES_REPEATS:g} times"
+    if outcome.shows:
         text += "the model lacks something, which poses nearby share."
         action = "Free what armcal identify --fixed recommends, add effects, and state masses for what sags."
     else:
@@ -569,30 +830,22 @@ def repeat_findings(structure: ResidualStructure, unit: str) -> list[Finding]:
     return [Finding("warning", text, test, action)]
 
 
-def neighbour_findings(structure: ResidualStructure | None, estimate: Estimate, unit: str = "mm") -> list[Finding]:
-    """Whether records that follow one another miss alike, why, and whether that made intervals wider."""
-    if structure is None:
+def neighbours(fit: Fit) -> list[Finding]:
+    return neighbour_findings(fit.of(structure), fit.estimate)
+
+
+def neighbour_findings(outcome: ResidualStructure | None, estimate: Estimate) -> list[Finding]:
+    """What it costs that neighbours err alike; why they do, the structure says."""
+    if outcome is None:
         return []
-    test = f"lag-one correlation, {100 * structure.level:g} % over all dependences and this"
-    if structure.lag_p > structure.level:
+    test = f"lag-one correlation, {100 * outcome.level:g} % over everything that was tested"
+    if outcome.lag_p > outcome.level:
         return [Finding("good", "Residuals of neighbouring records do not correlate.", test)]
-    text = f"Residuals of neighbouring records correlate by {structure.lag_one:.2f}"
-    if structure.lag_after_p > structure.level:
+    text = f"Residuals of neighbouring records correlate by {outcome.lag_one:.2f}"
+    if outcome.lag_after_p > outcome.level:
         return [Finding("note", f"{text}; what was found above explains it.", test)]
-    after = f", by {structure.lag_after:.2f} still beside what was found" if structure.structures else ""
-    text += f"{after}: they are not noise. {_what_neighbours_cost(estimate)}"
-    alike = structure.alike
-    if alike is None:
-        return [Finding("warning", text, test, _TELL_APART["open"])]
-    text += (
-        f" {_WHY[alike.cause]}predicted from the other records, a smooth function of time has an error of "
-        f"{readable(alike.time_mm)} {unit} and one of the pose {readable(alike.pose_mm)} {unit} (log odds against "
-        f"noise {alike.time:.0f} and {alike.pose:.0f})"
-    )
-    if max(alike.time_imitated, alike.pose_imitated) > IMITATED:
-        shares = f"the pose predicts {_share(alike.time_imitated)} of the first, time {_share(alike.pose_imitated)} of "
-        text += f"; as the poses were visited in an order, {shares}the second"
-    return [Finding("warning", f"{text}.", test, _TELL_APART[alike.cause])]
+    text += f", by {outcome.lag_after:.2f} still beside what was found. " if outcome.structures else ". "
+    return [Finding("note", text + _what_neighbours_cost(estimate), test)]
 
 
 def _what_neighbours_cost(estimate: Estimate) -> str:
@@ -604,19 +857,3 @@ def _what_neighbours_cost(estimate: Estimate) -> str:
         "Intervals that assume independent errors would be too narrow; those of the parameters are wider, by a factor "
         f"of {float(np.median(factors)):.1f} (median), at most {max(factors):.1f} ({estimate.names[widest]})."
     )
-
-
-_WHY = {
-    "time": "It goes with time, not with the pose: ",
-    "pose": "It goes with the pose, not with time: ",
-    "open": "Whether time or the pose is the cause is not known: ",
-}
-_TELL_APART = {
-    "time": "Let the base drift (parameters.drift); repeat one pose at the start, in the middle and at the end.",
-    "pose": "The model lacks an effect of pose; visiting the poses in random order would show it plainly.",
-    "open": "Repeat some of the first poses at the end: only time changes them. Visit others in random order.",
-}
-
-
-def _p(p: float) -> str:
-    return f"{p:.3f}" if p >= 0.01 else f"below {0.005 if p < 0.005 else 0.01:g}"

@@ -22,14 +22,13 @@ from armcal.arm.assembly import command_channels
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.units import digits, display_unit, from_unit, readable, si_unit, to_unit, unit
+from armcal.diagnose.causes import predicted_positions
 from armcal.diagnose.checks import Finding, first_few
-from armcal.diagnose.dependences import predicted_positions
 from armcal.diagnose.fit import Fit, thinned
+from armcal.diagnose.fit_rows import FitRows, sampled_rows
 from armcal.diagnose.gross import Figure, figure
 from armcal.diagnose.held import OFF, held_scales
-from armcal.diagnose.predictable import CLEAR
-from armcal.diagnose.residual_structure import structure
-from armcal.diagnose.score_tests import FitRows, sampled_rows
+from armcal.diagnose.residual_structure import CLEAR, structure
 from armcal.estimate.estimator import Estimate
 from armcal.planning.candidates import whitened_rows
 from armcal.problem.motion import LOADS, Motion
@@ -68,7 +67,7 @@ def rounding(fit: Fit) -> Rounding | None:
     if not fit.converged:
         return None
     left, train, estimate = fit.of(structure), fit.split.train, fit.estimate
-    predicted = left.predictable.share if left and left.is_predictable and left.predictable else 0.0
+    predicted = left.share if left is not None else 0.0
     problem = fit.few.subset(train).weighted(fit.fitted.weights)
     dataset, motion = fit.ready.trained, fit.motion.subset(train)
     share = min(1.0, max(estimate.degrees_of_freedom, 1.0) / max(problem.equations(), 1))

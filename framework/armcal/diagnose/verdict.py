@@ -19,7 +19,7 @@ from armcal.diagnose.fit import Fit
 from armcal.diagnose.gross import by_halves
 from armcal.diagnose.held import contradictions, instruments
 from armcal.diagnose.outliers import MOST_TOLD, component_findings, large_errors, suspicious_ids, suspicious_in_short
-from armcal.diagnose.residual_structure import predicted_in_short, repeat_findings, structure
+from armcal.diagnose.residual_structure import FEWEST_POSES, predicted_in_short, repeat_findings, structure
 from armcal.diagnose.unseen import Elsewhere, determined, elsewhere, hidden_payload, priors_alone, rounded, rounding
 from armcal.estimate.estimator import AT_BOUND, CHECK_THE_DATA, Estimate
 from armcal.estimate.identifiability import POOR_CONDITION, bound_together, correlated_pairs
@@ -33,6 +33,8 @@ from armcal.plugins import PluginRegistry
 from armcal.problem.problem import Problem
 
 LEVEL = 0.05
+SURE = 0.005
+"""Level of a warning: those of all checks add up to at most 5 % of sound runs."""
 SHARE = 0.95
 FEWEST_FREEDOM = 10
 DO_NOT_USE = "Do not use this calibration"
@@ -192,18 +194,15 @@ def _left(fit: Fit) -> list[str]:
     if left is None:
         return sentences or ["Whether the model lacks anything is not known: the training records are too few."]
     sentences += [finding.text for finding in repeat_findings(left, fit.unit)]
-    if left.predictable is not None and left.is_predictable:
-        sentences.append(predicted_in_short(left.predictable))
+    if left.predictable is not None:
+        sentences.append(predicted_in_short(left))
     if left.worthwhile:
         listed = "; ".join(
             f"{s.words}{', or on another cause' if s.alternatives else ''} ({readable(s.falls_mm)} {fit.unit})"
             for s in left.worthwhile
         )
         sentences.append(f"Residuals still depend on {listed}.")
-    elif not sentences and left.lag_after_p <= left.level:
-        text = "None of the tested causes explains the residuals, yet neighbours correlate by "
-        sentences.append(f"{text}{left.lag_after:.2f}.")
-    elif left.predictable is None:
+    elif not sentences and left.poses < FEWEST_POSES:
         sentences.append("None of the tested causes explains the residuals; for others the poses are too few.")
     elif not sentences and _is_beyond_noise(estimate):
         text = "Nothing that was recorded predicts the residuals, yet they are "
@@ -215,7 +214,7 @@ def _left(fit: Fit) -> list[str]:
 
 def _is_beyond_noise(estimate: Estimate) -> bool:
     freedom = max(1, estimate.degrees_of_freedom)
-    return bool(estimate.noise_scale**2 * freedom > chdtri(freedom, LEVEL / 2))
+    return bool(estimate.noise_scale**2 * freedom > chdtri(freedom, SURE))
 
 
 def converged(fit: Fit) -> list[Finding]:
@@ -243,8 +242,9 @@ def conditioned(fit: Fit) -> list[Finding]:
 
 
 def bounds(fit: Fit) -> list[Finding]:
-    """Is a bound that holds compatible with the data? One-sided, at 5 %, by the step that ignores bounds."""
+    """Is a bound that holds compatible with the data? One-sided, by the step that ignores bounds, over all of them."""
     estimate = fit.estimate
+    limit = ndtri(1 - SURE / max(len(estimate.at_bound), 1))
     agreeing: list[str] = []
     pushing: list[str] = []
     for i, name in enumerate(estimate.names):
@@ -252,8 +252,8 @@ def bounds(fit: Fit) -> list[Finding]:
             continue
         value, sd = estimate.values[estimate.free_entries[i]], estimate.deviations[i]
         beyond = abs(float(estimate.unconstrained[i] - value)) / sd if sd > 0 else 0.0
-        (pushing if beyond > ndtri(1 - LEVEL) else agreeing).append(f"{name} ({beyond:.1f} sd beyond)")
-    findings, test = [], "step without bounds, one-sided, 5 %"
+        (pushing if beyond > limit else agreeing).append(f"{name} ({beyond:.1f} sd beyond)")
+    findings, test = [], f"step without bounds, one-sided, {100 * SURE:g} % over all bounds that hold"
     if pushing:
         text = f"The data pushes against a bound: {first_few(pushing)}. Something else in the model is missing."
         findings.append(Finding("warning", text, test, "Check loads, masses and signs; look for a missing effect."))
@@ -268,17 +268,17 @@ def noise(fit: Fit) -> list[Finding]:
 
 
 def _size(fit: Fit) -> Finding:
-    """Are the residuals as large as the declared noise? Chi-square, two-sided, at 5 %."""
+    """Are the residuals as large as the declared noise? By chi-square."""
     estimate, left, contradicted = fit.estimate, fit.of(structure), fit.of(contradictions)
     freedom, ratio = max(1, estimate.degrees_of_freedom), estimate.noise_scale
-    total, test = ratio**2 * freedom, "chi-square, 5 %"
+    total, test = ratio**2 * freedom, f"chi-square, {100 * SURE:g} %"
     if _is_beyond_noise(estimate):
         why = "the model's error or the instrument's, which this test cannot separate"
         if fit.of(rounding) is not None:
             why = "rounding of the recorded joints would leave as much, see below"
         elif left is not None or contradicted:
             known = "some of it is the model's: what residuals depend on is named below"
-            is_seen = contradicted or (left is not None and (left.structures or left.is_predictable))
+            is_seen = contradicted or (left is not None and left.shows)
             why += f"; {known if is_seen else 'none of the causes that were tested is in it'}"
         mean = f"{readable(float(np.nanmean(fit.errors.calibrated_mm[fit.split.train])))} {fit.unit} on average"
         text = f"Residuals are {ratio:.1f} times the declared noise, {mean}: {why}. "
@@ -287,10 +287,10 @@ def _size(fit: Fit) -> Finding:
             "Repeat some poses, each from elsewhere: the spread of the repeats is noise, the rest the model's error."
         )
         return Finding("warning", text, test, action)
-    if ratio < 0.5 and total < chdtri(freedom, 1 - LEVEL / 2):
+    if ratio < 0.5 and total < chdtri(freedom, 1 - SURE):
         text = f"Residuals are only {readable(ratio)} times the declared noise: was it stated too large?"
         return Finding("note", text, f"ratio below 0.5, {test}", "State the noise as the instrument's data sheet does.")
-    explained = not contradicted and (left is None or not left.is_predictable)
+    explained = not contradicted and (left is None or not left.shows)
     text = f"Residuals are as large as the declared noise{': the model explains the data' if explained else ''}."
     return Finding("good", text, test)
 

@@ -1,12 +1,7 @@
-"""What residuals might still depend on: order, joint levels, approach, torques, payload, temperature.
+"""What residuals might still depend on: order, joint levels, approach, torques, payload, temperature; steps and scales.
 
-Each dependence is a set of columns: how residuals would move with it, to first order, along the motion of one joint,
-along the residual's own entries (base axes for a position), or along the turning of one site.
-
-Whether the scatter of residuals depends on something: time, place, a joint's angle, a torque.
-
-Squares of residuals, leverage counted, are regressed on one thing after another [Koenker1981]; all of them at once keep
-their level (Bonferroni). What does as well as the best, within 20 to 1, is named beside it.
+Each cause is a set of columns: how residuals would move with it, to first order, along the motion of one joint, along
+the residual's own entries (base axes for a position), or along the turning of one site.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,17 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
-from scipy.special import chdtrc, fdtrc
 
 from armcal.arm.assembly import Arm, shown_joint
 from armcal.arm.effects import joint_rate
 from armcal.arm.loading import SiteLoads
-from armcal.base.arrays import Array, Indices
+from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.units import display_unit, to_unit
 from armcal.diagnose.held import Moves
-from armcal.diagnose.predictable import CLEAR, Kernels, smooth
-from armcal.diagnose.score_tests import FitRows
 from armcal.estimate.identifiability import candidates
 from armcal.measure.measurement import NamesMistakes
 from armcal.problem.motion import Motion, recorded_order
@@ -46,7 +38,7 @@ _SURROUNDINGS = (
 
 
 @dataclass(frozen=True)
-class Dependence:
+class Cause:
     """One thing that residuals might depend on.
 
     Attributes:
@@ -92,8 +84,9 @@ class Records:
         return tuple(parts)
 
 
-def dependences(problem: Problem, motion: Motion, dataset: Dataset, moves: Moves) -> Iterator[Dependence]:
-    arms, here = problem.blueprint.arms, Records(dataset, motion)
+def causes_of(problem: Problem, here: Records, positions: Sequence[Array], moves: Moves) -> Iterator[Cause]:
+    """Causes in the arm, then outside of it; ``positions`` are those that instruments should read (3 x N; m)."""
+    arms, motion, dataset = problem.blueprint.arms, here.motion, here.dataset
     yield from _of_held(problem, moves)
     yield from _of_order(here)
     for name, arm in arms.items():
@@ -113,25 +106,26 @@ def dependences(problem: Problem, motion: Motion, dataset: Dataset, moves: Moves
             feature = dataset.column(channel)
             columns = here.axes((feature - feature.mean())[:, None] / feature.std())
             measure = _SECOND_LOAD if channel == "payload" else "repeat some poses cold and warm"
-            yield Dependence(channel, "", "", words, effect, measure, columns)
+            yield Cause(channel, "", "", words, effect, measure, columns)
+    yield from _outside(here, problem, positions, moves)
 
 
-def _of_held(problem: Problem, moves: Moves) -> Iterator[Dependence]:
+def _of_held(problem: Problem, moves: Moves) -> Iterator[Cause]:
     for name in filter(moves.__contains__, candidates(problem.parameters)):
         block, columns = problem.parameters[name], moves[name]
         words, measure = f"{name}, which is held", "armcal identify --fixed, which judges it on records held out"
         one = block.domain.dof == 1
         labels, unit = (("off by",), block.unit) if one else ((), "")
-        yield Dependence("held", name, "", words, f"free {name} (parameters.free)", measure, columns, labels, unit)
+        yield Cause("held", name, "", words, f"free {name} (parameters.free)", measure, columns, labels, unit)
 
 
-def _of_order(here: Records) -> Iterator[Dependence]:
+def _of_order(here: Records) -> Iterator[Cause]:
     order = recorded_order(here.dataset)
     if np.ptp(order) <= 0:
         return
     place = (order - order.min()) / np.ptp(order)
     slow = legendre.legvander(2 * place - 1, _SLOW)  # with its mean, which a drift has
-    yield Dependence(
+    yield Cause(
         "order",
         "",
         "",
@@ -144,10 +138,10 @@ def _of_order(here: Records) -> Iterator[Dependence]:
         arm, _, joint = channel.partition(".")
         words = f"the recorded order: {joint} drifts slowly along its own motion"
         effect = f"parameters.drift on the zero of {joint}"
-        yield Dependence("order", joint, arm, words, effect, _REPEATS, here.along(channel, slow))
+        yield Cause("order", joint, arm, words, effect, _REPEATS, here.along(channel, slow))
 
 
-def _of_level(here: Records, arm: str, channel: str, shown: str, dimension: str) -> Iterator[Dependence]:
+def _of_level(here: Records, arm: str, channel: str, shown: str, dimension: str) -> Iterator[Cause]:
     command = here.dataset.column(channel)
     levels = np.unique(np.round(_stated(command), 9))
     if len(levels) < 2:
@@ -164,8 +158,8 @@ def _of_level(here: Records, arm: str, channel: str, shown: str, dimension: str)
     between = f"command {shown} to levels in between, from both sides"
     si = "rad" if dimension == "angle" else "m"
     along = f"the angle of {shown}, along its own motion" if si == "rad" else f"the travel of {shown}, along itself"
-    yield Dependence("level", shown, arm, along, effect, between, here.along(channel, features), labels, si)
-    yield Dependence(
+    yield Cause("level", shown, arm, along, effect, between, here.along(channel, features), labels, si)
+    yield Cause(
         "level",
         shown,
         arm,
@@ -176,7 +170,7 @@ def _of_level(here: Records, arm: str, channel: str, shown: str, dimension: str)
     )
 
 
-def _of_approach(here: Records, arm: str, joint: str, shown: str, si: str) -> Iterator[Dependence]:
+def _of_approach(here: Records, arm: str, joint: str, shown: str, si: str) -> Iterator[Cause]:
     channel, command = f"{arm}.approach.{joint}", here.dataset.column(f"{arm}.{joint}")
     effect, side = f"approach_backlash on {shown}", f"the side {shown} was approached from"
     if here.dataset.has(channel):
@@ -192,14 +186,14 @@ def _of_approach(here: Records, arm: str, joint: str, shown: str, si: str) -> It
         return
     sign, measure = np.nan_to_num(-came[:, None]), _BOTH_SIDES.format(joint=shown)
     along = here.along(f"{arm}.{joint}", sign)
-    yield Dependence(
+    yield Cause(
         "approach", shown, arm, f"{side}, along its own motion", effect, measure, along, ("half of its play",), si
     )
     words = f"{side}, in directions that {shown} does not move"
-    yield Dependence("approach", shown, arm, words, "", measure, here.axes(sign))
+    yield Cause("approach", shown, arm, words, "", measure, here.axes(sign))
 
 
-def _of_coupling(here: Records, name: str, arm: Arm, joint: str, shown: str) -> Iterator[Dependence]:
+def _of_coupling(here: Records, name: str, arm: Arm, joint: str, shown: str) -> Iterator[Cause]:
     for other, dimension in arm.commanded.items():
         command = here.dataset.column(f"{name}.{other}")
         if other == joint or dimension != arm.commanded[joint] or _spread(command) <= 0:
@@ -208,12 +202,10 @@ def _of_coupling(here: Records, name: str, arm: Arm, joint: str, shown: str) -> 
         words = f"the command of {other}, along {shown}'s own motion: {other} moves {shown} with it"
         measure = f"move {other} alone from end to end, and watch {shown}"
         columns = here.along(f"{name}.{joint}", feature)
-        yield Dependence("coupling", f"{other} on {shown}", name, words, "", measure, columns, ("share",), "1")
+        yield Cause("coupling", f"{other} on {shown}", name, words, "", measure, columns, ("share",), "1")
 
 
-def _of_torque(
-    here: Records, arm: str, channel: str, shown: str, effort: Array, revolute: bool
-) -> Iterator[Dependence]:
+def _of_torque(here: Records, arm: str, channel: str, shown: str, effort: Array, revolute: bool) -> Iterator[Cause]:
     if _spread(effort) <= 1e-9 * max(1.0, float(np.abs(_stated(effort)).max(initial=0.0))):
         return
     effort = np.nan_to_num(effort)
@@ -229,10 +221,10 @@ def _of_torque(
     for words, effect, measure, feature, label, unit in laws:
         if np.ptp(feature) > 0:
             columns = here.along(channel, feature[:, None])
-            yield Dependence("torque", shown, arm, words, effect, measure, columns, (label,), unit)
+            yield Cause("torque", shown, arm, words, effect, measure, columns, (label,), unit)
 
 
-def _of_moments(problem: Problem, here: Records, arm: Arm, loads: SiteLoads, alone: bool) -> Iterator[Dependence]:
+def _of_moments(problem: Problem, here: Records, arm: Arm, loads: SiteLoads, alone: bool) -> Iterator[Cause]:
     """A symmetric compliance at each site, seen by the factors that measure this arm's tip in its base frame."""
     seen = [
         [channel.rpartition(".")[2] for channel in factor.output_channels] == list(_AXES)
@@ -254,10 +246,10 @@ def _of_moments(problem: Problem, here: Records, arm: Arm, loads: SiteLoads, alo
         name = arm.joint_names[site - 1] if site else "the mount"
         shown = name if alone else (f"{arm.name}.{name}" if site else f"the mount of {arm.name}")
         words = f"the moment that {shown} carries, in all directions"
-        yield Dependence("moment", shown, arm.name, words, f"compliance on {shown}", _SECOND_LOAD, columns)
+        yield Cause("moment", shown, arm.name, words, f"compliance on {shown}", _SECOND_LOAD, columns)
 
 
-def _of_rates(here: Records, arm: Arm, arms: Mapping[str, Arm]) -> Iterator[Dependence]:
+def _of_rates(here: Records, arm: Arm, arms: Mapping[str, Arm]) -> Iterator[Cause]:
     """Joints read before or after the measurement, which moved in between: to first order in that time.
 
     Beside it the play of all joints at once, which a delay resembles where each moved about as fast, to and fro.
@@ -273,12 +265,12 @@ def _of_rates(here: Records, arm: Arm, arms: Mapping[str, Arm]) -> Iterator[Depe
     words = f"how fast {which} moved: they were read at another time than the measurement was made"
     effect = "delay on all joints, or synchronise the clocks of joints and instrument"
     measure = "repeat some poses at rest, where a delay has no effect"
-    yield Dependence("delay", "", arm.name, words, effect, measure, columns, ("joints",), "s")
+    yield Cause("delay", "", arm.name, words, effect, measure, columns, ("joints",), "s")
     played = [here.along(channel, -np.sign(rate)[:, None]) for channel, rate in rates.items()]
     columns = tuple(np.concatenate(parts, axis=2) for parts in zip(*played, strict=True))
     words, effect = f"which way {which} moved, each along its own motion", "approach_backlash on all joints"
     measure = "move through the same poses slowly and fast: play stays, what a delay does grows with the rates"
-    yield Dependence("approach", "all joints", arm.name, words, effect, measure, columns)
+    yield Cause("approach", "all joints", arm.name, words, effect, measure, columns)
 
 
 def _stated(feature: Array) -> Array:
@@ -300,53 +292,8 @@ def _centred(features: Array, command: Array) -> Array:
     return centred
 
 
-LEVEL = 0.05
-LACK = 0.01
-TIMES_REPEATS = 3.0
-"""How many times what repeats scatter residuals are, for the rest to be worth a word: no model is perfect."""
-_FEWEST_REPEATS = 5
-_MM = 1000.0
-
-
-@dataclass(frozen=True)
-class NoiseTrend:
-    """What the scatter depends on.
-
-    Attributes:
-        low, high: scatter in units of the declared noise, in the third of the records with the least and most of it.
-    """
-
-    words: str  # as the end of a sentence
-    p_value: float  # that it does not, over all things looked at
-    low: float
-    high: float
-    alternatives: tuple[str, ...]  # what else may be meant, the most likely first
-
-
-def noise_trend(residual: Array, basis: Array, by_record: Indices, here: Records, place: Array) -> NoiseTrend | None:
-    """What the scatter of a residual (rows, whitened) depends on; None where nothing shows.
-
-    ``basis`` is what the fit takes up (rows x n), ``place`` what instruments read (3 x N; m), or nothing (0 x N).
-    """
-    leverage = np.sum(basis[by_record] ** 2, axis=2)
-    squares = np.mean(residual[by_record] ** 2 / np.maximum(1 - leverage, 0.05), axis=1)
-    tried = [(words, f) for words, f in _features(here, place) if np.ptp(f) > 1e-9 * max(1.0, float(np.abs(f).max()))]
-    spread = float(squares.std())
-    if not tried or not spread:
-        return None
-    explained = np.array([np.corrcoef(squares, f)[0, 1] ** 2 for _, f in tried])
-    best, count = int(np.argmax(explained)), len(squares)
-    p = min(1.0, len(tried) * float(chdtrc(1, count * explained[best])))
-    if p > LEVEL:
-        return None
-    gains = -0.5 * count * np.log1p(-np.minimum(explained, 1 - 1e-12))
-    close = [i for i in np.argsort(-gains) if i != best and gains[i] > gains[best] - CLEAR]
-    thirds = np.array_split(np.argsort(tried[best][1], kind="stable"), 3)
-    low, high = (float(np.sqrt(np.mean(squares[part]))) for part in (thirds[0], thirds[-1]))
-    return NoiseTrend(tried[best][0], p, low, high, tuple(tried[i][0] for i in close))
-
-
-def _features(here: Records, place: Array) -> Iterator[tuple[str, Array]]:
+def scatter_features(here: Records, place: Array) -> Iterator[tuple[str, Array]]:
+    """On what the scatter may depend, in words; ``place`` is what instruments read (3 x N; m), or nothing (0 x N)."""
     yield "the recorded order", recorded_order(here.dataset)
     for axis, coordinate in zip("xyz", place, strict=False):
         yield f"the coordinate {axis}", coordinate
@@ -365,60 +312,6 @@ def _features(here: Records, place: Array) -> Iterator[tuple[str, Array]]:
             yield f"the load on joint {number}", np.abs(np.nan_to_num(effort))
 
 
-@dataclass(frozen=True)
-class Repeats:
-    """What records of one pose say of noise.
-
-    Attributes:
-        records, poses: how many repeats there are, and of how many poses.
-    """
-
-    scatter_mm: float  # of a record about the mean of its pose (root mean square)
-    left_mm: float  # of all residuals (root mean square)
-    records: int
-    poses: int
-    p_value: float  # that residuals are as repeats have them
-    shared: bool  # whether the means of poses nearby miss alike
-
-    @property
-    def exceeded(self) -> bool:
-        return self.p_value < LACK and self.left_mm > TIMES_REPEATS * self.scatter_mm
-
-
-def repeats_of(residual: Array, basis: Array, rows: FitRows, pose: Indices, kernels: Kernels) -> Repeats | None:
-    """Of a fit's residual (rows), which took up a basis (rows x n); None where hardly a ``pose`` (N) was repeated."""
-    by_record, size = rows.by_record, np.bincount(pose)
-    again = int(np.sum(size - 1))
-    if again < _FEWEST_REPEATS:
-        return None
-    means = np.zeros((len(size), len(pose)))
-    means[pose, np.arange(len(pose))] = 1 / size[pose]
-    own, off = means @ residual[by_record], np.zeros_like(residual)
-    off[by_record] = residual[by_record] - own[pose]
-    acting = int(np.sum(np.any(residual[by_record] != 0, axis=0)))
-    spare, pure = again * acting, float(off @ off)
-    lacking = len(pose) * acting - basis.shape[1] - spare
-    lack = max(float(np.sum(residual[by_record] ** 2)) - pure, 0.0)
-    ratio = lack / max(lacking, 1) / max(pure / spare, 1e-300)
-    return Repeats(
-        float(np.sqrt(np.sum(rows.errors(off) ** 2) / again)) * _MM,
-        float(np.sqrt(np.mean(rows.errors(residual) ** 2))) * _MM,
-        again + int(np.sum(size > 1)),
-        int(np.sum(size > 1)),
-        float(fdtrc(lacking, spare, ratio)) if lacking > 0 else 1.0,
-        _shared(own, np.einsum("gn,nrc->grc", means, basis[by_record]), pose, kernels),
-    )
-
-
-def _shared(own: Array, taken_up: Array, pose: Indices, kernels: Kernels) -> bool:
-    within, first = np.linalg.qr(taken_up.reshape(own.size, -1))[0], np.unique(pose, return_index=True)[1]
-    if within.shape[1] >= own.size:
-        return False
-    left, places = own.ravel() - within @ (within.T @ own.ravel()), np.arange(own.size).reshape(own.shape)
-    of_poses = Kernels(tuple(kernel[np.ix_(first, first)] for kernel in kernels.kernels))
-    return bool(smooth(left, within, places, of_poses).evidence > CLEAR)
-
-
 _MOST_STEPS, _MOST_SLIPS = 40, 12
 """Places at which something may have jumped are looked at: of all that is measured, and of each joint."""
 _FEWEST_APART = 4
@@ -427,14 +320,8 @@ _LOAD_PARTS = (slice(0, 3), slice(3, 4), slice(4, 8))
 _STEP_MEASURE = "repeat some of the first poses now, and look at what was touched at that time"
 
 
-def outside(
-    problem: Problem,
-    motion: Motion,
-    dataset: Dataset,
-    positions: Sequence[Array],
-    moves: Moves,
-) -> Iterator[Dependence]:
-    here = Records(dataset, motion)
+def _outside(here: Records, problem: Problem, positions: Sequence[Array], moves: Moves) -> Iterator[Cause]:
+    motion = here.motion
     yield from _of_mistakes(here, problem, moves)
     if motion.by_load:
         by_load = [slope.transpose(0, 2, 1) for slope in motion.by_load]  # n_r x N x (gravity's turn, size, load)
@@ -443,16 +330,16 @@ def outside(
         turns = tuple(f"turned about {axis}" for axis in _AXES)
         gravity, size, load = (tuple(slope[:, :, part] for slope in by_load) for part in _LOAD_PARTS)
         words, effect = "the direction of gravity in the base frame", "statics.gravity_r?, freed"
-        yield Dependence("gravity", "", "", words, effect, level, gravity, turns, "rad")
+        yield Cause("gravity", "", "", words, effect, level, gravity, turns, "rad")
         words = "the size of gravity, or of all masses together"
-        yield Dependence("gravity", "size", "", words, "statics.gravity_m_s2", weigh, size, ("share",), "1")
+        yield Cause("gravity", "size", "", words, "statics.gravity_m_s2", weigh, size, ("share",), "1")
         words = "a load at the tool that is not stated"
-        yield Dependence("load", "", "", words, "statics.payload_g", weigh, load)
+        yield Cause("load", "", "", words, "statics.payload_g", weigh, load)
     yield from _of_instrument(here, positions)
     yield from _of_steps(here, problem, positions)
 
 
-def _of_instrument(here: Records, read: Sequence[Array]) -> Iterator[Dependence]:
+def _of_instrument(here: Records, read: Sequence[Array]) -> Iterator[Cause]:
     if not any(np.any(position) for position in read):
         return
     zeros = [np.zeros((size, len(here.dataset), 1)) for size in here.sizes]
@@ -470,13 +357,13 @@ def _of_instrument(here: Records, read: Sequence[Array]) -> Iterator[Dependence]
     known = "measure a known length along each axis with the instrument"
     together = tuple(np.sum(part, axis=2, keepdims=True) for part in columns((0, 0), (1, 1), (2, 2)))
     words = "the instrument's scale, along all axes alike"
-    yield Dependence("scale", "", "", words, "", known, together, ("share",), "1")
+    yield Cause("scale", "", "", words, "", known, together, ("share",), "1")
     for i, axis in enumerate(_AXES):
         words = f"the instrument's scale along {axis}"
-        yield Dependence("scale", axis, "", words, "", known, columns((i, i)), ("share",), "1")
+        yield Cause("scale", axis, "", words, "", known, columns((i, i)), ("share",), "1")
     words = "the instrument's axes, which are not at right angles"
     labels = tuple(f"between {_AXES[i]} and {_AXES[j]}" for i, j in ((0, 1), (0, 2), (1, 2)))
-    yield Dependence("scale", "axes", "", words, "", known, columns((0, 1), (0, 2), (1, 2)), labels, "rad")
+    yield Cause("scale", "axes", "", words, "", known, columns((0, 1), (0, 2), (1, 2)), labels, "rad")
 
 
 def predicted_positions(problem: Problem, values: Array, dataset: Dataset) -> tuple[Array, ...]:
@@ -492,7 +379,7 @@ def predicted_positions(problem: Problem, values: Array, dataset: Dataset) -> tu
     return tuple(positions)
 
 
-def _of_steps(here: Records, problem: Problem, read: Sequence[Array]) -> Iterator[Dependence]:
+def _of_steps(here: Records, problem: Problem, read: Sequence[Array]) -> Iterator[Cause]:
     order = recorded_order(here.dataset)
     if np.ptp(order) <= 0:
         return
@@ -505,10 +392,10 @@ def _of_steps(here: Records, problem: Problem, read: Sequence[Array]) -> Iterato
         after = (rank >= place).astype(float)[:, None]
         words = f"whether a record was measured before or after {ids[place]}: what is measured jumps there as a whole"
         effect, shifts = "the records before and after as groups of their own", here.axes(after)
-        yield Dependence("step", "", "", words, effect, _STEP_MEASURE, shifts, jumps=True)
+        yield Cause("step", "", "", words, effect, _STEP_MEASURE, shifts, jumps=True)
         if any(map(np.any, turns)):
             both = tuple(np.concatenate(p, axis=2) for p in zip(shifts, (t * after for t in turns), strict=True))
-            yield Dependence("step", "", "", f"{words}, and turns", effect, _STEP_MEASURE, both, jumps=True)
+            yield Cause("step", "", "", f"{words}, and turns", effect, _STEP_MEASURE, both, jumps=True)
     for channel in here.motion.channels:
         arm, _, joint = channel.partition(".")
         shown = shown_joint(channel, problem.blueprint.arms)
@@ -516,10 +403,10 @@ def _of_steps(here: Records, problem: Problem, read: Sequence[Array]) -> Iterato
         for place in _places(len(rank), _MOST_SLIPS):
             along = here.along(channel, (rank >= place).astype(float)[:, None])
             words = f"whether a record was measured before or after {ids[place]}: {shown} slips there"
-            yield Dependence("slip", shown, arm, words, "", _STEP_MEASURE, along, ("slip",), si, jumps=True)
+            yield Cause("slip", shown, arm, words, "", _STEP_MEASURE, along, ("slip",), si, jumps=True)
 
 
-def _of_mistakes(here: Records, problem: Problem, moves: Moves) -> Iterator[Dependence]:
+def _of_mistakes(here: Records, problem: Problem, moves: Moves) -> Iterator[Cause]:
     order, many = recorded_order(here.dataset), len(problem.blueprint.measurements) > 1
     ranked = np.argsort(order, kind="stable")
     rank = np.argsort(ranked, kind="stable")
@@ -536,12 +423,12 @@ def _of_mistakes(here: Records, problem: Problem, moves: Moves) -> Iterator[Depe
             labels, unit = (("change",), "1") if one.together and one.course != "once" else ((), "")
             if np.ptp(order) > 0 and one.course == "slowly":
                 course = tuple(move * (rank / max(len(rank) - 1, 1) - 0.5)[:, None] for move in moved)
-                yield Dependence(one.kind, subject, "", words, "", one.measure, course, labels, unit)
+                yield Cause(one.kind, subject, "", words, "", one.measure, course, labels, unit)
             elif np.ptp(order) > 0:
                 for place in _places(len(rank), _MOST_SLIPS):
                     jump = tuple(move * (rank >= place)[:, None] for move in moved)
                     at = f"whether a record was measured before or after {here.dataset.ids[ranked[place]]}: {words}"
-                    yield Dependence(one.kind, subject, "", at, "", one.measure, jump, jumps=True)
+                    yield Cause(one.kind, subject, "", at, "", one.measure, jump, jumps=True)
 
 
 def _places(count: int, most: int) -> list[int]:

@@ -1,12 +1,4 @@
-"""Score tests of residuals against many sets of columns at once, at a family-wise level.
-
-Residuals of a fit are noise less what the fit took up. A set of columns is freed of what the fit can take up (its
-Jacobian, priors as further rows, a drift as further columns), and its inner products with the residuals are added up
-over blocks of neighbouring records [Rao1948]. Their covariance is estimated from the blocks themselves [Liang1986],
-so that errors which resemble their neighbours' do not pass for many independent ones. Independent noise through the
-same projection gives the distribution of the smallest p-value of the whole family [Westfall1993].
-
-Covariances that hold where records which follow one another err alike.
+"""Rows of a fit, and covariances that hold where records which follow one another err alike.
 
 Errors of neighbours are taken for an independent part beside one that falls by e over some records, both by restricted
 maximum likelihood [Patterson1971], which counts what the fit took out of the residuals. An estimate is a weighted sum
@@ -20,7 +12,7 @@ from typing import Self
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.special import fdtrc, ndtr
+from scipy.special import ndtr
 
 from armcal.base.arrays import Array, Indices, Mask
 from armcal.diagnose.fit import Fit, thinned
@@ -127,45 +119,16 @@ def _whitening(noise: Sequence[float], records: FactorRecords) -> Array:
     return np.asarray(np.diag(1 / np.array(noise))[:, :, None] * root)
 
 
-DRAWS = 999
-"""Of noise, in the test that decides whether anything is found: the level of one design then scatters by 0.7 %."""
-FEWER_DRAWS = 299  # In the tests after it, and wherever they show enough
 SEEN = 0.05  # A direction that the fit takes up but for so much of its length is the model's own
-_FEWEST_SPARE_BLOCKS = 8
-_SMALLEST_P = 1e-300
-_OUT_OF_QUESTION = 0.1  # A p-value by the fewer draws that all of them would bring to 0.05 once in ten thousand times
-_COLUMNS_AT_ONCE = 12  # Their products with the draws, block by block, stay in a processor's cache
+SMALLEST = 1e-300
+_FEWEST_PAIRS = 10
+_DRAWS = 299  # Of noise: how neighbours of residuals without likeness correlate
 
 
-@dataclass(frozen=True)
-class LinearFit:
-    """A fit as its last linear step: all rows whitened, those of priors and drifts behind those of the data."""
-
-    residual: Array  # at the solution (rows)
-    draws: Array  # independent noise that went through the same fit (rows x draws)
-    block: Indices  # of each row, which block of records it belongs to
-    records: Indices  # rows of the data as (records x rows a record), in recorded order
-    neighbours: Mask  # whether each record but the last is followed by its neighbour in the recording (records - 1)
-
-    @property
-    def blocks(self) -> int:
-        return int(self.block.max(initial=-1)) + 1
-
-    def without(self, basis: Array) -> Self:
-        residual = self.residual - basis @ (basis.T @ self.residual)
-        return replace(self, residual=residual, draws=self.draws - basis @ (basis.T @ self.draws))
-
-    def with_fewer_draws(self) -> Self:
-        return replace(self, draws=self.draws[:, :FEWER_DRAWS])
-
-
-def linear_fit(
-    slopes: Array, residual: Array, block: Indices, records: Indices, neighbours: Mask
-) -> tuple[LinearFit, Array]:
+def basis_of(slopes: Array) -> Array:
+    """Orthonormal, of what the fit takes up (rows x n)."""
     lengths = np.linalg.norm(slopes, axis=0)
-    basis = np.linalg.qr(slopes / np.where(lengths > 0, lengths, 1.0))[0]
-    noise = np.random.default_rng(0).normal(size=(len(residual), DRAWS))
-    return LinearFit(residual, noise, block, records, neighbours).without(basis), basis
+    return np.asarray(np.linalg.qr(slopes / np.where(lengths > 0, lengths, 1.0))[0])
 
 
 def own_basis(columns: Array, basis: Array) -> tuple[Array, Array]:
@@ -182,91 +145,19 @@ def own_basis(columns: Array, basis: Array) -> tuple[Array, Array]:
     return left @ coefficients, coefficients / np.where(lengths > 0, lengths, 1.0)[:, None]
 
 
-@dataclass(frozen=True)
-class FamilyTest:
-    adjusted: Array  # p-values of each set, counting that so many were looked at (family-wise)
-    share: Array  # of the squared residual, how much each set would take up
-    lag_one: float  # correlation of neighbouring residuals, less what the fit itself makes of it
-    lag_adjusted: float  # its p-value in the same family; 1 where there are too few neighbours
+def lag_one(both: Array, by_record: Indices, neighbours: Mask) -> tuple[float, Array]:
+    """How the first of some residuals (rows x m) correlates with its neighbours, beyond what chance, the others, does.
 
-
-def family_test(fit: LinearFit, bases: Sequence[Array]) -> FamilyTest:
-    """Test the residual against orthonormal bases (rows x k each), and against its neighbours.
-
-    By fewer draws first: where those show that nothing is near significance, more would not change it.
+    And the p-value of each (m): 1 where there are too few ``neighbours`` (N - 1: whether the next record is one).
     """
-    few = _by_all_draws(fit.with_fewer_draws(), bases)
-    if min(few.adjusted.min(initial=1.0), few.lag_adjusted) > _OUT_OF_QUESTION:
-        return few
-    return _by_all_draws(fit, bases)
-
-
-def _by_all_draws(fit: LinearFit, bases: Sequence[Array]) -> FamilyTest:
-    both = np.column_stack([fit.residual, fit.draws])
-    lag, lag_p = _neighbours(fit, both)
-    own, least, by_size = np.ones(len(bases)), lag_p[1:], dict[int, list[int]]()
-    for i, basis in enumerate(bases):
-        by_size.setdefault(basis.shape[1], []).append(i)
-    for size, members in by_size.items():
-        spare = fit.blocks - size  # where blocks are too few for the columns, nothing is known of them
-        if size and spare >= _FEWEST_SPARE_BLOCKS:
-            ratios = _ratios([bases[i] for i in members], both, fit)
-            own[members] = _p_value(size, spare, ratios[:, 0])
-            least = np.minimum(least, _p_value(size, spare, ratios[:, 1:].max(axis=0)))
-    beaten = np.searchsorted(np.sort(least), np.append(own, lag_p[0]), side="right")
-    adjusted = (1 + beaten) / (1 + len(least))
-    total = max(float(fit.residual @ fit.residual), _SMALLEST_P)
-    share = np.array([np.sum((basis.T @ fit.residual) ** 2) for basis in bases]) / total
-    return FamilyTest(adjusted[:-1], share, lag, float(adjusted[-1]))
-
-
-def _ratios(bases: Sequence[Array], both: Array, fit: LinearFit) -> Array:
-    """F of sums of block products by their own spread (bases x draws), of bases that have equally many columns.
-
-    T = s' (sum of s_b s_b')^-1 s lies between 0 and the number of blocks B, and (B - k)/k T/(B - T) follows F(k, B - k)
-    for independent normal blocks.
-    """
-    size, rows, statistics = bases[0].shape[1], _by_block(both, fit), np.empty((len(bases), both.shape[1]))
-    most = max(1, _COLUMNS_AT_ONCE // size)
-    for start in range(0, len(bases), most):
-        columns = _by_block(np.hstack(bases[start : start + most]), fit)
-        products = (columns.transpose(0, 2, 1) @ rows).reshape(fit.blocks, -1, size, both.shape[1])
-        total = products.sum(axis=0)  # bases x k x draws
-        spread = np.empty((*total[:, 0].shape, size, size))
-        for i, j in zip(*np.tril_indices(size), strict=True):
-            spread[..., i, j] = spread[..., j, i] = np.einsum("bmd,bmd->md", products[:, :, i], products[:, :, j])
-        floor = 1e-12 * np.trace(spread, axis1=2, axis2=3) + _SMALLEST_P
-        if size == 1:
-            statistics[start : start + most] = total[:, 0] ** 2 / (spread[..., 0, 0] + floor)
-            continue
-        sums = total.transpose(0, 2, 1)
-        solved = np.linalg.solve(spread + floor[..., None, None] * np.eye(size), sums[..., None])[..., 0]
-        statistics[start : start + most] = np.sum(sums * solved, axis=2)
-    return np.asarray((fit.blocks - size) / size * statistics / np.maximum(fit.blocks - statistics, 1e-9))
-
-
-def _by_block(columns: Array, fit: LinearFit) -> Array:
-    order, sizes = np.argsort(fit.block, kind="stable"), np.bincount(fit.block)
-    place = np.arange(len(order)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    blocks = np.zeros((len(sizes), int(sizes.max()), columns.shape[1]))
-    blocks[fit.block[order], place] = columns[order]
-    return blocks
-
-
-def _p_value(size: int, spare: int, ratio: Array) -> Array:
-    return np.asarray(np.maximum(fdtrc(size, spare, ratio), _SMALLEST_P))
-
-
-def _neighbours(fit: LinearFit, both: Array) -> tuple[float, Array]:
-    first = np.flatnonzero(fit.neighbours)
-    if len(first) < 10:
+    first = np.flatnonzero(neighbours)
+    if len(first) < _FEWEST_PAIRS:
         return 0.0, np.ones(both.shape[1])
-    data = both[fit.records]
-    squares = np.sum(data**2, axis=(0, 1)) / len(data)
-    lag = np.sum(data[first] * data[first + 1], axis=(0, 1)) / len(first) / np.maximum(squares, _SMALLEST_P)
+    data = both[by_record]
+    squares = np.maximum(np.sum(data**2, axis=(0, 1)) / len(data), SMALLEST)
+    lag = np.sum(data[first] * data[first + 1], axis=(0, 1)) / len(first) / squares
     middle, spread = float(lag[1:].mean()), max(float(lag[1:].std()), 1e-12)
-    p = 2 * ndtr(-np.abs(lag - middle) / spread)
-    return float(lag[0] - middle), np.maximum(p, _SMALLEST_P)
+    return float(lag[0] - middle), np.maximum(2 * ndtr(-np.abs(lag - middle) / spread), SMALLEST)
 
 
 LEVEL = 0.05
@@ -293,9 +184,10 @@ def widened(problem: Problem, estimate: Estimate, position: Indices) -> Estimate
     if len(chosen) < FEWEST_RECORDS or not estimate.names or not estimate.verdict.converged:
         return estimate
     rows, place = FitRows.of(problem.subset(chosen), estimate), position[chosen]
-    block = np.zeros(len(rows.residual), dtype=np.intp)
-    fit, _ = linear_fit(rows.slopes, rows.residual, block, rows.by_record, np.diff(place) == 1)
-    if family_test(fit, []).lag_adjusted > LEVEL:
+    basis = basis_of(rows.slopes)
+    noise = np.random.default_rng(0).normal(size=(len(rows.residual), _DRAWS))
+    both = np.column_stack([rows.residual, noise])
+    if lag_one(both - basis @ (basis.T @ both), rows.by_record, np.diff(place) == 1)[1][0] > LEVEL:
         return estimate
     shared = _shared(rows, place, estimate.noise_scale, problem.increments)
     chain = problem.parameters.entries_jacobian(estimate.values) * problem.parameters.scales()
