@@ -13,9 +13,8 @@ import numpy as np
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.functions.batch_function import EvaluatorChoice
-from armcal.planning.candidates import Candidates, whitened_rows
-from armcal.planning.criterion import criterion
-from armcal.planning.exchange import Plan, choose, detmax, value_of
+from armcal.planning.candidates import Candidates, efficiency, value_of, whitened_rows
+from armcal.planning.exchange import Plan, choose, detmax
 from armcal.planning.relaxation import Task
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
@@ -56,9 +55,6 @@ class SvdTally:
         kept = self._without(candidate)
         return np.array([self._value([*kept, i]) for i in range(len(self._rows))]) - self._value(self._chosen)
 
-    def tolerance(self) -> float:
-        return 1e-9
-
     def _without(self, candidate: int) -> list[int]:
         kept = list(self._chosen)
         kept.remove(candidate)
@@ -96,7 +92,7 @@ def _one_start(task: Task, start: Indices) -> Row:
         found["svd"] = detmax(task, start, SvdTally(task.candidates))
 
     times = best_times({"ours": ours, "svd": obvious}, repeats=3)
-    ends = [value_of(task.candidates, task.criterion, found[name]) for name in ("ours", "svd")]
+    ends = [value_of(task.candidates, found[name]) for name in ("ours", "svd")]
     note = f"log det {ends[0]:.4f}, the peer's {ends[1]:.4f}"
     return Row(
         NAME, f"one start, {CANDIDATES} candidates", times["ours"], "an SVD for each candidate", times["svd"], note
@@ -112,7 +108,7 @@ def _many_starts(task: Task, starts: list[Indices]) -> Row:
         plans.append(choose(task))
 
     def others() -> None:
-        values.extend(value_of(task.candidates, task.criterion, detmax(task, start)) for start in starts)
+        values.extend(value_of(task.candidates, detmax(task, start)) for start in starts)
 
     times = best_times({"ours": ours, "others": others}, repeats=2)
     note = f"log det {plans[0].value:.4f}, the best random start's {max(values):.4f}"
@@ -140,7 +136,7 @@ def _task(dataset: Dataset, evaluator: EvaluatorChoice) -> Task:
     system, parameters = experiment.system, experiment.parameters
     problem = Problem.build(system.arms, system.measurements, parameters, system.environment, dataset, evaluator)
     rows = whitened_rows(problem, parameters.nominal(), dataset)
-    return Task(Candidates(np.zeros((0, rows.shape[2])), rows), criterion("D"), POSES)
+    return Task(Candidates(np.zeros((0, rows.shape[2])), rows), POSES)
 
 
 def _in_a_process() -> dict[str, Any]:
@@ -166,7 +162,7 @@ def _measure() -> dict[str, float]:
         "before_mb": before,
         "peak_mb": _peak_mb(),
         "gap": bound - plan.value,
-        "efficiency": task.criterion.efficiency(plan.value, bound, task.candidates.size),
+        "efficiency": efficiency(plan.value, bound, task.candidates.size),
     }
 
 

@@ -584,9 +584,9 @@ ENTRIES: tuple[Entry, ...] = (
     ),
     entry(
         "plan",
-        "poses by exchange for O1: with clearance, approach sides and given records",
+        "poses by exchange: with clearance, approach sides and given records",
         f"plan {BENCH} --poses 20 --out {{out}}/first.csv --json {LEVELS}",
-        f"plan {BENCH} --poses 8 --goal O1 --given {{out}}/first.csv --out {{out}}/next.csv --json {LEVELS}",
+        f"plan {BENCH} --poses 8 --given {{out}}/first.csv --out {{out}}/next.csv --json {LEVELS}",
         reads=["0.out", "1.out", "first.csv", "next.csv"],
     ),
     entry(

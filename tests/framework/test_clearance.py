@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,9 +16,7 @@ from armcal.arm.clearance import (
     segment_to_box,
     segment_to_segment,
 )
-from armcal.arm.loading import holding_efforts
-from armcal.errors import PluginError
-from armcal.run.plan_clearance import ClearanceSettings, clearance_check, enclosing_capsule
+from holding import holding_efforts
 from scipy.optimize import minimize
 
 RANDOM = np.random.default_rng(0)
@@ -188,44 +184,6 @@ def test_the_tool_stays_out_of_forbidden_boxes_and_balls(arm) -> None:
     inside = np.all([~check(q).allowed for check in axes], axis=0)
     assert 0 < inside.sum() < 6000
     assert np.array_equal(inside, ~ClearanceCheck(arm, Clearance({}, (), (box,)))(q).allowed)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_an_enclosing_capsule_holds_every_point_and_is_no_ball_about_a_rod(seed: int) -> None:
-    random = np.random.default_rng(seed)
-    points = random.normal(size=(200, 3)) * random.uniform(0.01, 1, 3)
-    capsule = enclosing_capsule(points, "tool")
-    ends = (np.array([p.at]) for p in (capsule.start, capsule.end))
-    assert segment_to_segment(*ends, points, points).max() <= capsule.radius * (1 + 1e-9)
-    rod = enclosing_capsule(np.array([[x, y, z] for x in (0, 1.0) for y in (0, 0.1) for z in (0, 0.1)]), "tool")
-    assert rod.radius == pytest.approx(0.05 * np.sqrt(2))
-
-
-def test_a_mesh_without_its_library_is_a_clear_error(lrm, arm, tmp_path, monkeypatch) -> None:
-    experiment = lrm.experiment()
-    mesh = tmp_path / "hand.stl"
-    mesh.write_text("solid\n")
-    part = {"hand": [{"type": "mesh", "path": str(mesh), "frame": "tool"}]}
-    settings = ClearanceSettings.model_validate({"parts": part})
-    monkeypatch.setitem(sys.modules, "trimesh", None)
-    with pytest.raises(PluginError, match="trimesh"):
-        clearance_check(settings, experiment.system.arms, experiment.source)
-
-
-def test_a_mesh_is_taken_in_its_unit_and_frame(lrm, arm, tmp_path, monkeypatch) -> None:
-    experiment = lrm.experiment()
-    corners = np.array([[x, y, z] for x in (0, 10.0) for y in (0, 10) for z in (0, 200)])
-    fake = SimpleNamespace(load=lambda path, force: SimpleNamespace(vertices=corners))
-    monkeypatch.setitem(sys.modules, "trimesh", fake)
-    parts = {
-        "hand": [{"type": "mesh", "path": str(tmp_path / "hand.stl"), "frame": "tool", "unit_mm": 1}],
-        "post": [{"type": "ball", "centre": {}, "radius_mm": 0}],
-    }
-    rules = [{"between": ["hand", "post"], "at_least_mm": 0}]
-    settings = ClearanceSettings.model_validate({"parts": parts, "rules": rules})
-    margin = clearance_check(settings, experiment.system.arms, experiment.source)(np.zeros((6, 1))).margins[0, 0]
-    own = {"hand": (enclosing_capsule(corners / 1000, "tool"),), "post": ball("base")}
-    assert margin == ClearanceCheck(arm, Clearance(own, (Rule(("hand", "post"), 0.0),)))(np.zeros((6, 1))).margins[0, 0]
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Completion in a shell: commands, options' values, and the names that plugins offer."""
+"""Completion in a shell: commands and options' values."""
 
 from __future__ import annotations
 
@@ -25,8 +25,6 @@ def completed(words: str, number: int) -> list[str]:
 
 @pytest.mark.slow
 def test_values_of_options_are_completed() -> None:
-    answer = completed("armcal export x.yaml --format ", 4)
-    assert "plain,urdf" in answer and "plain,c" in answer
     assert {"plain,effect", "plain,model", "plain,reader"} <= set(completed("armcal new plugin a --kind ", 5))
     assert completed("armcal wat", 1) == ["plain,watch"]
     assert "plain,a4" in completed("armcal board chessboard --paper ", 4)

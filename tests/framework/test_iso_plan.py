@@ -122,7 +122,7 @@ def test_single_poses_are_come_to_along_each_axis_and_joints_from_the_sides_that
     "options0-give --poses N to calibrate, or --iso-cube SIZE_MM to test",
     "options2-found '40cm', expected an edge of 1 to 10000 mm, or auto",
     "options3-found 'nan'",
-    "options4---goal has no meaning with --iso-cube",
+    "options4---order has no meaning with --iso-cube",
     "options6-found no limits for q2",
 )
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_single_poses_are_come_to_along_each_axis_and_joints_from_the_sides_that
         ((), "give --poses N to calibrate, or --iso-cube SIZE_MM to test"),
         (("--iso-cube", "40cm"), "found '40cm', expected an edge of 1 to 10000 mm, or auto"),
         (("--iso-cube", "nan"), "found 'nan'"),
-        (("--iso-cube", "auto", "--goal", "D"), "--goal has no meaning with --iso-cube"),
+        (("--iso-cube", "auto", "--order", "none"), "--order has no meaning with --iso-cube"),
         (("--iso-cube", "9000"), "no cube of 9000 mm was found within joint limits"),
         (("--iso-cube", "auto", "--set", "plan.limits={q1: [0 deg, 9 deg]}"), "found no limits for q2"),
     ],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from armcal.planning.criterion import observability
+from armcal.planning.candidates import observability
 
 
 def _jacobian(seed: int = 0, rows: int = 30, columns: int = 5) -> np.ndarray:
@@ -33,7 +33,7 @@ def test_the_means_stand_between_the_ends_and_in_order() -> None:
 
 def test_equal_singular_values_are_perfect() -> None:
     found = observability(np.full(4, 3.0), 9)
-    assert found.as_dict() == pytest.approx({"o1": 1.0, "o2": 1.0, "o3": 3.0, "o4": 3.0, "o5": 3.0})
+    assert found.__dict__ == pytest.approx({"o1": 1.0, "o2": 1.0, "o3": 3.0, "o4": 3.0, "o5": 3.0})
 
 
 def test_order_does_not_matter_and_scale_does_as_defined() -> None:
@@ -53,8 +53,8 @@ def test_measuring_every_pose_twice_leaves_the_mean_index_alone_and_raises_the_o
 
 
 def test_an_undetermined_direction_leaves_nothing() -> None:
-    assert set(observability(np.array([2.0, 1.0, 0.0]), 30).as_dict().values()) == {0.0}
-    assert set(observability(np.array([2.0, 1.0, 1e-17]), 2).as_dict().values()) == {0.0}
+    assert set(observability(np.array([2.0, 1.0, 0.0]), 30).__dict__.values()) == {0.0}
+    assert set(observability(np.array([2.0, 1.0, 1e-17]), 2).__dict__.values()) == {0.0}
 
 
 def test_many_large_values_do_not_overflow() -> None:

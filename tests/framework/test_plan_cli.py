@@ -68,7 +68,7 @@ def test_a_plan_is_a_csv_of_recorded_poses_and_trains_a_run(tmp_path: Path) -> N
     assert ids == told["ids"] and len(set(ids)) == 30
     for row in rows(out):
         assert all(float(row[f"q{i}_deg"]) == float(recorded[row["pose_id"]][f"q{i}_deg"]) for i in range(1, 7))
-    assert told["log_det"] == pytest.approx(log_det(scaled_rows(out)), rel=1e-9) == pytest.approx(told["value"])
+    assert told["log_det"] == pytest.approx(log_det(scaled_rows(out)), rel=1e-9)
     flags = ["--set", "validation.holdout=0", "--set", f"validation.train_ids={out}", "--set", "validation.folds=0"]
     run = armcal("run", DEMO, "--out", str(tmp_path / "run"), "--json", "--set", "evaluator=interpreted", *flags)
     assert run.exit_code == 0, run.output
@@ -105,24 +105,12 @@ def test_a_plan_reads_back_as_candidates_and_as_given_records(tmp_path: Path) ->
     assert all(p["sd_after"] < p["sd_before"] for p in after["parameters"])
 
 
-def test_given_records_may_be_a_list_of_ids(tmp_path: Path) -> None:
-    first, by_ids, by_poses = (tmp_path / f"{name}.csv" for name in "abc")
-    planned(first, "--poses", "40")
-    listed = tmp_path / "ids.csv"
-    listed.write_text("pose_id\n" + "\n".join(row["pose_id"] for row in rows(first)) + "\n")
-    answers = [
-        planned(by_ids, "--poses", "5", "--given", str(listed)),
-        planned(by_poses, "--poses", "5", "--given", str(first)),
-    ]
-    assert answers[0]["ids"] == answers[1]["ids"]
-
-
 @pytest.mark.slow
 def test_the_bound_holds_over_other_plans_and_is_told(tmp_path: Path) -> None:
     told = planned(tmp_path / "plan.csv", "--poses", "30")
-    other = planned(tmp_path / "other.csv", "--poses", "30", "--goal", "A")
-    assert told["bound"]["upper"] >= told["log_det"] > other["log_det"]
-    assert told["bound"]["gap"] == pytest.approx(told["bound"]["upper"] - told["value"])
+    other = planned(tmp_path / "other.csv", "--poses", "30", "--set", "plan.seed=3")
+    assert told["bound"]["upper"] >= max(told["log_det"], other["log_det"])
+    assert told["bound"]["gap"] == pytest.approx(told["bound"]["upper"] - told["log_det"])
     assert 0.95 < told["bound"]["efficiency"] <= 1
     spoken = armcal("plan", DEMO, "--poses", "30", "--out", str(tmp_path / "x.csv"), *QUICK).stdout
     assert "upper bound" not in spoken and "D-efficiency at least 9" in spoken and "least determined" in spoken
@@ -144,17 +132,6 @@ def test_order_approach_and_travel_time_belong_together(tmp_path: Path) -> None:
     half = planned(slow, "--poses", "30", "--set", "plan.speeds_deg_per_s={q1: 1}")
     assert half["visit"]["travel_s"] > told["visit"]["travel_s"]
     assert set(half["ids"]) == set(told["ids"])
-
-
-@pytest.mark.slow
-def test_by_torque_servos_stay_cooler_and_the_poses_are_the_same(tmp_path: Path) -> None:
-    plans = {
-        order: planned(tmp_path / f"{order}.csv", "--poses", "30", "--order", order)
-        for order in ("travel", "torque", "none")
-    }
-    assert set(plans["travel"]["ids"]) == set(plans["torque"]["ids"]) == set(plans["none"]["ids"])
-    assert plans["torque"]["visit"]["peak_squared_torque"] < plans["travel"]["visit"]["peak_squared_torque"]
-    assert plans["travel"]["visit"]["travel_s"] <= plans["torque"]["visit"]["travel_s"]
 
 
 def test_poses_are_drawn_until_enough_keep_a_clearance_that_few_keep() -> None:
@@ -219,13 +196,13 @@ def test_the_same_command_gives_the_same_file(tmp_path: Path) -> None:
         (["--poses", "50", "--candidates", "nowhere.csv"], "nowhere.csv"),
         (["--poses", "50", "--given", "nowhere.csv"], "nowhere.csv"),
         (["--poses", "50", "--calibration", "nowhere.yaml"], "nowhere.yaml"),
+        (["--poses", "50", "--set", "plan.order=torque"], "plan.order"),
         (["--poses", "50", "--set", "plan.limits={q1: [9 deg, 1 deg]}"], "not in rising order"),
         (["--poses", "50", "--set", "plan.limits={q9: [1 deg, 9 deg]}"], "'q9'"),
         (["--poses", "50", "--set", "plan.limits={q1: [1 deg, 9 deg]}"], "200 beyond joint limits"),
         (["--poses", "50", "--set", "plan.candidates=continuous"], "found no limits for q1"),
         (["--poses", "50", "--set", "plan.candidates=grid"], "found no levels for q1"),
         (["--poses", "50", "--set", "plan.speeds_deg_per_s={q9: 3}"], "'q9'"),
-        (["--poses", "50", "--set", "plan.goal=F"], "plan.goal"),
         (["--poses", "50", "--set", "parameters.free=[]"], "no parameter is free"),
         (["--poses", "50", "--set", "parameters.free=[arm.mdh.*]"], "even all 200 candidates leave"),
         (["--poses", "50", "--set", f"plan.clearance={{parts: {{a: [{NOSE}]}}}}"], "'nose'"),

@@ -8,10 +8,9 @@ from itertools import combinations
 import numpy as np
 import pytest
 from armcal.errors import ProblemError
-from armcal.planning.candidates import Candidates, deviations, whitened_rows
-from armcal.planning.criterion import GOALS, criterion
-from armcal.planning.exchange import SHORTLIST, built_up, choose, detmax, in_order, tally, value_of
-from armcal.planning.relaxation import Task
+from armcal.planning.candidates import Candidates, deviations, value_of, whitened_rows
+from armcal.planning.exchange import Tally, built_up, choose, detmax, in_order
+from armcal.planning.relaxation import AT_ONCE, Task
 
 
 def made(count=30, n_rows=3, size=5, known=2, seed=0) -> Candidates:
@@ -21,26 +20,16 @@ def made(count=30, n_rows=3, size=5, known=2, seed=0) -> Candidates:
     return Candidates(random.normal(size=(known, size)), random.normal(size=(n_rows, count, size)) * scale)
 
 
-def by_hand(candidates: Candidates, goal: str, chosen) -> float:
-    """The criterion from its definition."""
+def by_hand(candidates: Candidates, chosen) -> float:
+    """The log determinant from its definition."""
     stacked = np.vstack([candidates.base, *(candidates.rows[:, i] for i in chosen)])
-    s = np.linalg.svd(stacked, compute_uv=False)
-    values = {
-        "D": 2 * np.sum(np.log(s)),
-        "A": -np.trace(np.linalg.inv(stacked.T @ stacked)),
-        "E": s[-1] ** 2,
-        "O2": s[-1] / s[0],
-        "O4": s[-1] ** 2 / s[0],
-        "O5": -np.sum(1 / s),
-    }
-    return float(values[{"O1": "D", "O3": "E"}.get(goal, goal)])
+    return float(2 * np.sum(np.log(np.linalg.svd(stacked, compute_uv=False))))
 
 
-@pytest.mark.parametrize("goal", GOALS)
 @pytest.mark.parametrize("n_rows", [1, 2, 3, 6])
-def test_updates_agree_with_decompositions_after_many_exchanges(goal: str, n_rows: int) -> None:
+def test_updates_agree_with_decompositions_after_many_exchanges(n_rows: int) -> None:
     candidates = made(n_rows=n_rows)
-    held = tally(candidates, criterion(goal))
+    held = Tally(candidates)
     random = np.random.default_rng(1)
     chosen = [int(i) for i in random.choice(30, 8, replace=False)]
     held.restart(np.array(chosen))
@@ -50,67 +39,62 @@ def test_updates_agree_with_decompositions_after_many_exchanges(goal: str, n_row
         else:
             chosen.append(int(random.integers(30)))
             held.add(chosen[-1])
-    now = by_hand(candidates, goal, chosen)
+    now = by_hand(candidates, chosen)
     scale = max(1.0, abs(now))
     others = [*range(0, 30, 7)]
     assert np.allclose(
         held.if_added()[others],
-        [by_hand(candidates, goal, [*chosen, i]) - now for i in others],
+        [by_hand(candidates, [*chosen, i]) - now for i in others],
         rtol=1e-4,
         atol=1e-5 * scale,
     )
-    without = [by_hand(candidates, goal, chosen[:i] + chosen[i + 1 :]) - now for i in range(len(chosen))]
+    without = [by_hand(candidates, chosen[:i] + chosen[i + 1 :]) - now for i in range(len(chosen))]
     assert np.allclose(held.if_removed(np.array(chosen)), without, rtol=1e-4, atol=1e-5 * scale)
-    swapped = [by_hand(candidates, goal, [*chosen[1:], i]) - now for i in others]
+    swapped = [by_hand(candidates, [*chosen[1:], i]) - now for i in others]
     assert np.allclose(held.if_swapped(chosen[0])[others], swapped, rtol=1e-4, atol=1e-5 * scale)
 
 
-@pytest.mark.parametrize("goal", GOALS)
-def test_no_single_swap_improves_a_plan(goal: str) -> None:
+def test_no_single_swap_improves_a_plan() -> None:
     candidates = made(count=25, seed=3)
-    plan = choose(Task(candidates, criterion(goal), 6), starts=2)
+    plan = choose(Task(candidates, 6), starts=2)
     assert len(set(plan.chosen.tolist())) == 6
-    value = by_hand(candidates, goal, plan.chosen)
+    value = by_hand(candidates, plan.chosen)
     assert plan.value == pytest.approx(value, rel=1e-8)
     for leaving in plan.chosen:
         kept = [i for i in plan.chosen if i != leaving]
         for entering in set(range(25)) - set(plan.chosen.tolist()):
-            assert by_hand(candidates, goal, [*kept, entering]) <= value + 1e-6 * abs(value), (leaving, entering)
+            assert by_hand(candidates, [*kept, entering]) <= value + 1e-6 * abs(value), (leaving, entering)
 
 
-@pytest.mark.parametrize("goal", ["D", "A", "E"])
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.quick("0-D", "1-A", "2-E")
-def test_of_few_candidates_the_very_best_plan_is_found(goal: str, seed: int) -> None:
+@pytest.mark.quick("0", "1")
+def test_of_few_candidates_the_very_best_plan_is_found(seed: int) -> None:
     candidates = made(count=12, size=4, seed=seed)
-    best = max(by_hand(candidates, goal, chosen) for chosen in combinations(range(12), 4))
-    assert choose(Task(candidates, criterion(goal), 4)).value == pytest.approx(best, rel=1e-9)
+    best = max(by_hand(candidates, chosen) for chosen in combinations(range(12), 4))
+    assert choose(Task(candidates, 4)).value == pytest.approx(best, rel=1e-9)
 
 
 def test_what_is_known_already_changes_the_plan() -> None:
     candidates = made(known=0, seed=5)
-    first = choose(Task(candidates, criterion("D"), 5)).chosen
+    first = choose(Task(candidates, 5)).chosen
     after = Candidates(np.concatenate([candidates.rows[:, i] for i in first]), candidates.rows)
-    second = choose(Task(after, criterion("D"), 5))
+    second = choose(Task(after, 5))
     assert set(second.chosen.tolist()) != set(first.tolist())
-    assert second.value == pytest.approx(by_hand(after, "D", second.chosen))
+    assert second.value == pytest.approx(by_hand(after, second.chosen))
 
 
-def test_a_pose_stands_once_unless_repeats_are_allowed() -> None:
+def test_a_pose_stands_once_however_good_it_is() -> None:
     candidates = made(count=8, seed=2)
     candidates.rows[:, 3] *= 50  # so good that it would be taken every time
-    once = choose(Task(candidates, criterion("D"), 6)).chosen.tolist()
-    thrice = choose(Task(candidates, criterion("D"), 6, limit=3)).chosen.tolist()
-    assert sorted(set(once)) == sorted(once)
-    assert max(thrice.count(i) for i in thrice) == 3
-    assert by_hand(candidates, "D", thrice) > by_hand(candidates, "D", once)
+    chosen = choose(Task(candidates, 6)).chosen.tolist()
+    assert 3 in chosen and sorted(set(chosen)) == sorted(chosen)
 
 
 def test_the_units_of_parameters_do_not_change_a_d_optimal_plan() -> None:
     candidates = made(seed=7)
     other = np.array([3.0, 0.3, 7.0, 1.0, 0.2])
     scaled = Candidates(candidates.base * other, candidates.rows * other)
-    plans = [choose(Task(c, criterion("D"), 8)) for c in (candidates, scaled)]
+    plans = [choose(Task(c, 8)) for c in (candidates, scaled)]
     assert plans[0].chosen.tolist() == plans[1].chosen.tolist()
     assert plans[1].value - plans[0].value == pytest.approx(2 * np.sum(np.log(other)))
 
@@ -118,46 +102,45 @@ def test_the_units_of_parameters_do_not_change_a_d_optimal_plan() -> None:
 def test_the_order_of_candidates_does_not_change_the_value() -> None:
     candidates = made(count=40, seed=8)
     shuffled = candidates.subset(np.random.default_rng(0).permutation(40))
-    values = [choose(Task(c, criterion("D"), 8)).value for c in (candidates, shuffled)]
+    values = [choose(Task(c, 8)).value for c in (candidates, shuffled)]
     assert values[0] == pytest.approx(values[1], rel=1e-9)
 
 
 def test_poses_are_given_in_the_order_of_what_they_add() -> None:
     candidates = made(seed=9)
-    chosen = choose(Task(candidates, criterion("D"), 6)).chosen
-    task = Task(candidates, criterion("D"), 6)
+    chosen = choose(Task(candidates, 6)).chosen
+    task = Task(candidates, 6)
     assert in_order(task, chosen[::-1]).tolist() == chosen.tolist()
-    firsts = [by_hand(candidates, "D", [*chosen[:2], i]) for i in chosen[2:]]
+    firsts = [by_hand(candidates, [*chosen[:2], i]) for i in chosen[2:]]
     assert int(np.argmax(firsts)) == 0
 
 
 def test_a_singular_start_is_climbed_out_of() -> None:
     candidates = made(count=40, known=0, size=6, seed=4)
     candidates.rows[:, :20, 3:] = 0  # half of the candidates see half of the parameters
-    task = Task(candidates, criterion("D"), 8)
+    task = Task(candidates, 8)
     chosen = detmax(task, np.arange(8))
-    assert np.isfinite(by_hand(candidates, "D", chosen)) and by_hand(candidates, "D", chosen) > 0
-    assert value_of(candidates, criterion("D"), np.arange(8)) < -100
+    assert np.isfinite(by_hand(candidates, chosen)) and by_hand(candidates, chosen) > 0
+    assert value_of(candidates, np.arange(8)) < -100
 
 
 def test_a_plan_for_many_candidates_is_a_local_optimum_over_all_of_them() -> None:
     candidates = made(count=2600, size=4, seed=11)
-    for goal in ("D", "A"):
-        plan = choose(Task(candidates, criterion(goal), 6), starts=1)
-        held = tally(candidates, criterion(goal))
-        held.restart(plan.chosen)
-        for leaving in plan.chosen:
-            gains = np.delete(held.if_swapped(int(leaving)), plan.chosen)
-            assert gains.max() <= 1e-6 * abs(plan.value)
-    assert candidates.count > SHORTLIST
+    plan = choose(Task(candidates, 6), starts=1)
+    held = Tally(candidates)
+    held.restart(plan.chosen)
+    for leaving in plan.chosen:
+        gains = np.delete(held.if_swapped(int(leaving)), plan.chosen)
+        assert gains.max() <= 1e-6 * abs(plan.value)
+    assert candidates.count > AT_ONCE
 
 
 def test_a_plan_built_up_is_a_local_optimum() -> None:
     candidates = made(count=20, seed=12)
-    chosen = built_up(Task(candidates, criterion("D"), 4))
-    value = by_hand(candidates, "D", chosen)
+    chosen = built_up(Task(candidates, 4))
+    value = by_hand(candidates, chosen)
     others = set(range(20)) - set(chosen.tolist())
-    assert all(by_hand(candidates, "D", [*set(chosen) - {o}, i]) <= value + 1e-9 for o in chosen for i in others)
+    assert all(by_hand(candidates, [*set(chosen) - {o}, i]) <= value + 1e-9 for o in chosen for i in others)
 
 
 def test_information_that_is_not_finite_is_refused_in_a_sentence() -> None:
@@ -204,8 +187,8 @@ def test_fifty_of_the_measured_poses_beat_fifty_random_starts(lrm, shared_data) 
     experiment = Experiment.load(lrm.configs / "option1.yaml", (), shared_data / "lrm_arm" / "poses.csv")
     dataset = experiment.read()
     rows = whitened_rows(lrm.problem(experiment, dataset), experiment.parameters.nominal(), dataset)
-    task = Task(Candidates(np.zeros((0, 28)), rows), criterion("D"), 50)
+    task = Task(Candidates(np.zeros((0, 28)), rows), 50)
     random = np.random.default_rng(2024)
     starts = [random.choice(313, 50, replace=False) for _ in range(50)]
-    others = [value_of(task.candidates, task.criterion, detmax(task, start)) for start in starts]
+    others = [value_of(task.candidates, detmax(task, start)) for start in starts]
     assert choose(task).value >= max(others)

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 import oracle
 import pytest
-from armcal.arm.loading import holding_efforts, site_loads
+from armcal.arm.loading import site_loads
 from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.dataset import Dataset
 from armcal.diagnose.fit_rows import FitRows, own_basis
@@ -20,6 +20,7 @@ from armcal.diagnose.unseen import determined_finding, priors_alone, tip_by_prio
 from armcal.estimate.robust import fit
 from armcal_ipopt.estimator import IpoptEstimator
 from fits import fit_of
+from holding import holding_efforts
 from noise_cases import FEW, NOISE_M, posed
 from planted_arms import SLIDE, Case
 from scipy.stats import f as f_distribution

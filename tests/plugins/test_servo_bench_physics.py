@@ -159,7 +159,7 @@ class TestHeat:
         """Its poses in their order, a quarter of a minute each, without a rest; it is data that is not shipped."""
         import csv
 
-        from armcal.arm.loading import holding_efforts
+        from holding import holding_efforts
 
         data = repository.parent / "shared" / "data" / "lrm_arm" / "poses.csv"
         if not data.exists():

@@ -12,7 +12,7 @@ from armcal.base.parameters import Parameters
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
-from armcal.run.plan import plan_context
+from armcal.run.plan import PlanContext
 from armcal.run.plan_poses import JointSpace
 from armcal.run.settings import PlanSettings
 from armcal_tracker.position import TipPose, TipPoseSettings
@@ -255,7 +255,7 @@ def test_a_plan_counts_what_measured_orientations_would_tell(tmp_path):
     experiment = Experiment.load(tmp_path / "arm.yaml", ("parameters.free=['arm.mdh.theta[2-4]']",))
     q = np.random.default_rng(5).uniform(-1.5, 1.5, (20, 5))
     poses = Dataset(tuple(map(str, range(20))), {f"arm.q{i + 1}": q[:, i] for i in range(5)})
-    setup = plan_context(experiment, PlanSettings(), JointSpace.of(experiment), experiment.parameters, None)
+    setup = PlanContext(experiment, PlanSettings(), JointSpace.of(experiment), experiment.parameters, None)
     step, found = 1e-6, setup.rows(poses)
     scales = experiment.parameters.scales()
     for n, angles in enumerate(q):

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import yaml
 from armcal.arm.assembly import Arm
-from armcal.arm.loading import holding_efforts
 from armcal.arm.model import forward
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock, Parameters
@@ -28,6 +27,7 @@ from armcal.run.plan_poses import stated_beyond
 from armcal_joints.effects import ServoMap
 from armcal_urdf.model import UrdfModel, UrdfSettings
 from armcal_urdf.robot import MAX_BYTES, decode, encode
+from holding import holding_efforts
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 

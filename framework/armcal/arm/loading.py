@@ -48,21 +48,13 @@ def site_loads(arm: Arm, values: Mapping[str, Array], commands: Array, acting: A
     return SiteLoads(loads[: ends[0]].reshape(sites, 3, -1), loads[ends[0] : ends[1]], by_site)
 
 
-def holding_efforts(
-    arm: Arm, joint_angles: Array, gravity: Vector3, payload: float = 0.0, payload_com: Vector3 = (0.0, 0.0, 0.0)
-) -> Array:
-    """Static effort on each commanded joint (joints x N; N m or N) at commands (joints x N), rigid and nominal.
-
-    Gravity (m/s^2) in the base frame; the payload (kg) in the tool frame.
-    """
-    function = holding_function(arm, gravity, payload, payload_com)
-    return np.asarray(function.map(joint_angles.shape[1])(joint_angles).full())
-
-
 def holding_function(
     arm: Arm, gravity: Vector3, payload: float = 0.0, payload_com: Vector3 = (0.0, 0.0, 0.0)
 ) -> ca.Function:
-    """From commands (joints) to the efforts that ``holding_efforts`` gives of them, to be called often."""
+    """From commands (joints) to the static effort on each (N m or N), rigid and nominal, to be called often.
+
+    Gravity (m/s^2) in the base frame; the payload (kg) in the tool frame.
+    """
     chain, commands = arm.nominal_chain, ca.SX.sym("commands", len(arm.commanded))
     load = Environment(gravity, payload, payload_com).load
     frames, loads = _rigid_statics(arm, chain, arm.joint_commands(ca.vertsplit(commands)), load)

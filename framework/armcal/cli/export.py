@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -21,7 +20,6 @@ from armcal.calibration.exporter import (
     request_of,
 )
 from armcal.cli.common import FILE, Console, accept, arm, spare_inputs, speaking, unwritten
-from armcal.cli.completion import component_names
 from armcal.config.validate import validate
 from armcal.config.yaml_nodes import Node, Origin, assignment, set_at
 from armcal.config.yaml_source import Reader, as_source
@@ -62,14 +60,7 @@ _NOTHING_MM = 1e-6
 
 @click.command()
 @click.argument("calibration", type=FILE)
-@click.option(
-    "--format",
-    "kind",
-    required=True,
-    metavar="NAME",
-    shell_complete=partial(component_names, "exporter"),
-    help="The format; `armcal plugins list` shows the exporters.",
-)
+@click.option("--format", "kind", required=True, metavar="NAME", help="An exporter of `armcal plugins list`.")
 @click.option("--out", required=True, type=FILE, help="The file to write.")
 @arm
 @click.option("--option", "options", multiple=True, metavar="KEY=VALUE", help="A setting of the format: prefix=lrm.")

@@ -1,7 +1,7 @@
 """``armcal identify``."""
 
-import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +28,10 @@ from armcal.estimate.identifiability import (
     identify_from,
     minimal_set,
 )
-from armcal.estimate.validation import error_unit
-from armcal.planning.criterion import observability
+from armcal.planning.candidates import observability
 from armcal.problem.variants import factor_at_zero
 from armcal.run.experiment import Experiment
-from armcal.run.fixed_parameters import FixedParameters, FreedStep, fixed_parameters
+from armcal.run.fixed_parameters import FixedParameters, fixed_parameters
 from armcal.run.pipeline import Stopwatch, assemble
 
 
@@ -85,7 +84,9 @@ def identify(
             "sd_ordinary_sizes": {name: finite(sd) for name, sd in smallest.deviations.items()},
         }
     if fixed:
-        content["fixed"] = fixed_content(console, experiment.of_records(ready.dataset), ready)
+        with console.progress() as progress:
+            judged = fixed_parameters(experiment.of_records(ready.dataset), ready, progress)
+        content["fixed"] = asdict(judged)
     for text in ready.warnings:
         console.warn(text)
     console.result(content)
@@ -93,7 +94,7 @@ def identify(
     if "minimal" in content:
         _show_minimal(console, content["minimal"])
     if fixed:
-        show_fixed(console, content["fixed"])
+        _show_fixed(console, judged)
 
 
 def _preferred(parameters: Parameters, globs: Sequence[str]) -> list[tuple[str, ...]]:
@@ -112,7 +113,7 @@ def _content(experiment: Experiment, ready: Prepared, triangle: Array, known: Id
     equations = ready.training.equations()
     covariance = expected_covariance(triangle, parameters)
     deviation = np.sqrt(np.diag(covariance))
-    indices = observability(known.singular_values[: known.rank], equations).as_dict() if known.rank else None
+    indices = asdict(observability(known.singular_values[: known.rank], equations)) if known.rank else None
     explained = explain(ready.training, parameters.nominal(), known)
     return {
         "experiment": experiment.name,
@@ -219,56 +220,25 @@ def _section(console: Console, title: str, lines: list[str]) -> None:
             console.line(f"  {text}")
 
 
-def fixed_content(console: Console, experiment: Experiment, ready: Prepared) -> dict[str, Any]:
-    with console.progress() as progress:
-        judged = fixed_parameters(experiment, ready, progress)
-    return {
-        "unit": error_unit(ready.problem),
-        "error": _thousandths(judged.error),
-        "gaining": [_step(judged, step) for step in judged.steps],
-        "recommended": list(judged.recommended),
-        "determined_and_nothing_gained": list(judged.others),
-    }
-
-
-def _step(judged: FixedParameters, step: FreedStep) -> dict[str, Any]:
-    one = step.candidate
-    return {
-        "name": one.name,
-        "unit": step.unit,
-        "change": one.change.tolist(),
-        "sd": one.sd.tolist(),
-        "p_value": one.p_value,
-        "error": _thousandths(step.error),
-        "recommended": one.name in judged.recommended,
-    }
-
-
-def _thousandths(error: float) -> float | None:
-    return 1000 * error if math.isfinite(error) else None
-
-
-def show_fixed(console: Console, content: dict[str, Any]) -> None:
+def _show_fixed(console: Console, judged: FixedParameters) -> None:
     """The table, and what to write."""
-    unit = content["unit"]
-    if content["gaining"]:
-        first = f"held out: {content['error']:.3g} {unit} as configured; with each freed beside those above it"
+    if judged.error is not None:
+        first = f"held out: {judged.error:.3g} {judged.unit} as configured; with each freed beside those above it"
         console.line(f"Fixed parameters that would explain residuals (mean error of records {first}):", "bold")
-    width = max((len(step["name"]) for step in content["gaining"]), default=0)
-    for step in content["gaining"]:
-        sizes = f"{_shown(step['change'], step['unit'])} (sd {_shown(step['sd'], step['unit'])})"
-        error = "" if step["error"] is None else f"{step['error']:.3g} {unit}"
-        console.line(f"  {step['name']:{width}}  {sizes:34}  {error:10} {'free it' if step['recommended'] else ''}")
-    others = content["determined_and_nothing_gained"]
-    if others:
+    width = max((len(step.name) for step in judged.gaining), default=0)
+    for step in judged.gaining:
+        sizes = f"{_shown(step.change, step.unit)} (sd {_shown(step.sd, step.unit)})"
+        error = "" if step.error is None else f"{step.error:.3g} {judged.unit}"
+        console.line(f"  {step.name:{width}}  {sizes:34}  {error:10} {'free it' if step.recommended else ''}")
+    if others := judged.determined_and_nothing_gained:
         console.line(f"Determined too, and nothing is gained ({len(others)}): {', '.join(others)}.")
-    if content["recommended"]:
+    if judged.recommended:
         console.line("Add to parameters.free:", "bold")
-        console.line(f"  [{', '.join(content['recommended'])}]")
+        console.line(f"  [{', '.join(judged.recommended)}]")
     else:
         console.line("Free no more: records held out would not be predicted better than by chance.", "green")
 
 
-def _shown(numbers: list[float], unit: str) -> str:
+def _shown(numbers: Sequence[float], unit: str) -> str:
     measure = Measure(unit, 1.0)
     return f"{', '.join(f'{measure.shown(number)[0]:.2g}' for number in numbers)} {measure.shown(0.0)[1]}".strip()

@@ -3,18 +3,17 @@
 import math
 import time
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 from scipy.spatial.transform import Rotation
 
 from armcal.cli.common import FILE, Console, overrides, speaking
 from armcal.errors import ConfigError, InputError, Location
 from armcal.estimate.identifiability import Measure
 from armcal.measure.csv_writer import write_csv
-from armcal.planning.criterion import GOALS
 from armcal.report.document import Document, Section, Table
 from armcal.run.experiment import Experiment
 from armcal.run.iso_plan import NAMES, POINTS, make_iso_plan
@@ -46,10 +45,9 @@ _MM = 1000.0
 @click.option("--out", required=True, type=FILE, help="The CSV to write, in the order of visit.")
 @click.option("--data", type=FILE, help="A dataset to choose from instead of the configured one.")
 @click.option("--candidates", type=FILE, help="A CSV of poses to choose from.")
-@click.option("--given", type=FILE, help="Records that are there already: a CSV of them, or of their ids.")
+@click.option("--given", type=FILE, help="A CSV of records that are there already.")
 @click.option("--calibration", type=FILE, help="Plan about the values of this calibration.yaml.")
-@click.option("--goal", type=click.Choice(GOALS), help="D, A, E, or O1 to O5 [default: D, or the configured one].")
-@click.option("--order", type=click.Choice(["travel", "torque", "none"]), help="Order of visit [default: travel].")
+@click.option("--order", type=click.Choice(["travel", "none"]), help="Order of visit [default: travel].")
 @overrides
 @speaking
 def plan(
@@ -62,7 +60,7 @@ def plan(
         raise ConfigError(f"--out {out}: {text}.", hint="Give the path of a CSV in a directory that is there.")
     registry = console.registry()
     edge = _edge(given, count)
-    chosen = [f"plan.{key}={given[key]}" for key in ("goal", "order") if given[key]]
+    chosen = [f"plan.order={given['order']}"] if given["order"] else []
     experiment = Experiment.load(config, (*overrides, *chosen), given["data"], registry)
     settings = experiment.settings.plan or PlanSettings()
     for text in stated_beyond(experiment, {**settings.limits, **settings.travel_limits}):
@@ -74,11 +72,11 @@ def plan(
     with console.progress() as progress:
         result = make_plan(experiment, count, given["candidates"], given["given"], given["calibration"], progress)
     write_csv(out, result.dataset, experiment.request(measured=False).channels)
-    content = {**_content(experiment, result), "out": str(out), "seconds": time.perf_counter() - began}
+    seconds = time.perf_counter() - began
     for text in experiment.warnings:
         console.warn(text)
-    console.show(_document(content))
-    console.line(f"plan: {out}  ({content['seconds']:.1f} s)")
+    console.show(_document(experiment, result), out=str(out), seconds=seconds)
+    console.line(f"plan: {out}  ({seconds:.1f} s)")
 
 
 def _edge(given: Mapping[str, Any], count: int | None) -> float | None:
@@ -92,7 +90,7 @@ def _edge(given: Mapping[str, Any], count: int | None) -> float | None:
         raise InputError("give --poses N to calibrate, or --iso-cube SIZE_MM to test; one of them.")
     if text is None:
         return None
-    if idle := [name for name in ("data", "candidates", "given", "goal", "order") if given[name]]:
+    if idle := [name for name in ("data", "candidates", "given", "order") if given[name]]:
         raise InputError(f"--{idle[0]} has no meaning with --iso-cube.", hint="Leave it out.")
     if text == "auto":
         return None
@@ -108,126 +106,97 @@ def _edge(given: Mapping[str, Any], count: int | None) -> float | None:
 
 
 def _content(experiment: Experiment, result: PlanResult) -> dict[str, Any]:
-    settings, bound = experiment.settings.plan or PlanSettings(), result.certificate
-    certificate = bound and {
-        "upper": bound.bound,
-        "gap": bound.bound - result.value,
-        "efficiency": bound.efficiency,
-    }
-    units = [block.unit for block in experiment.parameters.coordinate_blocks]
-    scales = experiment.parameters.scales()
-    before, after = result.deviations
+    """For JSON."""
+    pool, parameters = result.pool, experiment.parameters
+    units = [block.unit for block in parameters.coordinate_blocks]
     return {
         "experiment": experiment.name,
-        "goal": settings.goal,
         "poses": len(result.dataset),
         "ids": list(result.dataset.ids),
         "given_records": result.given,
         "candidates": {
-            "kind": result.pool.kind,
-            "count": len(result.pool.dataset),
-            "left_out": dict(result.pool.left_out),
+            "kind": pool.kind,
+            "count": len(pool.dataset),
+            "left_out": dict(pool.left_out),
             "refined": result.refined,
         },
         "starts": result.starts,
-        "value": result.value,
         "log_det": result.log_det,
-        "bound": certificate,
-        "observability": result.observability.as_dict(),
+        "bound": {"upper": result.bound, "gap": result.bound - result.log_det, "efficiency": result.efficiency},
+        "observability": asdict(result.observability),
         "equations": result.equations,
         "parameters": [
-            {
-                "name": name,
-                "unit": unit,
-                "sd_before": float(before[i]) if math.isfinite(before[i]) else None,
-                "sd_after": float(after[i]),
-                "sd_in_ordinary_sizes": float(after[i] / scales[i]),
-            }
-            for i, (name, unit) in enumerate(zip(result.names, units, strict=True))
+            {"name": name, "unit": unit, "sd_before": before, "sd_after": after, "sd_in_ordinary_sizes": after / scale}
+            for name, unit, before, after, scale in zip(
+                result.names, units, *result.deviations.tolist(), parameters.scales().tolist(), strict=True
+            )
         ],
         "weakest": str(result.identifiability.weakest),
-        "visit": {"order": settings.order, "travel_s": result.travel_s, "peak_squared_torque": result.peak},
+        "visit": {"order": (experiment.settings.plan or PlanSettings()).order, "travel_s": result.travel_s},
     }
 
 
-def _document(content: dict[str, Any]) -> Document:
-    pool, visit, parameters = content["candidates"], content["visit"], content["parameters"]
-    omitted = f" ({counts_text(pool['left_out'])} left out)" if pool["left_out"] else ""
-    given = f" after {content['given_records']} given records" if content["given_records"] else ""
-    moved = f"; {pool['refined']} of the plan moved on from there" if pool["refined"] else ""
+def _document(experiment: Experiment, result: PlanResult) -> Document:
+    data, pool = _content(experiment, result), result.pool
+    omitted = f" ({counts_text(pool.left_out)} left out)" if pool.left_out else ""
+    given = f" after {result.given} given records" if result.given else ""
+    moved = f"; {result.refined} of the plan moved on from there" if result.refined else ""
     kinds = {"continuous": "spread through joint space", "grid": "of a grid", "listed": "listed"}
     headline = (
-        f"{content['experiment']}: {content['poses']} of {pool['count']} candidates "
-        f"{kinds.get(pool['kind'], pool['kind'])}{omitted}{moved}{given}, goal {content['goal']}, for "
-        f"{len(parameters)} parameters; {content['starts']} starts."
+        f"{experiment.name}: {len(result.dataset)} of {len(pool.dataset)} candidates "
+        f"{kinds.get(pool.kind, pool.kind)}{omitted}{moved}{given}, for {len(result.names)} parameters; "
+        f"{result.starts} starts."
     )
-    goal_value = "" if content["goal"] in ("D", "O1") else f", goal's value {content['value']:.6g}"
-    indices = "  ".join(f"{name.upper()} {value:.4g}" for name, value in content["observability"].items())
+    certified = f"D-efficiency at least {100 * result.efficiency:.2f} %, certified by the equivalence theorem"
+    certified += " over the candidates listed here, not all of joint space" * (pool.kind == "continuous") + "."
+    visit = f"order of visit: {data['visit']['order']}, {result.travel_s:.0f} s between poses."
     rows: list[tuple[str, ...]] = []
-    worst = np.argsort([-p["sd_in_ordinary_sizes"] for p in parameters], kind="stable")[:_SHOWN]
-    for p in (parameters[i] for i in worst):
-        measure = Measure(p["unit"], 1.0)
-        texts = ["-" if p[key] is None else f"{measure.shown(p[key])[0]:.3g}" for key in ("sd_before", "sd_after")]
-        rows.append((p["name"], *texts, measure.shown(0.0)[1] or p["unit"]))
+    for parameter in sorted(data["parameters"], key=lambda p: -p["sd_in_ordinary_sizes"])[:_SHOWN]:
+        measure = Measure(parameter["unit"], 1.0)
+        sds = (parameter["sd_before"], parameter["sd_after"])
+        texts = [f"{measure.shown(sd)[0]:.3g}" if math.isfinite(sd) else "-" for sd in sds]
+        rows.append((parameter["name"], *texts, measure.shown(0.0)[1] or parameter["unit"]))
     caption = "Predicted standard deviations, the largest first"
     table = Table(caption, ("parameter", "before", "after", "unit"), rows, left=("unit",))
-    hot = visit["peak_squared_torque"]
-    heat_text = f"; squared torque, averaged over 5 poses, at most {hot:.2f} of the largest" if hot is not None else ""
-    criterion = [f"log determinant {content['log_det']:.4f}{goal_value}", f"observability: {indices}"]
-    certified = "how good another choice could be is not known for this goal."
-    if (bound := content["bound"]) is not None:
-        criterion.append(f"upper bound {bound['upper']:.4f}, gap {bound['gap']:.4f}")
-        certified = (
-            f"{content['goal']}-efficiency at least {100 * bound['efficiency']:.2f} %, certified by the equivalence "
-        )
-        certified += "theorem"
-        certified += " over the candidates listed here, not all of joint space" * (pool["kind"] == "continuous") + "."
+    criterion = [
+        f"log determinant {result.log_det:.4f}, upper bound {result.bound:.4f}",
+        "observability: " + "  ".join(f"{name.upper()} {index:.4g}" for name, index in data["observability"].items()),
+    ]
     sections = [
-        Section("Precision", parts=[table, f"least determined: {content['weakest']}."], level="always"),
+        Section("Precision", parts=[table, f"least determined: {data['weakest']}."], level="always"),
         Section("Criterion", parts=criterion, level="verbose"),
     ]
-    order = f"order of visit: {visit['order']}, {visit['travel_s']:.0f} s between poses{heat_text}."
-    return Document("Plan", headline, sections, summary=[certified, order], data=content)
+    return Document("Plan", headline, sections, summary=[certified, visit], data=data)
 
 
 def _show_iso_plan(
     console: Console, experiment: Experiment, size: float | None, out: Path, options: Mapping[str, Any]
 ) -> None:
     """Plan the test in a cube of this size (m; None: the largest), write it to ``out`` and show it."""
-    began = time.perf_counter()
-    cube, dataset, warnings = make_iso_plan(
-        experiment, size, options["cycles"], options["directions"], options["calibration"]
-    )
+    began, cycles = time.perf_counter(), options["cycles"]
+    cube, dataset, warnings = make_iso_plan(experiment, size, cycles, options["directions"], options["calibration"])
     write_csv(out, dataset, experiment.request(measured=False).channels)
-    turned = None
+    turned, words = None, "the tool turns from pose to pose."
     if cube.rotation is not None:
         turned = Rotation.from_matrix(cube.rotation).as_euler("xyz", degrees=True).tolist()
-    centre, poses = (
-        (cube.centre * _MM).tolist(),
-        dict(zip(NAMES, ((cube.centre + cube.size * POINTS) * _MM).tolist(), strict=True)),
-    )
-    console.result(
-        {
-            "experiment": experiment.name,
-            "cube": {"size_mm": cube.size * _MM, "centre_mm": centre},
-            "tool_rpy_deg": turned,
-            "poses": poses,
-            "cycles": options["cycles"],
-            "visits": len(dataset),
-            "directions": list(dict.fromkeys(dataset.extra["direction"])),
-            "warnings": list(warnings),
-            "out": str(out),
-        }
-    )
+        words = f"tool at roll, pitch, yaw ({', '.join(f'{angle:.1f}' for angle in turned)}) deg."
+    centre, places = (cube.centre * _MM).tolist(), ((cube.centre + cube.size * POINTS) * _MM).tolist()
+    data = {
+        "experiment": experiment.name,
+        "cube": {"size_mm": cube.size * _MM, "centre_mm": centre},
+        "tool_rpy_deg": turned,
+        "poses": dict(zip(NAMES, places, strict=True)),
+        "cycles": cycles,
+        "visits": len(dataset),
+        "directions": list(dict.fromkeys(dataset.extra["direction"])),
+        "warnings": list(warnings),
+    }
     for text in warnings:
         console.warn(text)
-    at, angles = (", ".join(f"{number:.1f}" for number in numbers) for numbers in (centre, turned or ()))
-    console.line(
-        f"{experiment.name}: cube of {cube.size * _MM:g} mm about ({at}) mm, "
-        + (f"tool at roll, pitch, yaw ({angles}) deg." if turned else "the tool turns from pose to pose.")
-    )
-    rows = ((name, *(f"{coordinate:.1f}" for coordinate in place)) for name, place in poses.items())
-    console.table("Poses of the tool, mm, base frame", ("pose", "x", "y", "z"), rows)
-    visits = f"{len(dataset)} visits in {options['cycles']} cycles"
-    console.line(f"{visits}: {out}  ({time.perf_counter() - began:.1f} s)")
+    at = ", ".join(f"{number:.1f}" for number in centre)
+    headline = f"{experiment.name}: cube of {cube.size * _MM:g} mm about ({at}) mm, {words}"
+    rows = [(name, *(f"{x:.1f}" for x in place)) for name, place in zip(NAMES, places, strict=True)]
+    table = Table("Poses of the tool, mm, base frame", ("pose", "x", "y", "z"), rows)
+    console.show(Document("Plan", headline, [Section("Poses", parts=[table], level="always")], data=data), out=str(out))
+    console.line(f"{len(dataset)} visits in {cycles} cycles: {out}  ({time.perf_counter() - began:.1f} s)")
     console.line("Measure each visit, add the columns of the instrument, and give the table to armcal acceptance.")

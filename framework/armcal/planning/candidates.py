@@ -1,4 +1,9 @@
-"""Candidate poses as information: what each would add to what is known already."""
+"""Candidate poses as information: what each would add to what is known already, and what makes a set of them good.
+
+Information is by coordinates in their typical scales, so that metres and radians can be compared. A plan maximises its
+determinant (D-optimality [Pukelsheim2006], the index O1): the only one of the usual criteria whose best poses do not
+depend on these scales. The observability indices describe it.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +20,7 @@ from armcal.problem.variants import as_predicted, as_seen
 RIDGE = 1e-9
 """Information in typical scales that stands in for what nothing determines yet, relative to the candidates' mean:
 below what any real measurement gives, far above rounding."""
+_FLOOR = 1e-300  # Eigenvalues are kept above it, so that a singular matrix is very bad and not an error
 _ROWS_AT_ONCE = 8192
 _FEW_ROWS = 8
 _SEEN = 1e-9
@@ -85,6 +91,66 @@ def deviations(triangle: Array) -> Array:
     spread = np.linalg.norm(directions[seen].T / values[seen], axis=1)
     undetermined = np.linalg.norm(directions[~seen], axis=0) > _TAKES_PART
     return np.where(undetermined, np.inf, spread)
+
+
+def log_determinant(eigenvalues: Array) -> Array:
+    """Of information with these eigenvalues (... x n)."""
+    return np.asarray(np.sum(np.log(np.maximum(eigenvalues, _FLOOR)), axis=-1))
+
+
+def value_of(candidates: Candidates, chosen: Indices) -> float:
+    """The log determinant of what is known and the chosen ones."""
+    singular = np.linalg.svd(candidates.triangle(chosen), compute_uv=False)
+    padded = np.pad(singular, (0, candidates.size - len(singular)))
+    return float(log_determinant(np.sort(padded**2)))
+
+
+def efficiency(value: float, bound: float, size: int) -> float:
+    """The D-efficiency of a plan (log determinants, n parameters): 1 % more poses make up for 0.99."""
+    return float(np.exp((value - bound) / size))
+
+
+@dataclass(frozen=True)
+class Observability:
+    """The five indices [Sun2008]; larger is better, 0 where a combination is undetermined.
+
+    With s_1 >= ... >= s_n > 0 the singular values of the scaled whitened Jacobian of m equations:
+    """
+
+    o1: float  # geometric mean over sqrt(m), (s_1 ... s_n)^(1/n) / sqrt(m). [Borm1989] [Borm1991]
+    o2: float  # inverse condition, s_n / s_1. [Driels1990]
+    o3: float  # smallest singular value, s_n. [Nahvi1994]
+    o4: float  # noise amplification, s_n^2 / s_1. [Nahvi1996]
+    o5: float  # harmonic mean, n / (1/s_1 + ... + 1/s_n). [Sun2008]
+
+
+def observability(singular_values: Array, equations: int) -> Observability:
+    """The indices of a pose set.
+
+    Args:
+        singular_values: of its Jacobian (n), in any order; one a parameter, zeros included.
+        equations: how many rows the Jacobian has, m.
+
+    Raises:
+        ValueError: no singular value, no equation, or a value that is negative or not finite.
+    """
+    values = np.asarray(singular_values, dtype=float)
+    if not values.size or equations < 1:
+        raise ValueError(f"{values.size} singular values of {equations} equations have no observability")
+    if not np.isfinite(values).all() or values.min() < 0:
+        raise ValueError("singular values must be finite and not negative")
+    smallest, largest = float(values.min()), float(values.max())
+    # Fewer rows than columns: the missing singular values are zero.
+    if smallest == 0 or equations < values.size:
+        return Observability(0.0, 0.0, 0.0, 0.0, 0.0)
+    # By logarithms and ratios: a product of many singular values overflows.
+    return Observability(
+        o1=float(np.exp(np.mean(np.log(values))) / np.sqrt(equations)),
+        o2=smallest / largest,
+        o3=smallest,
+        o4=smallest * (smallest / largest),
+        o5=float(values.size / np.sum(1 / values)),
+    )
 
 
 def whitened_rows(problem: Problem, values: Array, dataset: Dataset) -> Array:

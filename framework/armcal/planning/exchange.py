@@ -14,32 +14,25 @@ and H C H' of every other candidate likewise, so that nothing is ever decomposed
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import TypeAlias
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armcal.base.arrays import Array, Indices, Mask
-from armcal.planning.candidates import Candidates
-from armcal.planning.criterion import Criterion, Goal, criterion
+from armcal.planning.candidates import Candidates, log_determinant, value_of
 from armcal.planning.relaxation import AT_ONCE, Relaxation, Task, relax
 
 Rows = Callable[[Array], Array]  # Poses (joints x N) to whitened Jacobians (n_r x N x n)
 Allowed = Callable[[Array], Mask]  # Poses (joints x N) to whether each may be visited (N, bool)
 STARTS = 10
 KICKS_A_START = 4
-DECOMPOSED_STARTS = 1
-"""Goals whose every change takes a decomposition get fewer random starts, and start from the plans for D and A."""
-SHORTLIST = 512
 _LONGEST_EXCURSION = 3
 _MOST_SWEEPS = 200
 _MOST_EXCURSIONS = 50
 _LEAST_WEIGHT = 1e-6
 _KICKED = 0.12
-_QUICK: tuple[Goal, ...] = ("D", "A")
 _REFRESH = 64
-_TOLERANCE = 1e-9
+_TOLERANCE = 1e-9  # Changes below it may be rounding
 _DOUBTFUL = -12.0  # A removal that takes so much of the log determinant would carry rounding into the inverse
 _SMALLEST = 1e-13  # determinant
 _FIRST_STEP, _SHRINK, _GAIN = 0.125, 0.5, 1e-9  # of a pose that is moved through joint space
@@ -49,63 +42,51 @@ _FIRST_STEP, _SHRINK, _GAIN = 0.125, 0.5, 1e-9  # of a pose that is moved throug
 class Plan:
     """A chosen set of poses."""
 
-    chosen: Indices  # in the order in which each adds most to those before it (repeated where that was allowed)
-    value: float  # of the criterion, with what is known before
+    chosen: Indices  # in the order in which each adds most to those before it
+    value: float  # the log determinant, with what is known before
     starts: int  # how many were made
-    relaxation: Relaxation  # of the log determinant where the criterion is no sum over eigenvalues
+    relaxation: Relaxation
 
 
-def value_of(candidates: Candidates, by: Criterion, chosen: Indices) -> float:
-    singular = np.linalg.svd(candidates.triangle(chosen), compute_uv=False)
-    padded = np.pad(singular, (0, candidates.size - len(singular)))
-    return float(by.value(np.maximum(np.sort(padded**2), 1e-300)))
-
-
-def choose(task: Task, starts: int | None = None, seed: int = 0, begin: Indices | None = None) -> Plan:
+def choose(task: Task, starts: int = STARTS, seed: int = 0, begin: Indices | None = None) -> Plan:
     """The best plan of several starts.
 
     Args:
-        task: candidates, criterion and number of poses.
+        task: candidates and number of poses.
         starts: drawn by the relaxation's weights, beside its rounding and one built up pose by pose; each brings a few
-            kicks of the best plan. None: as many as pay.
+            kicks of the best plan.
         seed: of what is random.
         begin: a plan to start from as well.
 
     Raises:
         ValueError: fewer candidates than poses.
     """
-    if task.count > task.candidates.count * task.limit:
+    if task.count > task.candidates.count:
         raise ValueError(f"{task.count} poses of {task.candidates.count} candidates")
-    quick = task.criterion.name in _QUICK
-    smooth = task if task.criterion.trace else replace(task, criterion=criterion("D"))
-    relaxed = relax(smooth)
+    relaxed = relax(task)
     few = _promising(task, relaxed, begin)
     smaller = task.subset(few)
     given = [np.searchsorted(few, start) for start in (_rounded(task, relaxed), begin) if start is not None]
-    if not quick:
-        given += [choose(replace(smaller, criterion=criterion(goal)), starts=0).chosen for goal in _QUICK]
-    if starts is None:
-        starts = STARTS if quick else DECOMPOSED_STARTS
     random = np.random.default_rng(seed)
     given += [_drawn(smaller, relaxed.weights[few], random) for _ in range(starts)]
-    kicks = starts * (KICKS_A_START if quick else 1)
+    kicks = starts * KICKS_A_START
     chosen = few[_best(smaller, given, kicks, random)]
     if len(few) < task.candidates.count:
         chosen = detmax(task, chosen, longest=0)
     chosen = in_order(task, chosen)
-    return Plan(chosen, value_of(task.candidates, task.criterion, chosen), len(given) + 1 + kicks, relaxed)
+    return Plan(chosen, value_of(task.candidates, chosen), len(given) + 1 + kicks, relaxed)
 
 
 def built_up(task: Task) -> Indices:
     """A plan without a relaxation: pose by pose, then led to where no swap helps; in the order of ``in_order``."""
-    held = tally(task.candidates, task.criterion)
+    held = Tally(task.candidates)
     return in_order(task, detmax(task, _built_up(task, held), held))
 
 
 def in_order(task: Task, chosen: Indices) -> Indices:
     """A plan's poses, each adding most to those before it: to stop early loses least."""
-    part = replace(task.subset(chosen), count=len(chosen), limit=1)
-    return chosen[_built_up(part, tally(part.candidates, part.criterion))]
+    part = Task(task.candidates.subset(chosen), len(chosen))
+    return chosen[_built_up(part, Tally(part.candidates))]
 
 
 def _best(task: Task, starts: list[Indices], kicks: int, random: np.random.Generator) -> Indices:
@@ -113,35 +94,31 @@ def _best(task: Task, starts: list[Indices], kicks: int, random: np.random.Gener
 
     A kick exchanges a few poses of the best plan for any others and climbs again: better plans lie near good ones.
     """
-    held = tally(task.candidates, task.criterion)
+    held = Tally(task.candidates)
     starts = [*starts, _built_up(task, held)]
     best, best_value = starts[0], -np.inf
     for number in range(len(starts) + kicks):
         if number < len(starts):
             start = starts[number]
         else:
-            times = np.bincount(best, minlength=task.candidates.count)
-            others = np.repeat(np.arange(task.candidates.count), task.limit - times)
+            others = np.setdiff1d(np.arange(task.candidates.count), best)
             size = min(max(1, round(_KICKED * task.count)), len(others))
             kept = random.permutation(best)[: task.count - size]
             start = np.concatenate([kept, random.choice(others, size, replace=False)]).astype(np.intp)
         chosen = detmax(task, start, held)
-        value = value_of(task.candidates, task.criterion, chosen)
+        value = value_of(task.candidates, chosen)
         if value > best_value:
             best, best_value = chosen, value
     return best
 
 
 def _drawn(task: Task, weights: Array, random: np.random.Generator) -> Indices:
-    pool = np.repeat(np.arange(task.candidates.count), task.limit)
-    waits = random.exponential(size=len(pool)) / np.maximum(weights[pool], _LEAST_WEIGHT)
-    return np.sort(pool[np.argsort(waits)[: task.count]])
+    waits = random.exponential(size=len(weights)) / np.maximum(weights, _LEAST_WEIGHT)
+    return np.sort(np.argsort(waits)[: task.count])
 
 
 def _rounded(task: Task, relaxed: Relaxation) -> Indices:
-    remaining = relaxed.weights[:, None] - np.arange(task.limit)
-    heaviest = np.argsort(-remaining.ravel(), kind="stable")[: task.count]
-    return np.sort(heaviest // task.limit).astype(np.intp)
+    return np.sort(np.argsort(-relaxed.weights, kind="stable")[: task.count]).astype(np.intp)
 
 
 def _promising(task: Task, relaxed: Relaxation, begin: Indices | None) -> Indices:
@@ -155,24 +132,23 @@ def _promising(task: Task, relaxed: Relaxation, begin: Indices | None) -> Indice
 
 def _built_up(task: Task, held: Tally) -> Indices:
     held.restart(np.zeros(0, dtype=np.intp))
-    times = np.zeros(task.candidates.count, dtype=int)
+    outside = np.ones(task.candidates.count, dtype=bool)
     chosen = []
     for _ in range(task.count):
-        best = _best_addition(held.if_added(), times, task.limit)
+        best = _best_addition(held.if_added(), outside)
         held.add(best)
-        times[best] += 1
+        outside[best] = False
         chosen.append(best)
     return np.array(chosen, dtype=np.intp)
 
 
-def _best_addition(change: Array, times: NDArray[np.int_], limit: int) -> int:
-    free = times < limit
-    best = int(np.argmax(np.where(free, change, -np.inf)))
-    return best if free[best] else int(np.flatnonzero(free)[0])
+def _best_addition(change: Array, outside: Mask) -> int:
+    best = int(np.argmax(np.where(outside, change, -np.inf)))
+    return best if outside[best] else int(np.flatnonzero(outside)[0])
 
 
 class _Climb:
-    """A plan under exchange: its poses, how often each is in it, its value beside the start's."""
+    """A plan under exchange: its poses, and which candidates are outside of it."""
 
     def __init__(self, task: Task, held: Tally, start: Indices) -> None:
         self.task, self.held = task, held
@@ -180,12 +156,13 @@ class _Climb:
 
     def begin(self, chosen: Indices) -> None:
         self.chosen: list[int] = [int(i) for i in chosen]
-        self.times = np.bincount(chosen, minlength=self.task.candidates.count)
+        self.outside = np.ones(self.task.candidates.count, dtype=bool)
+        self.outside[chosen] = False
         self.held.restart(chosen)
 
     def let_in(self) -> float:
         change = self.held.if_added()
-        best = _best_addition(change, self.times, self.task.limit)
+        best = _best_addition(change, self.outside)
         self._enter(best)
         return float(change[best])
 
@@ -198,10 +175,10 @@ class _Climb:
     def swap(self, place: int) -> float:
         """Exchange one pose for the best other, if that helps; the gain."""
         change = self.held.if_swapped(self.chosen[place])
-        self.times[self.chosen[place]] -= 1
-        best = _best_addition(change, self.times, self.task.limit)
-        self.times[self.chosen[place]] += 1
-        if not change[best] > self.held.tolerance() or best == self.chosen[place]:
+        self.outside[self.chosen[place]] = True
+        best = _best_addition(change, self.outside)
+        self.outside[self.chosen[place]] = False
+        if not change[best] > _TOLERANCE or best == self.chosen[place]:
             return 0.0
         self._leave(place)
         self._enter(best)
@@ -210,18 +187,18 @@ class _Climb:
     def _enter(self, candidate: int) -> None:
         self.held.add(candidate)
         self.chosen.append(candidate)
-        self.times[candidate] += 1
+        self.outside[candidate] = False
 
     def _leave(self, place: int) -> None:
         candidate = self.chosen.pop(place)
         self.held.remove(candidate)
-        self.times[candidate] -= 1
+        self.outside[candidate] = True
 
 
 def detmax(task: Task, start: Indices, held: Tally | None = None, longest: int = _LONGEST_EXCURSION) -> Indices:
     """DETMAX from a start, then exchanges until none helps."""
-    climb = _Climb(task, held or tally(task.candidates, task.criterion), start)
-    reachable = min(longest, task.count - 1, task.candidates.count * task.limit - task.count)
+    climb = _Climb(task, held or Tally(task.candidates), start)
+    reachable = min(longest, task.count - 1, task.candidates.count - task.count)
     length = 1
     for _ in range(_MOST_EXCURSIONS + 10 * task.count):
         if length > reachable:
@@ -241,25 +218,18 @@ def _excursion(climb: _Climb, length: int) -> bool:
         before = np.array(climb.chosen, dtype=np.intp)
         steps = [climb.let_in, climb.take_out] if up_first else [climb.take_out, climb.let_in]
         gained = sum(step() for step in steps for _ in range(length))
-        if gained > climb.held.tolerance() and not np.array_equal(np.sort(climb.chosen), np.sort(before)):
+        if gained > _TOLERANCE and not np.array_equal(np.sort(climb.chosen), np.sort(before)):
             return True
         if not np.array_equal(np.sort(climb.chosen), np.sort(before)):
             climb.begin(before)
     return False
 
 
-Tally: TypeAlias = "DeterminantTally | SpectralTally"
-"""The value of a plan as poses enter and leave it: for every candidate at once."""
+class Tally:
+    """The log determinant of a plan as poses enter and leave it, and with every candidate at once.
 
-
-def tally(candidates: Candidates, criterion: Criterion) -> Tally:
-    if criterion.name in ("D", "A"):
-        return DeterminantTally(candidates) if criterion.name == "D" else TraceTally(candidates)
-    return SpectralTally(candidates, criterion)
-
-
-class DeterminantTally:
-    """The log determinant of a plan in the making; n_r x n_r matrices of all candidates are kept packed (pairs x N)."""
+    n_r x n_r matrices of all candidates are kept packed (pairs x N).
+    """
 
     def __init__(self, candidates: Candidates) -> None:
         self._candidates = candidates
@@ -293,10 +263,6 @@ class DeterminantTally:
         half, _ = self._half(candidate, -1.0)
         return _packed_log_det(self._seen + self._outer(half, half), self._n_rows) + float(loss)
 
-    def tolerance(self) -> float:
-        """Changes below it may be rounding."""
-        return _TOLERANCE
-
     def _settle(self, information: Array) -> None:
         self._information, self._changes = information, 0
         self._inverse = np.linalg.inv(information)
@@ -314,10 +280,7 @@ class DeterminantTally:
             self._settle(information)
             return
         half, factor = self._half(candidate, sign)
-        self._advance(half, factor, sign)
         self._information, self._changes = information, self._changes + 1
-
-    def _advance(self, half: Array, factor: Array, sign: float) -> None:
         self._seen = self._seen - sign * self._outer(half, half)
         self._inverse = self._inverse - sign * (factor @ factor.T)
 
@@ -331,108 +294,13 @@ class DeterminantTally:
         middle = np.eye(self._n_rows) + sign * (rows @ reached)
         values, vectors = np.linalg.eigh((middle + middle.T) / 2)
         factor = reached @ (vectors / np.sqrt(np.maximum(values, _SMALLEST)))
-        return self._across(factor), factor
-
-    def _across(self, factor: Array) -> Array:
-        """factor' H' of every candidate (columns x n_r x N)."""
-        return np.asarray((factor.T @ self._flat.T).reshape(-1, self._n_rows, self._count))
+        return np.asarray((factor.T @ self._flat.T).reshape(-1, self._n_rows, self._count)), factor
 
     def _outer(self, first: Array, second: Array) -> Array:
         total = first[0][self._left] * second[0][self._right]
         for a, b in zip(first[1:], second[1:], strict=True):
             total += a[self._left] * b[self._right]
         return np.asarray(total)
-
-
-class TraceTally(DeterminantTally):
-    """Minus the trace of the covariance; H C^2 H' is kept beside H C H'."""
-
-    def if_added(self) -> Array:
-        return _packed_trace(self._seen, self._squared, self._n_rows)  # tr (I + H C H')^-1 H C^2 H'
-
-    def if_removed(self, chosen: Indices) -> Array:
-        return -_packed_trace(-self._seen[:, chosen], self._squared[:, chosen], self._n_rows)
-
-    def if_swapped(self, candidate: int) -> Array:
-        loss = self.if_removed(np.array([candidate]))[0]
-        half, factor = self._half(candidate, -1.0)
-        seen = self._seen + self._outer(half, half)
-        squared = self._squared_after(half, factor, -1.0)
-        return _packed_trace(seen, squared, self._n_rows) + float(loss)
-
-    def tolerance(self) -> float:
-        return _TOLERANCE * float(np.trace(self._inverse))
-
-    def _settle(self, information: Array) -> None:
-        super()._settle(information)
-        reached = (self._flat @ self._inverse).reshape(self._n_rows, self._count, -1)
-        pairs = zip(self._left, self._right, strict=True)
-        self._squared = np.array([np.einsum("ij,ij->i", reached[a], reached[b]) for a, b in pairs])
-
-    def _advance(self, half: Array, factor: Array, sign: float) -> None:
-        self._squared = self._squared_after(half, factor, sign)
-        super()._advance(half, factor, sign)
-
-    def _squared_after(self, half: Array, factor: Array, sign: float) -> Array:
-        """H (C - sign Y Y')^2 H' from H C^2 H'."""
-        twice = self._across(self._inverse @ factor)
-        mixed = np.tensordot(factor.T @ factor, half, axes=1)
-        cross = self._outer(twice, half) + self._outer(half, twice)
-        return np.asarray(self._squared - sign * cross + self._outer(mixed, half))
-
-
-class SpectralTally:
-    """Any function of eigenvalues, by decomposition; beyond ``SHORTLIST`` candidates, of those that promise most."""
-
-    def __init__(self, candidates: Candidates, criterion: Criterion) -> None:
-        self._candidates, self._criterion = candidates, criterion
-        self._known = candidates.known() + candidates.ridge() * np.eye(candidates.size)
-        self.restart(np.zeros(0, dtype=np.intp))
-
-    def restart(self, chosen: Indices) -> None:
-        rows = self._candidates.rows[:, chosen, :].reshape(-1, self._candidates.size)
-        self._settle(self._known + rows.T @ rows)
-
-    def add(self, candidate: int) -> None:
-        self._settle(self._information + self._of(np.array([candidate]))[0])
-
-    def remove(self, candidate: int) -> None:
-        self._settle(self._information - self._of(np.array([candidate]))[0])
-
-    def if_added(self) -> Array:
-        return self._tried(self._information)
-
-    def if_removed(self, chosen: Indices) -> Array:
-        return self._values(self._information - self._of(chosen)) - self._value
-
-    def if_swapped(self, candidate: int) -> Array:
-        return self._tried(self._information - self._of(np.array([candidate]))[0])
-
-    def tolerance(self) -> float:
-        return _TOLERANCE * abs(self._value)
-
-    def _settle(self, information: Array) -> None:
-        self._information = (information + information.T) / 2
-        self._value = float(self._values(self._information))
-
-    def _values(self, information: Array) -> Array:
-        return np.asarray(self._criterion.of(information))
-
-    def _of(self, chosen: Indices) -> Array:
-        rows = self._candidates.rows[:, chosen, :]
-        return np.asarray(np.einsum("rci,rcj->cij", rows, rows, optimize=True))
-
-    def _tried(self, information: Array) -> Array:
-        count = self._candidates.count
-        change = np.full(count, -np.inf)
-        few = np.arange(count)
-        if count > SHORTLIST:  # those that add most along the directions that are least determined
-            values, vectors = np.linalg.eigh(information)
-            weight = np.maximum(values, 1e-12 * values[-1]) ** -2.0
-            scores = self._candidates.scores((vectors * weight) @ vectors.T)
-            few = np.argpartition(-scores, SHORTLIST)[:SHORTLIST].astype(np.intp)
-        change[few] = self._values(information + self._of(few)) - self._value
-        return change
 
 
 def _packed_log_det(packed: Array, n_rows: int) -> Array:
@@ -444,45 +312,21 @@ def _packed_log_det(packed: Array, n_rows: int) -> Array:
         a, d, f = a + 1, d + 1, f + 1
         determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
     else:
-        signs, logarithms = np.linalg.slogdet(_unpacked(packed, n_rows) + np.eye(n_rows))
+        left, right = np.triu_indices(n_rows)
+        whole = np.empty((packed.shape[1], n_rows, n_rows))
+        whole[:, left, right] = whole[:, right, left] = packed.T
+        signs, logarithms = np.linalg.slogdet(whole + np.eye(n_rows))
         return np.asarray(np.where(signs > 0, logarithms, np.log(_SMALLEST)))
     return np.asarray(np.log(np.maximum(determinant, _SMALLEST)))
 
 
-def _packed_trace(seen: Array, squared: Array, n_rows: int) -> Array:
-    """tr (I + S)^-1 Q of packed symmetric matrices."""
-    if n_rows == 1:
-        return np.asarray(squared[0] / np.maximum(1 + seen[0], _SMALLEST))
-    if n_rows == 3:
-        a, b, c, d, e, f = seen
-        a, d, f = a + 1, d + 1, f + 1
-        adjugate = (d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b)
-        determinant = a * adjugate[0] + b * adjugate[1] + c * adjugate[2]
-        weights = (1.0, 2.0, 2.0, 1.0, 2.0, 1.0)
-        total = sum(w * x * q for w, x, q in zip(weights, adjugate, squared, strict=True))
-        return np.asarray(total / np.maximum(determinant, _SMALLEST))
-    whole = _unpacked(seen, n_rows) + np.eye(n_rows)
-    return np.asarray(np.trace(np.linalg.solve(whole, _unpacked(squared, n_rows)), axis1=1, axis2=2))
-
-
-def _unpacked(packed: Array, n_rows: int) -> Array:
-    left, right = np.triu_indices(n_rows)
-    whole = np.empty((packed.shape[1], n_rows, n_rows))
-    whole[:, left, right] = packed.T
-    whole[:, right, left] = packed.T
-    return whole
-
-
-def refine(
-    poses: Array, limits: Array, known: Array, by: Criterion, rows: Rows, allowed: Allowed, sweeps: int
-) -> Array:
+def refine(poses: Array, limits: Array, known: Array, rows: Rows, allowed: Allowed, sweeps: int) -> Array:
     """Poses moved coordinate by coordinate while that helps, with steps that shrink sweep by sweep.
 
     Args:
         poses: the plan (joints x N; rad or m).
         limits: of each joint (joints x 2).
         known: information before the plan, by coordinates in typical scales (n x n).
-        by: what is to grow.
         rows: Jacobians of poses.
         allowed: clearance.
         sweeps: how often each pose is tried.
@@ -505,16 +349,12 @@ def refine(
             if not trials.shape[1]:
                 continue
             tried = rows(trials)
-            without = information - _square(held[:, index])
-            values = by.of(without + np.einsum("rni,rnj->nij", tried, tried))
-            now = float(by.of(information))
+            without = information - held[:, index].T @ held[:, index]
+            values = log_determinant(np.linalg.eigvalsh(without + np.einsum("rni,rnj->nij", tried, tried)))
+            now = float(log_determinant(np.linalg.eigvalsh(information)))
             best = int(np.argmax(values))
             if values[best] > now + _GAIN * abs(now):
                 poses[:, index], held[:, index] = trials[:, best], tried[:, best]
-                information = without + _square(tried[:, best])
+                information = without + tried[:, best].T @ tried[:, best]
         step = step * _SHRINK
     return np.asarray(poses)
-
-
-def _square(rows: Array) -> Array:
-    return np.asarray(rows.T @ rows)

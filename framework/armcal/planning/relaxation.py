@@ -1,7 +1,7 @@
 """The convex relaxation of choosing poses, and what it certifies.
 
-Poses get weights between 0 and 1 that sum to their number. The criterion f is concave in the information M, so for
-any M at hand, and any plan v, with X the gradient of f at M,
+Poses get weights between 0 and 1 that sum to their number. The log determinant f is concave in the information M, so
+for any M at hand, and any plan v, with X the gradient of f at M,
 
     f(M_v) <= f(M) + <X, M_v - M>,
 
@@ -12,15 +12,13 @@ claim is never used.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from armcal.base.arrays import Array, Indices
-from armcal.planning.candidates import Candidates
-from armcal.planning.criterion import Criterion, spread
+from armcal.planning.candidates import Candidates, log_determinant
 
 AT_ONCE = 2000  # Above so many candidates the relaxation is solved on those that matter, and certified on all
 _MANY_COORDINATES = 64
@@ -34,30 +32,18 @@ _CENTRING = 0.15
 
 @dataclass(frozen=True)
 class Task:
-    """How many poses to choose from which candidates, each at most ``limit`` times, by which criterion."""
+    """How many poses to choose from which candidates."""
 
     candidates: Candidates
-    criterion: Criterion
     count: int
-    limit: int = 1
-
-    def most(self, scores: Array) -> float:
-        whole, left = divmod(self.count, self.limit)
-        best = -np.sort(-scores)
-        rest = best[whole] * left if left else 0.0
-        return float(np.sum(best[:whole]) * self.limit + rest)
-
-    def threshold(self, scores: Array) -> float:
-        last = -(-self.count // self.limit) - 1
-        return float(-np.partition(-scores, last)[last])
 
     def subset(self, chosen: Indices) -> Task:
-        return Task(self.candidates.subset(chosen), self.criterion, self.count, self.limit)
+        return Task(self.candidates.subset(chosen), self.count)
 
 
 @dataclass(frozen=True)
 class Tangent:
-    """An affine function above the criterion: ``constant`` plus <gradient, J'J> (n x n) of the chosen."""
+    """An affine function above the log determinant: ``constant`` plus <gradient, J'J> (n x n) of the chosen."""
 
     constant: float
     gradient: Array
@@ -73,20 +59,23 @@ class Relaxation:
 
 
 def tangent(task: Task, weights: Array) -> Tangent:
-    """The tangent at weights (N) of a criterion that is a sum over eigenvalues."""
-    slope, _ = _trace(task)
+    """The tangent at weights (N)."""
     candidates = task.candidates
     known = candidates.known()
     information = candidates.information(weights) + candidates.ridge() * np.eye(candidates.size)
     values, vectors = np.linalg.eigh(information)
     values = np.maximum(values, 1e-300)
-    gradient = np.asarray((vectors * slope(values)) @ vectors.T)
-    return Tangent(float(task.criterion.value(values) + np.sum(gradient * (known - information))), gradient)
+    gradient = np.asarray((vectors * (1 / values)) @ vectors.T)
+    return Tangent(float(log_determinant(values) + np.sum(gradient * (known - information))), gradient)
 
 
 def certified(task: Task, weights: Array, upper: Tangent) -> Relaxation:
     scores = task.candidates.scores(upper.gradient)
-    return Relaxation(weights, upper.constant + task.most(scores), scores)
+    return Relaxation(weights, upper.constant + _largest(scores, task.count), scores)
+
+
+def _largest(scores: Array, count: int) -> float:
+    return float(np.sum(-np.sort(-scores)[:count]))
 
 
 def relax(task: Task, at_once: int | None = None) -> Relaxation:
@@ -107,7 +96,7 @@ def relax(task: Task, at_once: int | None = None) -> Relaxation:
         weights = np.zeros(number)
         weights[active], upper = interior_point(task.subset(active))
         made = certified(task, weights, upper)
-        reached = upper.constant + task.subset(active).most(made.scores[active])
+        reached = upper.constant + _largest(made.scores[active], task.count)
         best = made if best is None or made.bound < best.bound else best
         if made.bound - reached <= _GAP * max(1.0, abs(made.bound)):
             break
@@ -117,8 +106,8 @@ def relax(task: Task, at_once: int | None = None) -> Relaxation:
 
 
 def _next_active(task: Task, made: Relaxation, active: Indices, most: int) -> Indices:
-    used = np.flatnonzero(made.weights > 1e-7 * task.limit)
-    floor = task.threshold(made.scores[active])
+    used = np.flatnonzero(made.weights > 1e-7)
+    floor = float(-np.partition(-made.scores[active], task.count - 1)[task.count - 1])
     outside = np.ones(task.candidates.count, dtype=bool)
     outside[active] = False
     better = np.flatnonzero(outside & (made.scores > floor))
@@ -129,14 +118,14 @@ def _next_active(task: Task, made: Relaxation, active: Indices, most: int) -> In
 
 
 def interior_point(task: Task) -> tuple[Array, Tangent]:
-    """A primal-dual interior-point method in the weights [Nocedal2006], for sums over eigenvalues.
+    """A primal-dual interior-point method in the weights [Nocedal2006].
 
-    Its Newton matrix is the criterion's Hessian, K K', plus a diagonal; it is solved in whichever of the two sizes
-    is smaller.
+    Its Newton matrix is the Hessian of the log determinant, K K', plus a diagonal; it is solved in whichever of the two
+    sizes is smaller.
     """
-    number, upper = task.candidates.count, float(task.limit)
+    number = task.candidates.count
     weights = np.full(number, task.count / number)
-    if task.count >= number * task.limit:
+    if task.count >= number:
         return weights, tangent(task, weights)
     gradient, curved = _derivatives(task, weights)
     scale = float(np.abs(gradient).max()) or 1.0
@@ -145,13 +134,13 @@ def interior_point(task: Task) -> tuple[Array, Tangent]:
     best_weights, best, best_bound = weights, tangent(task, weights), np.inf
     for _ in range(_ITERATIONS):
         here = tangent(task, weights)
-        bound = here.constant + task.most(gradient)
+        bound = here.constant + _largest(gradient, task.count)
         if bound < best_bound:
             best_weights, best, best_bound = weights, here, bound
-        gap = task.most(gradient) - float(gradient @ weights)
+        gap = _largest(gradient, task.count) - float(gradient @ weights)
         if gap <= _GAP * max(1.0, abs(bound)) * 0.1:
             break
-        room = upper - weights
+        room = 1.0 - weights
         barrier = _CENTRING * float(low @ weights + high @ room) / (2 * number)
         diagonal = low / weights + high / room
         right = gradient / scale - price + barrier / weights - barrier / room
@@ -166,15 +155,8 @@ def interior_point(task: Task) -> tuple[Array, Tangent]:
     return best_weights, best
 
 
-def _trace(task: Task) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-    if task.criterion.trace is None:
-        raise ValueError(f"the criterion {task.criterion.name} is no sum over eigenvalues")
-    return task.criterion.trace
-
-
 def _derivatives(task: Task, weights: Array) -> tuple[Array, Array]:
     """The gradient by weights (N), and K (N x columns) with K K' minus the Hessian."""
-    slope, curvature = _trace(task)
     candidates = task.candidates
     information = candidates.information(weights) + candidates.ridge() * np.eye(candidates.size)
     left, right = np.triu_indices(candidates.size)
@@ -182,8 +164,8 @@ def _derivatives(task: Task, weights: Array) -> tuple[Array, Array]:
     values, vectors = np.linalg.eigh(information)
     values = np.maximum(values, 1e-300)
     turned = candidates.rows @ vectors
-    gradient = np.einsum("rni,rni,i->n", turned, turned, slope(values), optimize=True)
-    factor = np.sqrt(np.maximum(-spread(slope, curvature, values), 0.0))
+    gradient = np.einsum("rni,rni,i->n", turned, turned, 1 / values, optimize=True)
+    factor = 1 / np.sqrt(np.outer(values, values))
     half = np.zeros((candidates.count, len(left)))
     for row in turned:
         half += row[:, left] * row[:, right]

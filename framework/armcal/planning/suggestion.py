@@ -13,7 +13,6 @@ from armcal.base.dataset import Dataset
 from armcal.base.units import display_unit, to_unit
 from armcal.estimate.estimator import Estimate
 from armcal.planning.candidates import Candidates, deviations, whitened_rows
-from armcal.planning.criterion import criterion
 from armcal.planning.exchange import built_up
 from armcal.planning.relaxation import Task
 from armcal.problem.problem import Problem, triangular
@@ -76,7 +75,7 @@ def suggest(
         return ()
     rows, poses = rows[:, usable], poses.subset(usable)
     candidates = Candidates(base, rows)
-    chosen = built_up(Task(candidates, criterion("D"), min(count, len(poses))))
+    chosen = built_up(Task(candidates, min(count, len(poses))))
     before = deviations(base)
     known = np.isfinite(before) & (before > 0)
     units = {channel: display_unit(dimension).name for channel, dimension in joints.items()}

@@ -7,9 +7,9 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.diagnose.fit import Prepared
 from armcal.estimate.estimator import Progress, no_progress
-from armcal.estimate.identifiability import Candidate, candidates, freeing
+from armcal.estimate.identifiability import candidates, freeing
 from armcal.estimate.robust import fit
-from armcal.estimate.validation import cross_validate, folds
+from armcal.estimate.validation import cross_validate, error_unit, folds
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import acting
@@ -22,25 +22,26 @@ _STANDARD_ERRORS, _LEAST_GAIN = 2.6, 0.01
 
 @dataclass(frozen=True)
 class FreedStep:
-    """A fixed parameter, freed beside those before it: mean error of records held out (m or rad; nan: not judged)."""
+    """A fixed parameter, freed beside those before it; ``error`` is the mean of records held out (None: not judged)."""
 
-    candidate: Candidate
+    name: str
     unit: str
-    error: float
+    change: tuple[float, ...]  # of its coordinates, to first order (SI)
+    sd: tuple[float, ...]
+    p_value: float
+    error: float | None  # in the unit of errors
+    recommended: bool
 
 
 @dataclass(frozen=True)
 class FixedParameters:
-    """What fixed parameters would gain.
+    """What fixed parameters would gain, as JSON has it."""
 
-    Attributes:
-        recommended: of these the ones to free: none if held-out errors do not fall by more than chance, and by 1 %.
-    """
-
-    error: float  # mean error of records held out as configured (m, or rad where nothing measured is a length)
-    steps: tuple[FreedStep, ...]  # parameters that explain residuals, in the order in which they are freed
-    recommended: tuple[str, ...]
-    others: tuple[str, ...]  # names of what the records would determine too, and that gains nothing
+    unit: str  # of errors
+    error: float | None  # mean error of records held out, as configured
+    gaining: tuple[FreedStep, ...]  # parameters that explain residuals, in the order in which they are freed
+    recommended: tuple[str, ...]  # to be freed: none if held-out errors do not fall by more than chance, and by 1 %
+    determined_and_nothing_gained: tuple[str, ...]
 
 
 def fixed_parameters(experiment: Experiment, ready: Prepared, progress: Progress = no_progress) -> FixedParameters:
@@ -59,8 +60,9 @@ def fixed_parameters(experiment: Experiment, ready: Prepared, progress: Progress
     values = fitted.solution.values
     chosen = freeing(wide.with_records(fitted.problem.records), own, values)
     others = tuple(one.name for one in chosen.others)
+    unit = error_unit(ready.problem)
     if not chosen.gaining:
-        return FixedParameters(float("nan"), (), (), others)
+        return FixedParameters(unit, None, (), (), others)
     splits = folds(len(train), _FOLDS, 0, experiment.poses(ready.dataset.subset(train)))
     names = [one.name for one in chosen.gaining]
 
@@ -75,8 +77,9 @@ def fixed_parameters(experiment: Experiment, ready: Prepared, progress: Progress
         chance = _STANDARD_ERRORS * float(np.std(gains)) / np.sqrt(len(gains))
         if np.mean(gains) > max(chance, _LEAST_GAIN * float(np.mean(errors[best]))):
             best = count
-    means = {count: float(np.mean(error)) for count, error in errors.items()}
-    steps = [
-        FreedStep(one, parameters[one.name].unit, means.get(i, float("nan"))) for i, one in enumerate(chosen.gaining, 1)
-    ]
-    return FixedParameters(means[0], tuple(steps), tuple(names[:best]), others)
+    means = {count: 1000 * float(np.mean(error)) for count, error in errors.items()}
+    steps = []
+    for i, one in enumerate(chosen.gaining, 1):
+        numbers = (tuple(one.change.tolist()), tuple(one.sd.tolist()), one.p_value)
+        steps.append(FreedStep(one.name, parameters[one.name].unit, *numbers, means.get(i), i <= best))
+    return FixedParameters(unit, means[0], tuple(steps), tuple(names[:best]), others)

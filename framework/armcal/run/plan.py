@@ -9,14 +9,12 @@ There a servo's table is right by construction; between them it is not, and no r
 """
 
 import math
-from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from armcal.arm.loading import holding_efforts
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
@@ -26,11 +24,17 @@ from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.identifiability import Identifiability, analyse, measures_of
 from armcal.estimate.simulation import with_channels
 from armcal.measure.groups import grouped_instances
-from armcal.planning.candidates import Candidates, deviations, whitened_rows
-from armcal.planning.criterion import Observability, criterion, observability
-from armcal.planning.exchange import Allowed, Plan, choose, refine, value_of
+from armcal.planning.candidates import (
+    Candidates,
+    Observability,
+    deviations,
+    efficiency,
+    observability,
+    value_of,
+    whitened_rows,
+)
+from armcal.planning.exchange import Allowed, Plan, choose, refine
 from armcal.planning.relaxation import Task
-from armcal.planning.visit import cool_order, heat, path_time, peak, quick_order, travel_times
 from armcal.problem.problem import Problem, triangular
 from armcal.run.experiment import Experiment
 from armcal.run.plan_poses import (
@@ -39,23 +43,31 @@ from armcal.run.plan_poses import (
     clearance_of,
     counts_text,
     dataset_of,
-    given_records,
     pool_of,
+    read_poses,
     same_poses,
 )
 from armcal.run.settings import PlanSettings
 
-_SPEEDS = {"angle": np.deg2rad(60.0), "length": 0.05}
+_SPEEDS = {"angle": np.deg2rad(60.0), "length": 0.05}  # rad/s, m/s
+_MOST_PASSES = 50  # of an order of visit that is improved
 
 
 @dataclass(frozen=True)
 class PlanContext:
+    """What is planned for; information is by coordinates in typical scales."""
+
     experiment: Experiment
     settings: PlanSettings
     space: JointSpace
     parameters: Parameters
     given: Dataset | None
-    priors: Array  # as rows of information by coordinates in typical scales
+
+    @cached_property
+    def priors(self) -> Array:
+        """As rows of information."""
+        scales, prior = self.parameters.scales(), self.parameters.prior_information()
+        return np.diag(scales * np.sqrt(prior))[prior > 0]
 
     @cached_property
     def base(self) -> Array:
@@ -67,8 +79,11 @@ class PlanContext:
 
     def rows(self, dataset: Dataset) -> Array:
         records = as_if_measured(self.experiment, dataset)
-        problem = problem_of(self.experiment, self.parameters, records)
-        return whitened_rows(problem, self.parameters.nominal(), records)
+        return whitened_rows(self.problem(records), self.parameters.nominal(), records)
+
+    def problem(self, records: Dataset) -> Problem:
+        system, evaluator = self.experiment.system, self.experiment.settings.evaluator
+        return Problem.build(system.arms, system.measurements, self.parameters, system.environment, records, evaluator)
 
 
 def parameters_of(experiment: Experiment, calibration: Path | None) -> Parameters:
@@ -109,11 +124,6 @@ def values_about(experiment: Experiment, calibration: Path | None) -> Parameters
     return parameters.with_nominal(calibrated.nominal())
 
 
-def problem_of(experiment: Experiment, parameters: Parameters, dataset: Dataset) -> Problem:
-    system, evaluator = experiment.system, experiment.settings.evaluator
-    return Problem.build(system.arms, system.measurements, parameters, system.environment, dataset, evaluator)
-
-
 def as_if_measured(experiment: Experiment, dataset: Dataset) -> Dataset:
     """Poses with the channels of all that would be measured there; which numbers they hold does not matter."""
     measured = [f"{name}.{c.name}" for name, m in experiment.system.measurements.items() for c in m.channels()]
@@ -121,50 +131,67 @@ def as_if_measured(experiment: Experiment, dataset: Dataset) -> Dataset:
     return with_channels(dataset, {channel: np.zeros(len(dataset)) for channel in missing})
 
 
-def plan_context(
-    experiment: Experiment, settings: PlanSettings, space: JointSpace, parameters: Parameters, given: Dataset | None
-) -> PlanContext:
-    scales, prior = parameters.scales(), parameters.prior_information()
-    priors = np.diag(scales * np.sqrt(prior))[prior > 0]
-    return PlanContext(experiment, settings, space, parameters, given, priors)
+def in_order_of_visit(context: PlanContext, chosen: Dataset, *, keeps_approaches: bool) -> tuple[Dataset, float]:
+    """The poses in the order of visit, and the time that takes (s).
 
-
-def in_order_of_visit(
-    context: PlanContext, chosen: Dataset, *, keeps_approaches: bool = False
-) -> tuple[Dataset, float, float | None]:
-    """The poses in the order of visit, the time that takes (s), and the peak of the torque's moving average.
-
-    Ids are unique where a pose is repeated; approaches are what this order makes them, unless planned ones are kept.
+    Approaches are what this order makes them, unless planned ones are kept.
     """
-    settings, space, environment = context.settings, context.space, context.experiment.system.environment
-    angles = chosen.stacked(space.channels)
+    settings, space = context.settings, context.space
     given = space.by_joint(
         {n: [np.deg2rad(v)] for n, v in settings.speeds_deg_per_s.items()},
         {n: [v / 1000] for n, v in settings.speeds_mm_per_s.items()},
         ("speeds_deg_per_s", "speeds_mm_per_s"),
     )
     speeds = [given.get(n, np.array([_SPEEDS[d]])) for n, d in zip(space.names, space.dimensions, strict=True)]
-    load = environment.gravity, environment.payload_mass, environment.payload_com
-    efforts = [
-        holding_efforts(arm, chosen.stacked([*arm.command_channels]), *load)
-        for arm in context.experiment.system.arms.values()
-    ]
-    times, heats = travel_times(angles, np.concatenate(speeds)), heat(np.concatenate(efforts))
-    if settings.order == "travel":
-        order = quick_order(times)
-    else:
-        order = cool_order(heats, times) if settings.order == "torque" else np.arange(len(chosen))
+    times = travel_times(chosen.stacked(space.channels), np.concatenate(speeds))
+    order = quick_order(times) if settings.order == "travel" else np.arange(len(chosen))
     visited = chosen.subset(order)
-    copies: Counter[str] = Counter()
-    ids: list[str] = []
-    for record in visited.ids:
-        copies[record] += 1
-        ids.append(record if copies[record] == 1 else f"{record}_{copies[record]}")
-    numbers = tuple(str(i) for i in range(1, len(ids) + 1))
     by_order = _approaches(visited, space)
     channels = by_order | dict(visited.channels) if keeps_approaches else dict(visited.channels) | by_order
-    visited = replace(visited, ids=tuple(ids), channels=channels, extra={"order": numbers})
-    return visited, path_time(times, order), peak(heats, order) if heats.any() else None
+    numbers = tuple(str(i) for i in range(1, len(order) + 1))
+    return replace(visited, channels=channels, extra={"order": numbers}), path_time(times, order)
+
+
+def travel_times(joint_angles: Array, speeds: Array) -> Array:
+    """Seconds between poses (N x N): the joint that needs longest, at its speed (joints; rad/s or m/s)."""
+    scaled = joint_angles / speeds[:, None]
+    times = np.zeros((scaled.shape[1],) * 2)
+    for joint in scaled:
+        np.maximum(times, np.abs(joint[:, None] - joint[None, :]), out=times)
+    return times
+
+
+def path_time(times: Array, order: Indices) -> float:
+    return float(times[order[:-1], order[1:]].sum())
+
+
+def quick_order(times: Array) -> Indices:
+    """Nearest neighbour from every start, the best improved by turning stretches round (2-opt)."""
+    number = len(times)
+    if number < 3:
+        return np.arange(number)
+    paths = []
+    for start in np.unique(np.linspace(0, number - 1, min(number, 50)).astype(int)):
+        path, left = [int(start)], np.arange(number) != start
+        while left.any():
+            path.append(int(np.argmin(np.where(left, times[path[-1]], np.inf))))
+            left[path[-1]] = False
+        paths.append(np.array(path, dtype=np.intp))
+    order = min(paths, key=lambda path: path_time(times, path))
+    for _ in range(_MOST_PASSES):
+        improved = False
+        for i in range(number - 1):
+            ends = np.arange(i + 1, number)
+            into = times[order[i - 1], order[ends]] - times[order[i - 1], order[i]] if i else np.zeros(len(ends))
+            after = times[order[i], order[ends[:-1] + 1]] - times[order[ends[:-1]], order[ends[:-1] + 1]]
+            change = into + np.append(after, 0.0)
+            best = int(np.argmin(change))
+            if change[best] < -1e-9:
+                order[i : ends[best] + 1] = order[i : ends[best] + 1][::-1].copy()
+                improved = True
+        if not improved:
+            break
+    return order
 
 
 def _approaches(visited: Dataset, space: JointSpace) -> dict[str, Array]:
@@ -182,10 +209,6 @@ APPROACH_ROOM = np.deg2rad(3.0)  # A joint that is come to from a side comes fro
 PLANNED = ("continuous", "grid")  # Kinds of candidates whose approaches can be chosen
 SHARE = 0.2  # Of the poses, those between the angles that the others repeat
 _SAME_LEVEL = 0.02  # Of a joint's range
-
-
-def depends_on_approach(problem: Problem) -> bool:
-    return any(".approach." in channel for kernel in problem.kernels for channel in kernel.factor.channels)
 
 
 def approach_channels(space: JointSpace) -> tuple[str, ...]:
@@ -251,35 +274,21 @@ _MORE = "Plan more poses, give the records that are there already (--given), or 
 
 
 @dataclass(frozen=True)
-class Certificate:
-    """The bound on the criterion of every plan from these candidates, and how near the plan comes."""
-
-    bound: float
-    efficiency: float
-
-
-@dataclass(frozen=True)
 class PlanResult:
-    """A plan and what is known of it.
+    """A plan and what is known of it."""
 
-    Attributes:
-        dataset: the poses in the order of visit, each with the approach that was planned, else that this order gives.
-        peak: of the moving average of squared holding torque beside the plan's largest; None where nothing is held.
-    """
-
-    dataset: Dataset
+    dataset: Dataset  # the poses in the order of visit, with planned approaches, else those that this order gives
     pool: Pool  # the candidates
     given: int  # how many records were there before
     equations: int  # how many residual numbers the plan and the records before give
-    value: float  # of the criterion
     log_det: float  # log determinant of the information by coordinates in their typical scales, at the nominal values
-    certificate: Certificate | None  # None where the goal has none
+    bound: float  # on the log determinant of every plan from these candidates
+    efficiency: float  # how near the plan comes to the bound
     observability: Observability  # O1 to O5, of plan, records before and priors
     names: tuple[str, ...]  # of the coordinates
     deviations: Array  # standard deviations before and after (2 x n, SI; infinite where undetermined)
     identifiability: Identifiability  # after the plan
     travel_s: float  # of the whole visit
-    peak: float | None
     starts: int  # of the exchange
     refined: int  # poses that were moved through joint space
 
@@ -303,23 +312,24 @@ def make_plan(
     check = clearance_of(experiment)
     progress("candidates", 0.0)
     pool = pool_of(experiment, settings, space, listed, check)
+    given = None if records is None else read_poses(experiment, records)
+    context = PlanContext(experiment, settings, space, parameters, given)
     both = come_from_both_sides(pool, space, space.limits(settings), settings.seed)
-    first = as_if_measured(experiment, both.dataset.subset([0]))
-    pool = both if depends_on_approach(problem_of(experiment, parameters, first)) else pool
-    given = None if records is None else given_records(experiment, records)
-    if given is not None and settings.repeats == 1 and pool.kind != "continuous":
+    problem = context.problem(as_if_measured(experiment, both.dataset.subset([0])))
+    if any(".approach." in channel for kernel in problem.kernels for channel in kernel.factor.channels):
+        pool = both  # the model depends on the side from which a joint comes
+    if given is not None and pool.kind != "continuous":
         again = same_poses(pool.dataset.stacked(space.channels), given.stacked(space.channels))
         pool = pool.without(again, "measured already")
-    if len(pool.dataset) * settings.repeats < count:
+    if len(pool.dataset) < count:
         left_out = f" ({counts_text(pool.left_out)} left out)" if pool.left_out else ""
         raise ProblemError(
             f"found {len(pool.dataset)} candidates{left_out}, too few for {count} poses.",
-            hint="Ask for fewer poses, give more candidates, or allow plan.repeats.",
+            hint="Plan fewer poses, or give more candidates.",
         )
-    context = plan_context(experiment, settings, space, parameters, given)
     progress("planning", 0.2)
     candidates = Candidates(context.base, context.rows(pool.dataset))
-    task = Task(candidates, criterion(settings.goal), count, settings.repeats)
+    task = Task(candidates, count)
     plan, refined = _chosen(task, settings, parameters), 0
     if pool.kind == "continuous" and settings.sweeps:
         progress("refinement", 0.5)
@@ -372,7 +382,7 @@ def _refined(
     channels, count = (*space.channels, *sides), len(space.channels)
     before = pool.dataset.stacked(channels)[:, plan.chosen]
     limits = np.vstack([limits, np.tile([-1.0, 1.0], (len(sides), 1))])
-    problem = problem_of(context.experiment, context.parameters, as_if_measured(context.experiment, pool.dataset))
+    problem = context.problem(as_if_measured(context.experiment, pool.dataset))
 
     def dataset_at(poses: Array) -> Dataset:
         plain = dataset_of(poses[:count], space)
@@ -385,8 +395,8 @@ def _refined(
             problem, context.parameters.nominal(), as_if_measured(context.experiment, dataset_at(poses))
         )
 
-    known, by = task.candidates.known(), task.criterion
-    after = refine(before, limits, known, by, rows, lambda q: allowed(q[:count]), context.settings.sweeps)
+    known = task.candidates.known()
+    after = refine(before, limits, known, rows, lambda q: allowed(q[:count]), context.settings.sweeps)
     moved = np.flatnonzero(np.any(after != before, axis=0))
     if not len(moved):
         return task, plan, pool, 0
@@ -408,36 +418,31 @@ def _between(context: PlanContext, task: Task, plan: Plan, pool: Pool) -> Plan:
         return plan
     poses = pool.dataset.stacked(space.channels)
     chosen = with_poses_between(poses, space.limits(context.settings), plan.chosen)
-    return replace(plan, chosen=chosen, value=value_of(task.candidates, task.criterion, chosen))
+    return replace(plan, chosen=chosen, value=value_of(task.candidates, chosen))
 
 
 def _result(context: PlanContext, task: Task, plan: Plan, pool: Pool, refined: int) -> PlanResult:
-    """A plan's figures; the relaxation bounds criteria that are sums over eigenvalues."""
-    parameters, chosen = context.parameters, pool.dataset.subset(plan.chosen)
-    certificate = None
-    if task.criterion.trace is not None:
-        bound = plan.relaxation.bound
-        certificate = Certificate(bound, task.criterion.efficiency(plan.value, bound, task.candidates.size))
-    measured = Task(Candidates(context.base, context.rows(chosen)), criterion("D"), task.count)
+    """A plan's figures."""
+    parameters, chosen, bound = context.parameters, pool.dataset.subset(plan.chosen), plan.relaxation.bound
+    measured = Task(Candidates(context.base, context.rows(chosen)), task.count)
     everything = np.arange(task.count)
     triangle = measured.candidates.triangle(everything)
     given = 0 if context.given is None else len(context.given)
     equations = (task.count + given) * measured.candidates.rows.shape[0] + len(context.priors)
-    dataset, seconds, hottest = in_order_of_visit(context, chosen, keeps_approaches=pool.kind in PLANNED)
+    dataset, seconds = in_order_of_visit(context, chosen, keeps_approaches=pool.kind in PLANNED)
     return PlanResult(
         dataset=dataset,
         pool=pool,
         given=given,
         equations=equations,
-        value=plan.value,
-        log_det=value_of(measured.candidates, measured.criterion, everything),
-        certificate=certificate,
+        log_det=value_of(measured.candidates, everything),
+        bound=bound,
+        efficiency=efficiency(plan.value, bound, task.candidates.size),
         observability=observability(np.linalg.svd(triangle, compute_uv=False).astype(float), equations),
         names=parameters.coordinate_names,
         deviations=np.array([deviations(part) for part in (context.base, triangle)]) * parameters.scales(),
         identifiability=_identifiability(measured, everything, parameters),
         travel_s=seconds,
-        peak=hottest,
         starts=plan.starts,
         refined=refined,
     )

@@ -16,11 +16,10 @@ from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.calibration.compensation.finder import Allowed
 from armcal.config.system import build_component
-from armcal.errors import ConfigError, DataError, Location, ProblemError
-from armcal.io.plain_files import input_file
+from armcal.errors import ConfigError, Location, ProblemError
 from armcal.measure.checks import records_of
 from armcal.measure.environment import TOLERANCE, own_limits, span_text
-from armcal.measure.reader import MAX_ID_LIST_BYTES, Reader, read_ids
+from armcal.measure.reader import Reader
 from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment, with_data
 from armcal.run.plan_clearance import clearance_check
@@ -158,37 +157,6 @@ def read_poses(experiment: Experiment, path: Path | None) -> Dataset:
     reader: Reader
     reader, _ = build_component(source, experiment.registry, "reader", ("data",))
     return records_of(reader, experiment.request(measured=False))
-
-
-def given_records(experiment: Experiment, path: Path) -> Dataset:
-    """Records that are there already: a table of poses, or a list of ids in the configured data.
-
-    Raises:
-        DataError: refused, or an id is not in the data.
-    """
-    try:
-        with input_file(path, MAX_ID_LIST_BYTES, "a list of ids") as stream:
-            line = stream.readline(1000).decode("utf-8-sig", "replace")
-    except DataError:
-        return read_poses(experiment, path)  # the reader reports what is wrong
-    if any(mark in line for mark in ",;\t|"):
-        return read_poses(experiment, path)
-    ids = read_ids(path)  # a file of one column
-    if experiment.settings.data is None:
-        raise DataError(
-            "it lists ids, and no data is configured that they could belong to.",
-            where=Location(str(path)),
-            hint="Give the data (--data FILE), or the poses themselves.",
-        )
-    recorded = read_poses(experiment, None)
-    place = {record: i for i, record in enumerate(recorded.ids)}
-    if missing := [record for record in ids if record not in place]:
-        raise DataError(
-            f"{len(missing)} of {len(ids)} ids are not in the data, the first: {missing[0]}.",
-            where=Location(str(path)),
-            hint="Give the poses themselves, or the data (--data FILE) that the ids belong to.",
-        )
-    return recorded.subset([place[record] for record in ids])
 
 
 def commands_of(dataset: Dataset, space: JointSpace) -> Dataset:

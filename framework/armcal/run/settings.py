@@ -9,7 +9,6 @@ from armcal.config.selection import ParameterSettings
 from armcal.config.system import StaticsSettings
 from armcal.estimate.robust import NoiseSettings
 from armcal.estimate.uncertainty import BootstrapSettings
-from armcal.planning.criterion import Goal
 from armcal.run.plan_clearance import ClearanceSettings
 
 Levels: TypeAlias = dict[str, Annotated[tuple[Angle, ...], Field(min_length=1)]]
@@ -69,19 +68,17 @@ class PlanSettings(Settings):
     limits is left out. ``speeds_deg_per_s`` and ``speeds_mm_per_s`` are by joint; 60 deg/s and 50 mm/s by default.
     """
 
-    goal: Goal = "D"
     candidates: Literal["recorded", "grid", "continuous"] | None = None
     count: Annotated[int, Field(ge=1, le=1_000_000)] = 4096
     limits: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)
     travel_limits: dict[str, tuple[Length, Length]] = Field(default_factory=dict)
     levels: Levels = Field(default_factory=dict)
     travel: Travel = Field(default_factory=dict)
-    repeats: Annotated[int, Field(ge=1)] = 1
-    starts: Annotated[int, Field(ge=0)] | None = None
+    starts: Annotated[int, Field(ge=0)] = 10
     seed: Annotated[int, Field(ge=0)] = 0
     sweeps: Annotated[int, Field(ge=0, le=100)] = 8
     clearance: ClearanceSettings | None = None
-    order: Literal["travel", "torque", "none"] = "travel"
+    order: Literal["travel", "none"] = "travel"
     speeds_deg_per_s: dict[str, Speed] = Field(default_factory=dict)
     speeds_mm_per_s: dict[str, Speed] = Field(default_factory=dict)
 
