@@ -7,20 +7,18 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from armcal.base.config_text import as_json
-from armcal.calibration.measured_point import Point
 from armcal.cli.console import Screen, columned
 from armcal.errors import CalibrationWarning, DataError, Location
-from armcal.estimate.estimator import Progress, no_progress
-from armcal.io.parallel import parse_executor
 from armcal.plugins import PluginRegistry, discover
 from armcal.version import JSON_SCHEMA
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # nothing here loads NumPy: commands that list things must not wait for it
+    from armcal.estimate.estimator import Progress
     from armcal.report.document import Document
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -69,10 +67,7 @@ class Console:
         self, title: str, columns: Iterable[str], rows: Iterable[Iterable[object]], left: Sequence[str] = ()
     ) -> None:
         """A table of the result; numbers stand to the right but in the first column and those of ``left``."""
-        table = columned(title, columns, left)
-        for row in rows:
-            table.add_row(*map(str, row))
-        self.out.print(table)
+        self.out.print(columned(title, columns, rows, left))
 
     def registry(self) -> PluginRegistry:
         registry = discover()
@@ -98,10 +93,10 @@ class Console:
             yield
 
     @contextmanager
-    def progress(self) -> Iterator[Progress]:
+    def progress(self) -> Iterator["Progress"]:
         """A progress line with the time left, on a terminal."""
         if self.quiet or self.json or not sys.stderr.isatty():
-            yield no_progress
+            yield lambda what, fraction: None
             return
         from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
         from rich.progress import Progress as Bar
@@ -150,14 +145,22 @@ arm = click.option("--arm", metavar="NAME", help="Which arm, where there are sev
 within = click.option("--within", type=FILE, help="A configuration whose plan has limits and clearance.")
 point = click.option(
     "--point",
-    type=click.Choice(get_args(Point)),
+    type=click.Choice(("tool", "target")),
     help="What arrives: the tool frame's origin, or the target that was measured [default: tool].",
 )
+
+
+def _executor(ctx: click.Context, option: click.Parameter, text: str) -> Any:
+    from armcal.io.parallel import parse_executor
+
+    return parse_executor(text)
+
+
 parallel = click.option(
     "--parallel",
     default="auto",
     metavar="N|BACKEND",
-    callback=lambda ctx, option, text: parse_executor(text),
+    callback=_executor,
     help="Processes for independent fits: N, threading:N, dask:ADDRESS [default: auto].",
 )
 

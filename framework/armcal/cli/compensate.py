@@ -8,6 +8,7 @@ import click
 import numpy as np
 
 from armcal.base.arrays import Array
+from armcal.base.dataset import Dataset
 from armcal.base.units import parse_quantity
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.compensation.compensator import Compensator
@@ -17,7 +18,7 @@ from armcal.calibration.recorded_range import beyond_records
 from armcal.cli.common import FILE, Console, accept, arm, point, spare_inputs, speaking, within
 from armcal.errors import InputError, Location
 from armcal.report.document import Document
-from armcal.run.compensate import Assessed, Bench, TargetFile, assess, check_units, commanded, summary, write_commands
+from armcal.run.compensate import Assessed, Bench, assess, check_units, commanded, summary, write_commands
 
 _SHOWN = 5
 _SAME_POINT_M = 1e-5
@@ -58,11 +59,11 @@ def compensate(console: Console, calibration: Path, targets: Path, out: Path, an
     bench = Bench.of(
         loaded, options["arm"], options["within"], options["redundancy"], registry, options["point"] or "tool"
     )
-    file = bench.read(targets, registry)
-    for text in file.dataset.warnings:
+    goals, given = bench.read(targets, registry)
+    for text in given.warnings:
         console.warn(text)
-    compensator = bench.compensator(file.targets)
-    check_units(targets, file.targets, compensator.reach)
+    compensator = bench.compensator(goals)
+    check_units(targets, goals, compensator.reach)
     limits = zip(compensator.joints, compensator.limits, strict=True)
     free = [joint for joint, ends in limits if not np.isfinite(ends).all()]
     if free:
@@ -78,15 +79,15 @@ def compensate(console: Console, calibration: Path, targets: Path, out: Path, an
         )
     start = _start(options["start"], compensator)
     reach = compensator.follow if options["kind"] == "path" else compensator.solve
-    commands = reach(file.targets, start)
-    assessed = assess(bench, compensator, file.targets, commands)
-    poses = sent(bench.nominal(), file.targets, commands) if options["controller"] else None
-    write_commands(out, compensator, file.targets, file.dataset, assessed, angles, poses)
+    commands = reach(goals, start)
+    assessed = assess(bench, compensator, goals, commands)
+    poses = sent(bench.nominal(), goals, commands) if options["controller"] else None
+    write_commands(out, compensator, goals, given, assessed, angles, poses)
     if kept := bench.calibration.record.prediction:
-        given = commanded(compensator, file.targets, commands).subset(np.flatnonzero(commands.reached))
-        if text := beyond_records(kept.ranges, given, {bench.arm: compensator.expression.arm})[1]:
+        reached = commanded(compensator, goals, commands).subset(np.flatnonzero(commands.reached))
+        if text := beyond_records(kept.ranges, reached, {bench.arm: compensator.expression.arm})[1]:
             console.warn(text)
-    _show(console, file, assessed, bench, out)
+    _show(console, given, assessed, bench, out)
 
 
 def _start(stated: Sequence[str], compensator: Compensator) -> Array | None:
@@ -110,14 +111,14 @@ def _start(stated: Sequence[str], compensator: Compensator) -> Array | None:
     return np.array(list(at.values()))
 
 
-def _show(console: Console, file: TargetFile, assessed: Assessed, bench: Bench, out: Path) -> None:
+def _show(console: Console, given: Dataset, assessed: Assessed, bench: Bench, out: Path) -> None:
     figures, commands = summary(assessed), assessed.commands
     missed = [
         {"id": name, "reason": reason, "nearest_mm": 1000 * float(distance) if np.isfinite(distance) else None}
-        for name, reason, distance in zip(file.dataset.ids, commands.reasons, commands.distances, strict=True)
+        for name, reason, distance in zip(given.ids, commands.reasons, commands.distances, strict=True)
         if reason
     ]
-    set_aside = [{"row": target.row, "reason": target.reason} for target in file.dataset.set_aside]
+    set_aside = [{"row": target.row, "reason": target.reason} for target in given.set_aside]
     offset = None if bench.target is None else [1000 * float(x) for x in bench.target.tool_T_target[:3, 3]]
     data = {**figures, "point": bench.point, "target_mm": offset, "missed": missed, "set_aside": set_aside}
     for target in missed[:_SHOWN]:

@@ -90,10 +90,8 @@ class Screen(Console):
             self.print(part)
         elif isinstance(part, Rows):
             kept = [i for i, heading in enumerate(part.headings) if heading not in part.page_only]
-            table = columned(part.caption, [part.headings[i] for i in kept], part.left)
-            for row in part.rows:
-                table.add_row(*(in_ascii(row[i]) for i in kept))
-            self.print(table)
+            rows = ([in_ascii(row[i]) for i in kept] for row in part.rows)
+            self.print(columned(part.caption, [part.headings[i] for i in kept], rows, part.left))
         elif isinstance(part, Finding):
             text = Text(part.text)
             if part.test and verbose:
@@ -109,11 +107,13 @@ class Screen(Console):
         self.quiet = True
 
 
-def columned(title: str, columns: Iterable[str], left: Sequence[str] = ()) -> Table:
+def columned(title: str, columns: Iterable[str], rows: Iterable[Iterable[object]], left: Sequence[str] = ()) -> Table:
     """A table of numbers, which stand to the right; the first column and those of ``left`` hold words."""
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for place, column in enumerate(columns):
         table.add_column(column, justify="left" if not place or column in left else "right")
+    for row in rows:
+        table.add_row(*map(str, row))
     return table
 
 

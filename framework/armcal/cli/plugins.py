@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from armcal.cli.common import Console, speaking
 from armcal.errors import EXIT_BAD_INPUT, PluginError
 from armcal.plugins import discover
 from armcal.version import JSON_SCHEMA
@@ -54,11 +55,12 @@ def list_plugins(as_json: bool, quiet: bool, verbose: bool) -> None:
 
 @plugins.command("check")
 @click.argument("name", required=False)
-@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on standard output.")
-@click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
-@click.option("-v", "--verbose", is_flag=True, help="Name every check, and why one did not run.")
-def check_plugin(name: str | None, as_json: bool, quiet: bool, verbose: bool) -> None:
-    """Check the plugin NAME, or all: imports, hooks, and the contract of each component."""
+@speaking
+def check_plugin(console: Console, name: str | None) -> None:
+    """Check the plugin NAME, or all: imports, hooks, and the contract of each component.
+
+    -v names every check, and why one did not run.
+    """
     from armcal.testing.contract import check_plugin as checks_of
 
     registry = discover()
@@ -78,16 +80,15 @@ def check_plugin(name: str | None, as_json: bool, quiet: bool, verbose: bool) ->
         counts = {"ran": len(rows) - idle, "failed": wrong, "not_run": idle}
         broken = "; ".join(plugin.fault for plugin in chosen if plugin.fault)
         reports.append({"plugin": text, "fault": broken or None, **counts, "checks": rows})
-    if as_json:
-        click.echo(json.dumps({**JSON_SCHEMA, **({"plugins": reports} if name is None else reports[0])}, indent=2))
-    elif not quiet:
+    console.result({"plugins": reports} if name is None else reports[0])
+    if not (console.json or console.quiet):
         for report in reports:
             for row in report["checks"]:
-                if verbose or row["fault"]:
+                if console.verbose or row["fault"]:
                     mark, fault = ("FAIL", f": {row['fault']}") if row["fault"] else ("ok  ", "")
                     click.echo(f"{'--  ' if row['not_run'] else mark} {row['component']}: {row['check']}{fault}")
             left = f", {report['not_run']} not run" if report["not_run"] else ""
-            why = f"{left} (-v says why)" if left and not verbose else left
+            why = f"{left} (-v says why)" if left and not console.verbose else left
             click.echo(f"{report['plugin']}: {report['ran'] - report['failed']} of {report['ran']} checks passed{why}.")
     failed = [report for report in reports if report["failed"]]
     for report in failed:

@@ -47,36 +47,30 @@ def roles(result: RunResult) -> tuple[Mask, Mask]:
 
 def in_space(result: RunResult) -> Figure | None:
     """Errors of the nominal and of the calibrated arm over the workspace, by one scale; None without positions."""
-    errors = result.errors
-    panels = {"nominal": errors.nominal_mm, "calibrated": errors.calibrated_mm}
-    caption = f"Places of the tip, mm, and the error of each record, {errors.unit}, by one scale."
-    return _space(result, panels, errors.unit, ("Error by place", caption))
-
-
-def _space(result: RunResult, numbers: dict[str, Array], unit: str, words: tuple[str, str]) -> Figure | None:
-    position = result.errors.position_mm
-    if position.shape[0] < 3:
+    errors, position = result.errors, result.errors.position_mm
+    unit, panels = errors.unit, list[Panel]()
+    shown = {"nominal": errors.nominal_mm, "calibrated": errors.calibrated_mm}
+    shown = {name: own for name, own in shown.items() if np.isfinite(own).any()}
+    if position.shape[0] < 3 or not shown:
         return None
-    shown = {name: own for name, own in numbers.items() if np.isfinite(own).any()}
-    known = np.isfinite(position[:3]).all(axis=0)
-    known &= np.all([np.isfinite(own) for own in shown.values()], axis=0) if shown else False
-    places = np.flatnonzero(known)
+    places = np.flatnonzero(np.isfinite([*position[:3], *shown.values()]).all(axis=0))
     if not len(places):
         return None
     ends = _levels(np.concatenate([own[places] for own in shown.values()]))
     chosen = _thinned(next(reversed(shown.values())), places)
     box, flat = _box(position[:3, places]), _projected(position[:3, chosen])
-    panels = []
+    small = " small" if len(chosen) > 600 else ""
     for name, own in shown.items():
         level = np.clip(np.searchsorted(ends, own[chosen]), 0, _LEVELS - 1)
-        small = " small" if len(chosen) > 600 else ""
         marks = [Marks(f"dot{small} l{i}", flat[:, level == i], name=_range(ends, i, unit)) for i in range(_LEVELS)]
         panels.append(Panel(name, (*box, *marks), equal=True, bare=True))
-    said = "; ".join(
-        f"{name or 'shift'}: median {significant(float(np.median(shown[name][places])))} {unit}" for name in shown
-    )
-    caption = words[1] + drawn_of(len(chosen), len(places))
-    return Figure(words[0], f"{plural(len(places), 'tip position')}; {said}.", caption, panels)
+    said = "; ".join(f"{n}: median {significant(float(np.median(own[places])))} {unit}" for n, own in shown.items())
+    spans = [
+        f"{axis} {low:.0f} to {high:.0f}" for axis, low, high in zip("xyz", *_span(position[:3, places]), strict=True)
+    ]
+    caption = f"Places of the tip, {', '.join(spans)} mm, and the error of each record, {unit}, by one scale."
+    caption += drawn_of(len(chosen), len(places))
+    return Figure("Error by place", f"{plural(len(places), 'tip position')}; {said}.", caption, panels)
 
 
 def _levels(numbers: Array) -> Array:
@@ -102,18 +96,23 @@ def _projected(places: Array) -> Array:
     return np.array([across, np.cos(lift) * places[2] - np.sin(lift) * towards])
 
 
+def _span(places: Array) -> tuple[Array, Array]:
+    return places.min(axis=1), np.maximum(places.max(axis=1), places.min(axis=1) + 1.0)
+
+
 def _box(places: Array) -> list[Marks]:
-    """The edges of the box that holds the places, and its ends along x, y and z."""
-    low, high = places.min(axis=1), np.maximum(places.max(axis=1), places.min(axis=1) + 1.0)
+    """The edges of the box that holds the places, and the names of its axes, outside of it."""
+    low, high = _span(places)
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(corners[a] - corners[b]).sum() == 1]
     gap = np.full((1, 3), np.nan)
     edges = np.vstack([np.vstack([corners[a], corners[b], gap[0]]) for a, b in pairs])
     lines = _projected((low + edges * (high - low)).T)
-    middle = np.array([[0.5, 0.0, 0.0], [1.0, 0.5, 0.0], [1.0, 1.0, 0.5]])
-    names = _projected((low + middle * (high - low)).T)
-    texts = [f"{axis} {a:.0f} to {b:.0f}" for axis, a, b in zip("xyz", low, high, strict=True)]
-    return [Marks("box", lines), Marks("tick", names, texts=texts)]
+    # The middles of the edges that end the picture below and to the right, and of the box.
+    middles = np.array([[0.5, 0.0, 0.0], [1.0, 0.5, 0.0], [1.0, 1.0, 0.5], [0.5, 0.5, 0.5]])
+    names = _projected((low + middles * (high - low)).T)
+    names = names[:, 3:] + 1.15 * (names[:, :3] - names[:, 3:])
+    return [Marks("box", lines), Marks("tick", names, texts="xyz")]
 
 
 def distribution(result: RunResult) -> Figure | None:
@@ -146,7 +145,7 @@ def distribution(result: RunResult) -> Figure | None:
     caption = "The further left a curve, the better; it cannot be left of what noise alone does for long."
     caption += " The error axis is logarithmic." if log else ""
     panel = Panel("", marks, f"error, {errors.unit}", "records below, %", log=log, low=0.0, high=100.0)
-    return Figure("Errors before and after", said, caption, [panel], columns=1)
+    return Figure("Share of records below each error", said, caption, [panel], columns=1)
 
 
 def _steps(errors: Array, low: float) -> tuple[Array, Array]:

@@ -44,16 +44,8 @@ _AS_DOCUMENTED = (
 _KINDS = {"quaternion": _QUATERNION, "angles": _RPY}
 
 
-@dataclass(frozen=True)
-class TargetFile:
-    """Targets, and the file's content: ids, columns that nothing asked for, rows set aside."""
-
-    targets: Targets
-    dataset: Dataset
-
-
-def read_targets(path: Path, expression: ToolExpression, registry: PluginRegistry) -> TargetFile:
-    """Targets of one arm.
+def read_targets(path: Path, expression: ToolExpression, registry: PluginRegistry) -> tuple[Targets, Dataset]:
+    """Targets of one arm; and the file's content: ids, columns that nothing asked for, rows set aside.
 
     Columns ``x_mm, y_mm, z_mm``, or ``target_x_mm`` and so on, which alone counts where a joint is called ``x``; for a
     rotation too ``qw, qx, qy, qz`` or ``roll_deg, pitch_deg, yaw_deg`` (about the base frame's x, then y, then z).
@@ -81,7 +73,7 @@ def read_targets(path: Path, expression: ToolExpression, registry: PluginRegistr
     joints = len(expression.joints)
     loads, approaches = acting[2 * joints : 2 * joints + len(LOAD_CHANNELS)], acting[joints : 2 * joints]
     conditions = {name: dataset.column(name) for name in expression.arm.conditions if dataset.has(name)}
-    return TargetFile(Targets(positions, _rotations(path, dataset), loads, approaches, conditions), dataset)
+    return Targets(positions, _rotations(path, dataset), loads, approaches, conditions), dataset
 
 
 def check_units(path: Path, targets: Targets, reach: Reach) -> None:
@@ -217,16 +209,16 @@ class Bench:
         """Whether measurements judge the point that arrives: not a tool's origin beside a target that was fitted."""
         return self.point == "target" or self.target is None or not self.target.fitted
 
-    def read(self, path: Path, registry: PluginRegistry) -> TargetFile:
-        """Targets from a CSV.
+    def read(self, path: Path, registry: PluginRegistry) -> tuple[Targets, Dataset]:
+        """Targets from a CSV, see ``read_targets``.
 
         Raises:
             DataError: it cannot be read, or the arm is elastic and nothing states what hangs on the tool.
         """
         conditions = self.calibration.system.arms[self.arm].conditions
-        file = read_targets(path, self.calibration.expression(self.arm, conditions), registry)
-        self.calibration.require_payload(file.dataset.has("payload"), str(path))
-        return file
+        targets, dataset = read_targets(path, self.calibration.expression(self.arm, conditions), registry)
+        self.calibration.require_payload(dataset.has("payload"), str(path))
+        return targets, dataset
 
     def compensator(self, targets: Targets | None = None) -> Compensator:
         """What finds commands, for targets that state such surroundings.
