@@ -17,7 +17,7 @@ from armcal.calibration.calibration import Calibration
 from armcal.plugins import PluginRegistry, discover
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.run.outputs import write
+from armcal.run.outputs import reserved, write
 from armcal.run.pipeline import calibrate
 from armcal_online.sources.source import Incoming
 from armcal_online.tracking.recalibrator import Recalibrator
@@ -126,7 +126,8 @@ def calibrated(world: World, count: int, folder: Path) -> Calibration:
     lines = [",".join([i, *(repr(float(x)) for x in row)]) for i, row in zip(dataset.ids, table, strict=True)]
     (folder / "data.csv").write_text("\n".join([",".join(head), *lines]) + "\n", encoding="utf-8")
     experiment = Experiment.load(configuration(world.rows, folder / "data.csv"), registry=registry())
-    write(calibrate(experiment), experiment, folder / "run", "")
+    with reserved(folder / "run") as held:
+        write(held, calibrate(experiment), experiment, "")
     return Calibration.load(folder / "run" / "calibration.yaml", registry())
 
 

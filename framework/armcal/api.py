@@ -78,7 +78,8 @@ class Run:
             InputError: the folder holds other things, or cannot be written.
         """
         document = run_document(self.result, plugin_sections(self.result, self.experiment.registry)[0])
-        outputs.write(self.result, self.experiment, Path(folder), page(document), accept)
+        with outputs.reserved(Path(folder)) as held:
+            outputs.write(held, self.result, self.experiment, page(document), accept)
         return Path(folder)
 
 

@@ -53,7 +53,6 @@ def test_a_run_leaves_every_file_and_says_the_same_in_json(demo: Path) -> None:
     assert names == {
         "calibration.yaml",
         "experiment.yaml",
-        "log.txt",
         "metrics.json",
         "report.html",
         "residuals.csv",

@@ -89,7 +89,7 @@ def test_the_arm_is_found_from_the_trained_positions(run):
         if name in TRUTH:
             assert abs(found[name] - TRUTH[name]) < 4 * sd, name
     assert not any("shelf" in name for name in run.estimate.names)
-    assert run.groups.keys == {"balls": tuple(sorted(SPOTS))}
+    assert run.fit.problem.blueprint.groups == {"balls": tuple(sorted(SPOTS))}
 
 
 def test_errors_of_each_position_are_distances_to_its_sockets(run, data):
@@ -201,5 +201,5 @@ def test_spaces_about_a_label_mean_nothing(data, tmp_path):
     )
     validation = {"train_groups": ["front", "back"]}
     result = calibrate(Experiment.load(written(tmp_path, spaced, validation=validation)))
-    assert [each.name for each in result.groups.errors] == ["back", "front", "shelf"]
+    assert [each.name for each in result.groups] == ["back", "front", "shelf"]
     assert ball(("left",)).group_labels == ("position", "socket")

@@ -13,8 +13,7 @@ from armcal.cli.main import cli
 from armcal.io.parallel import Sequential, Workers
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
-from armcal.run.study import Study, compare
-from armcal.run.study_result import StudyResult
+from armcal.run.study import Study, StudyResult, compare
 from click.testing import CliRunner, Result
 
 pytestmark = pytest.mark.slow

@@ -470,7 +470,7 @@ def test_a_run_tells_what_its_intervals_hold(recording: Path) -> None:
     assert same["radius_95_mm"] < 0.8 * message_of["new_recording"]["radius_95_mm"]
     page = (recording / "run" / "report.html").read_text()
     assert "a prediction is good to +-" in page
-    assert "90 % prediction intervals" in (recording / "run" / "log.txt").read_text()
+    assert "90 % prediction intervals" in page
 
 
 @pytest.mark.slow

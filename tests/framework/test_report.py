@@ -50,7 +50,7 @@ from armcal.report.run_document import run_document
 from armcal.run.result import RunResult
 from fits import fit_that_found
 
-SECTIONS = ("verdict", "accuracy", "parameters", "data", "reproduce")
+SECTIONS = ("verdict", "accuracy", "parameters", "reproduce")
 
 
 def render(result: RunResult) -> str:

@@ -179,10 +179,10 @@ def test_a_second_run_into_one_folder_is_refused_while_the_first_lasts(tmp_path:
         second = CliRunner().invoke(cli, ["run", DEMO, "--out", str(folder), "-q", *FAST])
         assert second.exit_code == 2 and "another run writes to it" in second.output, second.output
         assert "Wait until it ends, or give another --out." in second.output
-        held.place({"log.txt": "the first\n"})
+        held.place({"metrics.json": "{}\n"})
         third = CliRunner().invoke(cli, ["run", DEMO, "--out", str(folder), "-q", *FAST])
         assert third.exit_code == 2 and "another run writes to it" in third.output, "it lasts on after its files"
-    assert [path.name for path in folder.iterdir()] == ["log.txt"]
+    assert [path.name for path in folder.iterdir()] == ["metrics.json"]
     assert CliRunner().invoke(cli, ["run", DEMO, "--out", str(folder), "-q", *FAST]).exit_code == 0
 
 

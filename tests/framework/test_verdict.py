@@ -225,8 +225,11 @@ def test_terminal_and_report_say_what_the_json_says(tmp_path: Path) -> None:
     shown = " ".join(CliRunner().invoke(cli, run).stdout.split())
     page = " ".join((tmp_path / "run" / "report.html").read_text().split())
     told = json.loads((tmp_path / "run" / "metrics.json").read_text())["verdict"]
-    assert told["paragraph"].startswith("Good for +- ") and told["paragraph"] in shown
-    assert escape(told["paragraph"], quote=False).replace("'", "&#39;") in page
+    claim = re.match(r"Good for \+- .*?\)\. ", told["paragraph"] + " ")[0].strip()  # type: ignore[index]
+    assert claim in shown and escape(claim, quote=False).replace("'", "&#39;") in page
+    for finding in told["findings"]:
+        if finding["grade"] in ("bad", "warning"):
+            assert shown.count(finding["text"]) == 1, "what a warning says is not said before it, too"
     for finding in told["findings"]:
         for part in ("text", "test", "action"):
             assert escape(finding[part], quote=False).replace("'", "&#39;") in page

@@ -89,8 +89,8 @@ def test_unseen_errors_fall_to_near_the_noise_and_the_run_says_so():
     covered = run.metrics["prediction_intervals"]["same_recording"]["holdout"]
     chance = np.sqrt(0.9 * 0.1 / covered["coordinates"])
     assert abs(covered["share"]["90"] - 0.9) < 3.3 * chance  # once in a thousand by chance
-    log = (run.folder / "run/log.txt").read_text()
-    assert "The pose residual of arm takes unseen errors from" in log
+    texts = [finding["text"] for finding in run.metrics["verdict"]["findings"]]
+    assert any(text.startswith("The pose residual of arm takes unseen errors from") for text in texts)
 
 
 @pytest.mark.slow

@@ -48,15 +48,13 @@ def run(
         result = calibrate(experiment, command_line(), progress, watch, parallel, accept)
     for warning in result.warnings:
         console.warn(warning)
-    for line in result.odd_records:
-        console.detail(line)
     for stage, seconds in result.seconds.items():
         console.detail(f"{stage}: {seconds:.3f} s")
     console.detail(f"evaluated by: {result.backend}")
     result.seconds["total"] = watch.total()
     sections, faults = plugin_sections(result, registry)
     document = run_document(result, sections)
-    outputs.place(reserved, result, experiment, page(document), accept)
+    outputs.write(reserved, result, experiment, page(document), accept)
     converged = result.estimate.verdict.converged
     faults += registry.notify("armcal_run_ended", name=result.name, folder=str(folder), converged=converged)
     for text in faults:

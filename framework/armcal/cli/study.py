@@ -9,9 +9,8 @@ from armcal.io.folder import reserved
 from armcal.io.parallel import Executor
 from armcal.report.page import page
 from armcal.report.study_document import study_document
-from armcal.run import study_result
 from armcal.run.pipeline import Stopwatch
-from armcal.run.study import Study, compare
+from armcal.run.study import FILES, Study, compare, files
 
 
 @click.command()
@@ -27,7 +26,7 @@ def study(
     """Compare the variants that CONFIG lists by cross-validated error, and trained at one group of records each."""
     watch = Stopwatch()
     folder = out or Path("runs") / config.stem
-    kept = click.get_current_context().with_resource(reserved(folder, study_result.FILES))
+    kept = click.get_current_context().with_resource(reserved(folder, FILES))
     configured = Study.load(config, overrides, data, console.registry())
     with console.progress() as progress:
         result = compare(configured, parallel, command_line(), progress, watch)
@@ -40,6 +39,6 @@ def study(
     result.seconds["total"] = watch.total()
     sources = {name: experiment.source for name, experiment in configured.experiments.items()}
     document = study_document(result)
-    kept.place(study_result.files(result, configured.source, sources, page(document)))
+    kept.place(files(result, configured.source, sources, page(document)))
     console.show(document, folder=str(folder))
     console.line(f"page: {folder / 'study.html'}  ({watch.total():.1f} s)")

@@ -49,7 +49,11 @@ class Verdict:
 
     headline: str
     findings: tuple[Finding, ...]
-    paragraph: str = ""
+    sentences: tuple[str, ...] = ()  # of the paragraph; the first says how good the model is on unseen poses
+
+    @property
+    def paragraph(self) -> str:
+        return " ".join(self.sentences)
 
     @property
     def grade(self) -> Literal["good", "usable with care", "bad"]:
@@ -81,7 +85,7 @@ def in_all(fit: Fit, ranked: Sequence[Finding]) -> Verdict:
     first = _good_for(judged_mm, judged_on, fit.unit, fit.of(new_recording), fit.of(elsewhere))
     if ranked[0].grade == "bad":
         headline, first = f"{DO_NOT_USE}. {headline}", f"{DO_NOT_USE}: {ranked[0].text}"
-    return Verdict(headline, tuple(ranked), " ".join(_in_short(fit, first)))
+    return Verdict(headline, tuple(ranked), tuple(_in_short(fit, first)))
 
 
 def new_recording(fit: Fit) -> NewRecording | None:

@@ -8,8 +8,10 @@ import numpy as np
 
 from armcal.base.units import readable
 from armcal.diagnose.checks import Finding
+from armcal.diagnose.verdict import suggestions
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import CORRELATED, bound_together, correlated_pairs, correlations
+from armcal.planning.suggestion import is_worth_measuring
 from armcal.plugins import PluginRegistry, said
 from armcal.report import run_figures as figures
 from armcal.report import run_tables as tables
@@ -56,8 +58,12 @@ def run_document(result: RunResult, sections: Sequence[Section] = ()) -> Documen
     notes = [finding for finding in findings if finding.grade == "note"]
     passed = [finding for finding in findings if finding.grade == "good"]
     grade = next((g for g in ("bad", "warning") if g in {f.grade for f in findings}), "good" if findings else "note")
-    do = [] if urgent or not findings else ["No warning: the calibration can be used."]
-    summary: list[Part] = [text for text in (result.verdict.paragraph, *do) if text]
+    sentences = result.verdict.sentences
+    summary: list[Part] = [] if result.verdict.bad else [*sentences[:1]]  # what findings say is not said twice
+    if len(sentences) > 1 and is_worth_measuring(result.fit.of(suggestions)):
+        summary.append(sentences[-1])
+    if findings and not urgent:
+        summary.append("No warning: the calibration can be used.")
     own = [
         *_accuracy(result),
         *_parameters(result),
@@ -113,7 +119,7 @@ def _accuracy(result: RunResult) -> list[Section]:
     if result.table.turns is not None:
         what = "Orientation" if result.errors.name == "Tip" else "Angle"
         shown.append(tables.errors_table(f"{what} error, deg: {result.name}", result.table.turns))
-    groups = [tables.groups_table(result.groups.errors, unit)] if result.groups.errors else []
+    groups = [tables.groups_table(result.groups, unit)] if result.groups else []
     curve = [figure for figure in (figures.distribution(result),) if figure]
     return [
         Section("Errors before and after", parts=[*shown, words, *curve], name="accuracy", level="always"),
@@ -183,9 +189,9 @@ def _data(result: RunResult, warnings: Sequence[str]) -> list[Section]:
     aside = _some(tables.aside_table(result))
     return [
         Section("Warnings of the data and the configuration", parts=findings, name="warnings"),
-        Section("Suspicious records", parts=suspicious, name="suspicious"),
+        Section("Suspicious records", parts=suspicious, name="suspicious", level="verbose"),
         Section("Variance components", parts=scatter, name="components"),
-        Section("Records set aside", parts=aside or ["No record was set aside."], name="data", folded=not aside),
+        Section("Records set aside", parts=aside, name="data", level="verbose"),
     ]
 
 

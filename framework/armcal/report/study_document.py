@@ -1,4 +1,4 @@
-"""What a study says, as a document: what to conclude, its tables and figures, which records gain and lose."""
+"""What a study says, as a document: what to conclude, its tables, and a figure."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ import numpy as np
 from armcal.report.document import Code, Document, Figure, Marks, Panel, Part, Section, Table
 from armcal.report.numbers import NONE, common_decimals, count, fixed, plural, significant
 from armcal.report.run_tables import provenance_facts
-from armcal.run.study_result import Cell, StudyResult, VariantResult
+from armcal.run.study import Cell, StudyResult, VariantResult
 
 _SAME_MM = 1e-6
 _FEW_GROUPS = 3
@@ -19,14 +19,6 @@ def study_document(result: StudyResult) -> Document:
     title += f", trained at one {result.group_by}, judged at another" if result.cells else ""
     first, *others = conclusions(result)
     tables: list[Part] = [_cells(result), _variants(result)] if result.cells else [_variants(result)]
-    figures = [_by_group(result), _ladder(result)] if result.cells else [_ladder(result)]
-    changes: list[Part] = []
-    for variant in result.variants:
-        if (change := variant.change) is not None:
-            words = f"{variant.name} against {change.against}, {result.unit}."
-            for gain, pairs in (("Gain most", change.most_helped), ("Lose most", change.most_hurt)):
-                words += f" {gain}: {', '.join(f'{i} ({fixed(x, 3, signed=True)})' for i, x in pairs) or 'none'}."
-            changes.append(words)
     facts = [*provenance_facts(result.provenance), *((name, f"{took:.2f} s") for name, took in result.seconds.items())]
     origin: list[Part] = [
         Code(result.command),
@@ -34,8 +26,7 @@ def study_document(result: StudyResult) -> Document:
     ]
     sections = [
         Section("Side by side", parts=tables, name="table", level="always"),
-        Section("Errors", parts=figures, name="figures"),
-        Section("Which records gain and lose most", parts=changes, name="records"),
+        Section("Errors", parts=[_ladder(result)], name="figures"),
         Section("Warnings", parts=result.warnings, name="warnings"),
         Section("How to reproduce this", parts=origin, name="reproduce", folded=True),
     ]
@@ -176,48 +167,22 @@ def _shown(value: float | None, unit: str) -> str:
 
 def _ladder(result: StudyResult) -> Figure:
     """Errors of each variant."""
-    names = [v.name for v in result.variants]
-    styles = {
+    said = "; ".join(
+        f"{v.name}: mean {_said(v.crossed.mean)}, 95 % {_said(v.crossed.p95)} {result.unit}" for v in result.variants
+    )
+    numbers = {
         "dot": ("mean, cross-validated", [v.crossed.mean for v in result.variants]),
         "dot before": ("mean, training records", [v.train.mean for v in result.variants]),
         "dot holdout": ("95 %, cross-validated", [v.crossed.p95 for v in result.variants]),
     }
-    said = "; ".join(
-        f"{v.name}: mean {_said(v.crossed.mean)}, 95 % {_said(v.crossed.p95)} {result.unit}" for v in result.variants
-    )
-    marks = [(style, name, list(enumerate(numbers))) for style, (name, numbers) in styles.items()]
-    return _dots(names, marks, ("Errors by variant", said, "The further left, the better."), f"error, {result.unit}")
-
-
-def _by_group(result: StudyResult) -> Figure:
-    """Mean error at each group, by variant and by what it was trained at."""
-    rows = _rows(result)
-    names = [f"{variant}, {_trained(trained, result)}" for variant, trained in rows]
-    cells = [(place, cell) for place, own in enumerate(rows.values()) for cell in own]
-    texts = [(f"{c.variant}, {_trained(c.trained, result)}", c.judged, _said(c.errors.mean)) for c in result.cells]
-    said = "; ".join(f"{trained}, judged at {at}: {mean} {result.unit}" for trained, at, mean in texts)
-    marks = [
-        (style, f"judged {words}", [(place, cell.errors.mean) for place, cell in cells if cell.seen == seen])
-        for style, words, seen in (("dot", "where it trained too", True), ("dot holdout", "elsewhere", False))
-    ]
-    caption = "Mean errors, of records that also trained by cross-validation."
-    return _dots(names, marks, (f"Errors by {result.group_by}", said, caption), f"mean error, {result.unit}")
-
-
-def _dots(
-    names: Sequence[str],
-    numbers: Sequence[tuple[str, str, Sequence[tuple[int, float | None]]]],
-    words: tuple[str, str, str],
-    label: str,
-) -> Figure:
-    """Numbers of each row on one axis: style, name, and pairs of row and number; ``words``: title, said, caption."""
     marks = []
-    for style, name, pairs in numbers:
-        known = [(x, float(place)) for place, x in pairs if x is not None]
+    for style, (name, errors) in numbers.items():
+        known = [(x, float(place)) for place, x in enumerate(errors) if x is not None]
         marks.append(Marks(style, np.array(known).reshape(-1, 2).T, name=name))
     whole = np.concatenate([m.xy[0] for m in marks])
     log = len(whole) > 0 and float(whole.min()) > 0 and float(whole.max() / whole.min()) > _LOG_FROM
-    return Figure(*words, [Panel("", marks, label, rows=names, log=log)], columns=1)
+    panel = Panel("", marks, f"error, {result.unit}", rows=[v.name for v in result.variants], log=log)
+    return Figure("Errors by variant", said, "The further left, the better.", [panel], columns=1)
 
 
 def _said(value: float | None) -> str:

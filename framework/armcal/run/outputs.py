@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from armcal.base.config_text import as_json, finite, shown
+from armcal.base.config_text import as_json, finite
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import (
     SCHEMA,
@@ -22,7 +22,6 @@ from armcal.calibration.calibration_file import (
 from armcal.calibration.physics import check_poses
 from armcal.diagnose.verdict import evidence
 from armcal.errors import ArmcalError, CalibrationWarning, NotConvergedError
-from armcal.estimate.uncertainty import Bootstrap
 from armcal.estimate.validation import in_unit
 from armcal.io import folder as folders
 from armcal.io.cells import csv_text
@@ -31,16 +30,16 @@ from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment
 from armcal.run.result import RunResult
 
-FILES = ("experiment.yaml", "residuals.csv", "metrics.json", "report.html", "log.txt", "calibration.yaml")
+FILES = ("experiment.yaml", "residuals.csv", "metrics.json", "report.html", "calibration.yaml")
 """In the order in which they are put in place: the calibration last."""
 NOT_CONVERGED_SUFFIX = ".not-converged"
 DO_NOT_USE_SUFFIX = ".do-not-use"
 UNREADABLE_SUFFIX = ".unreadable"
-BOOTSTRAP_FILE = "bootstrap.csv"  # Only where a bootstrap was asked for
 PROFILE_FILE = "profile.json"  # Only where profiles were asked for
 _OURS = (
-    BOOTSTRAP_FILE,
     PROFILE_FILE,
+    "bootstrap.csv",  # of runs by earlier versions, which made these two files
+    "log.txt",
     *(f"calibration.yaml{suffix}" for suffix in (NOT_CONVERGED_SUFFIX, DO_NOT_USE_SUFFIX, UNREADABLE_SUFFIX)),
     *FILES,
 )
@@ -62,25 +61,10 @@ def calibration_name(result: RunResult, accepted: bool) -> str:
     return f"calibration.yaml{DO_NOT_USE_SUFFIX}" if result.verdict.bad and not accepted else "calibration.yaml"
 
 
-def write(result: RunResult, experiment: Experiment, folder: Path, page: str, accepted: bool = False) -> None:
-    """Write all files; those of an earlier run in the same place move to ``earlier/``.
-
-    Raises:
-        InputError: the folder cannot be written, or is not ours to write to.
-        ArmcalError: the calibration cannot be read back; everything else is written.
-    """
-    with reserved(folder) as held:
-        place(held, result, experiment, page, accepted)
-
-
-def place(
-    held: folders.Reservation,
-    result: RunResult,
-    experiment: Experiment,
-    page: str,
-    accepted: bool = False,
+def write(
+    held: folders.Reservation, result: RunResult, experiment: Experiment, page: str, accepted: bool = False
 ) -> None:
-    """Write all files into a reserved folder.
+    """Write all files into a reserved folder; those of an earlier run in the same place move to ``earlier/``.
 
     Raises:
         InputError: the folder cannot be written.
@@ -90,14 +74,11 @@ def place(
     fault: ArmcalError | None = None
     if result.profiles:  # each by its parameter (SI), with its curve
         texts[PROFILE_FILE] = as_json({profile.name: profile.as_dict() for profile in result.profiles}) + "\n"
-    if result.bootstrap:
-        texts[BOOTSTRAP_FILE] = bootstrap_text(result.bootstrap, result)
     texts |= {
         "experiment.yaml": dump(experiment.source.data),
         "residuals.csv": residuals_text(result),
         "metrics.json": as_json(metrics(result)) + "\n",
         "report.html": page,
-        "log.txt": log_text(result),
         calibration_name(result, accepted): sealed(calibration_content(result, experiment, accepted)),
     }
     if "calibration.yaml" in texts:
@@ -114,12 +95,12 @@ def place(
 
 def metrics(result: RunResult) -> dict[str, Any]:
     """The numbers of a run for other programs."""
-    estimate, known = result.estimate, result.estimate.identifiability
+    estimate, known, verdict = result.estimate, result.estimate.identifiability, result.verdict
     content = {
         "experiment": result.name,
         "error_mm": _errors(result),
         **({"orientation_error_deg": result.table.turns.as_dict()} if result.table.turns else {}),
-        "groups": result.groups.as_dict(),
+        "groups": {own.name: {k: v for k, v in asdict(own).items() if k != "name"} for own in result.groups},
         **({"pose_residual": result.pose_residual.as_dict()} if result.pose_residual else {}),
         "records": {
             "used": len(result.dataset),
@@ -140,7 +121,13 @@ def metrics(result: RunResult) -> dict[str, Any]:
         },
         "noise": _noise(result),
         "solver": asdict(estimate.verdict),
-        "verdict": {"usable": not result.verdict.bad, "grade": result.verdict.grade, **asdict(result.verdict)},
+        "verdict": {
+            "usable": not verdict.bad,
+            "grade": verdict.grade,
+            "headline": verdict.headline,
+            "findings": [asdict(finding) for finding in verdict.findings],
+            "paragraph": verdict.paragraph,
+        },
         "structure": evidence(result.fit),
         "prediction_intervals": result.intervals.as_dict(),
         "bootstrap": _bootstrap_metrics(result),
@@ -155,7 +142,7 @@ def metrics(result: RunResult) -> dict[str, Any]:
 
 def _errors(result: RunResult) -> dict[str, Any]:
     """The table, and of training and judging groups the mean of their means: a group of few records counts as much."""
-    table, groups = result.table.as_dict(), result.groups.errors
+    table, groups = result.table.as_dict(), result.groups
     for key, own in (("train", [g for g in groups if g.trained]), ("holdout", [g for g in groups if not g.trained])):
         if own:
             table["nominal"][key]["mean_of_groups"] = float(np.mean([g.nominal_error_mm for g in own]))
@@ -192,7 +179,7 @@ def calibration_content(result: RunResult, experiment: Experiment, accepted: boo
         arms=dict(result.system.description["arms"]),
         measurements=dict(result.system.description["measurements"]),
         statics=dict(result.system.description["statics"]),
-        groups={owner: tuple(keys) for owner, keys in result.groups.keys.items()},
+        groups={owner: tuple(keys) for owner, keys in result.fit.problem.blueprint.groups.items()},
         parameters=parameter_records(estimate),
         prediction=result.prediction,
         information=information,
@@ -244,26 +231,6 @@ def residuals_text(result: RunResult) -> str:
         residual = errors.calibrated_residual_mm[:, i]
         rows.append([record, row, "holdout" if held[i] else "train", weight, *numbers, *residual, *turned])
     return csv_text(rows)
-
-
-def bootstrap_text(resampled: Bootstrap, result: RunResult) -> str:
-    """A row a free canonical entry (SI): by the curvature at the estimate, and by refits to resampled records."""
-    estimate, columns = result.estimate, ("sd", "lower", "upper")
-    rows: list[list[object]] = [["parameter", "value", *columns, *(f"bootstrap_{name}" for name in columns)]]
-    for i, name in enumerate(resampled.names):
-        interval, sd = estimate.intervals[i], estimate.deviations[i]
-        own = [estimate.values[estimate.free_entries[i]], sd, interval.lower, interval.upper]
-        rows.append([name, *own, resampled.deviations[i], *resampled.intervals[i]])
-    return csv_text(rows, ".9g")
-
-
-def log_text(result: RunResult) -> str:
-    lines = [f"experiment: {result.name}", f"command: {result.command}", f"verdict: {result.verdict.headline}"]
-    lines += [f"{finding.grade}: {finding.whole}" for finding in result.verdict.findings]
-    lines += [f"warning: {text}" for text in result.warnings]
-    lines += result.odd_records
-    lines += [f"seconds in {stage}: {seconds:.3f}" for stage, seconds in result.seconds.items()]
-    return "\n".join(map(shown, lines)) + "\n"
 
 
 def _bootstrap_metrics(result: RunResult) -> dict[str, Any] | None:

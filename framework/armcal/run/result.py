@@ -22,7 +22,6 @@ from armcal.estimate.prediction import ResidualSpread, residual_spread
 from armcal.estimate.uncertainty import Bootstrap, Profile
 from armcal.estimate.validation import ErrorSummary, Split, summarise
 from armcal.estimate.variance import VarianceComponents
-from armcal.measure.groups import Groups
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment, group_texts
 from armcal.run.pose_residual import ResidualOutcome
@@ -84,16 +83,8 @@ class NoiseResult:
             content["components"] = [finite(asdict(component)) for component in self.components.components]
             content["inseparable"] = [list(pair) for pair in self.components.inseparable]
             content["unseen_joints"] = list(self.components.unseen)
-        content["scatter"] = {
-            name: {
-                "covariance": spread.covariance.tolist(),
-                "share": spread.share,
-                "over": spread.over,
-                "channel": spread.channel,
-                "freedom": spread.freedom,
-            }
-            for name, spread in self.scatter.items()
-        }
+        spreads = self.scatter.items()
+        content["scatter"] = {name: {**asdict(own), "covariance": own.covariance.tolist()} for name, own in spreads}
         return content
 
 
@@ -126,27 +117,12 @@ class GroupError:
     nominal_distance_error_mm: float | None
     distance_error_mm: float | None
 
-    def as_dict(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "name"}
 
-
-@dataclass(frozen=True)
-class RunGroups:
-    """What a run found of groups: their errors, sorted by name, and the keys of those that bring parameters."""
-
-    errors: tuple[GroupError, ...] = ()
-    keys: Groups = field(default_factory=dict)
-
-    def as_dict(self) -> dict[str, Any]:
-        return {error.name: error.as_dict() for error in self.errors}
-
-
-def run_groups(experiment: Experiment, fit: Fit) -> RunGroups:
-    """Errors of each group, sorted by name (none if nothing separates groups), and the keys of the problem's groups."""
-    problem, dataset, keys = fit.problem, fit.dataset, fit.problem.blueprint.groups
-    label, errors = experiment.label, fit.errors
+def run_groups(experiment: Experiment, fit: Fit) -> tuple[GroupError, ...]:
+    """Errors of each group, sorted by name; none if nothing separates groups."""
+    problem, dataset, label, errors = fit.problem, fit.dataset, experiment.label, fit.errors
     if label is None or not (label in dataset.extra or (label == PAYLOAD and dataset.has(PAYLOAD))):
-        return RunGroups((), keys)
+        return ()
     labels = np.array(group_texts(dataset, label))
     before = _distances(problem, settled(untrained(problem), problem.parameters.nominal()))
     # Distances are judged by what the records of each socket say, not by what the known distance made of them.
@@ -158,7 +134,7 @@ def run_groups(experiment: Experiment, fit: Fit) -> RunGroups:
         trained = int(np.sum(inside[fit.split.train]))
         of_nominal, of_calibrated = _within(name, before), _within(name, after)
         result.append(GroupError(name, int(inside.sum()), trained, nominal, calibrated, of_nominal, of_calibrated))
-    return RunGroups(tuple(result), keys)
+    return tuple(result)
 
 
 def _distances(problem: Problem, values: Array) -> list[tuple[tuple[str, str], float]]:
@@ -227,7 +203,7 @@ class RunResult:
         bootstrap: refits to resampled records, if they were asked for.
         profiles: intervals by profile likelihood, of the numbers asked for.
         prediction: what predictions need of the run beyond the values; None if it did not converge.
-        groups: of records, where a column separates them.
+        groups: errors of groups of records, where a column separates them.
         pose_residual: what became of one that was to be learned.
     """
 
@@ -242,7 +218,7 @@ class RunResult:
     bootstrap: Bootstrap | None = None
     profiles: tuple[Profile, ...] = ()
     prediction: PredictionRecord | None = None
-    groups: RunGroups = field(default_factory=RunGroups)
+    groups: tuple[GroupError, ...] = ()
     pose_residual: ResidualOutcome | None = None
 
     @property
@@ -285,13 +261,3 @@ class RunResult:
     def backend(self) -> str:
         """What evaluated the model."""
         return self.fit.problem.backend
-
-    @property
-    def odd_records(self) -> tuple[str, ...]:
-        """A line for each record that was set aside or is suspicious."""
-        aside = (f"set aside: row {a.row}, record {a.record_id}: {a.reason}" for a in self.dataset.set_aside)
-        suspicious = (
-            f"suspicious: row {s.row}, record {s.record_id}: {s.deviations:.1f} sd (limit {s.limit:.1f}), {s.fate}"
-            for s in self.noise.suspicious
-        )
-        return (*aside, *suspicious)

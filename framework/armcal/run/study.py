@@ -4,7 +4,7 @@ With ``group_by`` each variant is also trained at each group of records alone an
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -14,10 +14,12 @@ import numpy as np
 from pydantic import Field
 
 from armcal.base.arrays import Array, Indices
+from armcal.base.config_text import as_json
 from armcal.base.dataset import Dataset
 from armcal.base.settings import Settings
+from armcal.calibration.calibration_file import dump
 from armcal.config.validate import validate
-from armcal.config.yaml_source import ConfigSource, load_variants
+from armcal.config.yaml_source import VARIANTS, ConfigSource, load_variants
 from armcal.diagnose.fit import Prepared
 from armcal.errors import ConfigError, DataError, InputError, Location, NotConvergedError, ProblemError
 from armcal.estimate.estimator import Progress, no_progress
@@ -33,8 +35,10 @@ from armcal.estimate.validation import (
     errors_and_turns,
     fit_and_judge,
     folds,
+    in_unit,
     summarise,
 )
+from armcal.io.cells import csv_text
 from armcal.io.parallel import Executor
 from armcal.plugins import PluginRegistry, discover
 from armcal.problem.problem import Problem
@@ -42,13 +46,12 @@ from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, prepare
 from armcal.run.pose_residual import Layer, judged_with, layer_of
 from armcal.run.settings import ExperimentSettings, ValidationSettings
-from armcal.run.study_result import Cell, Change, NestedResult, StudyResult, VariantResult
 
 R = TypeVar("R")
 PREVIOUS = "previous"  # As a reference: each variant is compared with the one before it
 WORTH_COMPILING = 1000
 """Records to fit: less than for a run, since the models of a study may be large and their fits long."""
-MOST_LISTED = 10
+FILES = ("experiment.yaml", "study.csv", "study.json", "study.html")
 _MM = 1000.0
 
 
@@ -70,6 +73,145 @@ class StudySettings(Settings):
     nested: bool = False
     blocks: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     group_by: str | None = None
+
+
+@dataclass(frozen=True)
+class Change:
+    """One model against another, record by record; negative is better."""
+
+    against: str  # the other model
+    mean: float  # of the differences of each record's error
+    standard_error: float  # of that mean, from blocks of neighbouring records; the fitted models are taken as given
+    block: int  # how many neighbours a block has
+    helped: float  # the share of records whose error is smaller
+
+
+@dataclass(frozen=True)
+class VariantResult:
+    """One variant, judged.
+
+    Attributes:
+        crossed: errors of each record by a fit that did not see it (mm), the mean of each figure over the repeats.
+        turns: errors of orientations (deg), where they are measured beside lengths: ``nominal``, ``train``,
+            ``cross_validated``.
+    """
+
+    name: str  # of the variant
+    free: int  # how many numbers the fit may change
+    nominal: ErrorSummary  # errors without calibration (mm)
+    train: ErrorSummary  # errors of a fit on all records, on the same records (mm)
+    crossed: ErrorSummary
+    at_rest: ErrorSummary  # the same if nothing is known of a drift; equal where nothing drifts
+    errors_mm: Array  # ``crossed`` record by record, mean over the repeats (N; nan where a fold did not converge)
+    change: Change | None  # against the variant it is compared with (mm); None for the reference itself
+    converged: bool  # whether the fit on all records did
+    failed_folds: int  # how many fits of the cross-validation did not converge
+    fit_seconds: float  # of the fit on all records
+    seconds: float  # of all fits of this variant
+    turns: Mapping[str, ErrorSummary] | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        errors = {"nominal": self.nominal, "train": self.train}
+        errors |= {"cross_validated": self.crossed, "cross_validated_at_rest": self.at_rest}
+        content: dict[str, Any] = {"error_mm": errors, **({"orientation_error_deg": self.turns} if self.turns else {})}
+        return {
+            "name": self.name,
+            "free": self.free,
+            **{what: {of: asdict(own) for of, own in summaries.items()} for what, summaries in content.items()},
+            "change_mm": self.change and asdict(self.change),
+            "converged": self.converged,
+            "failed_folds": self.failed_folds,
+            "seconds": {"fit": self.fit_seconds, "all_fits": self.seconds},
+        }
+
+
+@dataclass(frozen=True)
+class NestedResult:
+    """The choice itself, judged: made inside of each fold's training records, its errors on the fold (mm).
+
+    ``chosen`` is the variant that each fold chose; ``errors_mm`` (N) is nan where the chosen fit did not converge.
+    """
+
+    crossed: ErrorSummary
+    chosen: tuple[str, ...]
+    errors_mm: Array
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One variant trained at some groups of records and judged at one (mm).
+
+    ``trained`` is empty for the nominal model; with ``seen`` the records that judge were of a group that also
+    trained, and were kept out of the training by folds. ``turns`` are errors of orientations (deg), where measured.
+    """
+
+    variant: str
+    trained: tuple[str, ...]
+    judged: str
+    errors: ErrorSummary
+    seen: bool
+    failed_fits: int
+    turns: ErrorSummary | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        return {
+            "variant": self.variant,
+            "trained_at": list(self.trained),
+            "judged_at": self.judged,
+            "error_mm": asdict(self.errors),
+            **({"orientation_error_deg": asdict(self.turns)} if self.turns else {}),
+            "cross_validated": self.seen,
+            "failed_fits": self.failed_fits,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyResult:
+    """A finished study."""
+
+    name: str
+    command: str  # that repeats it
+    dataset: Dataset
+    simulated: bool
+    folds: int
+    repeats: int
+    variants: tuple[VariantResult, ...]  # in the order written
+    best: str  # the lowest cross-validated mean error, of those whose fits all converged
+    simplest: str  # the fewest parameters within one standard error of it
+    nested: NestedResult | None
+    group_by: str | None
+    labels: tuple[str, ...]  # the group of each record
+    groups: Mapping[str, int]  # records of each; empty where nothing groups them
+    cells: tuple[Cell, ...]
+    trained_mm: Mapping[tuple[str, tuple[str, ...]], Array]  # by variant and groups trained at, record by record
+    warnings: tuple[str, ...]
+    seconds: dict[str, float]
+    provenance: dict[str, Any]
+    unit: str = "mm"  # of all errors; ``mrad`` where nothing measured is a length
+
+    def variant(self, name: str) -> VariantResult:
+        return next(v for v in self.variants if v.name == name)
+
+    def as_dict(self) -> dict[str, Any]:
+        nested, grouped = self.nested, dict[str, Any]()
+        if self.group_by is not None:
+            grouped = {"group_by": self.group_by, "simulated": self.simulated, "groups": dict(self.groups)}
+            grouped["cells"] = [cell.as_dict() for cell in self.cells]
+        content = {
+            "study": self.name,
+            "records": len(self.dataset),
+            "folds": self.folds,
+            "repeats": self.repeats,
+            "variants": [variant.as_dict() for variant in self.variants],
+            "lowest": self.best,
+            "simplest_within_one_standard_error": self.simplest,
+            "nested": nested and {"error_mm": asdict(nested.crossed), "chosen": list(nested.chosen)},
+            **grouped,
+            "warnings": list(self.warnings),
+            "seconds": dict(self.seconds),
+            "provenance": self.provenance,
+        }
+        return dict(in_unit(content, self.unit))
 
 
 @dataclass(frozen=True)
@@ -229,8 +371,8 @@ def compare(
     fits, count = _fits(study, ready, plan, executor, progress, watch), len(plan) // len(ready)
     by_name = {name: fits[i * count : (i + 1) * count] for i, name in enumerate(ready)}
     judged = [_judged(name, ready[name], by_name[name], whole) for name in ready]
-    variants = _compared(judged, settings, dataset.ids)
-    best, simplest = _choices(variants, settings, dataset.ids)
+    variants = _compared(judged, settings)
+    best, simplest = _choices(variants, settings)
     trained = {name: _by_training(by_name[name], (whole, *parts)) for name in ready} if parts else {}
     return StudyResult(
         name=study.name,
@@ -378,33 +520,29 @@ def _averaged(drawings: Array) -> ErrorSummary:
     return ErrorSummary(means["mean"], means["rms"], means["p95"], means["max"], min(s.count for s in summaries))
 
 
-def _compared(plain: Sequence[VariantResult], settings: StudySettings, ids: Sequence[str]) -> tuple[VariantResult, ...]:
+def _compared(plain: Sequence[VariantResult], settings: StudySettings) -> tuple[VariantResult, ...]:
     """Each with its change against the one before or the reference, unless it is that itself."""
     by_name = {result.name: result for result in plain}
     others = [plain[0], *plain] if settings.reference == PREVIOUS else [by_name[settings.reference]] * len(plain)
     return tuple(
         result
         if other is result
-        else replace(result, change=change(result.errors_mm, other.errors_mm, other.name, ids, settings.blocks))
+        else replace(result, change=change(result.errors_mm, other.errors_mm, other.name, settings.blocks))
         for result, other in zip(plain, others, strict=False)
     )
 
 
-def change(errors: Array, others: Array, against: str, ids: Sequence[str], block: BlockLength = "auto") -> Change:
+def change(errors: Array, others: Array, against: str, block: BlockLength = "auto") -> Change:
     """Errors (N) of one model against those of another on the same records in recorded order; nan where not judged."""
     both = np.flatnonzero(np.isfinite(errors) & np.isfinite(others))
     gained = errors[both] - others[both]
     length = automatic_block_length(gained) if block == "auto" else block
-    order = both[np.argsort(gained, kind="stable")]
-    listed = [(str(ids[i]), float(errors[i] - others[i])) for i in order]
     return Change(
         against=against,
         mean=float(np.mean(gained)) if len(both) else float("nan"),
         standard_error=standard_error_of_mean(gained, length),
         block=length,
         helped=float(np.mean(gained < 0)) if len(both) else float("nan"),
-        most_helped=tuple(pair for pair in listed[:MOST_LISTED] if pair[1] < 0),
-        most_hurt=tuple(pair for pair in listed[::-1][:MOST_LISTED] if pair[1] > 0),
     )
 
 
@@ -421,7 +559,7 @@ def simplest_good(means: Array, freedoms: Sequence[int], changes: Sequence[Chang
     return min(good, key=lambda i: (freedoms[i], means[i]))
 
 
-def _choices(variants: Sequence[VariantResult], settings: StudySettings, ids: Sequence[str]) -> tuple[str, str]:
+def _choices(variants: Sequence[VariantResult], settings: StudySettings) -> tuple[str, str]:
     whole = [v for v in variants if v.converged and not v.failed_folds]
     if not whole:
         raise NotConvergedError(
@@ -429,7 +567,7 @@ def _choices(variants: Sequence[VariantResult], settings: StudySettings, ids: Se
         )
     means = np.array([v.crossed.mean for v in whole], dtype=float)
     best = whole[int(np.argmin(means))]
-    changes = [change(v.errors_mm, best.errors_mm, best.name, ids, settings.blocks) for v in whole]
+    changes = [change(v.errors_mm, best.errors_mm, best.name, settings.blocks) for v in whole]
     return best.name, whole[simplest_good(means, [v.free for v in whole], changes)].name
 
 
@@ -500,3 +638,39 @@ def _warnings(ready: Mapping[str, Prepared], variants: Sequence[VariantResult]) 
         if v.failed_folds or not v.converged:
             listed.append(f"{v.name}: {v.failed_folds + (not v.converged)} fits did not converge; it is not chosen.")
     return tuple(listed)
+
+
+def files(result: StudyResult, study: ConfigSource, variants: Mapping[str, ConfigSource], page: str) -> dict[str, str]:
+    return {
+        "experiment.yaml": dump(_self_contained(study, variants)),
+        "study.csv": _csv_text(result),
+        "study.json": as_json(result.as_dict()) + "\n",
+        "study.html": page,
+    }
+
+
+def _self_contained(study: ConfigSource, variants: Mapping[str, ConfigSource]) -> dict[str, Any]:
+    """The configuration with each variant as the sections in which it differs: no other file is needed."""
+    read = next((own.data["data"] for own in variants.values() if "data" in own.data), None)
+    data = study.data if read is None else {**study.data, "data": read}
+    base = {key: section for key, section in data.items() if key != VARIANTS[0]}
+    listed = {}
+    for name, own in variants.items():
+        differing = {key: section for key, section in own.data.items() if base.get(key) != section}
+        listed[name] = {"set": differing | {key: None for key in base if key not in own.data}}
+    return {**data, VARIANTS[0]: {**data[VARIANTS[0]], "variants": listed}}
+
+
+def _csv_text(result: StudyResult) -> str:
+    """A row a record, an error a variant, by a fit that did not see the record."""
+    columns: dict[str, Any] = {} if result.group_by is None else {result.group_by: result.labels}
+    columns |= {f"{v.name}_{result.unit}": v.errors_mm for v in result.variants}
+    if result.nested:
+        columns[f"chosen_inside_{result.unit}"] = result.nested.errors_mm
+    for (name, trained), errors in result.trained_mm.items():
+        if len(trained) < len(result.groups):
+            columns[f"{name}_trained_at_{'_and_'.join(trained).replace(' ', '_')}_{result.unit}"] = errors
+    dataset = result.dataset
+    rows = dataset.rows or ("",) * len(dataset)
+    body = zip(dataset.ids, rows, *columns.values(), strict=True)
+    return csv_text([["pose_id", "source_row", *columns], *body])

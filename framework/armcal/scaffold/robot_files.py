@@ -177,7 +177,8 @@ def try_out(folder: Path, registry: PluginRegistry, command: str = "", progress:
     result = calibrate(experiment, command, progress, watch)
     result.seconds["total"] = watch.total()
     document = run_document(result, plugin_sections(result, registry)[0])
-    outputs.write(result, experiment, folder / RESULTS, page(document))
+    with outputs.reserved(folder / RESULTS) as held:
+        outputs.write(held, result, experiment, page(document))
     held_out = (of["holdout"].mean for of in (result.table.nominal, result.table.calibrated))
     return Trial(result, *(math.nan if error is None else error for error in held_out))
 
